@@ -1,0 +1,42 @@
+"""Errors of the solver.
+
+    SolverError                 base: catch this one
+    └── InvalidInput            what came in cannot be solved; says both sides and what to do
+        └── InvalidSettings     one of the settings is out of its range
+
+Not converging is not an error: see `pliant.solver.Outcome`.
+"""
+
+from __future__ import annotations
+
+
+class SolverError(Exception):
+    """The solver could not answer."""
+
+
+class InvalidInput(SolverError):
+    """An input is not what it must be.
+
+    Attributes
+    ----------
+    code : str
+        Stable machine-readable name of the fault, e.g. ``"too_few_frames"``.
+    field : str
+        The input at fault, e.g. ``"tracks"`` or ``"mesh.faces"``.
+    expected, got : str
+        Both sides, in words.
+    hint : str
+        What the user can do about it.
+    """
+
+    def __init__(self, code: str, *, field: str, expected: str, got: str, hint: str) -> None:
+        super().__init__(f"{field}: expected {expected}, got {got}. {hint}")
+        self.code = code
+        self.field = field
+        self.expected = expected
+        self.got = got
+        self.hint = hint
+
+
+class InvalidSettings(InvalidInput):
+    """A setting is out of its range, or two settings contradict each other."""

@@ -1,0 +1,364 @@
+"""The records that flow through a solve: Tracks → State … → Solution. Arrays are read-only from the door on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pliant.solver.errors import InvalidInput
+
+MIN_FRAMES = 3
+MIN_POINTS = 4
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int32]
+
+
+def read_only(array: NDArray[np.generic]) -> None:
+    """Switch off writing, so that a record handed around cannot be changed behind its reader's back."""
+    array.flags.writeable = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tracks:
+    """Dense 2-D point tracks: the paper's W, kept as points."""
+
+    points: Floats
+    """Image positions, shape `(F, P, 2)`, the input's unit (pixels unless told), x right, y down unless told.
+    Entries that were not seen hold 0 and carry weight 0; never NaN."""
+
+    visible: Floats
+    """Confidence in [0, 1] that the point was seen, shape `(F, P)`; 0 means hidden."""
+
+    @classmethod
+    def from_arrays(cls, points: ArrayLike, visible: ArrayLike | None = None) -> Tracks:
+        """Check and copy arrays as users have them.
+
+        Parameters
+        ----------
+        points : array_like, shape (F, P, 2)
+            NaN or infinity in either coordinate marks the observation as hidden.
+        visible : array_like, shape (F, P), optional
+            Bool or confidence in [0, 1].
+
+        Raises
+        ------
+        InvalidInput
+            Wrong shape or type, F < 3, P < 4, confidence outside [0, 1], or nothing visible.
+        """
+        given = np.asarray(points)
+        if given.dtype.kind not in "fiu":
+            raise _wrong("tracks", "wrong_type", "real numbers", f"dtype {given.dtype}", "Convert the array to float.")
+        if given.ndim != 3 or given.shape[2] != 2:
+            raise _wrong("tracks", "wrong_shape", "(frames, points, 2)", _shape(given), "Transpose or reshape the array.")
+        frames, count, _ = given.shape
+        if frames < MIN_FRAMES:
+            raise _wrong("tracks", "too_few_frames", f"at least {MIN_FRAMES} frames", f"{frames}", "Track a longer clip.")
+        if count < MIN_POINTS:
+            raise _wrong("tracks", "too_few_points", f"at least {MIN_POINTS} points", f"{count}", "Track more points.")
+        positions = np.array(given, dtype=np.float64)
+        confidence = _confidence(visible, (frames, count))
+        confidence[~np.isfinite(positions).all(axis=2)] = 0.0
+        if not confidence.any():
+            raise _wrong(
+                "tracks", "nothing_visible", "at least one finite, visible observation", "none",
+                "Check for NaN everywhere, or a visibility array that is inverted.",
+            )  # fmt: skip
+        positions[confidence == 0] = 0.0
+        read_only(positions)
+        read_only(confidence)
+        return cls(positions, confidence)
+
+    @property
+    def num_frames(self) -> int:
+        """F."""
+        return self.points.shape[0]
+
+    @property
+    def num_points(self) -> int:
+        """P."""
+        return self.points.shape[1]
+
+    @property
+    def all_visible(self) -> bool:
+        """True if every observation carries full weight."""
+        return bool((self.visible == 1).all())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mesh:
+    """Which points are neighbours. Vertex i is point i; the order is never changed."""
+
+    num_points: int
+    """P."""
+
+    faces: Ints
+    """Triangles `(T, 3)` or quads `(T, 4)`, counter-clockwise, indices into the points; T may be 0."""
+
+    grid: Ints | None = None
+    """For points that lie on a pixel grid: point index of every cell, −1 where the grid has a hole, shape `(rows, columns)`."""
+
+    @classmethod
+    def from_faces(cls, faces: ArrayLike, num_points: int) -> Mesh:
+        """Check faces against the number of points.
+
+        Raises
+        ------
+        InvalidInput
+            Not an integer array of 3 or 4 columns, an index out of range, or a face that repeats a vertex.
+        """
+        given = np.asarray(faces)
+        if given.size == 0:
+            given = np.zeros((0, 3), dtype=np.int32)
+        if given.dtype.kind not in "iu":
+            raise _wrong("mesh.faces", "wrong_type", "integers", f"dtype {given.dtype}", "Convert the faces to int32.")
+        if given.ndim != 2 or given.shape[1] not in (3, 4):
+            raise _wrong(
+                "mesh.faces", "wrong_shape", "(faces, 3) or (faces, 4)", _shape(given),
+                "Give triangles or quads; split larger polygons first.",
+            )  # fmt: skip
+        if len(given) > 0 and (int(given.min()) < 0 or int(given.max()) >= num_points):
+            raise _wrong(
+                "mesh.faces", "index_out_of_range", f"indices from 0 to {num_points - 1} (the tracks have {num_points} points)",
+                f"indices from {given.min()} to {given.max()}", "Vertex i of the mesh must be point i of the tracks; indices start at 0.",
+            )  # fmt: skip
+        ordered = np.sort(given, axis=1)
+        if bool((ordered[:, 1:] == ordered[:, :-1]).any()):
+            bad = int(np.flatnonzero((ordered[:, 1:] == ordered[:, :-1]).any(axis=1))[0])
+            raise _wrong(
+                "mesh.faces", "degenerate_face", "distinct vertices in every face", f"face {bad} = {given[bad].tolist()}",
+                "Remove faces that repeat a vertex.",
+            )  # fmt: skip
+        kept = np.array(given, dtype=np.int32)
+        read_only(kept)
+        return cls(num_points, kept)
+
+    @classmethod
+    def from_grid(cls, grid: ArrayLike) -> Mesh:
+        """Quads between the cells of a pixel grid, which may have holes.
+
+        Parameters
+        ----------
+        grid : array_like of int, shape (rows, columns)
+            The point index of each cell, −1 where there is none; every point appears exactly once.
+
+        Raises
+        ------
+        InvalidInput
+            Not two-dimensional, or the indices are not each of 0 … P−1 exactly once.
+        """
+        given = np.asarray(grid)
+        if given.dtype.kind not in "iu" or given.ndim != 2:
+            raise _wrong(
+                "mesh.grid", "wrong_shape", "an integer array (rows, columns)", f"{given.dtype} {_shape(given)}",
+                "Give the point index of every cell, −1 for holes.",
+            )  # fmt: skip
+        present = given[given >= 0]
+        if present.size == 0 or not np.array_equal(np.sort(present), np.arange(present.size)):
+            raise _wrong(
+                "mesh.grid", "index_out_of_range", f"each index from 0 to {max(present.size - 1, 0)} exactly once",
+                "missing or repeated indices", "Number the grid's points without gaps; −1 marks a hole.",
+            )  # fmt: skip
+        cells = np.array(given, dtype=np.int32)
+        corners = np.stack([cells[:-1, :-1], cells[1:, :-1], cells[1:, 1:], cells[:-1, 1:]], axis=-1).reshape(-1, 4)
+        faces = np.ascontiguousarray(corners[(corners >= 0).all(axis=1)])
+        read_only(cells)
+        read_only(faces)
+        return cls(int(present.size), faces, cells)
+
+    @property
+    def edges(self) -> Ints:
+        """Undirected edges of the faces, each once with the lower index first, shape `(E, 2)`."""
+        if len(self.faces) == 0:
+            return np.zeros((0, 2), dtype=np.int32)
+        following = np.roll(self.faces, -1, axis=1)
+        pairs = np.sort(np.stack([self.faces, following], axis=-1).reshape(-1, 2), axis=1)
+        return np.unique(pairs, axis=0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Camera:
+    """The estimated camera of every frame: points = scales · shapes · rotations[:, :2]ᵀ + translations."""
+
+    rotations: Floats
+    """Camera from world, shape `(F, 3, 3)`; orthographic: the first two rows project."""
+
+    scales: Floats
+    """Image units per world unit, shape `(F,)`; mean of the logarithm is 0; all 1 for plain orthography."""
+
+    translations: Floats
+    """Image position of each frame's shape origin, shape `(F, 2)`, the tracks' unit."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KnownCamera:
+    """Cameras that the user gives instead of having them estimated."""
+
+    rotations: Floats
+    """Shape `(F, 3, 3)`, camera from world."""
+
+    scales: Floats | None = None
+    """Shape `(F,)`, or None: estimated when the camera model has scales."""
+
+    @classmethod
+    def from_arrays(cls, rotations: ArrayLike, scales: ArrayLike | None = None) -> KnownCamera:
+        """Check cameras as users have them: `(F, 3, 3)`, or `(F, 2, 3)`, completed by the cross product.
+
+        Raises
+        ------
+        InvalidInput
+            Wrong shape, not finite, rows not orthonormal to 1e-3, or a scale that is not positive.
+        """
+        given = np.asarray(rotations, dtype=np.float64)
+        if given.ndim != 3 or given.shape[1:] not in ((2, 3), (3, 3)):
+            raise _wrong("rotations", "wrong_shape", "(frames, 2, 3) or (frames, 3, 3)", _shape(given), "Give one rotation a frame.")
+        rows = given[:, :2]
+        error = np.abs(rows @ rows.transpose(0, 2, 1) - np.eye(2)).max() if np.isfinite(rows).all() else np.inf
+        if error > 1e-3:
+            raise _wrong(
+                "rotations", "not_a_rotation", "orthonormal rows", f"a deviation of {error:.3g}",
+                "Rows must have length 1 and be perpendicular; scales are given separately.",
+            )  # fmt: skip
+        left, _, right = np.linalg.svd(rows, full_matrices=False)
+        rows = left @ right
+        complete = np.concatenate([rows, np.cross(rows[:, 0], rows[:, 1])[:, None]], axis=1)
+        read_only(complete)
+        if scales is None:
+            return cls(complete)
+        factors = np.array(scales, dtype=np.float64)
+        if factors.shape != (len(given),) or not np.isfinite(factors).all() or not (factors > 0).all():
+            raise _wrong("scales", "wrong_shape", f"{len(given)} positive numbers", _shape(factors), "Give one scale a frame.")
+        read_only(factors)
+        return cls(complete, factors)
+
+
+class Outcome(StrEnum):
+    """How a solve ended. Every member has a sentence for the user."""
+
+    CONVERGED = "converged"
+    MAX_REWEIGHTINGS = "max_reweightings"
+    STOPPED = "stopped"
+
+    @property
+    def sentence(self) -> str:
+        """What happened, and what to do next where there is something to do."""
+        return _SENTENCES[self]
+
+
+_SENTENCES = {
+    Outcome.CONVERGED: "Converged.",
+    Outcome.MAX_REWEIGHTINGS: (
+        "Stopped at the largest number of reweightings before the objective settled. The result is usable; "
+        "raise max_reweightings or tolerance if it must settle."
+    ),
+    Outcome.STOPPED: "Stopped on request; the shapes are those of the last finished step.",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """What `on_step` is told after each unit of work."""
+
+    stage: str
+    """`cameras`, `initialise`, `reweight` or `finish`."""
+
+    fraction: float
+    """Estimated share of the whole solve that is done, in [0, 1]."""
+
+    reweighting: int = 0
+    """Reweightings done."""
+
+    max_reweightings: int = 0
+    """Upper bound."""
+
+    objective: float | None = None
+    """E after this step, normalised units; None before there is one."""
+
+    residual: float | None = None
+    """Median visible reprojection residual, the tracks' unit; None before there is one."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trace:
+    """Per-reweighting history, arrays of equal length; entry 0 is the initialisation."""
+
+    objective: Floats
+    """E, normalised units; never rises."""
+
+    residual: Floats
+    """Median visible reprojection residual, the tracks' unit."""
+
+    iterations: Ints
+    """Inner conjugate-gradient iterations spent."""
+
+
+@dataclass(frozen=True, slots=True)
+class Choices:
+    """What was chosen automatically, with the reasons, so that a report can say it."""
+
+    basis_size: int
+    temporal_weight: float
+    spatial_weight: float
+    robust_scale: float
+    temporal_order: int
+    low_rank_weight: float
+    laplacian: str
+    unit: float
+    """RMS radius of the centred tracks, the tracks' unit: one normalised unit."""
+    noise: float
+    """Estimated standard deviation of the track noise, the tracks' unit."""
+    reasons: dict[str, str] = field(default_factory=dict)
+    """One sentence for each automatic choice, by name."""
+    warnings: tuple[str, ...] = ()
+    """Sentences the user should read, e.g. that the camera hardly moved."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solution:
+    """The answer."""
+
+    shapes: Floats
+    """Shape `(F, P, 3)`, world axes, the tracks' unit, centred per frame."""
+
+    camera: Camera
+    """Estimated or given cameras. Depth has one free sign for the whole sequence (the bas-relief mirror)."""
+
+    residuals: Floats
+    """Length of the reprojection residual, shape `(F, P)`, the tracks' unit; 0 where hidden."""
+
+    weights: Floats
+    """Final IRLS weight over its largest possible value, in [0, 1], shape `(F, P)`; 0 where hidden, small for outliers."""
+
+    trace: Trace
+    outcome: Outcome
+    choices: Choices
+    seconds: dict[str, float]
+    """Wall time per stage."""
+
+
+def _confidence(visible: ArrayLike | None, shape: tuple[int, int]) -> Floats:
+    if visible is None:
+        return np.ones(shape)
+    given = np.asarray(visible)
+    if given.dtype.kind not in "bfiu":
+        raise _wrong("visibility", "wrong_type", "bool or numbers", f"dtype {given.dtype}", "Convert the array to bool.")
+    if given.shape != shape:
+        raise _wrong("visibility", "wrong_shape", str(shape), _shape(given), "Visibility is (frames, points), as the tracks.")
+    confidence = np.array(given, dtype=np.float64)
+    if not np.isfinite(confidence).all() or confidence.min() < 0 or confidence.max() > 1:
+        raise _wrong(
+            "visibility", "out_of_range", "values from 0 to 1", f"values from {confidence.min():.3g} to {confidence.max():.3g}",
+            "Turn logits into probabilities first.",
+        )  # fmt: skip
+    return confidence
+
+
+def _shape(array: NDArray[np.generic]) -> str:
+    return "(" + ", ".join(str(n) for n in array.shape) + ")"
+
+
+def _wrong(name: str, code: str, expected: str, got: str, hint: str) -> InvalidInput:
+    return InvalidInput(code, field=name, expected=expected, got=got, hint=hint)
