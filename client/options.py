@@ -29,14 +29,17 @@ class Options(BaseModel):
         "spatio_temporal: smoothness in time and space, least squares. robust: the same with a loss that resists outliers.",
     )
     camera: Literal["scaled_orthographic", "orthographic"] = Field(
-        "scaled_orthographic", description="scaled_orthographic estimates one scale per frame (real video); orthographic has none."
+        "scaled_orthographic",
+        description="scaled_orthographic estimates one scale per frame (real video); orthographic has none.",
     )
     basis_size: Annotated[int, Field(ge=1, le=100)] | None = Field(
-        None, description="Number K of basis shapes in the factorization that gives the rotations; null: chosen from the data."
+        None,
+        description="Number K of basis shapes in the factorization that gives the rotations; null: chosen from the data.",
     )
     refine_rotations: bool = Field(True, description="Refine the cameras against the smoothness of the shapes.")
     preset: Literal["auto", "paper"] = Field(
-        "auto", description="Where weights that are not given come from: auto measures noise and motion; paper is the published setting."
+        "auto",
+        description="Where weights that are not given come from: auto measures noise and motion; paper is the published setting.",
     )
     temporal_weight: Weight | None = Field(
         None, description="λ1, weight of smoothness in time, dimensionless; null: the preset's."
@@ -45,17 +48,20 @@ class Options(BaseModel):
         None, description="λ2, weight of smoothness along the surface, dimensionless; null: the preset's."
     )
     robust_scale: Annotated[float, Field(ge=1e-9, le=1e3, allow_inf_nan=False)] | None = Field(
-        None, description="Residual size where the loss turns from quadratic to linear, in RMS radii of the tracks; null: the preset's."
+        None,
+        description="Residual size where the loss turns from quadratic to linear, in RMS radii of the tracks; null: the preset's.",
     )
     temporal_order: Literal[1, 2] | None = Field(
         None, description="1 penalises velocity, 2 acceleration; null: the preset's."
     )
     loss: Literal["l1", "l2", "huber"] = Field("l1", description="Loss of the data term when method is robust.")
     laplacian: Literal["auto", "grid8", "uniform", "cotangent"] = Field(
-        "auto", description="Spatial smoothness: 8-direction stencil on a pixel grid, or mesh Laplacian; auto: by the mesh given."
+        "auto",
+        description="Spatial smoothness: 8-direction stencil on a pixel grid, or mesh Laplacian; auto: by the mesh given.",
     )
     prior: Literal["smooth", "smooth+low_rank"] = Field(
-        "smooth", description="smooth: the published method; smooth+low_rank also favours shapes that few basis shapes explain."
+        "smooth",
+        description="smooth: the published method; smooth+low_rank also favours shapes that few basis shapes explain.",
     )
     low_rank_weight: Weight | None = Field(
         None, description="λ3, strength of the low-rank prior, dimensionless; null: from the data."
@@ -67,4 +73,6 @@ class Options(BaseModel):
     precision: Literal["float64", "float32"] = Field("float64", description="Arithmetic of the large arrays.")
     seed: int = Field(0, ge=0, lt=2**32, description="Seed of every random choice.")
 
-    fps: float = Field(25.0, gt=0, le=1000, allow_inf_nan=False, description="Frames per second of the written animation.")
+    fps: float = Field(
+        25.0, gt=0, le=1000, allow_inf_nan=False, description="Frames per second of the written animation."
+    )

@@ -6,9 +6,8 @@ from datetime import datetime
 from enum import StrEnum
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field
-
 from pliant.client.options import Options
+from pydantic import BaseModel, ConfigDict, Field
 
 
 class Status(StrEnum):
@@ -46,7 +45,9 @@ class Problem(Record):
     got: str | None = None
     hint: str | None = Field(None, description="What to do.")
     retryable: bool = Field(False, description="True if the same request may succeed later.")
-    choices: list[dict[str, Any]] | None = Field(None, description="The readings that fit, where the input is ambiguous.")
+    choices: list[dict[str, Any]] | None = Field(
+        None, description="The readings that fit, where the input is ambiguous."
+    )
 
 
 class Progress(Record):
@@ -82,9 +83,13 @@ class Interpretation(Record):
     mesh_source: str = Field(description="`given`, `grid`, `delaunay` or `none`.")
     has_ground_truth: bool
     has_rotations: bool
-    layout: str = Field(description="How the track array was read, e.g. `tracks (F, P, 2)` or `W (2F, P), rows interleaved`.")
+    layout: str = Field(
+        description="How the track array was read, e.g. `tracks (F, P, 2)` or `W (2F, P), rows interleaved`."
+    )
     y_axis: str = Field("down", description="`down` (pixels) or `up`.")
-    notes: list[str] = Field(default_factory=list, description="Sentences: the evidence, what was dropped, what was assumed.")
+    notes: list[str] = Field(
+        default_factory=list, description="Sentences: the evidence, what was dropped, what was assumed."
+    )
 
 
 class Job(Record):
@@ -102,7 +107,9 @@ class Job(Record):
     options: Options
     interpretation: Interpretation
     progress: Progress | None = None
-    metrics: dict[str, float] | None = Field(None, description="Every error metric that the inputs allow, by its documented name.")
+    metrics: dict[str, float] | None = Field(
+        None, description="Every error metric that the inputs allow, by its documented name."
+    )
     outcome: str | None = Field(None, description="How the solver ended: `converged`, `max_reweightings`.")
     sentence: str | None = Field(None, description="The outcome in words.")
     warnings: list[str] = Field(default_factory=list, description="What the user should read about this result.")

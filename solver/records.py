@@ -7,7 +7,6 @@ from enum import StrEnum
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-
 from pliant.solver.errors import InvalidInput
 
 MIN_FRAMES = 3
@@ -53,10 +52,14 @@ class Tracks:
         if given.dtype.kind not in "fiu":
             raise _wrong("tracks", "wrong_type", "real numbers", f"dtype {given.dtype}", "Convert the array to float.")
         if given.ndim != 3 or given.shape[2] != 2:
-            raise _wrong("tracks", "wrong_shape", "(frames, points, 2)", _shape(given), "Transpose or reshape the array.")
+            raise _wrong(
+                "tracks", "wrong_shape", "(frames, points, 2)", _shape(given), "Transpose or reshape the array."
+            )
         frames, count, _ = given.shape
         if frames < MIN_FRAMES:
-            raise _wrong("tracks", "too_few_frames", f"at least {MIN_FRAMES} frames", f"{frames}", "Track a longer clip.")
+            raise _wrong(
+                "tracks", "too_few_frames", f"at least {MIN_FRAMES} frames", f"{frames}", "Track a longer clip."
+            )
         if count < MIN_POINTS:
             raise _wrong("tracks", "too_few_points", f"at least {MIN_POINTS} points", f"{count}", "Track more points.")
         positions = np.array(given, dtype=np.float64)
@@ -75,12 +78,12 @@ class Tracks:
     @property
     def num_frames(self) -> int:
         """F."""
-        return self.points.shape[0]
+        return int(self.points.shape[0])
 
     @property
     def num_points(self) -> int:
         """P."""
-        return self.points.shape[1]
+        return int(self.points.shape[1])
 
     @property
     def all_visible(self) -> bool:
@@ -214,7 +217,13 @@ class KnownCamera:
         """
         given = np.asarray(rotations, dtype=np.float64)
         if given.ndim != 3 or given.shape[1:] not in ((2, 3), (3, 3)):
-            raise _wrong("rotations", "wrong_shape", "(frames, 2, 3) or (frames, 3, 3)", _shape(given), "Give one rotation a frame.")
+            raise _wrong(
+                "rotations",
+                "wrong_shape",
+                "(frames, 2, 3) or (frames, 3, 3)",
+                _shape(given),
+                "Give one rotation a frame.",
+            )
         rows = given[:, :2]
         error = np.abs(rows @ rows.transpose(0, 2, 1) - np.eye(2)).max() if np.isfinite(rows).all() else np.inf
         if error > 1e-3:
@@ -230,7 +239,9 @@ class KnownCamera:
             return cls(complete)
         factors = np.array(scales, dtype=np.float64)
         if factors.shape != (len(given),) or not np.isfinite(factors).all() or not (factors > 0).all():
-            raise _wrong("scales", "wrong_shape", f"{len(given)} positive numbers", _shape(factors), "Give one scale a frame.")
+            raise _wrong(
+                "scales", "wrong_shape", f"{len(given)} positive numbers", _shape(factors), "Give one scale a frame."
+            )
         read_only(factors)
         return cls(complete, factors)
 
@@ -344,9 +355,13 @@ def _confidence(visible: ArrayLike | None, shape: tuple[int, int]) -> Floats:
         return np.ones(shape)
     given = np.asarray(visible)
     if given.dtype.kind not in "bfiu":
-        raise _wrong("visibility", "wrong_type", "bool or numbers", f"dtype {given.dtype}", "Convert the array to bool.")
+        raise _wrong(
+            "visibility", "wrong_type", "bool or numbers", f"dtype {given.dtype}", "Convert the array to bool."
+        )
     if given.shape != shape:
-        raise _wrong("visibility", "wrong_shape", str(shape), _shape(given), "Visibility is (frames, points), as the tracks.")
+        raise _wrong(
+            "visibility", "wrong_shape", str(shape), _shape(given), "Visibility is (frames, points), as the tracks."
+        )
     confidence = np.array(given, dtype=np.float64)
     if not np.isfinite(confidence).all() or confidence.min() < 0 or confidence.max() > 1:
         raise _wrong(

@@ -113,5 +113,9 @@ def _check_choice(name: str, value: str, choices: object) -> None:
 
 def _out_of_range(name: str, expected: str, got: object) -> InvalidSettings:
     return InvalidSettings(
-        "invalid_option", field=f"options.{name}", expected=expected, got=repr(got), hint="Correct the value or leave it out."
+        "invalid_option",
+        field=f"options.{name}",
+        expected=expected,
+        got=repr(got),
+        hint="Correct the value or leave it out.",
     )

@@ -83,6 +83,8 @@ def test_every_code_folder_is_packaged() -> None:
 
 @pytest.mark.parametrize("folder", FOLDERS)
 def test_a_folder_is_not_importable_under_its_bare_name(folder: str) -> None:
-    ran = subprocess.run([sys.executable, "-c", f"import {folder}"], cwd=ROOT, capture_output=True, text=True, check=False)
+    ran = subprocess.run(
+        [sys.executable, "-c", f"import {folder}"], cwd=ROOT, capture_output=True, text=True, check=False
+    )
     assert ran.returncode != 0
     assert f"import this folder as pliant.{folder}" in ran.stderr
