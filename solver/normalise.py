@@ -1,0 +1,75 @@
+"""Units: every frame's centroid removed, then divided by the RMS radius, so that every weight is dimensionless."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pliant.solver.errors import InvalidInput
+from pliant.solver.records import Floats, Tracks, read_only
+
+FAR = 10.0
+"""An observation further than this many median radii from its frame's median says nothing about centre or size."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Normalised:
+    """Tracks without position and unit: `tracks.points = unit · points + centroid` wherever visible."""
+
+    points: Floats
+    """Shape `(F, P, 2)`, RMS radius 1; 0 where hidden."""
+
+    visible: Floats
+    """Confidence in [0, 1], shape `(F, P)`, as in the tracks."""
+
+    centroid: Floats
+    """Mean of each frame's visible points, shape `(F, 2)`, the tracks' unit; interpolated in frames that show nothing."""
+
+    unit: float
+    """One normalised unit: RMS radius of the centred tracks, the tracks' unit."""
+
+
+def normalise(tracks: Tracks) -> Normalised:
+    """Remove each frame's centroid and divide by the RMS radius of what is left.
+
+    Both are confidence-weighted means. Observations absurdly far away (beyond `FAR` median radii of their frame's
+    median) are left out of the means, for a single one could otherwise shrink the object to a dot; they stay in the
+    tracks, where the robust loss meets them. On tracks without such observations the means are the plain ones.
+
+    Raises
+    ------
+    InvalidInput
+        Every visible point of every frame lies at the frame's centroid: there is nothing to reconstruct.
+    """
+    seen = tracks.visible > 0
+    weight = np.where(_near(tracks, seen), tracks.visible, 0.0)
+    total = weight.sum(axis=1)
+    shown = total > 0
+    mean = np.einsum("fp,fpc->fc", weight, tracks.points)
+    mean[shown] /= total[shown, None]
+    frames = np.arange(tracks.num_frames)
+    centroid = np.stack([np.interp(frames, frames[shown], mean[shown, axis]) for axis in (0, 1)], axis=1)
+    points = np.where(seen[..., None], tracks.points - centroid[:, None], 0.0)
+    unit = float(np.sqrt(np.einsum("fp,fpc,fpc->", weight, points, points) / total.sum()))
+    if not unit > 1e-12 * max(float(np.abs(centroid).max()), np.finfo(float).tiny):
+        raise InvalidInput(
+            "no_extent", field="tracks", expected="points that differ from each other", got="one position for all points",
+            hint="Check that the points' axis is the second one and that the tracks are not all zero.",
+        )  # fmt: skip
+    points /= unit
+    read_only(points)
+    read_only(centroid)
+    return Normalised(points, tracks.visible, centroid, unit)
+
+
+def _near(tracks: Tracks, seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return which visible observations lie within `FAR` median radii of their frame's median, shape `(F, P)`."""
+    near = seen.copy()
+    radius = np.zeros(seen.shape)
+    for frame, mask in enumerate(seen):
+        if mask.any():
+            middle = np.median(tracks.points[frame, mask], axis=0)
+            radius[frame] = np.hypot(*(tracks.points[frame] - middle).T)
+    near &= radius <= FAR * np.median(radius[seen])
+    return near if near.any() else seen
