@@ -1,0 +1,198 @@
+"""The records at the door: what is accepted, what is refused, and that nothing behind the door can be changed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from pliant.solver import InvalidInput, KnownCamera, Mesh, Outcome, Settings, Tracks
+from pliant.solver.errors import InvalidSettings
+
+POINTS = np.arange(5 * 6 * 2, dtype=float).reshape(5, 6, 2)
+
+
+def refusal(make: Any, *args: Any, **kwargs: Any) -> InvalidInput:
+    with pytest.raises(InvalidInput) as caught:
+        make(*args, **kwargs)
+    error = caught.value
+    assert error.field in str(error)
+    assert error.expected in str(error)
+    assert error.got in str(error)
+    assert error.hint.endswith(".")
+    return error
+
+
+class TestTracks:
+    def test_nan_and_infinity_in_either_coordinate_hide_the_observation(self) -> None:
+        points = POINTS.copy()
+        points[0, 1, 0] = np.nan
+        points[2, 3, 1] = np.inf
+        tracks = Tracks.from_arrays(points)
+        assert (tracks.visible == 0).sum() == 2
+        assert tracks.visible[0, 1] == 0
+        assert tracks.visible[2, 3] == 0
+        assert np.isfinite(tracks.points).all()
+        assert not tracks.all_visible
+
+    def test_confidence_is_kept_and_false_is_hidden(self) -> None:
+        visible = np.full((5, 6), 0.25)
+        visible[4] = 0
+        tracks = Tracks.from_arrays(POINTS, visible)
+        assert tracks.visible[0, 0] == 0.25
+        assert (tracks.points[4] == 0).all()
+        assert Tracks.from_arrays(POINTS, np.ones((5, 6), dtype=bool)).all_visible
+
+    def test_arrays_are_copied_and_read_only(self) -> None:
+        points = POINTS.copy()
+        tracks = Tracks.from_arrays(points)
+        points[:] = -1
+        assert tracks.points[0, 0, 1] == 1
+        assert (tracks.num_frames, tracks.num_points) == (5, 6)
+        with pytest.raises(ValueError, match="read-only"):
+            tracks.points[0, 0, 0] = 1
+        with pytest.raises(ValueError, match="read-only"):
+            tracks.visible[0, 0] = 0
+
+    @pytest.mark.parametrize(
+        ("points", "visible", "field", "code"),
+        [
+            (POINTS.astype(str), None, "tracks", "wrong_type"),
+            (POINTS.astype(object), None, "tracks", "wrong_type"),
+            (POINTS.astype(complex), None, "tracks", "wrong_type"),
+            (POINTS[0], None, "tracks", "wrong_shape"),
+            (POINTS.transpose(2, 0, 1), None, "tracks", "wrong_shape"),
+            (POINTS[:2], None, "tracks", "too_few_frames"),
+            (POINTS[:, :3], None, "tracks", "too_few_points"),
+            (POINTS * np.nan, None, "tracks", "nothing_visible"),
+            (POINTS, np.zeros((5, 6)), "tracks", "nothing_visible"),
+            (POINTS, np.ones((6, 5)), "visibility", "wrong_shape"),
+            (POINTS, np.ones((5, 6)).astype(str), "visibility", "wrong_type"),
+            (POINTS, np.full((5, 6), 1.5), "visibility", "out_of_range"),
+            (POINTS, np.full((5, 6), -0.5), "visibility", "out_of_range"),
+            (POINTS, np.full((5, 6), np.nan), "visibility", "out_of_range"),
+        ],
+    )
+    def test_refusals(self, points: Any, visible: Any, field: str, code: str) -> None:
+        error = refusal(Tracks.from_arrays, points, visible)
+        assert (error.field, error.code) == (field, code)
+
+
+class TestMesh:
+    def test_edges_of_two_triangles_are_five_each_once(self) -> None:
+        mesh = Mesh.from_faces([[0, 1, 2], [2, 1, 3]], 4)
+        assert mesh.edges.tolist() == [[0, 1], [0, 2], [1, 2], [1, 3], [2, 3]]
+
+    def test_a_quad_has_four_edges_and_no_diagonal(self) -> None:
+        assert Mesh.from_faces([[0, 1, 2, 3]], 4).edges.tolist() == [[0, 1], [0, 3], [1, 2], [2, 3]]
+
+    def test_no_faces_have_no_edges(self) -> None:
+        assert Mesh.from_faces([], 4).edges.shape == (0, 2)
+
+    def test_a_grid_leaves_out_the_quads_that_touch_a_hole(self) -> None:
+        full = Mesh.from_grid(np.arange(12).reshape(3, 4))
+        assert (full.num_points, len(full.faces)) == (12, 6)
+        holed = np.array([[0, 1, 2], [3, -1, 4], [5, 6, 7]])
+        mesh = Mesh.from_grid(holed)
+        assert (mesh.num_points, len(mesh.faces)) == (8, 0)
+        corner = np.array([[-1, 0, 1], [2, 3, 4]])
+        assert Mesh.from_grid(corner).faces.tolist() == [[0, 3, 4, 1]]
+
+    def test_grid_quads_turn_counter_clockwise_seen_with_rows_downward(self) -> None:
+        (face,) = Mesh.from_grid([[0, 1], [2, 3]]).faces.tolist()
+        assert face == [0, 2, 3, 1]
+
+    @pytest.mark.parametrize(
+        ("faces", "code"),
+        [
+            ([[0.0, 1.0, 2.0]], "wrong_type"),
+            ([[0, 1]], "wrong_shape"),
+            ([[0, 1, 2, 3, 4]], "wrong_shape"),
+            ([[0, 1, 4]], "index_out_of_range"),
+            ([[0, 1, 2], [-1, 2, 3]], "index_out_of_range"),
+            ([[0, 1, 2], [1, 1, 3]], "degenerate_face"),
+        ],
+    )
+    def test_face_refusals(self, faces: Any, code: str) -> None:
+        error = refusal(Mesh.from_faces, faces, 4)
+        assert (error.field, error.code) == ("mesh.faces", code)
+
+    @pytest.mark.parametrize(
+        ("grid", "code"),
+        [
+            ([0, 1, 2], "wrong_shape"),
+            ([[0.0, 1.0]], "wrong_shape"),
+            ([[0, 1], [1, 2]], "index_out_of_range"),
+            ([[0, 1], [3, 4]], "index_out_of_range"),
+            ([[-1, -1]], "index_out_of_range"),
+        ],
+    )
+    def test_grid_refusals(self, grid: Any, code: str) -> None:
+        error = refusal(Mesh.from_grid, grid)
+        assert (error.field, error.code) == ("mesh.grid", code)
+
+
+class TestKnownCamera:
+    def test_two_rows_are_completed_to_a_rotation(self) -> None:
+        rows = np.tile(np.eye(3)[:2], (4, 1, 1))
+        camera = KnownCamera.from_arrays(rows, np.ones(4))
+        assert np.allclose(camera.rotations, np.eye(3))
+        assert np.allclose(np.linalg.det(camera.rotations), 1)
+
+    def test_rows_rounded_in_a_file_are_made_orthonormal_again(self) -> None:
+        turned = np.array([[0.8, 0.6, 0.0], [-0.6, 0.8, 0.0]]) + 2e-4
+        camera = KnownCamera.from_arrays(np.tile(turned, (3, 1, 1)))
+        assert camera.scales is None
+        products = camera.rotations @ camera.rotations.transpose(0, 2, 1)
+        assert np.abs(products - np.eye(3)).max() < 1e-12
+
+    @pytest.mark.parametrize(
+        ("rotations", "scales", "field", "code"),
+        [
+            (np.eye(3), None, "rotations", "wrong_shape"),
+            (np.zeros((4, 3, 2)), None, "rotations", "wrong_shape"),
+            (np.tile(np.eye(3) * 1.1, (4, 1, 1)), None, "rotations", "not_a_rotation"),
+            (np.full((4, 2, 3), np.nan), None, "rotations", "not_a_rotation"),
+            (np.tile(np.eye(3), (4, 1, 1)), np.ones(3), "scales", "wrong_shape"),
+            (np.tile(np.eye(3), (4, 1, 1)), np.zeros(4), "scales", "wrong_shape"),
+            (np.tile(np.eye(3), (4, 1, 1)), np.full(4, np.inf), "scales", "wrong_shape"),
+        ],
+    )
+    def test_refusals(self, rotations: Any, scales: Any, field: str, code: str) -> None:
+        error = refusal(KnownCamera.from_arrays, rotations, scales)
+        assert (error.field, error.code) == (field, code)
+
+
+class TestSettings:
+    @pytest.mark.parametrize(
+        "wrong",
+        [
+            {"method": "magic"},
+            {"camera": "perspective"},
+            {"preset": "best"},
+            {"loss": "l3"},
+            {"laplacian": "none"},
+            {"prior": "flat"},
+            {"precision": "float16"},
+            {"temporal_order": 3},
+            {"basis_size": 0},
+            {"basis_size": 101},
+            {"temporal_weight": -1.0},
+            {"spatial_weight": float("nan")},
+            {"low_rank_weight": 1e7},
+            {"robust_scale": 0.0},
+            {"max_reweightings": 0},
+            {"tolerance": 1.0},
+            {"seed": -1},
+        ],
+        ids=str,
+    )
+    def test_refusals_name_the_option(self, wrong: dict[str, Any]) -> None:
+        with pytest.raises(InvalidSettings) as caught:
+            Settings(**wrong)
+        assert caught.value.field == f"options.{next(iter(wrong))}"
+        assert caught.value.code == "invalid_option"
+
+
+def test_every_outcome_has_a_sentence() -> None:
+    assert all(outcome.sentence.endswith(".") for outcome in Outcome)
