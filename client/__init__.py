@@ -1,4 +1,76 @@
-"""The wire contract, the SDK and the command line."""
+"""The wire contract, the SDK and the command line.
+
+``from pliant.client import Client`` is the usual beginning. Names are looked up when first used, so that whoever needs only
+the wire contract (`pliant.client.schemas`) does not load NumPy and httpx.
+"""
 
 if __name__ != "pliant.client":
     raise ImportError(f"import this folder as pliant.client, not as {__name__!r}: install it with pip install -e .")
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pliant.client.asynchronous import AsyncClient, AsyncRemoteJob, AsyncResult
+    from pliant.client.errors import (
+        BadArgument,
+        CorruptDownload,
+        InvalidRequest,
+        JobCancelled,
+        JobEnded,
+        JobFailed,
+        NotAllowedNow,
+        NotAuthorized,
+        NotFound,
+        NotLoaded,
+        PliantError,
+        Refused,
+        ServiceFailed,
+        TimeIsUp,
+        TooManyRequests,
+        UnexpectedAnswer,
+        Unreachable,
+    )
+    from pliant.client.options import Options
+    from pliant.client.policy import Policy
+    from pliant.client.schemas import (
+        Artifact,
+        Interpretation,
+        Job,
+        Problem,
+        Progress,
+        Status,
+    )
+    from pliant.client.sync import Client, RemoteJob, Result
+
+_HOMES = {
+    "errors": (
+        "BadArgument", "CorruptDownload", "InvalidRequest", "JobCancelled", "JobEnded", "JobFailed", "NotAllowedNow",
+        "NotAuthorized", "NotFound", "NotLoaded", "PliantError", "Refused", "ServiceFailed", "TimeIsUp", "TooManyRequests",
+        "UnexpectedAnswer", "Unreachable",
+    ),
+    "options": ("Options",),
+    "policy": ("Policy",),
+    "schemas": ("Artifact", "Interpretation", "Job", "Problem", "Progress", "Status"),
+    "asynchronous": ("AsyncClient", "AsyncRemoteJob", "AsyncResult"),
+    "sync": ("Client", "RemoteJob", "Result"),
+}  # fmt: skip
+_HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
+
+__all__ = [  # noqa: RUF022 - by use, not by alphabet
+    "Client", "RemoteJob", "Result", "AsyncClient", "AsyncRemoteJob", "AsyncResult", "Policy", "Options",
+    "Artifact", "Interpretation", "Job", "Problem", "Progress", "Status",
+    "PliantError", "Unreachable", "TimeIsUp", "UnexpectedAnswer", "CorruptDownload", "BadArgument", "NotLoaded",
+    "Refused", "InvalidRequest", "NotAuthorized", "NotFound", "NotAllowedNow", "TooManyRequests", "ServiceFailed",
+    "JobEnded", "JobFailed", "JobCancelled",
+]  # fmt: skip
+
+
+def __getattr__(name: str) -> object:
+    if name not in _HOME_OF:
+        raise AttributeError(f"module 'pliant.client' has no attribute {name!r}")
+    return getattr(import_module(f"pliant.client.{_HOME_OF[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

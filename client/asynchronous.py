@@ -1,0 +1,264 @@
+"""The asynchronous client: the verbs of the synchronous one, awaited. A test holds the two together."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import AsyncIterator, Iterable, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import httpx
+from numpy.typing import ArrayLike
+from pliant.client import verbs
+from pliant.client.drive import aiterate, arun
+from pliant.client.options import Options
+from pliant.client.parts import OnBytes, Source
+from pliant.client.policy import Attempts, Contact, Policy
+from pliant.client.request import base_of, headers_of
+from pliant.client.result import ANIMATION, LOADED, Reconstruction, copied
+from pliant.client.schemas import Job, Status
+from pliant.client.verbs import OnJob
+
+DEFAULT_URL = "http://127.0.0.1:8000"
+
+
+class AsyncClient:
+    """A Pliant service, seen from here.
+
+    Parameters
+    ----------
+    url : str
+        Where `pliant up` listens.
+    token : str, optional
+        Sent as `Authorization: Bearer`.
+    policy : Policy
+        How patiently calls are repeated.
+    transport : httpx.AsyncBaseTransport, optional
+        Instead of the network, e.g. `pliant.client.testing.FakeService`.
+
+    Examples
+    --------
+    ``Client().submit(points).wait(timeout=600).shapes`` is an array (F, P, 3).
+    """
+
+    def __init__(
+        self,
+        url: str = DEFAULT_URL,
+        *,
+        token: str | None = None,
+        policy: Policy = Policy(),  # noqa: B008 - frozen, so one for all is safe
+        transport: httpx.AsyncBaseTransport | None = None,
+    ) -> None:
+        self.url = base_of(url)
+        self._http = httpx.AsyncClient(base_url=self.url, headers=headers_of(token), transport=transport)
+        self._policy = policy
+        self._contact = Contact()
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, fault: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self.close()
+
+    async def close(self) -> None:
+        """Give up the connections."""
+        await self._http.aclose()
+
+    async def submit(
+        self,
+        tracks: Source,
+        *,
+        visible: ArrayLike | None = None,
+        mesh: Source | tuple[int, int] | None = None,
+        ground_truth: Source | None = None,
+        rotations: Source | None = None,
+        options: Options | Mapping[str, Any] | None = None,
+        name: str = "",
+        job_id: str | None = None,
+        idempotency_key: str | None = None,
+        on_upload: OnBytes | None = None,
+        timeout: float | None = None,
+    ) -> AsyncRemoteJob:
+        """As `Client.submit`."""
+        with tempfile.TemporaryDirectory(prefix="pliant-submit-") as folder:
+            flow = verbs.submit(
+                self._attempts(timeout, "the submission"),
+                tracks,
+                folder=Path(folder),
+                visible=visible,
+                mesh=mesh,
+                ground_truth=ground_truth,
+                rotations=rotations,
+                options=options,
+                name=name,
+                job_id=job_id,
+                idempotency_key=idempotency_key,
+                on_upload=on_upload,
+            )
+            return AsyncRemoteJob(self, await arun(self._http, flow))
+
+    async def get(self, job: str, *, timeout: float | None = None) -> AsyncRemoteJob:
+        """As `Client.get`."""
+        return AsyncRemoteJob(self, await arun(self._http, verbs.get(self._attempts(timeout), job)))
+
+    async def list(
+        self, *, statuses: Iterable[Status | str] = (), page_size: int = 50, timeout: float | None = None
+    ) -> AsyncIterator[AsyncRemoteJob]:
+        """As `Client.list`."""
+        flow = verbs.jobs(self._attempts(timeout), statuses=statuses, page_size=page_size)
+        async for job in aiterate(self._http, flow):
+            yield AsyncRemoteJob(self, job)
+
+    async def wait(
+        self,
+        job: str,
+        *,
+        on_progress: OnJob | None = None,
+        folder: Path | str | None = None,
+        load: bool = True,
+        timeout: float | None = None,
+    ) -> AsyncResult:
+        """As `Client.wait`."""
+        attempts = self._attempts(timeout, f"job {job}")
+        final = verbs.succeeded(await arun(self._http, verbs.wait(attempts, job, on_progress=on_progress)))
+        result = AsyncResult(self, final, folder)
+        if load:
+            await arun(self._http, verbs.fetch(attempts, final, result.folder, names=LOADED, on_download=None))
+        return result
+
+    async def result(
+        self, job: str, *, folder: Path | str | None = None, load: bool = True, timeout: float | None = None
+    ) -> AsyncResult:
+        """As `Client.result`."""
+        attempts = self._attempts(timeout, f"the result of job {job}")
+        final = verbs.finished(await arun(self._http, verbs.get(attempts, job)))
+        result = AsyncResult(self, final, folder)
+        if load:
+            await arun(self._http, verbs.fetch(attempts, final, result.folder, names=LOADED, on_download=None))
+        return result
+
+    async def cancel(self, job: str, *, timeout: float | None = None) -> AsyncRemoteJob:
+        """As `Client.cancel`."""
+        return AsyncRemoteJob(self, await arun(self._http, verbs.cancel(self._attempts(timeout), job)))
+
+    async def retry(self, job: str, *, timeout: float | None = None) -> AsyncRemoteJob:
+        """As `Client.retry`."""
+        return AsyncRemoteJob(self, await arun(self._http, verbs.retry(self._attempts(timeout), job)))
+
+    async def delete(self, job: str, *, timeout: float | None = None) -> None:
+        """As `Client.delete`."""
+        await arun(self._http, verbs.delete(self._attempts(timeout), job))
+
+    async def download(
+        self,
+        job: str,
+        folder: Path | str,
+        *,
+        names: Iterable[str] | None = None,
+        on_download: OnBytes | None = None,
+        timeout: float | None = None,
+    ) -> dict[str, Path]:
+        """As `Client.download`."""
+        attempts = self._attempts(timeout, f"the files of job {job}")
+        record = await arun(self._http, verbs.get(attempts, job))
+        return await arun(self._http, verbs.fetch(attempts, record, Path(folder), names=names, on_download=on_download))
+
+    async def options(self, *, timeout: float | None = None) -> dict[str, Any]:
+        """As `Client.options`."""
+        return await arun(self._http, verbs.document(self._attempts(timeout), "/v1/options"))
+
+    async def limits(self, *, timeout: float | None = None) -> dict[str, Any]:
+        """As `Client.limits`."""
+        return await arun(self._http, verbs.document(self._attempts(timeout), "/v1/limits"))
+
+    def _attempts(self, timeout: float | None, doing: str = "this call") -> Attempts:
+        return Attempts(policy=self._policy, contact=self._contact, timeout=timeout, doing=doing)
+
+
+class AsyncRemoteJob:
+    """A job of a service: its record as last seen, and the verbs that apply to it.
+
+    Attributes
+    ----------
+    record : Job
+        What the service said last; `refresh` asks again.
+    """
+
+    def __init__(self, client: AsyncClient, record: Job) -> None:
+        self._client = client
+        self.record = record
+
+    def __repr__(self) -> str:
+        return f"<AsyncRemoteJob {self.id} {self.status}>"
+
+    @property
+    def id(self) -> str:
+        """The job's id."""
+        return self.record.id
+
+    @property
+    def status(self) -> Status:
+        """As `RemoteJob.status`."""
+        return self.record.status
+
+    async def refresh(self, *, timeout: float | None = None) -> Self:
+        """As `RemoteJob.refresh`."""
+        self.record = (await self._client.get(self.id, timeout=timeout)).record
+        return self
+
+    async def wait(
+        self,
+        *,
+        on_progress: OnJob | None = None,
+        folder: Path | str | None = None,
+        load: bool = True,
+        timeout: float | None = None,
+    ) -> AsyncResult:
+        """As `RemoteJob.wait`."""
+        return await self._client.wait(self.id, on_progress=on_progress, folder=folder, load=load, timeout=timeout)
+
+    async def cancel(self, *, timeout: float | None = None) -> Self:
+        """As `RemoteJob.cancel`."""
+        self.record = (await self._client.cancel(self.id, timeout=timeout)).record
+        return self
+
+    async def retry(self, *, timeout: float | None = None) -> Self:
+        """As `RemoteJob.retry`."""
+        self.record = (await self._client.retry(self.id, timeout=timeout)).record
+        return self
+
+    async def delete(self, *, timeout: float | None = None) -> None:
+        """As `RemoteJob.delete`."""
+        await self._client.delete(self.id, timeout=timeout)
+
+
+class AsyncResult(Reconstruction):
+    """The result of a job; files that are not here yet are fetched by its methods."""
+
+    def __init__(self, client: AsyncClient, job: Job, folder: Path | str | None) -> None:
+        super().__init__(job, folder)
+        self._client = client
+
+    async def load(self, *, timeout: float | None = None) -> Self:
+        """Fetch the arrays and the report."""
+        await self._client.download(self.job.id, self.folder, names=LOADED, timeout=timeout)
+        return self
+
+    async def download(
+        self,
+        folder: Path | str,
+        *,
+        names: Iterable[str] | None = None,
+        on_download: OnBytes | None = None,
+        timeout: float | None = None,
+    ) -> dict[str, Path]:
+        """As `Result.download`."""
+        return await self._client.download(self.job.id, folder, names=names, on_download=on_download, timeout=timeout)
+
+    async def save_glb(self, path: Path | str, *, timeout: float | None = None) -> Path:
+        """As `Result.save_glb`."""
+        held = await self._client.download(self.job.id, self.folder, names=[ANIMATION], timeout=timeout)
+        return copied(held[ANIMATION], path)

