@@ -1,0 +1,139 @@
+"""Bring a reconstruction into the axes of the truth, in the three ways that the literature's error metrics ask for.
+
+Each is an orthogonal Procrustes problem (Schönemann 1966): with both shapes centred, `Q = U Vᵀ` from the singular value
+decomposition of the 3×3 matrix `Gᵀ S` minimises `‖S Qᵀ − G‖_F` over O(3); for a rotation the smallest singular
+direction changes sign where `det(U Vᵀ) < 0` (Kabsch 1976, Umeyama 1991).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pliant.solver.errors import InvalidInput
+from pliant.solver.records import Floats
+
+Kind = Literal["sequence", "frame", "frame_similarity"]
+
+MIRROR = np.diag([1.0, 1.0, -1.0])
+"""The one mirror that orthographic views leave open: depth changes sign (the bas-relief flip)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Aligned:
+    """A reconstruction in the truth's axes, and the truth it is compared with. Both are centred in every frame."""
+
+    shapes: Floats
+    """`scales_f · S_f · transforms_fᵀ`, shape `(F, P, 3)`, the truth's unit."""
+
+    truth: Floats
+    """Centred ground truth, shape `(F, P, 3)`, its own unit."""
+
+    transforms: Floats
+    """Orthogonal matrices that were applied, shape `(F, 3, 3)`; the same in every frame for `sequence`."""
+
+    scales: Floats
+    """Shape `(F,)`; 1 unless the alignment is `frame_similarity`."""
+
+    @property
+    def distances(self) -> Floats:
+        """Distance of every point of every frame from its true place, shape `(F, P)`, the truth's unit."""
+        return np.asarray(np.linalg.norm(self.shapes - self.truth, axis=2))
+
+    @property
+    def relative(self) -> Floats:
+        """`‖S_f − G_f‖_F / ‖G_f‖_F` of every frame, shape `(F,)`."""
+        return frobenius(self.shapes - self.truth) / frobenius(self.truth)
+
+
+def align(shapes: ArrayLike, truth: ArrayLike, *, kind: Kind = "frame") -> Aligned:
+    """Centre both per frame and bring `shapes` as near to `truth` as `kind` allows.
+
+    Parameters
+    ----------
+    shapes, truth : array_like, shape (F, P, 3)
+        Reconstruction and ground truth, any unit (the same one, unless `kind` is `frame_similarity`).
+    kind : {'sequence', 'frame', 'frame_similarity'}
+        `sequence`: one matrix of O(3) for the whole sequence, minimising `Σ_f ‖S_f Qᵀ − G_f‖²`.
+        `frame`: a rotation for every frame, and one mirror for the sequence (the better of the two).
+        `frame_similarity`: rotation, mirror and scale free in every frame.
+
+    Raises
+    ------
+    InvalidInput
+        The two differ in shape, are not `(F, P, 3)`, are not finite, or a frame of the truth has no extent.
+    """
+    moved, fixed = _centred_pair(shapes, truth)
+    if kind == "sequence":
+        one = procrustes(np.einsum("fpi,fpj->ij", fixed, moved))
+        transforms = np.broadcast_to(one, (len(moved), 3, 3)).copy()
+        return Aligned(moved @ transforms.transpose(0, 2, 1), fixed, transforms, np.ones(len(moved)))
+    if kind == "frame":
+        plain, mirrored = (_rotate_frames(moved, fixed, mirror=mirror) for mirror in (np.eye(3), MIRROR))
+        return plain if plain.relative.mean() <= mirrored.relative.mean() else mirrored
+    products = fixed.transpose(0, 2, 1) @ moved
+    transforms = procrustes(products)
+    overlap = np.einsum("fij,fij->f", transforms, products)
+    energy = frobenius(moved) ** 2
+    scales = np.divide(overlap, energy, out=np.zeros_like(energy), where=energy > 0)
+    turned = scales[:, None, None] * (moved @ transforms.transpose(0, 2, 1))
+    return Aligned(turned, fixed, transforms, scales)
+
+
+def procrustes(products: Floats, *, proper: bool = False) -> Floats:
+    """Orthogonal Q that maximises `tr(Qᵀ M)` for every 3×3 matrix M, shape `(…, 3, 3)`.
+
+    Parameters
+    ----------
+    products : array, shape (…, 3, 3)
+        `M = Gᵀ S` for shapes whose rows are points.
+    proper : bool
+        Rotations only (determinant +1).
+    """
+    left, _, right = np.linalg.svd(products)
+    if proper:
+        sign = np.sign(np.linalg.det(left) * np.linalg.det(right))
+        left[..., :, 2] *= sign[..., None]
+    return np.asarray(left @ right)
+
+
+def centred(shapes: Floats) -> Floats:
+    """Subtract every frame's mean point."""
+    return np.asarray(shapes - shapes.mean(axis=1, keepdims=True))
+
+
+def frobenius(shapes: Floats) -> Floats:
+    """Frobenius norm of every frame, shape `(F,)`."""
+    return np.asarray(np.sqrt(np.einsum("fpi,fpi->f", shapes, shapes)))
+
+
+def _rotate_frames(moved: Floats, fixed: Floats, *, mirror: Floats) -> Aligned:
+    products = fixed.transpose(0, 2, 1) @ moved @ mirror
+    transforms = procrustes(products, proper=True) @ mirror
+    return Aligned(moved @ transforms.transpose(0, 2, 1), fixed, transforms, np.ones(len(moved)))
+
+
+def _centred_pair(shapes: ArrayLike, truth: ArrayLike) -> tuple[Floats, Floats]:
+    moved = np.asarray(shapes, dtype=np.float64)
+    fixed = np.asarray(truth, dtype=np.float64)
+    if fixed.ndim != 3 or fixed.shape[2] != 3:
+        raise _wrong("ground_truth.shapes", "wrong_shape", "(frames, points, 3)", str(fixed.shape))
+    if moved.shape != fixed.shape:
+        raise _wrong("ground_truth.shapes", "wrong_shape", str(moved.shape), str(fixed.shape))
+    for name, array in (("shapes", moved), ("ground_truth.shapes", fixed)):
+        if not np.isfinite(array).all():
+            raise _wrong(name, "not_finite", "finite numbers", f"{int((~np.isfinite(array)).sum())} that are not")
+    fixed = centred(fixed)
+    if not (frobenius(fixed) > 0).all():
+        flat = int(np.flatnonzero(frobenius(fixed) == 0)[0])
+        raise _wrong(
+            "ground_truth.shapes", "no_extent", "points that differ in every frame", f"one point in frame {flat}"
+        )
+    return centred(moved), fixed
+
+
+def _wrong(name: str, code: str, expected: str, got: str) -> InvalidInput:
+    hint = "Ground truth must hold one finite (P, 3) shape for every frame of the tracks, in the same point order."
+    return InvalidInput(code, field=name, expected=expected, got=got, hint=hint)

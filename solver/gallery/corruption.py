@@ -1,0 +1,59 @@
+"""Noise, gross outliers and hidden points, as the literature's experiments add them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from pliant.solver.gallery.sequence import Sequence, refusal, with_tracks
+
+
+def corrupt(
+    sequence: Sequence, *, noise: float = 0.0, outliers: float = 0.0, hidden: float = 0.0, seed: int = 0
+) -> Sequence:
+    """Spoil the tracks of a sequence; the truth stays.
+
+    Parameters
+    ----------
+    sequence
+        As the gallery made it, or already corrupted.
+    noise : float
+        r: Gaussian noise of standard deviation `σ = r · max |W|` on every coordinate, W the tracks with every frame's
+        centroid removed (Dai, Deng, He 2017, section 5; their r goes to .05).
+    outliers : float
+        Share of the F·P observations put at random: uniform over the box that holds the whole centred sequence.
+    hidden : float
+        Share of the F·P observations hidden, in addition to those hidden already, each chosen at random.
+    seed : int
+        The same seed spoils the same observations in the same way.
+
+    Raises
+    ------
+    InvalidInput
+        Noise below 0, or a share outside [0, 1].
+    """
+    if not noise >= 0:
+        raise refusal("noise", "a number from 0", noise)
+    for name, share in (("outliers", outliers), ("hidden", hidden)):
+        if not 0 <= share <= 1:
+            raise refusal(name, "a share from 0 to 1", share)
+    random = np.random.default_rng(seed)
+    visible = sequence.tracks.visible.copy()
+    seen = visible > 0
+    counts = seen.sum(axis=1)[:, None]
+    middles = (sequence.tracks.points * seen[..., None]).sum(axis=1) / np.maximum(counts, 1)
+    centred = (sequence.tracks.points - middles[:, None]) * seen[..., None]
+    largest = np.abs(centred).max()
+    box = np.stack([centred.min(axis=(0, 1)), centred.max(axis=(0, 1))])
+    points = centred + noise * largest * random.standard_normal(centred.shape)
+    wrong = _pick(seen.shape, outliers, random)
+    points[wrong] = random.uniform(box[0], box[1], (int(wrong.sum()), 2))
+    visible[_pick(seen.shape, hidden, random)] = 0.0
+    return with_tracks(sequence, points + middles[:, None], visible, (sequence.outliers | wrong) & (visible > 0))
+
+
+def _pick(shape: tuple[int, ...], share: float, random: np.random.Generator) -> NDArray[np.bool_]:
+    """Choose exactly round(share · F · P) entries."""
+    size = int(np.prod(shape))
+    mask = np.zeros(size, dtype=bool)
+    mask[random.choice(size, round(share * size), replace=False)] = True
+    return mask.reshape(shape)

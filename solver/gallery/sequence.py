@@ -1,0 +1,142 @@
+"""What every gallery surface is turned into: tracks of a moving orthographic camera, with the truth beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from pliant.solver.errors import InvalidInput
+from pliant.solver.records import Floats, Mesh, Tracks, read_only
+
+PIXELS = 200.0
+"""Image pixels per model unit: half of a face's height, half of a flag's, or a sphere's radius."""
+
+IMAGE_CENTRE = (320.0, 240.0)
+GRAZING = 0.05
+"""A vertex is seen if its normal turns at least this far (sine of the angle) towards the viewer."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sequence:
+    """A synthetic sequence: `tracks = scales · shapes · rotations[:, :2]ᵀ + translation`, exactly, until corrupted."""
+
+    tracks: Tracks
+    mesh: Mesh
+    shapes: Floats
+    """True shapes, `(F, P, 3)`, world axes, pixels."""
+
+    rotations: Floats
+    """True cameras, `(F, 3, 3)`, camera from world."""
+
+    scales: Floats
+    """True scales, `(F,)`; the mean of the logarithm is 0."""
+
+    name: str
+    outliers: NDArray[np.bool_]
+    """Observations that `corrupt` put at random places, `(F, P)`."""
+
+
+def sweep(num_frames: int, degrees: float, *, tilt: float) -> Floats:
+    """Cameras that turn at an even pace from −`degrees` to +`degrees` about the vertical, nodding by ±`tilt` degrees.
+
+    The nod (one period) and a roll of a third of it keep the motion off a single axis.
+
+    Returns
+    -------
+    array, shape (F, 3, 3)
+        Camera from world, `roll · nod · turn`.
+    """
+    time = np.arange(num_frames) / max(num_frames - 1, 1)
+    turn = np.radians(degrees) * (2 * time - 1)
+    nod = np.radians(tilt) * np.sin(2 * np.pi * time)
+    roll = np.radians(tilt) / 3 * np.sin(4 * np.pi * time)
+    return np.asarray(_about(2, roll) @ _about(0, nod) @ _about(1, turn))
+
+
+def film(
+    name: str,
+    surface: Callable[[float], Floats],
+    mesh: Mesh,
+    rotations: Floats,
+    *,
+    scale_change: float,
+    self_occlusion: bool,
+) -> Sequence:
+    """Let the cameras watch a surface that moves with time.
+
+    Parameters
+    ----------
+    name
+        Name of the sequence.
+    surface
+        From time in [0, 1] to the points, `(P, 3)`, model units, image axes.
+    mesh, rotations
+        Neighbours of the points; cameras, `(F, 3, 3)`.
+    scale_change
+        Amplitude c of one sinusoidal period in the logarithm of the scale: image size varies by e^±c.
+    self_occlusion
+        Hide the points whose surface is turned away from the camera. Exact for a convex body, without cast occlusion.
+
+    Raises
+    ------
+    InvalidInput
+        F < 3 or P < 4, or a scale change outside [0, 1].
+    """
+    if not 0 <= scale_change <= 1:
+        raise refusal("scale_change", "a number from 0 to 1", scale_change)
+    num_frames = len(rotations)
+    times = np.arange(num_frames) / max(num_frames - 1, 1)
+    shapes = PIXELS * np.stack([surface(float(time)) for time in times])
+    log_scales = scale_change * np.sin(2 * np.pi * times + 0.7)
+    scales = np.exp(log_scales - log_scales.mean())
+    drift = np.stack([24 * np.sin(2 * np.pi * times), 15 * np.cos(2 * np.pi * times)], axis=1)
+    points = scales[:, None, None] * (shapes @ rotations[:, :2].transpose(0, 2, 1)) + (drift + IMAGE_CENTRE)[:, None]
+    seen = facing(shapes, mesh, rotations) if self_occlusion else None
+    for array in (shapes, rotations, scales):
+        read_only(array)
+    tracks = Tracks.from_arrays(points, seen)
+    return Sequence(tracks, mesh, shapes, rotations, scales, name, np.zeros(points.shape[:2], dtype=bool))
+
+
+def facing(shapes: Floats, mesh: Mesh, rotations: Floats) -> NDArray[np.bool_]:
+    """Which points' surface is turned towards the camera, shape `(F, P)`; the viewer looks along +z."""
+    depth = np.stack([vertex_normals(shape, mesh) @ turn[2] for shape, turn in zip(shapes, rotations, strict=True)])
+    return np.asarray(depth < -GRAZING)
+
+
+def vertex_normals(points: Floats, mesh: Mesh) -> Floats:
+    """Average the faces around each vertex, weighted with area: unit normals, `(P, 3)`, outward where faces run counter-clockwise."""
+    corners = points[mesh.faces]
+    across = (corners[:, 1] - corners[:, -1], corners[:, 2] - corners[:, 0])
+    normals = np.cross(*across) if mesh.faces.shape[1] == 4 else np.cross(corners[:, 1] - corners[:, 0], across[1])
+    total = np.stack(
+        [
+            np.bincount(mesh.faces.ravel(), np.repeat(normals[:, axis], mesh.faces.shape[1]), len(points))
+            for axis in range(3)
+        ],
+        axis=1,
+    )
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    return np.asarray(np.divide(total, length, out=np.zeros_like(total), where=length > 0))
+
+
+def with_tracks(sequence: Sequence, points: Floats, visible: Floats, outliers: NDArray[np.bool_]) -> Sequence:
+    """Replace what was seen, keep the truth."""
+    return replace(sequence, tracks=Tracks.from_arrays(points, visible), outliers=outliers)
+
+
+def refusal(name: str, expected: str, got: object) -> InvalidInput:
+    """Build the error for an argument of the gallery that is out of its range."""
+    return InvalidInput("out_of_range", field=name, expected=expected, got=repr(got), hint="Correct the argument.")
+
+
+def _about(axis: int, angles: Floats) -> Floats:
+    """Rotations about one axis, shape `(F, 3, 3)`."""
+    first, second = (axis + 1) % 3, (axis + 2) % 3
+    matrices = np.tile(np.eye(3), (len(angles), 1, 1))
+    matrices[:, first, first] = matrices[:, second, second] = np.cos(angles)
+    matrices[:, first, second] = -np.sin(angles)
+    matrices[:, second, first] = np.sin(angles)
+    return matrices
