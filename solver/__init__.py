@@ -6,7 +6,8 @@ Numerics alone: no files, no environment, no logging set-up, no network.
 if __name__ != "pliant.solver":
     raise ImportError(f"import this folder as pliant.solver, not as {__name__!r}: install it with pip install -e .")
 
-from pliant.solver.errors import InvalidInput, SolverError
+from pliant.solver.errors import InvalidInput, InvalidSettings, NotFinite, SolverError
+from pliant.solver.reconstruct import solve
 from pliant.solver.records import Camera, Choices, KnownCamera, Mesh, Outcome, Solution, Step, Trace, Tracks
 from pliant.solver.settings import Settings
 
@@ -14,8 +15,10 @@ __all__ = [
     "Camera",
     "Choices",
     "InvalidInput",
+    "InvalidSettings",
     "KnownCamera",
     "Mesh",
+    "NotFinite",
     "Outcome",
     "Settings",
     "Solution",
@@ -23,4 +26,5 @@ __all__ = [
     "Step",
     "Trace",
     "Tracks",
+    "solve",
 ]

@@ -1,8 +1,9 @@
 """Errors of the solver.
 
     SolverError                 base: catch this one
-    └── InvalidInput            what came in cannot be solved; says both sides and what to do
-        └── InvalidSettings     one of the settings is out of its range
+    ├── InvalidInput            what came in cannot be solved; says both sides and what to do
+    │   └── InvalidSettings     one of the settings is out of its range
+    └── NotFinite               the arithmetic overflowed; no shapes
 
 Not converging is not an error: see `pliant.solver.Outcome`.
 """
@@ -12,6 +13,15 @@ from __future__ import annotations
 
 class SolverError(Exception):
     """The solver could not answer."""
+
+
+class NotFinite(SolverError):
+    """The arithmetic left the numbers: infinity or NaN where the energy should be. Never handed out as a result."""
+
+    code = "not_finite"
+
+    def __init__(self, what: str) -> None:
+        super().__init__(f"{what}. Check the tracks for absurdly large values, or solve in float64.")
 
 
 class InvalidInput(SolverError):

@@ -1,0 +1,32 @@
+"""Shapes without iterations: the pseudo-inverse, and the smooth shapes for uniform weights."""
+
+from __future__ import annotations
+
+import numpy as np
+from pliant.solver.operator import Operator
+from pliant.solver.precondition import build_preconditioner
+from pliant.solver.records import Floats
+from pliant.solver.state import Array, Problem
+
+
+def pseudo_inverse(problem: Problem, translations: Floats) -> Array:
+    """Return R†(W − t), frame by frame: flat shapes, each in its own image plane; hidden points at the centre.
+
+    Dai, Deng, He (2017), Fig. 1, first column: the shapes of least norm that explain the tracks.
+    """
+    target = (problem.points - translations[:, :, None]) * (problem.confidence > 0)[:, None]
+    inverse = np.linalg.pinv(problem.projections.astype(np.float64))
+    flat: Array = np.matmul(inverse, target).astype(problem.points.dtype)
+    return flat
+
+
+def uniform_solution(problem: Problem, translations: Floats) -> Array:
+    """Return the least-squares shapes if every observation weighed the same (eq. 5 when λ2 is 0).
+
+    min_S ‖W − R S‖² + λ1 ‖H S‖² + λ2 ‖A S‖²: exact where all is visible and space is a whole grid or has no weight,
+    a good start for the iteration elsewhere.
+    """
+    weights = np.array(np.broadcast_to(problem.confidence[:, None, :], problem.points.shape))
+    operator = Operator(problem.projections, weights, problem.bands, problem.laplacian, problem.weights.spatial)
+    target = problem.points - translations[:, :, None].astype(problem.points.dtype)
+    return build_preconditioner(operator)(operator.right_hand_side(target))

@@ -1,0 +1,56 @@
+"""Losses of the data term and the weights that majorise them.
+
+Iteratively reweighted least squares is majorise–minimise: with ω(r) = ρ'(r) / 2r every one of these losses, being concave
+in r², lies below its tangent ω(r₀) r² + constant, so that solving (or only improving) the weighted problem never raises the loss.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.floating]
+
+
+def loss_value(residual: Array, confidence: Array, *, loss: str, scale: float) -> float:
+    """Return Σ v ρ(r).
+
+    Parameters
+    ----------
+    residual : array, shape (F, 2, P)
+        r, normalised units; both coordinates.
+    confidence : array, shape (F, P)
+        v in [0, 1].
+    loss : {"l1", "l2", "huber"}
+        l1, on each coordinate as in the paper: √(r² + ε²) − ε. l2: r². huber, on the length of both: r² up to δ, then 2δr − δ².
+    scale : float
+        ε or δ, normalised units.
+    """
+    if loss == "l2":
+        return float(np.einsum("fcp,fcp,fp->", residual, residual, confidence, dtype=np.float64))
+    if loss == "l1":
+        # Rationalised: √(r² + ε²) − ε loses all digits of small residuals.
+        squared = residual * residual
+        value = squared / (np.sqrt(squared + scale * scale) + scale)
+        return float(np.einsum("fcp,fp->", value, confidence, dtype=np.float64))
+    length = np.sqrt((residual * residual).sum(axis=1))
+    value = np.where(length <= scale, length * length, 2 * scale * length - scale * scale)
+    return float(np.einsum("fp,fp->", value, confidence, dtype=np.float64))
+
+
+def loss_weights(residual: Array, confidence: Array, *, loss: str, scale: float) -> Array:
+    """Return v ω(r), shape of the residual: what multiplies r² in the majorising problem."""
+    spread = np.broadcast_to(confidence[:, None, :], residual.shape)
+    if loss == "l2":
+        return np.array(spread)
+    if loss == "l1":
+        weights: Array = spread / (2 * np.sqrt(residual * residual + scale * scale))
+        return weights
+    length = np.sqrt((residual * residual).sum(axis=1, keepdims=True))
+    weights = spread * (scale / np.maximum(length, scale))
+    return weights
+
+
+def largest_weight(loss: str, scale: float) -> float:
+    """Return ω(0), the weight of an observation that fits perfectly."""
+    return 1 / (2 * scale) if loss == "l1" else 1.0

@@ -1,0 +1,118 @@
+"""The normal equations of one reweighting, applied without ever being formed.
+
+For shapes X of layout `(F, 3, P)` the operator is
+
+    𝒜 X = s² Rᵀ(ω ∘ (R X))  +  λ1 (HᵀH) X  +  λ2 X (AᵀA)  +  Q X
+
+frame by frame: a 2×3 projection, a stencil over frames, a sparse product along the surface, and the F×F matrix Q of the
+low-rank prior, kept as a multiple of the identity minus a few modes. The weights stand in 𝒜 and in the right-hand side alike
+(the paper's printed eq. 9 has them in the first only).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pliant.solver.laplacian import Laplacian, Matrix
+from pliant.solver.parallel import over_ranges
+from pliant.solver.records import Floats
+
+Array = NDArray[np.floating]
+SMALLEST = 200_000
+"""Numbers a thread should have to work on, at least: below, starting it costs more than it saves."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RankTerm:
+    """Q = level · I − U diag(drop) Uᵀ over frames: the quadratic that majorises the low-rank prior."""
+
+    level: float
+    """Weight of everything outside the kept modes, λ included."""
+
+    modes: Floats
+    """U, orthonormal columns, shape `(F, k)`."""
+
+    drop: Floats
+    """How much less than `level` each mode is penalised, shape `(k,)`, in [0, level)."""
+
+    def matrix(self) -> Floats:
+        """Return Q, dense `(F, F)`."""
+        return self.level * np.eye(len(self.modes)) - (self.modes * self.drop) @ self.modes.T
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Operator:
+    """Everything that 𝒜 is made of; `weights` and `rank` change with every reweighting."""
+
+    projections: Array
+    """s_f times the first two rows of R_f, shape `(F, 2, 3)`."""
+
+    weights: Array
+    """ω of every coordinate, confidence included, shape `(F, 2, P)`."""
+
+    bands: Floats
+    """λ1 times the upper bands of HᵀH, shape `(order + 1, F)`."""
+
+    laplacian: Laplacian | None
+    spatial_weight: float
+    """λ2."""
+
+    rank: RankTerm | None = None
+
+    def apply(self, shapes: Array) -> Array:
+        """Return 𝒜 X, shape `(F, 3, P)`."""
+        result = np.zeros_like(shapes)
+        spatial = shapes.dtype.type(self.spatial_weight)
+        smooth = self.laplacian is not None and self.spatial_weight > 0
+        if smooth:
+            assert self.laplacian is not None
+            forward = _as_type(self.laplacian.matrix, shapes.dtype)
+            backward = _as_type(self.laplacian.adjoint, shapes.dtype)
+
+        def work(start: int, stop: int) -> None:
+            for frame in range(start, stop):
+                camera = self.projections[frame]
+                image = camera @ shapes[frame]
+                image *= self.weights[frame]
+                out = result[frame]
+                np.matmul(camera.T, image, out=out)
+                self._add_temporal(shapes, frame, out)
+                if smooth:
+                    for axis in range(3):
+                        out[axis] += backward @ (spatial * (forward @ shapes[frame, axis]))
+
+        over_ranges(work, len(shapes), smallest=max(1, SMALLEST // shapes[0].size))
+        if self.rank is not None:
+            self._add_rank(shapes, result)
+        return result
+
+    def _add_temporal(self, shapes: Array, frame: int, out: Array) -> None:
+        kind = shapes.dtype.type
+        for k in range(len(self.bands)):
+            if k == 0:
+                out += kind(self.bands[0, frame]) * shapes[frame]
+                continue
+            if frame + k < len(shapes) and self.bands[k, frame] != 0:
+                out += kind(self.bands[k, frame]) * shapes[frame + k]
+            if frame - k >= 0 and self.bands[k, frame - k] != 0:
+                out += kind(self.bands[k, frame - k]) * shapes[frame - k]
+
+    def _add_rank(self, shapes: Array, result: Array) -> None:
+        assert self.rank is not None
+        flat, out = shapes.reshape(len(shapes), -1), result.reshape(len(shapes), -1)
+        modes = self.rank.modes.astype(shapes.dtype)
+        parts = modes.T @ flat
+        parts *= -self.rank.drop.astype(shapes.dtype)[:, None]
+        out += shapes.dtype.type(self.rank.level) * flat
+        out += modes @ parts
+
+    def right_hand_side(self, target: Array) -> Array:
+        """Return s Rᵀ (ω ∘ W) for centred tracks W of shape `(F, 2, P)`."""
+        back: Array = np.matmul(self.projections.transpose(0, 2, 1), self.weights * target)
+        return back
+
+
+def _as_type(matrix: Matrix, kind: np.dtype[np.floating]) -> Matrix:
+    return matrix if matrix.dtype == kind else matrix.astype(kind)

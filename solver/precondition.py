@@ -1,0 +1,98 @@
+"""Preconditioners: the same equations with one weight a frame, which decouple.
+
+With uniform weights 𝒜 is the Sylvester operator X ↦ T X + λ2 X K, T the 3F×3F temporal part, K = AᵀA over points. T is
+diagonalised once a reweighting (3F numbers); on a grid K is nearly diagonal in the cosine basis.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pliant.solver.operator import Operator
+from pliant.solver.parallel import available_cores
+from pliant.solver.records import Floats, Ints
+from scipy import fft, linalg
+
+Array = NDArray[np.floating]
+
+
+def temporal_matrix(operator: Operator) -> Floats:
+    """Return T, dense `(3F, 3F)`: every frame's data term with its mean weights, the stencil over frames, the rank term."""
+    frames = len(operator.projections)
+    cameras = operator.projections.astype(np.float64)
+    mean = operator.weights.mean(axis=2, dtype=np.float64)
+    blocks = np.einsum("fic,fi,fid->fcd", cameras, mean, cameras)
+    over_frames = np.zeros((frames, frames))
+    for k, band in enumerate(operator.bands):
+        index = np.arange(frames - k)
+        over_frames[index, index + k] = over_frames[index + k, index] = band[: frames - k]
+    if operator.rank is not None:
+        over_frames += operator.rank.matrix()
+    whole = np.kron(over_frames, np.eye(3)).reshape(frames, 3, frames, 3)
+    index = np.arange(frames)
+    whole[index, :, index, :] += blocks
+    return np.asarray(whole.reshape(3 * frames, 3 * frames), dtype=np.float64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Diagonalised:
+    """T = V diag(values) Vᵀ."""
+
+    vectors: Array
+    values: Floats
+
+    @classmethod
+    def of(cls, operator: Operator, kind: np.dtype[np.floating]) -> Diagonalised:
+        """Diagonalise the temporal part; directions that nothing holds get a tiny positive value."""
+        values, vectors = linalg.eigh(temporal_matrix(operator))
+        return cls(vectors.astype(kind), np.maximum(values, 1e-10 * values[-1]))
+
+
+def build_preconditioner(operator: Operator) -> Callable[[Array], Array]:
+    """Return M⁻¹ for this reweighting's operator."""
+    kind = operator.weights.dtype
+    temporal = Diagonalised.of(operator, kind)
+    laplacian = operator.laplacian
+    if laplacian is None or operator.spatial_weight == 0:
+        return lambda r: _by_point(r, temporal, None)
+    if laplacian.grid is not None:
+        return lambda r: _by_cosines(r, temporal, laplacian.grid, operator.spatial_weight)  # type: ignore[arg-type]
+    diagonal: Floats = (
+        operator.spatial_weight * np.asarray(laplacian.matrix.power(2).sum(axis=0), dtype=np.float64).ravel()
+    )
+    return lambda r: _by_point(r, temporal, diagonal)
+
+
+def _by_point(r: Array, temporal: Diagonalised, shift: Floats | None) -> Array:
+    """Solve (T + shift_p I) x_p = r_p for every point p."""
+    flat = r.reshape(len(temporal.values), -1)
+    inner = temporal.vectors.T @ flat
+    added = 0.0 if shift is None else shift
+    inner /= (temporal.values[:, None] + added).astype(r.dtype)
+    return (temporal.vectors @ inner).reshape(r.shape)
+
+
+def _by_cosines(r: Array, temporal: Diagonalised, grid: Ints, weight: float) -> Array:
+    """Solve T X + λ2 X K = R on the bounding grid with reflecting borders, K diagonal in cosines."""
+    height, width = grid.shape
+    filled = grid >= 0
+    inner = temporal.vectors.T @ r.reshape(len(temporal.values), -1)
+    image = np.zeros((len(inner), height, width), dtype=r.dtype)
+    image[:, filled] = inner[:, grid[filled]]
+    image = fft.dctn(image, axes=(1, 2), norm="ortho", workers=available_cores(), overwrite_x=True)
+    shift = weight * stencil_symbol(height, width) ** 2
+    image /= (temporal.values[:, None, None] + shift).astype(r.dtype)
+    image = fft.idctn(image, axes=(1, 2), norm="ortho", workers=available_cores(), overwrite_x=True)
+    inner[:, grid[filled]] = image[:, filled]
+    return (temporal.vectors @ inner).reshape(r.shape)
+
+
+def stencil_symbol(height: int, width: int) -> Floats:
+    """Eigenvalues of the 8-direction stencil with reflecting borders, shape `(height, width)`, ≤ 0."""
+    down = np.cos(np.pi * np.arange(height) / height)[:, None]
+    right = np.cos(np.pi * np.arange(width) / width)[None, :]
+    symbol: Floats = 2 * down + 2 * right + 4 * down * right - 8
+    return symbol

@@ -1,0 +1,216 @@
+"""The door's `solve`: cameras, then shapes, the loop written once."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+from pliant.solver.cameras import CameraEstimate, estimate_cameras, estimate_scales
+from pliant.solver.closed_form import pseudo_inverse, uniform_solution
+from pliant.solver.energy import residuals
+from pliant.solver.errors import InvalidInput
+from pliant.solver.iteration import init, no_higher, step, terminate
+from pliant.solver.loss import largest_weight
+from pliant.solver.normalise import Normalised, normalise
+from pliant.solver.problem import build_problem
+from pliant.solver.records import (
+    Camera,
+    Choices,
+    Floats,
+    KnownCamera,
+    Mesh,
+    Outcome,
+    Solution,
+    Step,
+    Trace,
+    Tracks,
+    read_only,
+)  # fmt: skip
+from pliant.solver.settings import Settings
+from pliant.solver.state import Problem, State
+
+CAMERA_SHARE = 0.3
+"""Share of the whole that progress gives to the cameras."""
+
+
+def solve(
+    tracks: Tracks,
+    mesh: Mesh | None = None,
+    *,
+    cameras: KnownCamera | None = None,
+    settings: Settings | None = None,
+    on_step: Callable[[Step], None] | None = None,
+    should_stop: Callable[[], bool] | None = None,
+) -> Solution:
+    """Reconstruct a shape for every frame.
+
+    Parameters
+    ----------
+    tracks : Tracks
+        F frames of P points.
+    mesh : Mesh, optional
+        Which points are neighbours; without it there is no smoothness in space.
+    cameras : KnownCamera, optional
+        Given cameras; None estimates them. Scales that are not given are estimated if the camera model has them.
+    settings : Settings, optional
+        Method, weights, precision; the defaults are meant to need no change.
+    on_step : callable, optional
+        Told after every unit of work.
+    should_stop : callable, optional
+        Asked between units of work; once it says True, the solve ends with `Outcome.STOPPED` and the last shapes.
+
+    Raises
+    ------
+    InvalidInput
+        Mesh or cameras do not fit the tracks, or the tracks show nothing.
+    InvalidSettings
+        The settings ask for what the mesh does not have.
+    NotFinite
+        The arithmetic overflowed.
+    """
+    settings = settings if settings is not None else Settings()
+    _check_fit(tracks, mesh, cameras)
+    tell = on_step if on_step is not None else _silent
+    began = time.perf_counter()
+    normalised = normalise(tracks)
+    estimate = _cameras(normalised, cameras, settings, on_step=on_step, should_stop=should_stop)
+    tell(Step("cameras", CAMERA_SHARE, max_reweightings=settings.max_reweightings))
+    seconds = {"cameras": time.perf_counter() - began}
+
+    began = time.perf_counter()
+    problem, choices = build_problem(normalised, estimate, mesh, settings)
+    state = _start(problem, estimate, settings)
+    tell(_told("initialise", state, settings, normalised.unit))
+    seconds["initialise"] = time.perf_counter() - began
+
+    began = time.perf_counter()
+    history, outcome = _loop(problem, state, settings, normalised.unit, tell, should_stop)
+    seconds["shapes"] = time.perf_counter() - began
+
+    began = time.perf_counter()
+    solution = finish(
+        problem, history, outcome, normalised=normalised, estimate=estimate, choices=choices, seconds=seconds
+    )
+    seconds["finish"] = time.perf_counter() - began
+    tell(_told("finish", history[-1], settings, normalised.unit, fraction=1.0))
+    return solution
+
+
+def _loop(
+    problem: Problem,
+    state: State,
+    settings: Settings,
+    unit: float,
+    tell: Callable[[Step], None],
+    should_stop: Callable[[], bool] | None,
+) -> tuple[list[State], Outcome]:
+    """Step until `terminate` says how it ended. Only the newest state keeps its arrays."""
+    history = [state]
+    if settings.method == "pseudo_inverse":
+        return history, Outcome.CONVERGED
+    while True:
+        if should_stop is not None and should_stop():
+            return history, Outcome.STOPPED
+        before = history[-1]
+        after = no_higher(before, step(problem, before, should_stop=should_stop))
+        history[-1] = before.summary()
+        history.append(after)
+        tell(_told("reweight", after, settings, unit))
+        outcome = terminate(before, after, tolerance=settings.tolerance, max_reweightings=settings.max_reweightings)
+        if outcome is not None:
+            return history, outcome
+
+
+def finish(
+    problem: Problem,
+    history: list[State],
+    outcome: Outcome,
+    *,
+    normalised: Normalised,
+    estimate: CameraEstimate,
+    choices: Choices,
+    seconds: dict[str, float],
+) -> Solution:
+    """Turn the last state into a Solution in the tracks' unit."""
+    state, unit = history[-1], normalised.unit
+    left = residuals(problem, state.shapes, state.translations).astype(np.float64)
+    seen = problem.confidence > 0
+    length = np.where(seen, np.hypot(left[:, 0], left[:, 1]), 0.0)
+    top = largest_weight(problem.loss, problem.weights.robust_scale)
+    trust = np.where(seen, state.omega.mean(axis=1, dtype=np.float64) / top, 0.0)
+    shapes = np.ascontiguousarray(state.shapes.transpose(0, 2, 1), dtype=np.float64) * unit
+    camera = Camera(
+        np.array(estimate.rotations, dtype=np.float64),
+        np.array(estimate.scales, dtype=np.float64),
+        normalised.centroid + unit * state.translations,
+    )
+    trace = Trace(
+        np.array([s.objective for s in history]),
+        unit * np.array([s.residual for s in history]),
+        np.array([s.iterations for s in history], dtype=np.int32),
+    )
+    residual = unit * length
+    arrays: list[Floats] = [shapes, camera.rotations, camera.scales, camera.translations, residual, trust]
+    for array in arrays:
+        read_only(array)
+    return Solution(shapes, camera, residual, np.clip(trust, 0.0, 1.0), trace, outcome, choices, seconds)
+
+
+def _start(problem: Problem, estimate: CameraEstimate, settings: Settings) -> State:
+    translations = np.array(estimate.translations, dtype=np.float64)
+    if settings.method == "pseudo_inverse":
+        return init(problem, pseudo_inverse(problem, translations), translations)
+    return init(problem, uniform_solution(problem, translations), translations)
+
+
+def _cameras(
+    normalised: Normalised,
+    known: KnownCamera | None,
+    settings: Settings,
+    *,
+    on_step: Callable[[Step], None] | None,
+    should_stop: Callable[[], bool] | None,
+) -> CameraEstimate:
+    if known is None:
+        return estimate_cameras(normalised, settings, on_step=on_step, should_stop=should_stop)
+    if known.scales is not None:
+        scales = np.array(known.scales)
+        reasons = {"camera": "Rotations and scales were given."}
+    elif settings.camera == "scaled_orthographic":
+        scales = np.array(estimate_scales(normalised, known.rotations))
+        reasons = {"camera": "Rotations were given; scales were estimated."}
+    else:
+        scales = np.ones(len(known.rotations))
+        reasons = {"camera": "Rotations were given; orthography has no scales."}
+    still = np.zeros((len(scales), 2))
+    return CameraEstimate(known.rotations, scales, still, 0, reasons, ())
+
+
+def _check_fit(tracks: Tracks, mesh: Mesh | None, cameras: KnownCamera | None) -> None:
+    if mesh is not None and mesh.num_points != tracks.num_points:
+        raise InvalidInput(
+            "mesh_mismatch", field="mesh", expected=f"{tracks.num_points} vertices, one for each point of the tracks",
+            got=f"{mesh.num_points}", hint="Vertex i of the mesh must be point i of the tracks.",
+        )  # fmt: skip
+    if cameras is not None and len(cameras.rotations) != tracks.num_frames:
+        raise InvalidInput(
+            "camera_mismatch", field="rotations", expected=f"{tracks.num_frames} rotations, one for each frame of the tracks",
+            got=f"{len(cameras.rotations)}", hint="Give one camera a frame, in the order of the frames.",
+        )  # fmt: skip
+
+
+def _told(stage: str, state: State, settings: Settings, unit: float, *, fraction: float | None = None) -> Step:
+    done = CAMERA_SHARE + (0.95 - CAMERA_SHARE) * min(1.0, (1 + state.reweighting) / (1 + settings.max_reweightings))
+    return Step(
+        stage,
+        done if fraction is None else fraction,
+        reweighting=state.reweighting,
+        max_reweightings=settings.max_reweightings,
+        objective=state.objective,
+        residual=unit * state.residual,
+    )
+
+
+def _silent(_: Step) -> None:
+    return None

@@ -1,0 +1,73 @@
+"""What a solve is made of and where it stands: Problem in, State after State."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from pliant.solver.laplacian import Laplacian
+from pliant.solver.operator import RankTerm
+from pliant.solver.records import Floats
+
+Array = NDArray[np.floating]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Weights:
+    """Every number of the energy, chosen; dimensionless, in normalised units."""
+
+    temporal: float
+    """λ1."""
+    spatial: float
+    """λ2; 0 without a mesh."""
+    low_rank: float
+    """λ3; 0 for the paper's prior."""
+    robust_scale: float
+    """ε of the smoothed L1 or δ of Huber."""
+    order: int
+    """Order of H."""
+    rank_floor: float = 0.0
+    """δ of the low-rank prior: variance of a mode, per point, below which it counts as noise."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Problem:
+    """One energy to minimise, normalised units."""
+
+    points: Array
+    """Centred tracks, shape `(F, 2, P)`."""
+    confidence: Array
+    """v, shape `(F, P)`."""
+    projections: Array
+    """s_f times the first two rows of R_f, shape `(F, 2, 3)`."""
+    loss: str
+    weights: Weights
+    bands: Floats
+    """λ1 times the bands of HᵀH, shape `(order + 1, F)`."""
+    laplacian: Laplacian | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class State:
+    """Where the minimisation stands after some reweightings."""
+
+    shapes: Array
+    """X, shape `(F, 3, P)`, centred per frame."""
+    translations: Floats
+    """t relative to the tracks' centroids, shape `(F, 2)`."""
+    omega: Array
+    """IRLS weights of the current residual, shape `(F, 2, P)`."""
+    rank: RankTerm | None
+    """Majoriser of the low-rank prior at the current shapes."""
+    objective: float
+    residual: float
+    """Median visible reprojection residual, normalised units."""
+    reweighting: int
+    iterations: int
+    """Conjugate-gradient iterations of the last step."""
+
+    def summary(self) -> State:
+        """Return the numbers without the arrays, for the history."""
+        nothing = np.zeros(0)
+        return replace(self, shapes=nothing, omega=nothing, rank=None)

@@ -1,0 +1,29 @@
+"""Smoothness in time: the difference operator H of eq. 3 and the bands of HᵀH."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from pliant.solver.records import Floats
+
+
+def difference_bands(num_frames: int, order: int) -> Floats:
+    """Return the upper bands of HᵀH, shape `(order + 1, F)`: `bands[k, f]` couples frames f and f + k (0 beyond the end).
+
+    H takes differences over frames: first order x[f+1] − x[f] (Dai, Deng, He 2017, eq. 3), second order
+    x[f+2] − 2x[f+1] + x[f]. A clip shorter than the stencil takes the longest difference it can hold.
+    """
+    order = min(order, num_frames - 1)
+    stencil = np.array([(-1.0) ** (order - k) * math.comb(order, k) for k in range(order + 1)])
+    bands = np.zeros((order + 1, num_frames))
+    for start in range(num_frames - order):
+        for k in range(order + 1):
+            bands[k, start : start + order + 1 - k] += stencil[: order + 1 - k] * stencil[k:]
+    return bands
+
+
+def differences(shapes: NDArray[np.floating], order: int) -> NDArray[np.floating]:
+    """Return H X for X of shape `(F, 3, P)`."""
+    return np.diff(shapes, n=min(order, len(shapes) - 1), axis=0)

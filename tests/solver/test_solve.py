@@ -1,0 +1,110 @@
+"""The whole solve: methods, refusals, stopping."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pliant.solver import (
+    InvalidInput,
+    InvalidSettings,
+    KnownCamera,
+    Mesh,
+    NotFinite,
+    Outcome,
+    Settings,
+    Step,
+    Tracks,
+    solve,
+)
+from waving_sheet import cameras_of, project, sheet, triangulated, turning
+
+METHODS = ("pseudo_inverse", "temporal", "spatio_temporal", "robust")
+
+
+def scene(frames: int = 12, degrees: float = 45) -> tuple[np.ndarray, np.ndarray, Tracks, Mesh]:
+    shapes, grid = sheet(frames)
+    rotations = turning(frames, degrees)
+    return shapes, rotations, Tracks.from_arrays(5 * project(shapes, rotations) + [3.0, 4.0]), Mesh.from_grid(grid)
+
+
+def error(found: np.ndarray, truth: np.ndarray) -> float:
+    return float(np.mean(np.linalg.norm(found - truth, axis=(1, 2)) / np.linalg.norm(truth, axis=(1, 2))))
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_gives_finite_centred_shapes_that_explain_the_tracks(method: str) -> None:
+    _, rotations, tracks, mesh = scene()
+    found = solve(tracks, mesh, cameras=cameras_of(rotations), settings=Settings(method=method))
+    assert np.isfinite(found.shapes).all()
+    np.testing.assert_allclose(found.shapes.mean(axis=1), 0, atol=1e-9)
+    camera = found.camera
+    image = np.einsum("f,fij,fpj->fpi", camera.scales, camera.rotations[:, :2], found.shapes)
+    image += camera.translations[:, None]
+    np.testing.assert_allclose(np.linalg.norm(tracks.points - image, axis=2), found.residuals, atol=1e-9)
+    assert np.median(found.residuals) < 0.1
+
+
+def test_smoothness_gives_depth_that_the_pseudo_inverse_does_not() -> None:
+    shapes, rotations, tracks, mesh = scene()
+    flat, deep = (
+        error(solve(tracks, mesh, cameras=cameras_of(rotations), settings=Settings(method=method)).shapes, 5 * shapes)
+        for method in ("pseudo_inverse", "temporal")
+    )
+    assert 0.2 < flat < 0.6
+    assert 0.001 < deep < 0.1
+
+
+def test_estimated_cameras_and_a_mesh_run_end_to_end() -> None:
+    _, _, tracks, _ = scene()
+    told: list[Step] = []
+    found = solve(tracks, triangulated(sheet()[1]), on_step=told.append)
+    assert found.outcome is Outcome.CONVERGED
+    assert np.isfinite(found.shapes).all()
+    fractions = [s.fraction for s in told]
+    assert fractions == sorted(fractions)
+    assert fractions[-1] == 1
+    assert (np.diff(found.trace.objective) <= 0).all()
+
+
+def test_the_same_call_gives_the_same_bits() -> None:
+    _, _, tracks, mesh = scene()
+    one, two = solve(tracks, mesh), solve(tracks, mesh)
+    assert np.array_equal(one.shapes, two.shapes)
+
+
+def test_stopping_gives_the_last_shapes_and_says_so() -> None:
+    _, rotations, tracks, mesh = scene()
+    asked = iter([False] * 3)
+    found = solve(tracks, mesh, cameras=cameras_of(rotations), should_stop=lambda: next(asked, True))
+    assert found.outcome is Outcome.STOPPED
+    assert np.isfinite(found.shapes).all()
+
+
+def test_a_mesh_of_another_size_is_refused() -> None:
+    _, _, tracks, _ = scene()
+    with pytest.raises(InvalidInput, match="63 vertices") as caught:
+        solve(tracks, Mesh.from_faces([[0, 1, 2]], 64))
+    assert caught.value.code == "mesh_mismatch"
+
+
+def test_cameras_of_another_length_are_refused() -> None:
+    _, rotations, tracks, _ = scene()
+    with pytest.raises(InvalidInput, match="12 rotations") as caught:
+        solve(tracks, cameras=KnownCamera.from_arrays(rotations[:5]))
+    assert caught.value.code == "camera_mismatch"
+
+
+def test_the_grid_stencil_needs_a_grid() -> None:
+    _, rotations, tracks, _ = scene()
+    with pytest.raises(InvalidSettings, match="pixel grid"):
+        solve(tracks, triangulated(sheet()[1]), cameras=cameras_of(rotations), settings=Settings(laplacian="grid8"))
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_overflow_is_an_error_not_a_result() -> None:
+    _, rotations, tracks, mesh = scene()
+    points = tracks.points.copy()
+    points[0, 0] = 1e39
+    settings = Settings(precision="float32")
+    with pytest.raises(NotFinite, match="float64"):
+        solve(Tracks.from_arrays(points), mesh, cameras=cameras_of(rotations), settings=settings)
