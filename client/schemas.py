@@ -103,6 +103,7 @@ class Job(Record):
     finished_at: datetime | None = None
     expires_at: datetime | None = Field(None, description="When the job and its files are removed; null: never.")
     attempt: int = Field(0, description="How often a worker has begun it.")
+    retry_of: str | None = Field(None, description="The finished job whose inputs and options this one runs again.")
     place_in_queue: int | None = Field(None, description="0 is next; null when not queued.")
     options: Options
     interpretation: Interpretation

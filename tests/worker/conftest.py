@@ -1,0 +1,87 @@
+"""Real stores for the worker's tests: one embedded Valkey for the session, a fresh key prefix for each test."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from pliant.client.options import Options
+from pliant.client.schemas import Interpretation
+from pliant.worker.blobs import Blobs
+from pliant.worker.connection import connect
+from pliant.worker.jobs import Jobs
+from pliant.worker.memory import MemoryQueue, MemoryRecords
+from pliant.worker.queue import RedisQueue
+from pliant.worker.redis_records import RedisRecords
+from pliant.worker.settings import Settings
+from pliant.worker.valkey import Valkey
+
+
+@pytest.fixture(scope="session")
+def valkey_data(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    data = tmp_path_factory.mktemp("valkey")
+    valkey = Valkey.claim(data)
+    server = valkey.start()
+    yield data
+    server.terminate()
+    server.wait(10)
+    valkey.release()
+
+
+@pytest.fixture
+def settings(valkey_data: Path, tmp_path: Path) -> Settings:
+    """Settings on the session's Valkey, with blobs and keys of the test's own."""
+    return Settings(
+        data=tmp_path, redis_url=Settings(data=valkey_data).redis, queue=f"test-{secrets.token_hex(4)}", lost_after=2.0
+    )
+
+
+@pytest.fixture(params=["redis", "memory"])
+def jobs(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Jobs]:
+    """The whole door, on the real stores and on their doubles."""
+    if request.param == "memory":
+        yield Jobs(
+            records=MemoryRecords(),
+            blobs=Blobs.open("memory:///"),
+            queue=MemoryQueue(),
+            settings=Settings(data=tmp_path),
+        )
+        return
+    settings: Settings = request.getfixturevalue("settings")
+    text, raw = connect(settings.redis, decode=True), connect(settings.redis, decode=False)
+    yield Jobs(
+        records=RedisRecords(text, prefix=settings.queue),
+        blobs=Blobs.open(settings.blobs),
+        queue=RedisQueue(raw, name=settings.queue),
+        settings=settings,
+    )
+    text.close()
+    raw.close()
+
+
+@pytest.fixture
+def interpretation() -> Interpretation:
+    return Interpretation(
+        num_frames=4,
+        num_points=5,
+        num_faces=0,
+        hidden_fraction=0.0,
+        mesh_source="none",
+        has_ground_truth=False,
+        has_rotations=False,
+        layout="tracks (F, P, 2)",
+    )
+
+
+@pytest.fixture
+def inputs_file(tmp_path: Path) -> Path:
+    path = tmp_path / "some-inputs.npz"
+    path.write_bytes(b"x" * 3_000_000)
+    return path
+
+
+@pytest.fixture
+def options() -> Options:
+    return Options()

@@ -1,0 +1,48 @@
+"""Connections to Redis, and the translation of their failures into ours."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import redis
+from pliant.worker.errors import StoreUnavailable
+from redis.backoff import ExponentialWithJitterBackoff
+from redis.retry import Retry
+
+ANSWER_WITHIN = 30.0
+"""Seconds a command may take, blocking reads included."""
+
+
+def connect(url: str, *, decode: bool, retries: int = 3) -> redis.Redis:
+    """Return a client, which connects when it is first used.
+
+    Parameters
+    ----------
+    url : str
+        `redis://`, `rediss://` or `unix://`.
+    decode : bool
+        Text instead of bytes; RQ needs bytes.
+    retries : int
+        Attempts after the first when the connection breaks, with growing pauses of up to half a second. Every write
+        of ours is a compare-and-set or may be repeated, so a retry after an unheard answer does no harm.
+    """
+    return redis.Redis.from_url(
+        url,
+        decode_responses=decode,
+        socket_connect_timeout=5,
+        socket_timeout=ANSWER_WITHIN,
+        health_check_interval=15,
+        retry=Retry(ExponentialWithJitterBackoff(base=0.05, cap=0.5), retries),
+    )
+
+
+@contextmanager
+def reachable() -> Iterator[None]:
+    """Turn Redis' failures to answer into `StoreUnavailable`; what Redis says against a command passes through."""
+    try:
+        yield
+    except (redis.ConnectionError, redis.TimeoutError, redis.exceptions.ClusterDownError) as error:
+        raise StoreUnavailable("The job store", reason=type(error).__name__) from error
+    except redis.OutOfMemoryError as error:
+        raise StoreUnavailable("The job store", reason="its memory limit is reached") from error

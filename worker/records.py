@@ -1,0 +1,209 @@
+"""Job records: what is stored of a job, and the store that keeps it, as an interface.
+
+The record is the only truth about a job; RQ merely carries its token to a worker. Every change is a compare-and-set
+on the record's version, and every change an attempt makes checks the attempt's token first (`pliant.worker.lifecycle`).
+An attempt whose job was taken away can therefore write nothing.
+"""
+
+from __future__ import annotations
+
+import secrets
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Sequence
+from datetime import datetime
+from typing import NamedTuple
+
+from pliant.client.schemas import Job, Status
+from pydantic import BaseModel, ConfigDict
+
+EVENTS_KEPT = 256
+"""Events of one job that can be read again; older ones are dropped."""
+
+LOG_KEPT = 2000
+"""Lines of one job's log; older ones are dropped."""
+
+
+class Stored(BaseModel):
+    """A job with what only the machinery needs to know of it."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    job: Job
+    owner: str = ""
+    """Whose job it is, empty where there are no owners."""
+
+    token: str
+    """The one attempt that may write: the id under which RQ carries the job. Changed by every requeue."""
+
+    inputs: str
+    """Blob of the canonical inputs."""
+
+    bytes: int = 0
+    """Size of everything kept for the job."""
+
+    prefix: str | None = None
+    """Where the published artifacts lie among the blobs; None until the job has succeeded."""
+
+    worker: str | None = None
+    """Name of the worker that has it."""
+
+    key: str | None = None
+    """Digest of owner and idempotency key."""
+
+    fingerprint: str | None = None
+    """Digest of the request, to tell a repeated request from a different one under the same key or id."""
+
+    version: int = 0
+    """Counts the changes; the compare-and-set compares it."""
+
+    @property
+    def sort_key(self) -> str:
+        """Order of creation, ties broken by id."""
+        return f"{int(self.job.created_at.timestamp() * 1000):014d}:{self.job.id}"
+
+
+class Event(NamedTuple):
+    """One change of a job, as told to those who follow it."""
+
+    id: str
+    """Ascending; pass it back as `after`."""
+
+    name: str
+    """`job` when anything but the progress changed, else `progress`."""
+
+    data: str
+    """JSON of the `Job` or of its `Progress`."""
+
+
+class Beat(NamedTuple):
+    """A sign of life."""
+
+    token: str
+    beats: int
+
+
+Change = Callable[[Stored], Stored]
+
+
+def new_token(id: str) -> str:
+    """Return a fresh attempt token; RQ allows letters, digits, underscores and dashes in it."""
+    return f"{id}-{secrets.token_hex(6)}"
+
+
+def event_of(before: Stored | None, after: Stored) -> tuple[str, str]:
+    """Return name and data of the event that this change is."""
+    if before is not None and after.job.progress is not None:
+        still = {"progress": None}
+        if before.job.model_copy(update=still) == after.job.model_copy(update=still):
+            return "progress", after.job.progress.model_dump_json()
+    return "job", after.job.model_dump_json()
+
+
+class Records(ABC):
+    """A store of job records. One test suite runs on every implementation.
+
+    Raises
+    ------
+    StoreUnavailable
+        From every method, when the store does not answer.
+    """
+
+    @abstractmethod
+    def create(self, stored: Stored) -> Stored:
+        """Write a new record, unless its idempotency key or its id is taken: then return the record that has it."""
+
+    @abstractmethod
+    def get(self, id: str) -> Stored:
+        """Return a record.
+
+        Raises
+        ------
+        UnknownJob
+            There is none of that id.
+        """
+
+    @abstractmethod
+    def find(self, key: str) -> Stored | None:
+        """Return the record of an idempotency key's digest."""
+
+    @abstractmethod
+    def replace(self, before: Stored, after: Stored) -> bool:
+        """Write `after` if the stored version is still `before`'s; tell whether it was."""
+
+    @abstractmethod
+    def delete(self, id: str) -> None:
+        """Remove a record, its events, its log and its idempotency key; nothing happens if there is none."""
+
+    @abstractmethod
+    def page(
+        self, *, cursor: str | None, limit: int, statuses: Sequence[Status], owner: str | None
+    ) -> tuple[list[Stored], str | None]:
+        """Return up to `limit` records, newest first, older than the cursor, and the next page's cursor."""
+
+    @abstractmethod
+    def ids(self, status: Status) -> list[str]:
+        """Return every job id of one status, oldest first."""
+
+    @abstractmethod
+    def count(self, statuses: Sequence[Status], *, owner: str | None = None) -> int:
+        """Return how many jobs have one of these statuses."""
+
+    @abstractmethod
+    def used(self) -> int:
+        """Return the bytes that all jobs hold together."""
+
+    @abstractmethod
+    def beat(self, id: str, token: str) -> Status | None:
+        """Give a sign of life for an attempt; return the job's status, None if the attempt no longer owns the job."""
+
+    @abstractmethod
+    def look(self, id: str, token: str) -> Status | None:
+        """Return the job's status, None if the attempt no longer owns the job; no sign of life."""
+
+    @abstractmethod
+    def beats(self, ids: Iterable[str]) -> dict[str, Beat]:
+        """Return the count of signs of life of every job that is there."""
+
+    @abstractmethod
+    def events(self, id: str, *, after: str | None, timeout: float) -> list[Event]:
+        """Return the job's events after one id (None: all that are kept), waiting up to `timeout` seconds for the first."""
+
+    @abstractmethod
+    def append_log(self, id: str, lines: Sequence[str]) -> None:
+        """Add lines to a job's log; a job that is gone gets none."""
+
+    @abstractmethod
+    def log(self, id: str) -> list[str]:
+        """Return a job's log."""
+
+    @abstractmethod
+    def ping(self) -> None:
+        """Return if the store answers."""
+
+    def update(self, id: str, change: Change) -> Stored:
+        """Apply a change to a record, again on the newer record whenever somebody else was quicker.
+
+        Parameters
+        ----------
+        change : callable
+            Pure function of the stored record; its exceptions pass through, and nothing is written then. Returning
+            the record it was given means that there is nothing to write.
+
+        Raises
+        ------
+        UnknownJob
+            There is no record of that id.
+        """
+        while True:
+            before = self.get(id)
+            changed = change(before)
+            if changed is before:
+                return before
+            after = changed.model_copy(update={"version": before.version + 1})
+            if self.replace(before, after):
+                return after
+
+
+def milliseconds(moment: datetime) -> int:
+    """Return a moment as whole milliseconds since 1970."""
+    return int(moment.timestamp() * 1000)
