@@ -1,0 +1,86 @@
+"""Mathematics of SO(3), for stacks of rotations: exponential map, its Jacobian, nearest rotation, mean."""
+
+from __future__ import annotations
+
+import numpy as np
+from pliant.solver.records import Floats
+
+SMALL_ANGLE = 1e-4
+"""Below this angle (rad) the closed forms cancel; their Taylor series to second order is exact to 1e-17."""
+
+MIRROR = np.diag([1.0, 1.0, -1.0])
+"""The depth mirror D: (S, R) and (S·D, D·R·D) have the same orthographic image."""
+
+
+def hat(vectors: Floats) -> Floats:
+    """Return the skew matrices [v]×, so that [v]× u = v × u; shapes `(..., 3)` to `(..., 3, 3)`."""
+    matrices = np.zeros((*vectors.shape, 3))
+    matrices[..., 0, 1], matrices[..., 0, 2], matrices[..., 1, 2] = -vectors[..., 2], vectors[..., 1], -vectors[..., 0]
+    return matrices - np.swapaxes(matrices, -1, -2)
+
+
+def vee(matrices: Floats) -> Floats:
+    """Return u with ⟨X, [v]×⟩ = uᵀv for every v: the gradient with respect to v of a function whose gradient is X."""
+    flipped = matrices - np.swapaxes(matrices, -1, -2)
+    return np.stack([flipped[..., 2, 1], flipped[..., 0, 2], flipped[..., 1, 0]], axis=-1)
+
+
+def _coefficients(vectors: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return sin θ/θ, (1 − cos θ)/θ², (θ − sin θ)/θ³ of the angles, shape `(..., 1, 1)` each."""
+    angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
+    small = angle < SMALL_ANGLE
+    safe = np.where(small, 1.0, angle)
+    square = angle**2
+    first = np.where(small, 1 - square / 6, np.sin(safe) / safe)
+    second = np.where(small, 0.5 - square / 24, (1 - np.cos(safe)) / safe**2)
+    third = np.where(small, 1 / 6 - square / 120, (safe - np.sin(safe)) / safe**3)
+    return first, second, third
+
+
+def exponential(vectors: Floats) -> Floats:
+    """Return the rotations by angle ‖v‖ about v (Rodrigues), shapes `(..., 3)` to `(..., 3, 3)`."""
+    first, second, _ = _coefficients(vectors)
+    skew = hat(vectors)
+    return np.eye(3) + first * skew + second * (skew @ skew)
+
+
+def left_jacobian(vectors: Floats) -> Floats:
+    """Return J with exp(v + dv) = exp(J dv) exp(v) to first order, shape `(..., 3, 3)`."""
+    _, second, third = _coefficients(vectors)
+    skew = hat(vectors)
+    return np.eye(3) + second * skew + third * (skew @ skew)
+
+
+def from_rows(rows: Floats) -> Floats:
+    """Return the rotations whose first two rows are nearest to the given ones, up to a scale each.
+
+    Parameters
+    ----------
+    rows : shape (..., 2, 3)
+        Need not be orthonormal; the nearest orthonormal pair in the Frobenius norm is taken (polar factor).
+
+    Returns
+    -------
+    shape (..., 3, 3)
+    """
+    left, _, right = np.linalg.svd(rows, full_matrices=False)
+    pair = left @ right
+    return np.concatenate([pair, np.cross(pair[..., 0, :], pair[..., 1, :])[..., None, :]], axis=-2)
+
+
+def nearest(matrices: Floats) -> Floats:
+    """Return the rotations nearest to the given 3×3 matrices in the Frobenius norm (determinant +1)."""
+    left, _, right = np.linalg.svd(matrices)
+    left[..., :, 2] *= np.sign(np.linalg.det(left @ right))[..., None]
+    return left @ right
+
+
+def angles_between(first: Floats, second: Floats) -> Floats:
+    """Return the angles in radians between rotations, shape `(...)`; accurate near zero."""
+    chord = np.linalg.norm(first - second, axis=(-2, -1)) / np.sqrt(8.0)
+    return 2.0 * np.arcsin(np.minimum(chord, 1.0))
+
+
+def start_at_identity(rotations: Floats) -> Floats:
+    """Return the rotations in the world of the first frame's camera: R_f R_0ᵀ."""
+    return rotations @ rotations[0].T
