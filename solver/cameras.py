@@ -6,9 +6,20 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
+from pliant.solver.completion import Completed, complete
+from pliant.solver.metric_upgrade import Upgrade, upgrade
 from pliant.solver.normalise import Normalised
-from pliant.solver.records import Floats, Step
+from pliant.solver.records import Floats, Step, read_only
 from pliant.solver.settings import Settings
+
+SHARE = 0.3
+"""Share of the whole solve that progress gives to the cameras."""
+
+EXPLAINED = 0.999
+"""Without a K in the settings: the fewest basis shapes that explain this share of the tracks' variance."""
+
+LARGEST_BASIS = 8
+"""Largest K tried."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -17,50 +28,94 @@ class CameraEstimate:
 
     rotations: Floats
     """Camera from world, shape `(F, 3, 3)`; the first is the identity."""
+
     scales: Floats
     """Shape `(F,)`, mean of the logarithm 0."""
+
     translations: Floats
     """Correction to the centroid, normalised units, shape `(F, 2)`."""
+
     basis_size: int
+    """K of the factorization; 0 for given cameras."""
+
     reasons: dict[str, str] = field(default_factory=dict)
+    """One sentence for each choice."""
+
     warnings: tuple[str, ...] = ()
+    """What the user should know before trusting the result."""
 
 
 def estimate_cameras(
     normalised: Normalised,
     settings: Settings,
     *,
-    on_step: Callable[[Step], None] | None = None,  # noqa: ARG001
+    on_step: Callable[[Step], None] | None = None,
     should_stop: Callable[[], bool] | None = None,  # noqa: ARG001
 ) -> CameraEstimate:
-    """Return rigid cameras: rank-3 factor and metric upgrade (Tomasi, Kanade 1992)."""
-    frames = len(normalised.points)
-    tracks = normalised.points.transpose(0, 2, 1).reshape(2 * frames, -1)
-    values, vectors = np.linalg.eigh(tracks @ tracks.T)
-    factor = vectors[:, -3:] * np.sqrt(np.maximum(values[-3:], 0))
-    x, y = factor[0::2], factor[1::2]
+    """Return the cameras of the tracks, without anything known about the shapes.
 
-    def row(a: Floats, b: Floats) -> Floats:
-        mixed = np.stack([a[:, i] * b[:, j] + a[:, j] * b[:, i] * (i != j) for i in range(3) for j in range(i, 3)], 1)
-        return np.asarray(mixed, dtype=np.float64)
-
-    equations = np.concatenate([row(x, x) - row(y, y), row(x, y), row(x[:1], x[:1])])
-    goal = np.zeros(len(equations))
-    goal[-1] = 1
-    q = np.linalg.lstsq(equations, goal, rcond=None)[0]
-    gram = np.array([[q[0], q[1], q[2]], [q[1], q[3], q[4]], [q[2], q[4], q[5]]])
-    value, vector = np.linalg.eigh(gram)
-    upgraded = factor @ (vector * np.sqrt(np.maximum(value, 1e-9 * value[-1])))
-    pairs = upgraded.reshape(frames, 2, 3)
-    left, size, right = np.linalg.svd(pairs, full_matrices=False)
-    rows = left @ right
-    complete = np.concatenate([rows, np.cross(rows[:, 0], rows[:, 1])[:, None]], axis=1)
-    complete = complete @ complete[0].T
-    scales = size.mean(axis=1)
-    scales = np.ones(frames) if settings.camera == "orthographic" else scales / np.exp(np.log(scales).mean())
-    return CameraEstimate(complete, scales, np.zeros((frames, 2)), 1, {"basis_size": "Rigid."})
+    Parameters
+    ----------
+    normalised : Normalised
+        Centred tracks; hidden entries and gross outliers are filled first.
+    settings : Settings
+        `camera`, `basis_size`, `seed`.
+    on_step : callable, optional
+        Told after completion and after every factorization; fractions run from 0 to `SHARE`.
+    should_stop : callable, optional
+        Asked between units of work; once it says True, the best cameras so far are returned.
+    """
+    tell = on_step if on_step is not None else _silent
+    completed = complete(normalised, seed=settings.seed)
+    tell(Step("cameras", 0.5 * SHARE))
+    size, reason = _basis_size(completed, settings)
+    found = upgrade(completed.gram, size)
+    scales = _scales(completed, found, settings)
+    read_only(scales)
+    tell(Step("cameras", SHARE))
+    return CameraEstimate(found.rotations, scales, completed.translations, size, {"basis_size": reason})
 
 
-def estimate_scales(normalised: Normalised, rotations: Floats) -> Floats:  # noqa: ARG001
-    """Return scales for given rotations."""
-    return np.ones(len(rotations))
+def estimate_scales(normalised: Normalised, rotations: Floats) -> Floats:
+    """Return the scale of every frame for given rotations, shape `(F,)`, mean of the logarithm 0.
+
+    The scales are those with which one rigid shape explains the tracks best: Σ_f ‖W_f − s_f R_f S‖². Shrinking them all
+    gains nothing, for S grows in return.
+    """
+    return _rigid_scales(complete(normalised).gram, rotations)
+
+
+def _basis_size(completed: Completed, settings: Settings) -> tuple[int, str]:
+    limit = max(1, min(LARGEST_BASIS, len(completed.gram) // 3, completed.sample.shape[1] // 3))
+    if settings.basis_size is not None:
+        size = min(settings.basis_size, len(completed.gram) // 3)
+        return size, f"K = {size} as set."
+    values = np.linalg.eigvalsh(completed.gram)[::-1]
+    explained = np.cumsum(values)[2::3] / values.sum()
+    size = min(limit, 1 + int((explained < EXPLAINED).sum()))
+    return size, f"K = {size} basis shapes explain {explained[size - 1]:.4%} of the tracks' variance."
+
+
+def _scales(completed: Completed, found: Upgrade, settings: Settings) -> Floats:
+    if settings.camera == "orthographic":
+        return np.ones(len(found.rotations))
+    return _rigid_scales(completed.gram, found.rotations)
+
+
+def _rigid_scales(gram: Floats, rotations: Floats, *, rounds: int = 30) -> Floats:
+    frames = len(rotations)
+    scales = np.ones(frames)
+    for _ in range(rounds):
+        rows = (rotations[:, :2] * scales[:, None, None]).reshape(2 * frames, 3)
+        pseudo = np.linalg.pinv(rows)
+        shape_gram, cross = pseudo @ gram @ pseudo.T, (gram @ pseudo.T).reshape(frames, 2, 3)
+        pair = rotations[:, :2]
+        hit = np.einsum("fij,fij->f", pair, cross)
+        size = np.einsum("fij,jk,fik->f", pair, shape_gram, pair)
+        scales = np.maximum(hit, 1e-3 * size) / np.maximum(size, np.finfo(float).tiny)
+        scales = np.asarray(scales / np.exp(np.log(scales).mean()))
+    return scales
+
+
+def _silent(_: Step) -> None:
+    pass

@@ -77,7 +77,7 @@ def complete(normalised: Normalised, *, seed: int = 0) -> Completed:
     chosen = choose_points(normalised.visible, random)
     points, weight = normalised.points[:, chosen], normalised.visible[:, chosen]
     basis, scale = fit_basis(points, weight, random)
-    filled, outliers = fill(points, weight, basis, scale)
+    outliers = fill(points, weight, basis, scale)[1]
     clean = outliers == 0.0 and bool((normalised.visible > 0).all())
     gram, translations, sample = _carry(normalised, None if clean else basis, scale, chosen)
     return Completed(gram, sample, translations, 0 if clean else basis.shape[2], outliers)
@@ -164,7 +164,7 @@ def coefficients_of(points: Floats, weight: Floats, basis: Floats, *, sweeps: in
 
 def predict(basis: Floats, coefficients: Floats) -> Floats:
     """Return M B + t as points, shape `(F, S, 2)`."""
-    return np.einsum("fci,pi->fpc", basis[:, :, :-1], coefficients, optimize=True) + basis[:, None, :, -1]
+    return np.asarray(np.einsum("fci,pi->fpc", basis[:, :, :-1], coefficients, optimize=True) + basis[:, None, :, -1])
 
 
 def fill(points: Floats, weight: Floats, basis: Floats, scale: float) -> tuple[Floats, float]:
@@ -181,7 +181,9 @@ def gross(points: Floats, weight: Floats, predicted: Floats, scale: float) -> ND
     return np.asarray((weight > 0) & (_lengths(points - predicted) > max(OUTLIER * scale, GROSS)))
 
 
-def _carry(normalised: Normalised, basis: Floats | None, scale: float, chosen: NDArray[np.intp]) -> tuple[Floats, Floats, Floats]:
+def _carry(
+    normalised: Normalised, basis: Floats | None, scale: float, chosen: NDArray[np.intp]
+) -> tuple[Floats, Floats, Floats]:
     """Return Gram matrix, translations and centred sample, filling all points chunk by chunk."""
     frames, count = normalised.visible.shape
     gram, total = np.zeros((2 * frames, 2 * frames)), np.zeros((frames, 2))
@@ -229,7 +231,7 @@ def _widen(basis: Floats, points: Floats, weight: Floats, start: Floats, rank: i
         left *= (weight / (1 + (_lengths(left) / (3 * scale)) ** 2))[..., None]
         old, shift = basis[:, :, :-1], basis[:, :, -1]
     stacked = (left - left.mean(axis=1, keepdims=True)).transpose(0, 2, 1).reshape(2 * frames, -1)
-    vectors = np.linalg.eigh(stacked @ stacked.T)[1][:, ::-1][:, : rank - 1 - old.shape[2]]
+    vectors = _leading(stacked, rank - 1 - old.shape[2])
     new = vectors.reshape(frames, 2, -1)
     return np.concatenate([old, new, shift[..., None]], axis=2)
 
@@ -248,9 +250,19 @@ def _ridge(normal: Floats) -> Floats:
 
 
 def _lengths(difference: Floats) -> Floats:
-    return np.sqrt(np.einsum("fpc,fpc->fp", difference, difference))
+    return np.asarray(np.sqrt(np.einsum("fpc,fpc->fp", difference, difference)))
 
 
 def _typical(lengths: Floats, mask: NDArray[np.bool_]) -> float:
     """Return the standard deviation per coordinate of an isotropic Gaussian with this median length."""
     return float(np.median(lengths[mask]) / 1.1774) if mask.any() else 0.0
+
+
+def _leading(matrix: Floats, count: int) -> Floats:
+    """Return the `count` leading left singular vectors, through the Gram matrix of the shorter side."""
+    rows, columns = matrix.shape
+    if rows <= columns:
+        return np.asarray(np.linalg.eigh(matrix @ matrix.T)[1][:, ::-1][:, :count])
+    values, right = np.linalg.eigh(matrix.T @ matrix)
+    values, right = values[::-1][:count], right[:, ::-1][:, :count]
+    return np.asarray(np.asarray(matrix @ right) / np.sqrt(np.maximum(values, 1e-14 * max(float(values[0]), 1e-300))))

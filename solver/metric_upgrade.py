@@ -15,9 +15,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from pliant.solver.records import Floats
 from pliant.solver.rotation import from_rows, start_at_identity
 from scipy.optimize import minimize
+
+Upper = tuple[NDArray[np.intp], NDArray[np.intp]]
 
 TRACE_WEIGHT = 1e-3
 """μ of ½‖A(Q) − b‖²/F + μ tr Q; small, for the constraints come first."""
@@ -71,7 +74,7 @@ def leading_factor(gram: Floats, rank: int) -> Floats:
     rank = min(rank, len(gram))
     positive = np.maximum(values[::-1][:rank], 1e-14 * max(float(values[-1]), np.finfo(float).tiny))
     factor = (vectors[:, ::-1][:, :rank] * np.sqrt(positive)).reshape(len(gram) // 2, 2, rank)
-    return factor / np.sqrt((factor**2).sum() / len(gram))
+    return np.asarray(factor / np.sqrt((factor**2).sum() / len(gram)))
 
 
 def least_trace_factor(factor: Floats) -> Floats:
@@ -81,7 +84,8 @@ def least_trace_factor(factor: Floats) -> Floats:
     with a matrix inverted once, the rest by shrinking eigenvalues. The last row of A fixes the mean of c_f² at 1.
     """
     size = factor.shape[2]
-    upper = np.triu_indices(size)
+    rows, columns = np.triu_indices(size)
+    upper = (rows.astype(np.intp), columns.astype(np.intp))
     stretch = np.where(upper[0] == upper[1], 1.0, np.sqrt(2.0))
     normal, right = _normal_equations(factor, upper, stretch)
     penalty = 0.3 * float(np.trace(normal)) / len(normal)
@@ -98,7 +102,7 @@ def least_trace_factor(factor: Floats) -> Floats:
     return np.asarray(vectors[:, -3:] * np.sqrt(np.maximum(values[-3:], 1e-9 * max(float(values[-1]), 1e-9))))
 
 
-def _normal_equations(factor: Floats, upper: tuple[Floats, ...], stretch: Floats) -> tuple[Floats, Floats]:
+def _normal_equations(factor: Floats, upper: Upper, stretch: Floats) -> tuple[Floats, Floats]:
     """Return AᵀA/F and Aᵀb/F in the coordinates where ⟨Q, Q'⟩ is the plain inner product of upper triangles."""
     first, second = factor[:, 0], factor[:, 1]
     i, j = upper
@@ -114,7 +118,7 @@ def _normal_equations(factor: Floats, upper: tuple[Floats, ...], stretch: Floats
     return rows.T @ rows / frames + gauge * np.outer(mean, mean), gauge * mean
 
 
-def _unfold(coordinates: Floats, upper: tuple[Floats, ...], stretch: Floats, size: int) -> Floats:
+def _unfold(coordinates: Floats, upper: Upper, stretch: Floats, size: int) -> Floats:
     matrix = np.zeros((size, size))
     matrix[upper] = coordinates / stretch
     return np.asarray(matrix + np.triu(matrix, 1).T)

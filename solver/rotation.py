@@ -72,15 +72,15 @@ def nearest(matrices: Floats) -> Floats:
     """Return the rotations nearest to the given 3×3 matrices in the Frobenius norm (determinant +1)."""
     left, _, right = np.linalg.svd(matrices)
     left[..., :, 2] *= np.sign(np.linalg.det(left @ right))[..., None]
-    return left @ right
+    return np.asarray(left @ right)
 
 
 def angles_between(first: Floats, second: Floats) -> Floats:
     """Return the angles in radians between rotations, shape `(...)`; accurate near zero."""
     chord = np.linalg.norm(first - second, axis=(-2, -1)) / np.sqrt(8.0)
-    return 2.0 * np.arcsin(np.minimum(chord, 1.0))
+    return np.asarray(2.0 * np.arcsin(np.minimum(chord, 1.0)))
 
 
 def start_at_identity(rotations: Floats) -> Floats:
     """Return the rotations in the world of the first frame's camera: R_f R_0ᵀ."""
-    return rotations @ rotations[0].T
+    return np.asarray(rotations @ rotations[0].T)
