@@ -76,3 +76,16 @@ class Options(BaseModel):
     fps: float = Field(
         25.0, gt=0, le=1000, allow_inf_nan=False, description="Frames per second of the written animation."
     )
+
+    layout: Literal["auto", "frames_points", "points_frames"] = Field(
+        "auto",
+        description="Order of the track array's axes. auto: by the names in the file and by smoothness in time; refused where two fit.",
+    )
+    rows: Literal["auto", "interleaved", "stacked"] = Field(
+        "auto",
+        description="Rows of a 2F × P matrix: interleaved x1, y1, x2, y2 … or stacked all x, then all y; auto: from the data.",
+    )
+    y_axis: Literal["auto", "down", "up"] = Field(
+        "auto",
+        description="Which way y grows. auto: down (pixels), or up where coordinates are centred on zero. Turns written meshes upright.",
+    )

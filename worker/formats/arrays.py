@@ -1,0 +1,228 @@
+"""Read .npy and .npz without trusting them: headers are checked before anything is inflated, and nothing is unpickled.
+
+NumPy's own `load` inflates whatever the file says (a megabyte can become a gigabyte), takes the last of two members with one name,
+and reads object arrays by unpickling when allowed. Here the zip directory and every header are read first; then exactly as many
+bytes as the header announces are read into memory that the system hands out only as it is filled.
+"""
+
+from __future__ import annotations
+
+import ast
+import math
+import os
+import re
+import struct
+import zipfile
+import zlib
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+from numpy.typing import NDArray
+from pliant.solver import InvalidInput
+from pliant.worker.formats.errors import damaged, refusal, too_large
+from pliant.worker.formats.records import Arrays, Limits
+
+NPY_MAGIC = b"\x93NUMPY"
+MAX_HEADER = 4096
+MAX_DIMENSIONS = 8
+MAX_DIRECTORY = 1 << 20
+CHUNK = 1 << 20
+MEMBER = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_. -]{0,120}\.npy")
+END_OF_DIRECTORY = b"PK\x05\x06"
+ZIP64_LOCATOR = b"PK\x06\x07"
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """What a .npy says of itself."""
+
+    shape: tuple[int, ...]
+    fortran: bool
+    dtype: np.dtype[np.generic]
+    bytes: int
+    """Bytes of the data that must follow."""
+
+
+def read_npy(stream: IO[bytes], size: int, *, field: str, limits: Limits) -> NDArray[np.generic]:
+    """Read one array from a stream that holds `size` bytes.
+
+    Raises
+    ------
+    InvalidInput
+        Codes damaged_file, object_array, wrong_type, too_large.
+    """
+    header, used = read_header(stream, field=field, limits=limits)
+    if header.bytes != size - used:
+        raise damaged(field, f"a header that announces {header.bytes} bytes over {size - used} bytes of data")
+    flat = np.zeros(header.bytes, dtype=np.uint8)
+    view = flat.data
+    filled = 0
+    while filled < header.bytes:
+        got = stream.read(min(CHUNK, header.bytes - filled))
+        if not got:
+            raise damaged(field, f"{filled} of {header.bytes} bytes")
+        view[filled : filled + len(got)] = got
+        filled += len(got)
+    array = flat.view(header.dtype).reshape(header.shape, order="F" if header.fortran else "C")
+    return array.astype(header.dtype.newbyteorder("="), copy=False)
+
+
+def read_header(stream: IO[bytes], *, field: str, limits: Limits) -> tuple[Header, int]:
+    """Read and check the header alone; returns it and the number of bytes it took."""
+    start = stream.read(8)
+    if start[:6] != NPY_MAGIC or len(start) < 8:
+        raise damaged(field, "no NumPy header")
+    wide = start[6] >= 2
+    length_bytes = stream.read(4 if wide else 2)
+    length = int.from_bytes(length_bytes, "little")
+    if start[6] not in (1, 2, 3) or length > MAX_HEADER:
+        raise damaged(field, f"a NumPy header of version {start[6]} and {length} bytes")
+    text = stream.read(length)
+    if len(text) != length:
+        raise damaged(field, "a header that is cut off")
+    described = _header_dictionary(text, field)
+    return _checked(described, field, limits), 8 + len(length_bytes) + length
+
+
+def read_npz(
+    path: Path, *, field: str, limits: Limits, wanted: Collection[str] | None = None
+) -> tuple[Arrays, dict[str, str]]:
+    """Read the wanted members of a zip of arrays.
+
+    Returns
+    -------
+    arrays : dict
+        By name, without `.npy`.
+    passed_over : dict
+        Members that were not read, with the reason in words.
+
+    Raises
+    ------
+    InvalidInput
+        Codes damaged_file, duplicate_member, member_name, object_array, pickle_refused, too_large, wrong_type.
+    """
+    check_directory(path, field=field)
+    arrays: Arrays = {}
+    passed_over: dict[str, str] = {}
+    try:
+        with zipfile.ZipFile(path) as archive:
+            members = checked_members(archive, field=field, limits=limits)
+            for name, member in members.items():
+                if wanted is not None and name not in wanted:
+                    passed_over[name] = "not known"
+                    continue
+                with archive.open(member) as stream:
+                    arrays[name] = read_npy(stream, member.file_size, field=f"{field}.{name}", limits=limits)
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, struct.error, UnicodeDecodeError) as error:
+        raise damaged(field, f"a zip file that cannot be read ({error})") from error
+    return arrays, passed_over
+
+
+def check_directory(path: Path, *, field: str) -> None:
+    """Look at the end of a zip file before the library builds one object for each entry of its directory."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        file.seek(max(0, size - (1 << 16) - 22))
+        tail = file.read()
+    at = tail.rfind(END_OF_DIRECTORY)
+    if at < 0 or len(tail) - at < 22:
+        raise damaged(field, "a zip file without its directory, probably cut off")
+    directory = struct.unpack("<4s4H2LH", tail[at : at + 22])[5]
+    if directory > MAX_DIRECTORY or tail[max(0, at - 20) : at].startswith(ZIP64_LOCATOR):
+        raise too_large(field, expected="a zip directory below 1 MiB", got=f"{directory} bytes or a 64-bit directory")
+
+
+def checked_members(archive: zipfile.ZipFile, *, field: str, limits: Limits) -> dict[str, zipfile.ZipInfo]:
+    """Members by array name, once names, number, methods and declared sizes are found in order."""
+    infos = archive.infolist()
+    if len(infos) > limits.max_members:
+        raise too_large(field, expected=f"at most {limits.max_members} members", got=f"{len(infos)}")
+    if any(info.filename.endswith("data.pkl") for info in infos):
+        raise pickle_refusal(field)
+    members: dict[str, zipfile.ZipInfo] = {}
+    for info in infos:
+        if MEMBER.fullmatch(info.filename) is None or ".." in info.filename:
+            raise refusal(
+                "member_name", field, expected="members named like tracks.npy", got=repr(info.filename[:80]),
+                hint="Write the file with numpy.savez and plain names.",
+            )  # fmt: skip
+        name = info.filename.removesuffix(".npy")
+        if name in members:
+            raise refusal(
+                "duplicate_member", field, expected="each member once", got=f"{name!r} twice",
+                hint="Write the file again with numpy.savez.",
+            )  # fmt: skip
+        if info.flag_bits & 1 or info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise refusal(
+                "unsupported_feature", field, expected="stored or deflated members", got=f"{name!r} encrypted or packed otherwise",
+                hint="Write the file with numpy.savez or numpy.savez_compressed.",
+            )  # fmt: skip
+        members[name] = info
+    declared = sum(info.file_size for info in infos)
+    if declared > limits.max_bytes:
+        raise too_large(field, expected=f"at most {limits.max_bytes} bytes inflated", got=f"{declared} bytes")
+    return members
+
+
+def pickle_refusal(field: str) -> InvalidInput:
+    """Pickles run code when they are read."""
+    return refusal(
+        "pickle_refused", field, expected="arrays that can be read without running code", got="a Python pickle",
+        hint="Convert it where it was made: numpy.savez('tracks.npz', tracks=..., visibility=...); for a torch tensor use .cpu().numpy().",
+    )  # fmt: skip
+
+
+def read_file(path: Path, *, field: str, limits: Limits, wanted: Collection[str] | None = None) -> Arrays:
+    """Read a file that starts as .npy (named `array`) or as a zip of them."""
+    size = path.stat().st_size
+    if size > limits.max_bytes:
+        raise too_large(field, expected=f"a file of at most {limits.max_bytes} bytes", got=f"{size} bytes")
+    with path.open("rb") as file:
+        if file.read(6) == NPY_MAGIC:
+            file.seek(0, os.SEEK_SET)
+            return {"array": read_npy(file, size, field=field, limits=limits)}
+    return read_npz(path, field=field, limits=limits, wanted=wanted)[0]
+
+
+def _header_dictionary(text: bytes, field: str) -> dict[str, object]:
+    try:
+        described = ast.literal_eval(text.decode("utf-8"))
+    except (ValueError, SyntaxError, UnicodeDecodeError, MemoryError, RecursionError) as error:
+        raise damaged(field, "a NumPy header that is not a Python dictionary") from error
+    if not isinstance(described, dict) or set(described) != {"descr", "fortran_order", "shape"}:
+        raise damaged(field, "a NumPy header with other entries than descr, fortran_order and shape")
+    return described
+
+
+def _checked(described: dict[str, object], field: str, limits: Limits) -> Header:
+    shape, fortran, spelled = described["shape"], described["fortran_order"], described["descr"]
+    if not isinstance(shape, tuple) or not all(type(n) is int and n >= 0 for n in shape):
+        raise damaged(field, "a NumPy header whose shape is not a tuple of whole numbers")
+    if len(shape) > MAX_DIMENSIONS or not isinstance(fortran, bool):
+        raise damaged(field, f"a NumPy header of {len(shape)} dimensions, fortran_order {fortran!r}")
+    if not isinstance(spelled, str) or re.fullmatch(r"[<>|=][a-zA-Z]\d{0,4}", spelled) is None:
+        raise refusal(
+            "wrong_type", field, expected="an array of numbers or bool", got=f"dtype {str(spelled)[:60]}",
+            hint="Give one plain array for each name.",
+        )  # fmt: skip
+    if spelled[1] == "O":
+        raise refusal(
+            "object_array", field, expected="an array of numbers", got="an array of Python objects",
+            hint="Reading objects can run code, so they are refused: save plain arrays, e.g. numpy.asarray(x, dtype=float).",
+        )  # fmt: skip
+    try:
+        dtype: np.dtype[np.generic] = np.dtype(spelled)
+    except TypeError as error:
+        raise damaged(field, f"an unknown dtype {spelled}") from error
+    if dtype.kind not in "fiub" or dtype.itemsize > 8:
+        raise refusal(
+            "wrong_type", field, expected="real numbers or bool of at most 64 bits", got=f"dtype {dtype}",
+            hint="Convert the array to float64.",
+        )  # fmt: skip
+    count = math.prod(shape) * dtype.itemsize
+    if count > limits.max_bytes:
+        raise too_large(field, expected=f"at most {limits.max_bytes} bytes", got=f"{shape} of {dtype}: {count} bytes")
+    return Header(shape, fortran, dtype, count)

@@ -1,0 +1,92 @@
+"""The stored form of a job's inputs: one npz of ours, written once at the door and read back bit for bit."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pliant.client.schemas import Interpretation
+from pliant.solver import KnownCamera, Mesh, Tracks
+from pliant.worker.formats.arrays import read_file
+from pliant.worker.formats.errors import damaged
+from pliant.worker.formats.records import Arrays, GroundTruth, Inputs, Limits
+
+VERSION = 1
+_OURS = Limits(max_bytes=1 << 36)
+
+
+def save_inputs(inputs: Inputs, path: Path) -> None:
+    """Write the canonical npz. Values that single precision or a byte holds exactly are stored so, to halve the file."""
+    arrays: Arrays = {
+        "version": np.array(VERSION),
+        "points": _narrow(inputs.tracks.points),
+        "visible": _narrow(inputs.tracks.visible),
+        "interpretation": np.frombuffer(inputs.interpretation.model_dump_json().encode(), dtype=np.uint8),
+    }
+    if inputs.mesh is not None:
+        arrays["faces"] = inputs.mesh.faces
+        if inputs.mesh.grid is not None:
+            arrays["grid"] = inputs.mesh.grid
+    if inputs.cameras is not None:
+        arrays["rotations"] = inputs.cameras.rotations
+        if inputs.cameras.scales is not None:
+            arrays["scales"] = inputs.cameras.scales
+    if inputs.ground_truth is not None:
+        arrays["true_shapes"] = _narrow(inputs.ground_truth.shapes)
+        if inputs.ground_truth.rotations is not None:
+            arrays["true_rotations"] = inputs.ground_truth.rotations
+    with path.open("wb") as file:
+        np.savez(file, allow_pickle=False, **arrays)
+
+
+def load_inputs(path: Path) -> Inputs:
+    """Read what `save_inputs` wrote.
+
+    Raises
+    ------
+    InvalidInput
+        Code damaged_file, when the file is not one of ours or was damaged.
+    """
+    arrays = read_file(path, field="inputs", limits=_OURS)
+    missing = {"version", "points", "visible", "interpretation"} - set(arrays)
+    if missing or int(arrays["version"]) != VERSION:
+        raise damaged(
+            "inputs", f"not a canonical input of version {VERSION} (missing: {', '.join(sorted(missing)) or 'nothing'})"
+        )
+    points = _wide(arrays["points"])
+    mesh = None
+    if "faces" in arrays:
+        grid = arrays.get("grid")
+        mesh = Mesh(points.shape[1], _kept(arrays["faces"]), None if grid is None else _kept(grid))
+    cameras = None
+    if "rotations" in arrays:
+        cameras = KnownCamera(_wide(arrays["rotations"]), _wide(arrays["scales"]) if "scales" in arrays else None)
+    truth = None
+    if "true_shapes" in arrays:
+        turned = _wide(arrays["true_rotations"]) if "true_rotations" in arrays else None
+        truth = GroundTruth(_wide(arrays["true_shapes"]), turned)
+    told = Interpretation.model_validate(json.loads(arrays["interpretation"].tobytes()))
+    return Inputs(Tracks(points, _wide(arrays["visible"])), mesh, truth, cameras, told)
+
+
+def _narrow(values: NDArray[np.float64]) -> NDArray[np.generic]:
+    """Choose the smallest type that gives back the same bits."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        if not (np.signbit(values) & (values == 0)).any() and np.array_equal(values.astype(np.uint8), values):
+            return values.astype(np.uint8)
+        single = values.astype(np.float32)
+    return single if single.astype(np.float64).tobytes() == values.tobytes() else values
+
+
+def _wide(values: NDArray[np.generic]) -> NDArray[np.float64]:
+    wide = np.ascontiguousarray(values, dtype=np.float64)
+    wide.flags.writeable = False
+    return wide
+
+
+def _kept(values: NDArray[np.generic]) -> NDArray[np.int32]:
+    whole = np.ascontiguousarray(values, dtype=np.int32)
+    whole.flags.writeable = False
+    return whole

@@ -1,0 +1,48 @@
+"""Refusals of the readers.
+
+    pliant.solver.InvalidInput      base: every refusal has code, field, expected, got and hint
+    └── AmbiguousInput              two readings fit; lists the choices
+
+Codes of this package: ambiguous_layout, damaged_file, duplicate_member, empty_file, member_name, missing_array,
+object_array, pickle_refused, too_large, unknown_format, unsupported_feature, vertex_count_mismatch, wrong_shape, wrong_type.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pliant.solver import InvalidInput
+
+
+class AmbiguousInput(InvalidInput):
+    """More than one reading of the input fits, and guessing could be wrong.
+
+    Attributes
+    ----------
+    choices : list of dict
+        One for each reading: `layout` in words, `options` that select it, `evidence` for it.
+    """
+
+    def __init__(self, *, field: str, expected: str, got: str, hint: str, choices: list[dict[str, Any]]) -> None:
+        super().__init__("ambiguous_layout", field=field, expected=expected, got=got, hint=hint)
+        self.choices = choices
+
+
+def refusal(code: str, field: str, *, expected: str, got: str, hint: str) -> InvalidInput:
+    """Build (not raise) a refusal; the caller raises it, so that the traceback starts where the fault was seen."""
+    return InvalidInput(code, field=field, expected=expected, got=got, hint=hint)
+
+
+def too_large(field: str, *, expected: str, got: str) -> InvalidInput:
+    """Say that the input is beyond a limit of this installation."""
+    return refusal(
+        "too_large", field, expected=expected, got=got,
+        hint="Reduce the input, e.g. fewer frames or points, or ask the operator to raise the limit.",
+    )  # fmt: skip
+
+
+def damaged(field: str, what: str) -> InvalidInput:
+    """Say that the file claims a format that its bytes do not hold."""
+    return refusal(
+        "damaged_file", field, expected="a complete, consistent file", got=what, hint="Write the file again."
+    )

@@ -1,0 +1,138 @@
+"""Meshes from OBJ and PLY. Vertex order is the file's: nothing is merged, split, sorted or cleaned.
+
+General loaders split vertices at texture seams and merge equal ones, which destroys the correspondence of vertex i with point i;
+so OBJ is read here, `v` and `f` alone. PLY is read by plyfile, which keeps rows as they are.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from typing import IO
+
+import numpy as np
+import plyfile
+from numpy.typing import NDArray
+from pliant.solver import InvalidInput
+from pliant.worker.formats.errors import damaged, refusal, too_large
+from pliant.worker.formats.records import Arrays, Limits
+
+MAX_LINE = 4096
+PLY_ELEMENT = re.compile(rb"^element[ \t]+(\S{1,64})[ \t]+(\S{1,20})", re.MULTILINE)
+NOT_A_MESH = "Give an OBJ, PLY, glTF or npz mesh, a grid size such as 48x64, or leave the mesh out."
+
+
+def read_obj(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
+    """Read `v` and `f` of a Wavefront OBJ; everything else is passed over.
+
+    Returns
+    -------
+    dict
+        `vertices (V, 3)` and `faces (T, 3)` or `(T, 4)`, indices from 0.
+
+    Raises
+    ------
+    InvalidInput
+        Codes damaged_file, unknown_format, too_large, wrong_shape.
+    """
+    vertices: list[list[float]] = []
+    polygons: list[list[int]] = []
+    number = 0
+    while line := stream.readline(MAX_LINE + 1):
+        number += 1
+        if len(line) > MAX_LINE or b"\0" in line:
+            raise damaged(field, f"line {number} longer than {MAX_LINE} bytes or not text")
+        words = line.split()
+        if not words:
+            continue
+        try:
+            if words[0] == b"v":
+                vertices.append([float(word) for word in words[1:4]])
+            elif words[0] == b"f":
+                polygons.append([_obj_index(word, len(vertices)) for word in words[1:]])
+        except ValueError as error:
+            raise damaged(field, f"line {number} is not a vertex or face") from error
+        if len(vertices) > limits.max_points or len(polygons) > limits.max_faces:
+            raise too_large(
+                field, expected=f"at most {limits.max_points} vertices, {limits.max_faces} faces", got="more"
+            )
+    if not vertices:
+        raise refusal("unknown_format", field, expected="a mesh file", got="text without vertices", hint=NOT_A_MESH)
+    if any(len(vertex) != 3 for vertex in vertices):
+        raise damaged(field, "a vertex without three coordinates")
+    return {"vertices": np.array(vertices, dtype=np.float64), "faces": join_polygons(polygons, field=field)}
+
+
+def read_ply(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
+    """Read vertices and faces of a PLY, ascii or binary of either byte order.
+
+    Raises
+    ------
+    InvalidInput
+        Codes damaged_file, too_large, wrong_shape.
+    """
+    head = stream.read(1 << 16).partition(b"end_header")[0]
+    stream.seek(0)
+    allowed = {b"vertex": limits.max_points, b"face": limits.max_faces}
+    for name, count in PLY_ELEMENT.findall(head):
+        if not count.isdigit() or int(count) > allowed.get(name, limits.max_faces):
+            raise too_large(
+                field, expected=f"at most {limits.max_points} vertices, {limits.max_faces} faces",
+                got=f"element {name.decode('latin-1')} {count.decode('latin-1')}",
+            )  # fmt: skip
+    try:
+        content = plyfile.PlyData.read(io.BytesIO(stream.read()), mmap=False)
+        names = {element.name for element in content.elements}
+        vertices = np.column_stack([np.asarray(content["vertex"][axis], dtype=np.float64) for axis in "xyz"])
+        polygons = _ply_polygons(content["face"]) if "face" in names else []
+    except (plyfile.PlyParseError, ValueError, KeyError, TypeError, IndexError, EOFError, OverflowError) as error:
+        raise damaged(field, f"a PLY file that cannot be read ({str(error)[:120]})") from error
+    return {"vertices": vertices, "faces": join_polygons(polygons, field=field)}
+
+
+def join_polygons(polygons: list[list[int]], *, field: str) -> NDArray[np.int64]:
+    """One array of faces: quads stay quads if all are; otherwise polygons become fans of triangles."""
+    sizes = {len(polygon) for polygon in polygons}
+    if sizes and min(sizes) < 3:
+        raise refusal(
+            "wrong_shape", f"{field}.faces", expected="faces of three vertices or more", got=f"a face of {min(sizes)}",
+            hint="Remove points and lines from the faces.",
+        )  # fmt: skip
+    if sizes in ({3}, {4}):
+        return np.array(polygons, dtype=np.int64)
+    fans = [[face[0], face[i], face[i + 1]] for face in polygons for i in range(1, len(face) - 1)]
+    return np.array(fans, dtype=np.int64).reshape(-1, 3)
+
+
+def given_vertices(arrays: Arrays, *, num_points: int, field: str) -> None:
+    """Check that the mesh has a vertex for each point.
+
+    Raises
+    ------
+    InvalidInput
+        Code vertex_count_mismatch.
+    """
+    if "vertices" in arrays and len(arrays["vertices"]) != num_points:
+        raise mismatch(field, num_points, len(arrays["vertices"]))
+
+
+def mismatch(field: str, num_points: int, num_vertices: int) -> InvalidInput:
+    """Say that the mesh and the tracks do not belong together."""
+    return refusal(
+        "vertex_count_mismatch", field, expected=f"{num_points} vertices, as the tracks have points", got=f"{num_vertices}",
+        hint="Vertex i of the mesh must be point i of the tracks, in the same order; give no mesh to have one made.",
+    )  # fmt: skip
+
+
+def _obj_index(word: bytes, so_far: int) -> int:
+    """`7`, `7/1`, `7//3` count from 1; negative counts back from the latest vertex."""
+    index = int(word.split(b"/", 1)[0])
+    return index - 1 if index > 0 else so_far + index if index < 0 else -1
+
+
+def _ply_polygons(element: plyfile.PlyElement) -> list[list[int]]:
+    lists = [item.name for item in element.properties if isinstance(item, plyfile.PlyListProperty)]
+    name = next((name for name in ("vertex_indices", "vertex_index") if name in lists), None)
+    if name is None:
+        raise ValueError("faces without vertex_indices")
+    return [[int(index) for index in polygon] for polygon in element[name]]

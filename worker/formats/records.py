@@ -1,0 +1,112 @@
+"""What the readers give: checked inputs, and the limits that they keep."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pliant.client.schemas import Interpretation
+from pliant.solver import KnownCamera, Mesh, Tracks
+from pliant.worker.formats.errors import refusal
+
+Arrays = dict[str, NDArray[np.generic]]
+"""Named arrays as a file holds them, not yet interpreted; members of nested structures have dotted names."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Limits:
+    """How much one job may bring. Beyond them a reader refuses before it allocates."""
+
+    max_bytes: int = 1 << 30
+    """Size of one file, and of all arrays that are read from it, inflated."""
+
+    max_frames: int = 10_000
+    """Frames after selection."""
+
+    max_points: int = 1_000_000
+    """Points after selection."""
+
+    max_observations: int = 40_000_000
+    """Frames times points, after selection."""
+
+    max_faces: int = 4_000_000
+    """Faces of the mesh."""
+
+    max_members: int = 256
+    """Members of one zip file."""
+
+    parse_seconds: float = 60.0
+    """Processor time, and half the wall time, that parsing one file may take."""
+
+    parse_memory: int = 4 << 30
+    """Address space of the process that parses a file."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GroundTruth:
+    """The right answer, where it is known; used for metrics alone."""
+
+    shapes: NDArray[np.float64]
+    """Shape `(F, P, 3)`, any unit; NaN where a point has no truth."""
+
+    rotations: NDArray[np.float64] | None = None
+    """Shape `(F, 3, 3)`, camera from world, or None."""
+
+    @classmethod
+    def from_arrays(cls, shapes: ArrayLike, rotations: ArrayLike | None, *, like: tuple[int, int]) -> GroundTruth:
+        """Check truth against the tracks' frames and points.
+
+        Parameters
+        ----------
+        shapes : array_like, shape (F, P, 3)
+            True points; NaN marks points without truth.
+        rotations : array_like, shape (F, 2, 3) or (F, 3, 3), optional
+            True cameras.
+        like : tuple of int
+            `(F, P)` of the tracks.
+
+        Raises
+        ------
+        InvalidInput
+            Wrong type or shape, nothing finite, or rows that are not orthonormal.
+        """
+        given = np.asarray(shapes)
+        expected = f"({like[0]}, {like[1]}, 3)"
+        if given.dtype.kind not in "fiu":
+            raise refusal(
+                "wrong_type", "ground_truth.shapes", expected="real numbers", got=f"dtype {given.dtype}",
+                hint="Convert the array to float.",
+            )  # fmt: skip
+        if given.shape != (*like, 3):
+            raise refusal(
+                "wrong_shape", "ground_truth.shapes", expected=expected, got=str(given.shape),
+                hint="Truth is (frames, points, 3), with the tracks' frames and points in the tracks' order.",
+            )  # fmt: skip
+        points = np.array(given, dtype=np.float64)
+        if not np.isfinite(points).any():
+            raise refusal(
+                "nothing_visible", "ground_truth.shapes", expected="finite coordinates", got="none",
+                hint="Leave the ground truth out if it is not known.",
+            )  # fmt: skip
+        points.flags.writeable = False
+        if rotations is None:
+            return cls(points)
+        turned = np.asarray(rotations)
+        if turned.ndim != 3 or len(turned) != like[0]:
+            raise refusal(
+                "wrong_shape", "ground_truth.rotations", expected=f"({like[0]}, 2, 3) or ({like[0]}, 3, 3)",
+                got=str(turned.shape), hint="Give one rotation a frame.",
+            )  # fmt: skip
+        return cls(points, KnownCamera.from_arrays(turned).rotations)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Inputs:
+    """Everything a job works on, checked; vertex i of the mesh and of the truth is point i of the tracks."""
+
+    tracks: Tracks
+    mesh: Mesh | None
+    ground_truth: GroundTruth | None
+    cameras: KnownCamera | None
+    interpretation: Interpretation
