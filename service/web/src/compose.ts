@@ -1,0 +1,229 @@
+// The form for a new job: files by drop or by choice, what is in them, options, and the service's answer if it says no.
+
+import { type Example, Refusal, exampleFile, listExamples, submit } from "./api";
+import { button, h, uniqueId } from "./dom";
+import { OptionsForm } from "./options";
+import { type Entry, describe, peek } from "./peek";
+import { refusalBox } from "./refusal";
+import { type Job, PARTS, type Part } from "./types";
+import { bytes, percent } from "./words";
+
+const SLOTS: Record<Part, { label: string; hint: string }> = {
+  tracks: { label: "Tracks", hint: "npz, npy, mat or csv: where each point is in each frame" },
+  mesh: { label: "Mesh", hint: "optional: which points are neighbours" },
+  ground_truth: { label: "Ground truth", hint: "optional: true shapes, to measure errors" },
+  rotations: { label: "Cameras", hint: "optional: known rotations" },
+};
+
+interface Slot {
+  input: HTMLInputElement;
+  name: HTMLElement;
+  contents: HTMLElement;
+  remove: HTMLButtonElement;
+  file: File | null;
+}
+
+export class Compose {
+  readonly element: HTMLElement;
+  private readonly options = new OptionsForm();
+  private readonly slots = new Map<Part, Slot>();
+  private readonly grid = h("input", { type: "text", id: "grid", placeholder: "rows×columns", size: 10, autocomplete: "off" });
+  private readonly label = h("input", { type: "text", id: "job-name", maxlength: 200, autocomplete: "off" });
+  private readonly send = h("button", { type: "submit", class: "primary" }, "Reconstruct");
+  private readonly stop = button("Stop", () => this.sending?.abort(), { hidden: true });
+  private readonly answer = h("div", { class: "answer", "aria-live": "assertive" });
+  private readonly examples = h("p", { class: "examples" });
+  private sending: AbortController | null = null;
+
+  constructor(private readonly onJob: (job: Job) => void) {
+    const zone = h(
+      "div",
+      { class: "zone" },
+      h("p", { class: "zone-title" }, "Drop a track file here, and a mesh if you have one"),
+      h("p", { class: "hint" }, "They stay on this service; nothing is sent anywhere else."),
+      ...PARTS.map((part) => this.slot(part)),
+    );
+    const form = h(
+      "form",
+      { class: "compose", onsubmit: (event: SubmitEvent) => void this.submit(event), "aria-labelledby": "compose-title" },
+      zone,
+      this.examples,
+      this.options.first,
+      this.options.more,
+      h("div", { class: "option" }, h("label", { for: "job-name" }, "name (optional)"), this.label),
+      h("div", { class: "row" }, this.send, this.stop),
+      this.answer,
+    );
+    this.element = h("section", { class: "card" }, h("h2", { id: "compose-title" }, "New reconstruction"), form);
+    this.acceptDrops();
+  }
+
+  /** Fetch what the service knows about options and examples. */
+  async load(): Promise<void> {
+    await this.options.load();
+    try {
+      const { examples } = await listExamples();
+      this.examples.replaceChildren(...this.exampleButtons(examples));
+    } catch (error) {
+      if (!(error instanceof Refusal)) throw error;
+      this.examples.replaceChildren(); // a service without examples is whole all the same
+    }
+  }
+
+  private exampleButtons(examples: Example[]): (Node | string)[] {
+    if (examples.length === 0) return [];
+    const buttons = examples.flatMap((example, index) => [
+      index > 0 ? ", " : "",
+      button(example.title, () => void this.takeExample(example), { class: "link" }),
+    ]);
+    return ["Nothing at hand? Try a made-up ", ...buttons, "."];
+  }
+
+  private async takeExample(example: Example): Promise<void> {
+    this.answer.replaceChildren(h("p", { class: "muted" }, "Making the example…"));
+    try {
+      for (const part of PARTS) await this.put(part, null);
+      for (const { part, file } of example.files) {
+        if (part in SLOTS) await this.put(part as Part, await exampleFile(example.name, file));
+      }
+      this.label.value = example.title;
+      this.answer.replaceChildren();
+      this.send.focus();
+    } catch (error) {
+      this.refuse(error);
+    }
+  }
+
+  private slot(part: Part): HTMLElement {
+    const id = uniqueId("file");
+    const input = h("input", { type: "file", id, class: "visually-hidden", "aria-describedby": `${id}-hint` });
+    const name = h("span", { class: "file-name" });
+    const contents = h("span", { class: "hint", id: `${id}-hint` }, SLOTS[part].hint);
+    const remove = button("×", () => void this.put(part, null).then(() => input.focus()), {
+      class: "quiet",
+      hidden: true,
+      "aria-label": `Remove ${SLOTS[part].label.toLowerCase()}`,
+    });
+    input.addEventListener("change", () => void this.put(part, input.files?.[0] ?? null));
+    this.slots.set(part, { input, name, contents, remove, file: null });
+    const choose = h("label", { for: id, class: "choose" }, h("span", { class: "slot-label" }, SLOTS[part].label), name);
+    const row = h("div", { class: "slot", "data-part": part }, input, choose, remove, contents);
+    if (part === "mesh") row.append(h("span", { class: "grid-size" }, h("label", { for: "grid" }, "or a grid of "), this.grid));
+    return row;
+  }
+
+  private async put(part: Part, file: File | null): Promise<void> {
+    const slot = this.slots.get(part) as Slot;
+    slot.file = file;
+    slot.remove.hidden = file === null;
+    slot.name.textContent = file === null ? "" : `${file.name}, ${bytes(file.size)}`;
+    slot.contents.textContent = SLOTS[part].hint;
+    if (part === "mesh") this.grid.disabled = file !== null;
+    if (file === null) {
+      slot.input.value = "";
+      return;
+    }
+    const entries = await peek(file);
+    if (slot.file === file && entries.length > 0) slot.contents.textContent = describe(entries);
+  }
+
+  private acceptDrops(): void {
+    const over = (event: DragEvent): void => {
+      if (!event.dataTransfer?.types.includes("Files")) return;
+      event.preventDefault();
+      document.body.classList.toggle("dropping", event.type === "dragover");
+    };
+    document.addEventListener("dragover", over);
+    document.addEventListener("dragleave", over);
+    document.addEventListener("drop", (event) => {
+      over(event);
+      void this.take([...(event.dataTransfer?.files ?? [])]);
+    });
+  }
+
+  /** Put dropped files where their names and contents say they belong. */
+  async take(files: File[]): Promise<void> {
+    for (const file of files) await this.put(roleOf(file.name, await peek(file), this.slots.get("tracks")?.file != null), file);
+  }
+
+  private async submit(event: SubmitEvent): Promise<void> {
+    event.preventDefault();
+    if (this.sending) return;
+    const form = this.form();
+    if (form === null) {
+      this.answer.replaceChildren(h("p", { class: "sentence bad" }, "Choose a track file first, or try the example."));
+      this.slots.get("tracks")?.input.focus();
+      return;
+    }
+    this.sending = new AbortController();
+    this.busy(true);
+    const meter = h("progress", { max: 1, value: 0, "aria-label": "Upload" });
+    const words = h("span", { class: "muted" }, "Sending…");
+    this.answer.replaceChildren(h("p", { class: "sending" }, meter, words));
+    const onSent = (fraction: number): void => {
+      meter.value = fraction;
+      words.textContent = fraction < 1 ? `Sending, ${percent(fraction)}` : "Sent; the service is reading it…";
+    };
+    try {
+      const job = await submit(form, onSent, this.sending.signal);
+      this.answer.replaceChildren();
+      this.onJob(job);
+    } catch (error) {
+      this.refuse(error);
+    } finally {
+      this.sending = null;
+      this.busy(false);
+    }
+  }
+
+  private form(): FormData | null {
+    const form = new FormData();
+    form.append("options", JSON.stringify(this.options.values()));
+    if (this.label.value.trim()) form.append("name", this.label.value.trim());
+    const grid = this.grid.value.trim().replace("×", "x");
+    if (grid && !this.slots.get("mesh")?.file) form.append("mesh", grid);
+    for (const part of PARTS) {
+      const file = this.slots.get(part)?.file;
+      if (file) form.append(part, file, file.name);
+      else if (part === "tracks") return null;
+    }
+    return form;
+  }
+
+  private busy(busy: boolean): void {
+    this.send.disabled = busy;
+    this.stop.hidden = !busy;
+  }
+
+  private refuse(error: unknown): void {
+    if (error instanceof DOMException && error.name === "AbortError") {
+      this.answer.replaceChildren(h("p", { class: "muted" }, "Stopped; nothing was kept."));
+    } else if (error instanceof Refusal) {
+      const choose = (choice: Record<string, unknown>): void => {
+        for (const [name, value] of Object.entries(choice)) this.options.set(name, value);
+        this.send.form?.requestSubmit();
+      };
+      this.answer.replaceChildren(refusalBox(error.problem, choose));
+    } else throw error;
+  }
+}
+
+const WITHIN: [Part, RegExp][] = [
+  ["tracks", /^(tracks|points|pred_tracks|trajs?_e|W|tracks_xyz|visibility)$/],
+  ["ground_truth", /^(shapes|S|ground_truth|truth|points3d)$/i],
+  ["mesh", /^(faces|triangles|grid)$/i],
+  ["rotations", /^(rotations|Rs|R)$/],
+];
+const NAMED: [Part, RegExp][] = [
+  ["mesh", /\.(obj|ply|glb|gltf|png)$/i],
+  ["ground_truth", /truth|(^|[_-])gt([_.-]|$)/i],
+  ["rotations", /rotation|camera/i],
+  ["mesh", /mesh|faces/i],
+];
+
+/** Decide what a dropped file is: by the arrays in it, then by its name, then tracks first and a mesh second. */
+export function roleOf(name: string, entries: Entry[], haveTracks: boolean): Part {
+  for (const [part, pattern] of WITHIN) if (entries.some((entry) => pattern.test(entry.name))) return part;
+  for (const [part, pattern] of NAMED) if (pattern.test(name)) return part;
+  return haveTracks && !/track/i.test(name) ? "mesh" : "tracks";
+}

@@ -1,0 +1,189 @@
+// One job: where it stands, what it was understood as, and what came of it.
+
+import { Refusal, artifactPath, cancelJob, deleteJob, getReport, retryJob } from "./api";
+import { Curves } from "./curves";
+import { button, fill, h, say } from "./dom";
+import { follow } from "./events";
+import { refusalBox } from "./refusal";
+import { Files, Metrics, Understood } from "./results";
+import { Snippets } from "./snippets";
+import { type Job, type Progress, isFinal } from "./types";
+import { STATUS_WORDS, ago, bytes, percent, standing, title } from "./words";
+
+export interface DetailEvents {
+  onJob: (job: Job) => void;
+  onDeleted: (id: string) => void;
+}
+
+const PREVIEW = "preview.bin";
+
+export class Detail {
+  readonly element: HTMLElement;
+  private readonly heading = h("h2", { tabindex: -1, id: "job-title" });
+  private readonly status = h("span", { class: "status" });
+  private readonly when = h("span", { class: "muted" });
+  private readonly actions = h("div", { class: "row actions" });
+  private readonly standing = h("p", { class: "standing", role: "status" });
+  private readonly meter = h("progress", { max: 1, value: 0, "aria-label": "Progress of this job" });
+  private readonly share = h("span", { class: "muted" });
+  private readonly trouble = h("div", {});
+  private readonly failure = h("div", {});
+  private readonly stage = h("div", { class: "stage", hidden: true });
+  private readonly curves = new Curves();
+  private readonly understood = new Understood();
+  private readonly metrics = new Metrics();
+  private readonly files = new Files();
+  private readonly snippets = new Snippets();
+  private readonly leaving = new AbortController();
+  private job: Job | null = null;
+  private finished = false;
+
+  constructor(
+    readonly id: string,
+    private readonly events: DetailEvents,
+  ) {
+    this.element = h(
+      "article",
+      { class: "detail", "aria-labelledby": "job-title" },
+      h("header", { class: "detail-head" }, h("div", {}, this.heading, h("p", { class: "row" }, this.status, this.when)), this.actions),
+      this.standing,
+      h("div", { class: "meter" }, this.meter, this.share),
+      this.trouble,
+      this.failure,
+      this.stage,
+      this.curves.element,
+      h("div", { class: "panels" }, this.metrics.element, this.understood.element, this.files.element, this.snippets.element),
+    );
+    void this.follow();
+  }
+
+  /** Stop following and give the graphics card back. */
+  close(): void {
+    this.leaving.abort();
+  }
+
+  focus(): void {
+    this.heading.focus({ preventScroll: true });
+    if (this.element.getBoundingClientRect().top > innerHeight * 0.5) {
+      const smooth = !matchMedia("(prefers-reduced-motion: reduce)").matches;
+      this.element.scrollIntoView({ behavior: smooth ? "smooth" : "auto" });
+    }
+  }
+
+  private async follow(): Promise<void> {
+    const follower = {
+      onJob: (job: Job) => this.show(job),
+      onProgress: (progress: Progress) => this.job && this.show({ ...this.job, status: this.runningStatus(), progress }),
+      onTrouble: (refusal: Refusal | null) => this.trouble.replaceChildren(...(refusal ? [refusalBox(refusal.problem)] : [])),
+    };
+    await follow(this.id, follower, this.leaving.signal);
+  }
+
+  /** Progress of a job that is not known to run yet means that it runs. */
+  private runningStatus(): Job["status"] {
+    return this.job?.status === "queued" ? "running" : (this.job?.status ?? "running");
+  }
+
+  show(job: Job): void {
+    this.job = job;
+    say(this.heading, title(job));
+    say(this.status, STATUS_WORDS[job.status]);
+    this.status.dataset["status"] = job.status;
+    say(this.when, `${ago(job.created_at)}${job.expires_at ? `, kept until ${new Date(job.expires_at).toLocaleDateString()}` : ""}`);
+    say(this.standing, job.status === "failed" ? "" : standing(job));
+    this.showMeter(job);
+    this.showActions(job);
+    fill(this.failure, JSON.stringify(job.error), () => (job.error ? [refusalBox(job.error)] : []));
+    this.curves.job(job);
+    this.understood.show(job);
+    this.metrics.show(job);
+    this.files.show(job);
+    this.snippets.show(job);
+    this.events.onJob(job);
+    if (job.status === "succeeded" && !this.finished) {
+      this.finished = true;
+      void this.showResult(job);
+    }
+    if (!isFinal(job.status)) this.finished = false;
+  }
+
+  private showMeter(job: Job): void {
+    const running = job.status === "running" || job.status === "cancelling";
+    (this.meter.parentElement as HTMLElement).hidden = !running;
+    this.meter.value = job.progress?.fraction ?? 0;
+    say(this.share, percent(this.meter.value));
+  }
+
+  private showActions(job: Job): void {
+    const actions: [string, () => Promise<unknown>][] = [];
+    if (job.status === "queued" || job.status === "running") actions.push(["Cancel", () => cancelJob(job.id)]);
+    if (job.status === "failed" || job.status === "cancelled") actions.push(["Try again", () => retryJob(job.id)]);
+    if (isFinal(job.status)) actions.push(["Delete", () => deleteJob(job.id)]);
+    fill(this.actions, actions.map(([label]) => label).join(), () => actions.map(([label, act]) => this.action(label, act)));
+  }
+
+  private action(label: string, act: () => Promise<unknown>): HTMLButtonElement {
+    let sure = label !== "Delete";
+    const made = button(label, () => {
+      if (!sure) {
+        sure = true;
+        made.textContent = "Delete it for good?";
+        setTimeout(() => {
+          sure = false;
+          made.textContent = label;
+        }, 4000);
+        return;
+      }
+      made.disabled = true;
+      act()
+        .then((answer) => this.acted(label, answer as Job | undefined))
+        .catch((error: unknown) => {
+          made.disabled = false;
+          if (!(error instanceof Refusal)) throw error;
+          this.trouble.replaceChildren(refusalBox(error.problem));
+        });
+    });
+    return made;
+  }
+
+  private acted(label: string, job: Job | undefined): void {
+    this.trouble.replaceChildren();
+    if (label === "Delete") {
+      this.events.onDeleted(this.id);
+      return;
+    }
+    if (!job) return;
+    if (job.id !== this.id) {
+      location.hash = `job=${encodeURIComponent(job.id)}`;
+      return;
+    }
+    const wasFinal = this.job !== null && isFinal(this.job.status);
+    this.show(job);
+    this.heading.focus({ preventScroll: true });
+    if (wasFinal) void this.follow();
+  }
+
+  private async showResult(job: Job): Promise<void> {
+    const preview = job.artifacts.find((artifact) => artifact.name === PREVIEW);
+    if (job.artifacts.some((artifact) => artifact.name === "report.json")) {
+      getReport(job.id)
+        .then((report) => this.curves.report(report))
+        .catch((error: unknown) => {
+          if (!(error instanceof Refusal)) throw error; // the charts keep what they saw live
+        });
+    }
+    if (!preview) return;
+    this.stage.hidden = false;
+    this.stage.replaceChildren(h("p", { class: "view waiting" }, `Fetching the moving mesh, ${bytes(preview.bytes)}…`));
+    try {
+      const { Viewer } = await import("./viewer/viewer");
+      if (this.leaving.signal.aborted) return;
+      await Viewer.open(this.stage, artifactPath(job.id, PREVIEW), this.leaving.signal);
+    } catch (error) {
+      if (this.leaving.signal.aborted) return;
+      const words = error instanceof Error ? error.message : String(error);
+      const sentence = `The moving mesh cannot be shown here (${words}). The files below are complete; shapes.glb opens in any 3-D viewer.`;
+      this.stage.replaceChildren(h("p", { class: "view waiting" }, sentence));
+    }
+  }
+}

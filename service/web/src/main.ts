@@ -1,0 +1,93 @@
+// The page: a form, a list, and the job that the address names (#job=…), so that a reload comes back to it.
+
+import { Refusal, setToken } from "./api";
+import { Compose } from "./compose";
+import { Detail } from "./detail";
+import { button, h } from "./dom";
+import { JobList } from "./list";
+import { refusalBox } from "./refusal";
+import type { Job } from "./types";
+
+const trouble = document.getElementById("trouble") as HTMLElement;
+const side = document.getElementById("side") as HTMLElement;
+const main = document.getElementById("main") as HTMLElement;
+const welcome = document.getElementById("welcome") as HTMLElement;
+
+const list = new JobList();
+const compose = new Compose((job: Job) => {
+  list.update(job);
+  location.hash = `job=${encodeURIComponent(job.id)}`;
+});
+side.append(compose.element, list.element);
+
+let detail: Detail | null = null;
+
+function show(id: string | null, byPerson: boolean): void {
+  detail?.close();
+  detail?.element.remove();
+  detail = null;
+  list.select(id);
+  welcome.hidden = id !== null;
+  if (id === null) return;
+  detail = new Detail(id, {
+    onJob: (job) => list.update(job),
+    onDeleted: (deleted) => {
+      list.remove(deleted);
+      location.hash = "";
+      document.getElementById("compose-title")?.scrollIntoView({ block: "nearest" });
+    },
+  });
+  main.append(detail.element);
+  if (byPerson) detail.focus();
+}
+
+function named(): string | null {
+  return new URLSearchParams(location.hash.slice(1)).get("job") || null;
+}
+
+/** Something every part of the page depends on failed: say it at the top, and ask for a token if that is what is missing. */
+function report(error: unknown): void {
+  if (!(error instanceof Refusal)) throw error;
+  const parts: Node[] = [refusalBox(error.problem)];
+  if (error.problem.status === 401) parts.push(tokenForm());
+  if (trouble.childElementCount === 0 || error.problem.status !== 401) trouble.replaceChildren(...parts);
+}
+
+function tokenForm(): HTMLElement {
+  const input = h("input", { type: "password", id: "token", autocomplete: "off", required: true });
+  const form = h("form", { class: "row" }, h("label", { for: "token" }, "Token"), input, h("button", { type: "submit" }, "Use it"));
+  form.append(button("Forget it", () => setToken(""), { class: "quiet" }));
+  form.addEventListener("submit", (event) => {
+    event.preventDefault();
+    setToken(input.value.trim());
+    trouble.replaceChildren();
+    void start();
+  });
+  return form;
+}
+
+let loaded = false;
+
+async function start(): Promise<void> {
+  try {
+    if (!loaded) await compose.load();
+    loaded = true;
+    await list.refresh();
+    trouble.replaceChildren();
+  } catch (error) {
+    report(error);
+  }
+}
+
+/** Look at the list again: often while something runs, seldom otherwise, never while nobody looks. */
+async function watch(): Promise<void> {
+  for (;;) {
+    await new Promise((resolve) => setTimeout(resolve, list.busy ? 2000 : 8000));
+    if (!document.hidden) await start();
+  }
+}
+
+addEventListener("hashchange", () => show(named(), true));
+show(named(), false);
+await start();
+void watch();

@@ -1,0 +1,150 @@
+// The form for a job's options, made from the service's own schema: a new option appears here by itself.
+
+import { getOptions } from "./api";
+import { h, uniqueId } from "./dom";
+import type { Options, Schema } from "./types";
+
+/** Shown by name at the top; the rest is folded away. */
+const FIRST = ["method", "preset"];
+
+const LABELS: Record<string, string> = {
+  pseudo_inverse: "pseudo-inverse",
+  temporal: "temporal",
+  spatio_temporal: "spatio-temporal",
+  robust: "robust",
+  auto: "automatic",
+  paper: "as published",
+};
+
+interface Field {
+  name: string;
+  schema: Schema;
+  read: () => unknown;
+  write: (value: unknown) => void;
+}
+
+export class OptionsForm {
+  readonly first = h("div", { class: "options" });
+  readonly more = h("details", { class: "more" });
+  private fields: Field[] = [];
+
+  /** Ask the service for its options and build the form. Until then, and if that fails, a job is sent with the defaults. */
+  async load(): Promise<void> {
+    const properties = (await getOptions()).properties ?? {};
+    const names = Object.keys(properties);
+    const rest = names.filter((name) => !FIRST.includes(name));
+    this.fields = [];
+    this.first.replaceChildren(...FIRST.filter((name) => names.includes(name)).map((name) => this.row(name, properties)));
+    const changed = h("span", { class: "muted" });
+    const body = h("div", { class: "options" }, ...rest.map((name) => this.row(name, properties)));
+    this.more.replaceChildren(h("summary", {}, "More options ", changed), body);
+    body.addEventListener("change", () => {
+      const given = Object.keys(this.values()).filter((name) => !FIRST.includes(name)).length;
+      changed.textContent = given > 0 ? `(${given} changed)` : "";
+    });
+  }
+
+  /** The options that differ from the defaults. */
+  values(): Options {
+    const given: Options = {};
+    for (const field of this.fields) {
+      const value = field.read();
+      if (value !== undefined && value !== (field.schema.default ?? null)) given[field.name] = value;
+    }
+    return given;
+  }
+
+  /** Set one option, for instance a reading that the service offered. */
+  set(name: string, value: unknown): void {
+    const field = this.fields.find((one) => one.name === name);
+    field?.write(value);
+    this.more.dispatchEvent(new Event("change"));
+  }
+
+  private row(name: string, properties: Record<string, Schema>): HTMLElement {
+    const schema = properties[name] as Schema;
+    const id = uniqueId("option");
+    const control = controlFor(schema, id);
+    this.fields.push({ name, schema, ...control });
+    const words = describe(schema, String(control.read() ?? ""));
+    const hint = h("p", { class: "hint", id: `${id}-hint` }, words);
+    control.element.setAttribute("aria-describedby", hint.id);
+    control.element.addEventListener("change", () => {
+      hint.textContent = describe(schema, String(control.read() ?? ""));
+    });
+    const label = h("label", { for: id }, name.replaceAll("_", " "));
+    return h("div", { class: "option" }, label, control.element, hint);
+  }
+}
+
+interface Control extends Pick<Field, "read" | "write"> {
+  element: HTMLElement;
+}
+
+function controlFor(schema: Schema, id: string): Control {
+  const kinds = schema.anyOf ?? [schema];
+  const nullable = kinds.some((kind) => kind.type === "null");
+  const main = kinds.find((kind) => kind.type !== "null") ?? schema;
+  const initial = schema.default ?? null;
+  const values = main.enum ?? (main.const === undefined ? undefined : [main.const]);
+  if (values) return choice(id, values, nullable, initial);
+  if (main.type === "boolean") return tick(id, initial === true);
+  return entry(id, main, nullable, initial);
+}
+
+function choice(id: string, values: unknown[], nullable: boolean, initial: unknown): Control {
+  const all = nullable ? [null, ...values] : values;
+  const element = h(
+    "select",
+    { id },
+    ...all.map((value, index) => h("option", { value: index }, value === null ? "automatic" : label(value))),
+  );
+  const write = (value: unknown): void => {
+    element.value = String(Math.max(0, all.indexOf(value)));
+  };
+  write(initial);
+  return { element, read: () => all[Number(element.value)], write };
+}
+
+function tick(id: string, initial: boolean): Control {
+  const element = h("input", { id, type: "checkbox" });
+  element.checked = initial;
+  return { element, read: () => element.checked, write: (value) => void (element.checked = value === true) };
+}
+
+function entry(id: string, schema: Schema, nullable: boolean, initial: unknown): Control {
+  const numeric = schema.type === "number" || schema.type === "integer";
+  const element = h("input", {
+    id,
+    type: numeric ? "number" : "text",
+    step: schema.type === "integer" ? 1 : "any",
+    min: schema.minimum ?? schema.exclusiveMinimum,
+    max: schema.maximum ?? schema.exclusiveMaximum,
+    placeholder: nullable ? "automatic" : null,
+    inputmode: numeric ? "decimal" : null,
+  });
+  const write = (value: unknown): void => {
+    element.value = value === null || value === undefined ? "" : String(value);
+  };
+  write(initial);
+  const read = (): unknown => {
+    if (element.value === "") return nullable ? null : initial;
+    return numeric ? Number(element.value) : element.value;
+  };
+  return { element, read, write };
+}
+
+function label(value: unknown): string {
+  return LABELS[String(value)] ?? String(value);
+}
+
+/** The part of a description that belongs to the chosen value ("robust: …"), or all of it where there is no such part. */
+function describe(schema: Schema, chosen: string): string {
+  const text = schema.description ?? "";
+  const starts = (schema.enum ?? []).map((value) => text.indexOf(`${String(value)}: `)).filter((at) => at >= 0);
+  const from = text.indexOf(`${chosen}: `);
+  if (!chosen || !starts.includes(from)) return text;
+  const to = Math.min(...starts.filter((at) => at > from), text.length);
+  const part = text.slice(from + chosen.length + 2, to).replace(/[.;, ]+$/, "");
+  return `${part.charAt(0).toUpperCase()}${part.slice(1)}.`;
+}

@@ -1,0 +1,95 @@
+// What is in a chosen file, read from its first bytes in the browser: array names, shapes and types, before anything is sent.
+
+export interface Entry {
+  name: string;
+  shape: number[];
+  dtype: string;
+}
+
+const LOCAL = 0x04034b50;
+const CENTRAL = 0x02014b50;
+const END = 0x06054b50;
+
+/** Return the arrays of an .npy or .npz file; an empty list for anything else. Never throws on a strange file. */
+export async function peek(file: File): Promise<Entry[]> {
+  try {
+    const head = new Uint8Array(await file.slice(0, 4).arrayBuffer());
+    if (head[0] === 0x93) {
+      const entry = header(new Uint8Array(await file.slice(0, 65536).arrayBuffer()));
+      return entry ? [{ ...entry, name: "" }] : [];
+    }
+    if (new DataView(head.buffer).getUint32(0, true) === LOCAL) return await members(file);
+  } catch (error) {
+    // Shorter than it says, or not what it says: the service will explain it when it is sent.
+    if (!(error instanceof RangeError || error instanceof TypeError)) throw error;
+  }
+  return [];
+}
+
+async function members(file: File): Promise<Entry[]> {
+  const tail = new DataView(await file.slice(Math.max(0, file.size - 66000)).arrayBuffer());
+  let end = tail.byteLength - 22;
+  while (end >= 0 && tail.getUint32(end, true) !== END) end -= 1;
+  if (end < 0) return [];
+  const from = tail.getUint32(end + 16, true);
+  const directory = new DataView(await file.slice(from, from + tail.getUint32(end + 12, true)).arrayBuffer());
+  const found: Entry[] = [];
+  let at = 0;
+  while (at + 46 <= directory.byteLength && directory.getUint32(at, true) === CENTRAL && found.length < 16) {
+    const nameLength = directory.getUint16(at + 28, true);
+    const name = new TextDecoder().decode(new Uint8Array(directory.buffer, at + 46, nameLength));
+    const entry = await member(file, directory.getUint32(at + 42, true), directory.getUint16(at + 10, true));
+    if (entry) found.push({ ...entry, name: name.replace(/\.npy$/, "") });
+    at += 46 + nameLength + directory.getUint16(at + 30, true) + directory.getUint16(at + 32, true);
+  }
+  return found;
+}
+
+async function member(file: File, offset: number, method: number): Promise<Omit<Entry, "name"> | null> {
+  const local = new DataView(await file.slice(offset, offset + 30).arrayBuffer());
+  const start = offset + 30 + local.getUint16(26, true) + local.getUint16(28, true);
+  const packed = file.slice(start, start + 16384);
+  if (method === 0) return header(new Uint8Array(await packed.arrayBuffer()));
+  if (method !== 8) return null;
+  const reader = packed.stream().pipeThrough(new DecompressionStream("deflate-raw")).getReader();
+  let got = new Uint8Array(0);
+  try {
+    while (got.length < 10 || got.length < 10 + new DataView(got.buffer).getUint16(8, true)) {
+      const { done, value } = await reader.read();
+      if (done) break;
+      const longer = new Uint8Array(got.length + value.length);
+      longer.set(got);
+      longer.set(value, got.length);
+      got = longer;
+    }
+  } finally {
+    // The rest of the member was cut off on purpose, which the decompressor may call an error.
+    reader.cancel().catch(() => undefined);
+  }
+  return header(got);
+}
+
+function header(start: Uint8Array): Omit<Entry, "name"> | null {
+  if (start[0] !== 0x93 || start.length < 12) return null;
+  const view = new DataView(start.buffer, start.byteOffset);
+  const [length, from] = start[6] === 1 ? [view.getUint16(8, true), 10] : [view.getUint32(8, true), 12];
+  const text = new TextDecoder("latin1").decode(start.subarray(from, from + length));
+  const dtype = /'descr':\s*'([^']+)'/.exec(text)?.[1];
+  const shape = /'shape':\s*\(([^)]*)\)/.exec(text)?.[1];
+  if (dtype === undefined || shape === undefined) return null;
+  return { dtype: typeName(dtype), shape: shape.split(",").filter((part) => part.trim()).map(Number) };
+}
+
+function typeName(descr: string): string {
+  const kinds: Record<string, string> = { f: "float", i: "int", u: "uint", b: "bool", c: "complex" };
+  const kind = kinds[descr.charAt(1)];
+  if (kind === undefined) return descr;
+  return kind === "bool" ? kind : kind + 8 * Number(descr.slice(2));
+}
+
+/** Write entries as "tracks 60 × 2400 × 2 float32". */
+export function describe(entries: Entry[]): string {
+  return entries
+    .map((entry) => [entry.name, entry.shape.join(" × ") || "one value", entry.dtype].filter(Boolean).join(" "))
+    .join(", ");
+}

@@ -1,0 +1,117 @@
+// "Do this from code", for the very job shown: the same options, the same parts, this service's address.
+
+import { button, fill, h } from "./dom";
+import type { Job } from "./types";
+
+type Language = "Python" | "Shell" | "curl";
+
+export class Snippets {
+  readonly element: HTMLElement;
+  private readonly code = h("code", {});
+  private readonly copied = h("span", { class: "muted", role: "status" });
+  private readonly tabs: HTMLButtonElement[];
+  private language: Language = "Python";
+  private job: Job | null = null;
+
+  constructor() {
+    const languages: Language[] = ["Python", "Shell", "curl"];
+    this.tabs = languages.map((language) =>
+      button(language, () => this.choose(language), { "aria-pressed": String(language === this.language) }),
+    );
+    const copy = button("Copy", () => void this.copy(), { class: "quiet" });
+    this.element = h(
+      "section",
+      { class: "panel", "aria-labelledby": "snippet-title" },
+      h("h3", { id: "snippet-title" }, "Do this from code"),
+      h("div", { class: "row", role: "group", "aria-label": "Language" }, ...this.tabs, copy, this.copied),
+      h("pre", { tabindex: 0, "aria-label": "Code" }, this.code),
+    );
+  }
+
+  show(job: Job): void {
+    this.job = job;
+    const text = snippet(job, this.language, new URL(".", document.baseURI).href.replace(/\/$/, ""));
+    fill(this.code, text, () => [text]);
+  }
+
+  private choose(language: Language): void {
+    this.language = language;
+    for (const tab of this.tabs) tab.setAttribute("aria-pressed", String(tab.textContent === language));
+    if (this.job) this.show(this.job);
+  }
+
+  private async copy(): Promise<void> {
+    // The clipboard is only there on https and on localhost; elsewhere the text is selected, ready for Ctrl-C.
+    try {
+      await navigator.clipboard.writeText(this.code.textContent ?? "");
+      this.copied.textContent = "Copied.";
+    } catch {
+      getSelection()?.selectAllChildren(this.code);
+      this.copied.textContent = "Selected; press Ctrl+C.";
+    }
+    setTimeout(() => (this.copied.textContent = ""), 3000);
+  }
+}
+
+/** The options a job was given, without those that say what the default says anyway (null is "choose for me"). */
+function given(job: Job): [string, unknown][] {
+  return Object.entries(job.options).filter(([, value]) => value !== null);
+}
+
+function parts(job: Job): [string, string][] {
+  const seen = job.interpretation;
+  const found: [string, string][] = [["tracks", "tracks.npz"]];
+  if (seen.mesh_source === "given") found.push(["mesh", "mesh.npz"]);
+  if (seen.has_ground_truth) found.push(["ground_truth", "truth.npz"]);
+  if (seen.has_rotations) found.push(["rotations", "cameras.npz"]);
+  return found;
+}
+
+/** Write the job as a program. */
+export function snippet(job: Job, language: Language, url: string): string {
+  if (language === "Python") return python(job, url);
+  if (language === "Shell") return shell(job, url);
+  return curl(job, url);
+}
+
+function python(job: Job, url: string): string {
+  const literal = (value: unknown): string =>
+    value === true ? "True" : value === false ? "False" : JSON.stringify(value);
+  const options = given(job).map(([name, value]) => `    ${JSON.stringify(name)}: ${literal(value)},\n`);
+  const files = parts(job)
+    .slice(1)
+    .map(([part, file]) => `    ${part}=${JSON.stringify(file)},\n`);
+  const name = job.name ? `    name=${JSON.stringify(job.name)},\n` : "";
+  return (
+    `from pliant.client import Client\n\n` +
+    `options = {\n${options.join("")}}\n` +
+    `job = Client(${JSON.stringify(url)}).submit(\n    "tracks.npz",\n${files.join("")}${name}    options=options,\n)\n` +
+    `shapes = job.wait(timeout=3600).shapes  # array (${job.interpretation.num_frames}, ${job.interpretation.num_points}, 3)\n`
+  );
+}
+
+const quote = (text: string): string => (/^[\w@%+=:,./-]+$/.test(text) ? text : `'${text.replaceAll("'", "'\\''")}'`);
+
+function shell(job: Job, url: string): string {
+  const files = parts(job)
+    .slice(1)
+    .map(([part, file]) => `--${part.replace("_", "-")} ${file}`);
+  const options = given(job).map(([name, value]) => `--option ${quote(`${name}=${String(value)}`)}`);
+  const name = job.name ? [`--name ${quote(job.name)}`] : [];
+  return `${["pliant submit tracks.npz", ...files, ...name, `--url ${quote(url)}`, ...options].join(" \\\n  ")}\n`;
+}
+
+function curl(job: Job, url: string): string {
+  const options = JSON.stringify(Object.fromEntries(given(job)));
+  const fields = [
+    ...parts(job).map(([part, file]) => `-F ${part}=@${file}`),
+    ...(job.name ? [`-F ${quote(`name=${job.name}`)}`] : []),
+    `-F ${quote(`options=${options}`)}`,
+  ];
+  return (
+    `${[`curl ${quote(`${url}/v1/jobs`)}`, ...fields].join(" \\\n  ")}\n\n` +
+    `# this job's record, and its animated mesh\n` +
+    `curl ${quote(`${url}/v1/jobs/${job.id}`)}\n` +
+    `curl -O ${quote(`${url}/v1/jobs/${job.id}/artifacts/shapes.glb`)}\n`
+  );
+}

@@ -1,0 +1,245 @@
+// One moving surface (or cloud of points): two frames on the graphics card, mixed by the shader.
+//
+// Only the two frames around the present moment are uploaded, 16 bytes a point and frame: for 99 frames of 29,000 points that
+// is 1 MB on the card instead of the 46 MB that 99 morph targets take there, and a frame costs one mix instead of a loop over targets.
+
+import {
+  BufferAttribute,
+  BufferGeometry,
+  Color,
+  DynamicDrawUsage,
+  Group,
+  LineSegments,
+  Mesh,
+  Points,
+  ShaderMaterial,
+  Vector3,
+} from "three";
+import { SCALE, type Values } from "./colours";
+import type { Preview } from "./preview";
+
+const VERTEX = `
+attribute vec4 a; attribute vec4 b; attribute vec4 na; attribute vec4 nb;
+uniform float mixing; uniform vec3 origin; uniform float unit; uniform float dot_size;
+varying vec3 normal_; varying float value;
+void main() {
+  vec4 p = mix(a, b, mixing);
+  value = p.w / 32767.0;
+  normal_ = normalMatrix * mix(na.xyz, nb.xyz, mixing);
+  gl_Position = projectionMatrix * modelViewMatrix * vec4(origin + unit * p.xyz, 1.0);
+  gl_PointSize = dot_size;
+}`;
+
+// Light from the upper left and a weaker one from behind, both fixed to the viewer; both sides of a surface are lit.
+const FRAGMENT = `
+uniform vec3 plain; uniform vec3 scale[6]; uniform float coloured; uniform float lit;
+varying vec3 normal_; varying float value;
+void main() {
+  float at = clamp(value, 0.0, 1.0) * 5.0;
+  vec3 shade = scale[0];
+  for (int i = 0; i < 5; i++) shade = mix(shade, scale[i + 1], clamp(at - float(i), 0.0, 1.0));
+  vec3 base = mix(plain, shade, coloured);
+  vec3 n = normalize(normal_ + vec3(1e-9));
+  if (n.z < 0.0) n = -n;
+  float key = max(dot(n, normalize(vec3(-0.45, 0.6, 0.66))), 0.0);
+  float fill = max(dot(n, normalize(vec3(0.7, -0.25, 0.6))), 0.0);
+  float shine = pow(max(dot(n, normalize(vec3(-0.24, 0.33, 0.91))), 0.0), 40.0) * 0.10;
+  vec3 c = mix(base, base * (0.36 + 0.62 * key + 0.20 * fill) + shine, lit);
+  gl_FragColor = vec4(c, 1.0);
+  #include <colorspace_fragment>
+}`;
+
+interface Slot {
+  frame: number;
+  place: BufferAttribute;
+  normal: BufferAttribute;
+}
+
+export class Body {
+  readonly group = new Group();
+  private readonly geometry = new BufferGeometry();
+  private readonly slots: [Slot, Slot];
+  private readonly materials: ShaderMaterial[] = [];
+  private readonly wire = new LineSegments(new BufferGeometry(), this.material({ lit: 0 }));
+  private values: Values | null = null;
+  private readonly accumulated: Float32Array;
+
+  constructor(
+    private readonly preview: Preview,
+    private readonly source: Int16Array,
+  ) {
+    const { points, faces } = preview;
+    this.accumulated = new Float32Array(3 * points);
+    const slot = (): Slot => ({
+      frame: -1,
+      place: new BufferAttribute(new Int16Array(4 * points), 4).setUsage(DynamicDrawUsage),
+      normal: new BufferAttribute(new Int8Array(4 * points), 4, true).setUsage(DynamicDrawUsage),
+    });
+    this.slots = [slot(), slot()];
+    if (faces.length > 0) {
+      this.geometry.setIndex(new BufferAttribute(faces, 1));
+      const surface = new Mesh(this.geometry, this.material({ lit: 1 }));
+      surface.frustumCulled = false;
+      this.group.add(surface);
+    } else {
+      const cloud = new Points(this.geometry, this.material({ lit: 0, dot_size: points > 5000 ? 2 : 5 }));
+      cloud.frustumCulled = false;
+      this.group.add(cloud);
+    }
+    this.wire.frustumCulled = false;
+    this.wire.visible = false;
+    this.group.add(this.wire);
+  }
+
+  /** Show the moment `time`, in frames, between 0 and F − 1. */
+  show(time: number): void {
+    const last = Math.max(0, this.preview.ready - 1);
+    const first = Math.min(Math.floor(time), last);
+    const second = Math.min(first + 1, last);
+    let [a, b] = this.slots;
+    if (a.frame !== first && b.frame === first) [a, b] = [b, a];
+    this.load(a, first);
+    this.load(b, second);
+    this.slots[0] = a;
+    this.slots[1] = b;
+    for (const geometry of [this.geometry, this.wire.geometry]) {
+      geometry.setAttribute("a", a.place);
+      geometry.setAttribute("b", b.place);
+      geometry.setAttribute("na", a.normal);
+      geometry.setAttribute("nb", b.normal);
+      // three.js counts vertices by this name; the shader reads a and b.
+      geometry.setAttribute("position", a.place);
+    }
+    for (const material of this.materials) material.uniforms["mixing"]!.value = second > first ? time - first : 0;
+  }
+
+  /** Colour by values, or plainly. */
+  colour(values: Values | null): void {
+    this.values = values;
+    for (const slot of this.slots) slot.frame = -1;
+    for (const material of this.materials) material.uniforms["coloured"]!.value = values === null ? 0 : 1;
+    this.wireTint();
+  }
+
+  /** The plain colour and that of the wires, from the page's theme. */
+  theme(plain: string, wire: string): void {
+    for (const material of this.materials) (material.uniforms["plain"]!.value as Color).set(plain);
+    (this.wire.material as ShaderMaterial).uniforms["plain"]!.value = new Color(wire);
+  }
+
+  /** Draw the mesh's edges over the surface. */
+  wireframe(on: boolean): void {
+    if (on && this.wire.geometry.index === null && this.preview.faces.length > 0) {
+      this.wire.geometry.setIndex(new BufferAttribute(edges(this.preview.faces, this.preview.points), 1));
+    }
+    this.wire.visible = on && this.preview.faces.length > 0;
+  }
+
+  dispose(): void {
+    this.geometry.dispose();
+    this.wire.geometry.dispose();
+    for (const material of this.materials) material.dispose();
+  }
+
+  private wireTint(): void {
+    (this.wire.material as ShaderMaterial).uniforms["coloured"]!.value = 0;
+  }
+
+  private material(options: { lit: number; dot_size?: number }): ShaderMaterial {
+    const { header } = this.preview;
+    const surface = options.lit === 1;
+    const made = new ShaderMaterial({
+      vertexShader: VERTEX,
+      fragmentShader: FRAGMENT,
+      side: 2,
+      // The surface is pushed back by a hair, so that wires on it are seen whole.
+      polygonOffset: surface,
+      polygonOffsetFactor: 1,
+      polygonOffsetUnits: 1,
+      uniforms: {
+        mixing: { value: 0 },
+        origin: { value: new Vector3(...header.origin) },
+        unit: { value: header.step },
+        dot_size: { value: (options.dot_size ?? 1) * globalThis.devicePixelRatio },
+        plain: { value: new Color() },
+        scale: { value: SCALE.map((hex) => new Color(hex)) },
+        coloured: { value: 0 },
+        lit: { value: options.lit },
+      },
+    });
+    this.materials.push(made);
+    return made;
+  }
+
+  private load(slot: Slot, frame: number): void {
+    if (slot.frame === frame) return;
+    const { points } = this.preview;
+    const from = this.source.subarray(3 * points * frame, 3 * points * (frame + 1));
+    const into = slot.place.array as Int16Array;
+    for (let i = 0, j = 0; j < from.length; i += 4, j += 3) {
+      into[i] = from[j] as number;
+      into[i + 1] = from[j + 1] as number;
+      into[i + 2] = from[j + 2] as number;
+    }
+    this.values?.write(frame, into, 4, 3);
+    this.normals(from, slot.normal.array as Int8Array);
+    slot.place.needsUpdate = true;
+    slot.normal.needsUpdate = true;
+    slot.frame = frame;
+  }
+
+  /** Area-weighted vertex normals: the sum of the cross products of the faces around each point. */
+  private normals(at: Int16Array, into: Int8Array): void {
+    const { faces } = this.preview;
+    const sum = this.accumulated.fill(0);
+    for (let i = 0; i < faces.length; i += 3) {
+      const p = 3 * (faces[i] as number);
+      const q = 3 * (faces[i + 1] as number);
+      const r = 3 * (faces[i + 2] as number);
+      const ux = at[q]! - at[p]!;
+      const uy = at[q + 1]! - at[p + 1]!;
+      const uz = at[q + 2]! - at[p + 2]!;
+      const vx = at[r]! - at[p]!;
+      const vy = at[r + 1]! - at[p + 1]!;
+      const vz = at[r + 2]! - at[p + 2]!;
+      const x = uy * vz - uz * vy;
+      const y = uz * vx - ux * vz;
+      const z = ux * vy - uy * vx;
+      sum[p]! += x;
+      sum[p + 1]! += y;
+      sum[p + 2]! += z;
+      sum[q]! += x;
+      sum[q + 1]! += y;
+      sum[q + 2]! += z;
+      sum[r]! += x;
+      sum[r + 1]! += y;
+      sum[r + 2]! += z;
+    }
+    for (let i = 0, j = 0; j < sum.length; i += 4, j += 3) {
+      const length = Math.hypot(sum[j]!, sum[j + 1]!, sum[j + 2]!) || 1;
+      into[i] = (127 * sum[j]!) / length;
+      into[i + 1] = (127 * sum[j + 1]!) / length;
+      into[i + 2] = (127 * sum[j + 2]!) / length;
+    }
+  }
+}
+
+/** Each undirected edge of the triangles once. */
+function edges(faces: Uint32Array, points: number): Uint32Array {
+  const seen = new Set<number>();
+  for (let i = 0; i < faces.length; i += 3) {
+    for (let k = 0; k < 3; k += 1) {
+      const p = faces[i + k] as number;
+      const q = faces[i + ((k + 1) % 3)] as number;
+      seen.add(Math.min(p, q) * points + Math.max(p, q));
+    }
+  }
+  const pairs = new Uint32Array(2 * seen.size);
+  let at = 0;
+  for (const edge of seen) {
+    pairs[at] = Math.floor(edge / points);
+    pairs[at + 1] = edge % points;
+    at += 2;
+  }
+  return pairs;
+}

@@ -1,0 +1,103 @@
+// Numbers, sizes, times and names as people read them.
+
+import type { Job, Status } from "./types";
+
+const whole = new Intl.NumberFormat("en");
+
+export function count(value: number, one: string, many = `${one}s`): string {
+  return `${whole.format(value)} ${value === 1 ? one : many}`;
+}
+
+export function number(value: number | null | undefined): string {
+  if (value === null || value === undefined || !Number.isFinite(value)) return "–";
+  const size = Math.abs(value);
+  if (size === 0) return "0";
+  if (size >= 1e5 || size < 1e-4) return value.toExponential(2);
+  if (size >= 100) return value.toFixed(1);
+  return value.toPrecision(size < 1 ? 3 : 4);
+}
+
+export function percent(fraction: number): string {
+  const value = 100 * fraction;
+  return `${value > 0 && value < 10 ? value.toFixed(1) : Math.round(value)} %`;
+}
+
+export function bytes(value: number): string {
+  if (value < 1000) return `${value} B`;
+  const units = ["kB", "MB", "GB"];
+  let scaled = value / 1000;
+  let unit = 0;
+  while (scaled >= 999.5 && unit < units.length - 1) {
+    scaled /= 1000;
+    unit += 1;
+  }
+  return `${scaled < 9.95 ? scaled.toFixed(1) : Math.round(scaled)} ${units[unit]}`;
+}
+
+export function seconds(value: number): string {
+  if (value < 1) return "less than a second";
+  if (value < 90) return count(Math.round(value), "second");
+  if (value < 5400) return count(Math.round(value / 60), "minute");
+  return `${(value / 3600).toFixed(1)} hours`;
+}
+
+export function ago(iso: string, now = Date.now()): string {
+  const age = (now - Date.parse(iso)) / 1000;
+  if (age < 5) return "just now";
+  if (age < 90) return `${Math.round(age)} s ago`;
+  if (age < 5400) return `${Math.round(age / 60)} min ago`;
+  if (age < 129600) return `${Math.round(age / 3600)} h ago`;
+  return new Date(iso).toLocaleDateString();
+}
+
+export function title(job: Job): string {
+  return job.name || `Job ${job.id.slice(0, 8)}`;
+}
+
+export const STATUS_WORDS: Record<Status, string> = {
+  queued: "Queued",
+  running: "Running",
+  cancelling: "Cancelling",
+  succeeded: "Done",
+  failed: "Failed",
+  cancelled: "Cancelled",
+};
+
+const STAGES: Record<string, string> = {
+  loading: "Reading the tracks",
+  cameras: "Estimating the cameras",
+  initialise: "First shapes",
+  reweight: "Refining the shapes",
+  finish: "Finishing",
+  exporting: "Writing the files",
+};
+
+/** One line on where a job stands. */
+export function standing(job: Job): string {
+  switch (job.status) {
+    case "queued":
+      if (job.place_in_queue === null) return "Waiting for a worker.";
+      return job.place_in_queue === 0
+        ? "Next in the queue."
+        : `In the queue: ${count(job.place_in_queue, "job")} before this one.`;
+    case "running": {
+      const progress = job.progress;
+      if (progress === null) return "A worker has begun.";
+      const stage = STAGES[progress.stage] ?? progress.stage;
+      const step =
+        progress.stage === "reweight" && progress.max_reweightings > 0
+          ? `, reweighting ${progress.reweighting} of at most ${progress.max_reweightings}`
+          : "";
+      const left = progress.seconds_left === null ? "" : `; about ${seconds(progress.seconds_left)} left`;
+      return `${stage}${step}${left}.`;
+    }
+    case "cancelling":
+      return "Stopping at the next safe point.";
+    case "succeeded":
+      return job.sentence ?? "Done.";
+    case "failed":
+      return job.error?.detail ?? "The job failed; its log says more.";
+    case "cancelled":
+      return "Cancelled; nothing was kept but the record.";
+  }
+}

