@@ -3,6 +3,7 @@
     WorkerError                 base: catch this one
     ├── UnknownJob              no job of that id (or not yours)
     ├── UnknownArtifact         the job has no such file
+    ├── UnknownExample          there is no such made-up sequence, or it has no such file
     ├── NotAllowedNow           the job's status does not allow it
     ├── Conflict                an id or idempotency key is already used for something else
     ├── InvalidRequest          an id or cursor that cannot be one
@@ -56,6 +57,16 @@ class UnknownArtifact(WorkerError):
         have = ", ".join(names) if names else "none (only a succeeded job has files)"
         super().__init__(f"Job {id!r} has no file {name!r}. It has: {have}.")
         self.id, self.name, self.names = id, name, names
+
+
+class UnknownExample(WorkerError):
+    """There is no such example, or it has no such file."""
+
+    code = "unknown_example"
+
+    def __init__(self, name: str, file: str, *, known: list[str]) -> None:
+        super().__init__(f"There is no example file {name}/{file}. There are: {', '.join(known)}.")
+        self.name, self.file = name, file
 
 
 class NotAllowedNow(WorkerError):

@@ -1,0 +1,76 @@
+"""Made-up sequences that a newcomer can reconstruct at once: input files in the formats that the readers take."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pliant.solver.gallery import Sequence, corrupt, face, flag, sphere
+from pliant.worker.errors import UnknownExample
+
+Write = Callable[[Sequence], bytes]
+
+
+@dataclass(frozen=True, slots=True)
+class Example:
+    """One example: what it is called, how it is made, and its files by the form part they belong to."""
+
+    name: str
+    title: str
+    make: Callable[[], Sequence]
+    files: tuple[tuple[str, str], ...] = (
+        ("tracks", "tracks.npz"),
+        ("mesh", "mesh.npz"),
+        ("ground_truth", "truth.npz"),
+    )
+
+
+def _npz(**arrays: ArrayLike) -> bytes:
+    packed = io.BytesIO()
+    np.savez_compressed(packed, allow_pickle=False, **arrays)
+    return packed.getvalue()
+
+
+WRITERS: dict[str, Write] = {
+    "tracks.npz": lambda sequence: _npz(
+        tracks=sequence.tracks.points.astype(np.float32), visibility=sequence.tracks.visible > 0
+    ),
+    "mesh.npz": lambda sequence: _npz(faces=sequence.mesh.faces),
+    "truth.npz": lambda sequence: _npz(shapes=sequence.shapes.astype(np.float32), rotations=sequence.rotations),
+}
+
+EXAMPLES = {
+    example.name: example
+    for example in (
+        Example("face", "talking face", lambda: corrupt(face(40, 2500, degrees=40), noise=0.002, outliers=0.02)),
+        Example("flag", "waving flag", lambda: corrupt(flag(50, 1500), noise=0.002, hidden=0.05)),
+        Example("sphere", "breathing sphere", lambda: sphere(60, 1200)),
+    )
+}
+"""Small enough for a result within seconds, and with something wrong in each (noise, outliers, hidden points)."""
+
+
+def example_file(name: str, file: str) -> bytes:
+    """Make one input file of an example; the same bytes every time.
+
+    Parameters
+    ----------
+    name : str
+        A key of `EXAMPLES`.
+    file : str
+        A file that the example lists.
+
+    Raises
+    ------
+    UnknownExample
+        There is no such example, or it has no such file.
+    """
+    example = EXAMPLES.get(name)
+    if example is None or file not in (listed for _, listed in example.files):
+        raise UnknownExample(
+            name, file, known=[f"{one.name}/{listed}" for one in EXAMPLES.values() for _, listed in one.files]
+        )
+    return WRITERS[file](example.make())
