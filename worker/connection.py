@@ -14,7 +14,7 @@ ANSWER_WITHIN = 30.0
 """Seconds a command may take, blocking reads included."""
 
 
-def connect(url: str, *, decode: bool, retries: int = 3) -> redis.Redis:
+def connect(url: str, *, decode: bool, retries: int = 3, answer_within: float = ANSWER_WITHIN) -> redis.Redis:
     """Return a client, which connects when it is first used.
 
     Parameters
@@ -26,12 +26,14 @@ def connect(url: str, *, decode: bool, retries: int = 3) -> redis.Redis:
     retries : int
         Attempts after the first when the connection breaks, with growing pauses of up to half a second. Every write
         of ours is a compare-and-set or may be repeated, so a retry after an unheard answer does no harm.
+    answer_within : float
+        Seconds a command may take.
     """
     return redis.Redis.from_url(
         url,
         decode_responses=decode,
-        socket_connect_timeout=5,
-        socket_timeout=ANSWER_WITHIN,
+        socket_connect_timeout=min(5.0, answer_within),
+        socket_timeout=answer_within,
         health_check_interval=15,
         retry=Retry(ExponentialWithJitterBackoff(base=0.05, cap=0.5), retries),
     )

@@ -108,9 +108,11 @@ def stop(stored: Stored, *, token: str, now: datetime, retention: float) -> Stor
     Raises
     ------
     StaleAttempt
-        The job belongs to another attempt, or is finished.
+        The job belongs to another attempt, is finished, or nobody asked for its end.
     """
     _check_owner(stored, token)
+    if stored.job.status is not Status.CANCELLING:
+        raise StaleAttempt(stored.job.id)
     return _finish(stored, Status.CANCELLED, now=now, retention=retention)
 
 
@@ -135,9 +137,16 @@ def cancel(stored: Stored, *, now: datetime, retention: float) -> Stored:
 
 
 def requeue(
-    stored: Stored, *, token: str, fresh: str, problem: Problem, now: datetime, max_attempts: int, retention: float
+    stored: Stored,
+    *,
+    token: str,
+    fresh: str,
+    problem: Problem,
+    now: datetime,
+    max_attempts: int | None,
+    retention: float,
 ) -> Stored:
-    """Put a job back that lost its worker; after `max_attempts` it fails with `problem` instead.
+    """Put a job back that lost its worker; after `max_attempts` (None: never) it fails with `problem`.
 
     Parameters
     ----------
@@ -150,7 +159,8 @@ def requeue(
         The job belongs to another attempt, or is finished.
     """
     _check_owner(stored, token)
-    if stored.job.status is Status.CANCELLING or stored.job.attempt >= max_attempts:
+    spent = max_attempts is not None and stored.job.attempt >= max_attempts
+    if spent or stored.job.status is Status.CANCELLING:
         return fail(stored, token=token, problem=problem, now=now, retention=retention)
     job = stored.job.model_copy(update={"status": Status.QUEUED, "started_at": None, "progress": None})
     return stored.model_copy(update={"job": job, "token": fresh, "worker": None})

@@ -191,6 +191,9 @@ class MemoryQueue(Queue):
         """See `Queue.place`."""
         return self._tokens.index(token) if token in self._tokens else None
 
+    def tidy(self) -> None:
+        """See `Queue.tidy`."""
+
     def workers(self) -> list[str]:
         """See `Queue.workers`."""
         return ["memory"]

@@ -11,6 +11,7 @@ from rq import Queue as RqQueue
 from rq import worker_registration
 from rq.exceptions import NoSuchJobError
 from rq.job import Job as RqJob
+from rq.registry import clean_registries
 from rq.serializers import JSONSerializer
 
 FUNCTION = "pliant.worker.job.run"
@@ -45,6 +46,10 @@ class Queue(ABC):
         """Return how many attempts wait before this one, None if it does not wait."""
 
     @abstractmethod
+    def tidy(self) -> None:
+        """Remove what dead workers left behind in the queue's own books."""
+
+    @abstractmethod
     def workers(self) -> list[str]:
         """Return the names of the workers that have shown signs of life lately."""
 
@@ -75,7 +80,8 @@ class RedisQueue(Queue):
     def remove(self, token: str) -> None:
         """See `Queue.remove`."""
         with reachable():
-            self._redis.lrem(self._queue.key, 0, token)
+            for key in (self._queue.key, self._queue.intermediate_queue_key):
+                self._redis.lrem(key, 0, token)
             try:
                 RqJob.fetch(token, connection=self._redis, serializer=JSONSerializer).delete()
             except NoSuchJobError:
@@ -91,6 +97,17 @@ class RedisQueue(Queue):
         with reachable():
             place: int | None = self._redis.lpos(self._queue.key, token)
         return place
+
+    def tidy(self) -> None:
+        """See `Queue.tidy`."""
+        with reachable():
+            if not self._queue.acquire_maintenance_lock():
+                return
+            try:
+                clean_registries(self._queue)
+                worker_registration.clean_worker_registry(self._queue)
+            finally:
+                self._queue.release_maintenance_lock()  # type: ignore[no-untyped-call]
 
     def workers(self) -> list[str]:
         """See `Queue.workers`."""

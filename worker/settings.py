@@ -12,6 +12,9 @@ from urllib.parse import quote
 from pliant.worker.errors import InvalidSetting
 from pliant.worker.paths import socket_path
 
+NUMERICAL_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
+"""What the numerical libraries read when they are loaded."""
+
 
 def usable_cores() -> int:
     """Cores this process may run on (the affinity mask, where the system has one)."""

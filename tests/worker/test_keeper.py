@@ -1,0 +1,209 @@
+"""The keeper, on a clock of our own: what counts as lost, what as forgotten, what expires, and what never does."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from pliant.client.options import Options
+from pliant.client.schemas import Interpretation, Status
+from pliant.worker import lifecycle
+from pliant.worker.blobs import Blobs
+from pliant.worker.errors import StoreUnavailable, UnknownJob
+from pliant.worker.files import clean_up, last_words, working_directory
+from pliant.worker.jobs import Jobs
+from pliant.worker.keeper import Keeper, Stillness
+from pliant.worker.memory import MemoryQueue, MemoryRecords
+from pliant.worker.settings import Settings
+
+
+class World:
+    """Jobs in memory, two clocks that we turn, a keeper."""
+
+    def __init__(self, data: Path, **settings: object) -> None:
+        self.now = datetime(2030, 1, 1, tzinfo=UTC)
+        self.monotonic = 1000.0
+        self.jobs = Jobs(
+            records=MemoryRecords(),
+            blobs=Blobs.open("memory:///"),
+            queue=MemoryQueue(),
+            settings=Settings(data=data, lost_after=5.0, retention=60.0, max_attempts=2, **settings),  # type: ignore[arg-type]
+            clock=lambda: self.now,
+        )
+        self.keeper = Keeper(jobs=self.jobs, clock=lambda: self.monotonic)
+        self.keeper.tick()
+
+    def pass_seconds(self, seconds: float, *, meanwhile: Callable[[], object] = lambda: None) -> None:
+        for _ in range(round(seconds)):
+            self.monotonic += 1
+            self.now += timedelta(seconds=1)
+            meanwhile()
+            self.keeper.tick()
+
+    def claim(self, id: str) -> str:
+        token = self.jobs.records.get(id).token
+        self.jobs.queue.remove(token)
+        self.jobs.records.update(id, lambda held: lifecycle.claim(held, token=token, worker="w", now=self.now))
+        return token
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> World:
+    return World(tmp_path)
+
+
+@pytest.fixture
+def submit(inputs_file: Path, interpretation: Interpretation) -> Callable[[World], str]:
+    return lambda world: world.jobs.submit(inputs_file, options=Options(), interpretation=interpretation).id
+
+
+def test_a_job_whose_worker_falls_silent_is_queued_again_then_fails(
+    world: World, submit: Callable[[World], str]
+) -> None:
+    id = submit(world)
+    old = world.claim(id)
+    working_directory(world.jobs.settings, old).mkdir(parents=True)
+    world.pass_seconds(5)
+    assert world.jobs.get(id).status is Status.RUNNING, "five seconds of watching begin with the first look"
+    world.pass_seconds(1)
+    assert world.jobs.get(id).status is Status.QUEUED
+    assert not working_directory(world.jobs.settings, old).exists()
+    (fresh,) = world.jobs.queue.waiting()
+    assert fresh != old
+    world.claim(id)
+    world.pass_seconds(7)
+    job = world.jobs.get(id)
+    assert (job.status, job.attempt) == (Status.FAILED, 2)
+    assert job.error is not None
+    assert (job.error.code, job.error.retryable) == ("worker_lost", True)
+
+
+def test_a_cancelled_job_whose_worker_falls_silent_is_cancelled(world: World, submit: Callable[[World], str]) -> None:
+    id = submit(world)
+    world.claim(id)
+    world.jobs.cancel(id)
+    world.pass_seconds(7)
+    assert world.jobs.get(id).status is Status.CANCELLED
+
+
+def test_signs_of_life_keep_a_job(world: World, submit: Callable[[World], str]) -> None:
+    id = submit(world)
+    token = world.claim(id)
+    world.pass_seconds(30, meanwhile=lambda: world.jobs.records.beat(id, token))
+    assert world.jobs.get(id).status is Status.RUNNING
+
+
+def test_neither_an_outage_nor_a_jumping_clock_loses_a_job(world: World, submit: Callable[[World], str]) -> None:
+    id = submit(world)
+    token = world.claim(id)
+    world.pass_seconds(2)
+    world.monotonic += 600  # nobody could look, and nobody could give a sign of life
+    world.now += timedelta(days=1)
+    world.pass_seconds(1)
+    assert world.jobs.get(id).status is Status.RUNNING
+    world.jobs.records.beat(id, token)
+    world.pass_seconds(4)
+    assert world.jobs.get(id).status is Status.RUNNING
+
+
+def test_a_queued_job_that_the_queue_does_not_hold_is_queued_again(
+    world: World, submit: Callable[[World], str]
+) -> None:
+    id, other = submit(world), submit(world)
+    token = world.jobs.records.get(id).token
+    world.jobs.queue.remove(token)
+    world.pass_seconds(5)
+    assert world.jobs.records.get(id).token != token, "the old delivery, should it turn up, is void"
+    assert world.jobs.queue.waiting() == [world.jobs.records.get(each).token for each in (other, id)]
+
+
+def test_only_what_has_expired_is_removed(world: World, submit: Callable[[World], str]) -> None:
+    queued, running, early, late = (submit(world) for _ in range(4))
+    token = world.claim(running)
+    world.jobs.cancel(early)
+    beat = lambda: world.jobs.records.beat(running, token)  # noqa: E731
+    world.pass_seconds(40, meanwhile=beat)
+    world.jobs.cancel(late)
+    world.pass_seconds(52, meanwhile=beat)
+    with pytest.raises(UnknownJob):
+        world.jobs.get(early)
+    assert {job.id for job in world.jobs.page().jobs} == {queued, running, late}
+    assert world.jobs.get(late).expires_at is not None
+    assert all(early not in key for key, _ in world.jobs.blobs.list("jobs/"))
+
+
+def test_without_retention_nothing_expires(world: World, submit: Callable[[World], str]) -> None:
+    world.jobs = dataclasses.replace(world.jobs, settings=dataclasses.replace(world.jobs.settings, retention=0))
+    world.keeper.jobs = world.jobs
+    id = submit(world)
+    assert world.jobs.cancel(id).expires_at is None
+    world.now += timedelta(days=10_000)
+    world.pass_seconds(40)
+    assert world.jobs.get(id).status is Status.CANCELLED
+
+
+def test_files_of_no_job_are_removed_once_they_are_old(
+    world: World, submit: Callable[[World], str], tmp_path: Path
+) -> None:
+    file = tmp_path / "some-inputs.npz"
+    id = submit(world)
+    token = world.claim(id)
+    wanted = {world.jobs.records.get(id).inputs, f"jobs/{id}/{token}/artifacts/shapes.npz"}
+    stray = {f"jobs/{id}/{id}-000000000000/artifacts/shapes.npz", "jobs/nobody/nobody-1/inputs.npz"}
+    for key in (wanted | stray) - {world.jobs.records.get(id).inputs}:
+        world.jobs.blobs.put(key, file)
+    directories = [working_directory(world.jobs.settings, each) for each in (token, "nobody-1")]
+    for directory in directories:
+        directory.mkdir(parents=True)
+        os.utime(directory, (0, 0))
+    beat = lambda: world.jobs.records.beat(id, token)  # noqa: E731
+
+    def sweep_at(moment: datetime) -> set[str]:
+        world.now = moment
+        world.monotonic += 3600
+        world.pass_seconds(1, meanwhile=beat)
+        return {key for key, _ in world.jobs.blobs.list("jobs/")}
+
+    assert sweep_at(datetime.now(UTC) + timedelta(hours=5)) == wanted | stray
+    assert sweep_at(datetime.now(UTC) + timedelta(hours=7)) == wanted
+    assert [directory.exists() for directory in directories] == [True, False]
+
+
+def test_a_store_that_is_away_is_waited_for(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = []
+
+    def tick(self: Keeper) -> None:
+        calls.append(self)
+        raise StoreUnavailable("The job store", reason="ConnectionError")
+
+    monkeypatch.setattr(Keeper, "tick", tick)
+    monkeypatch.setattr(time, "sleep", lambda seconds: None)
+    world.keeper.run(lambda: len(calls) == 3)
+    assert len(calls) == 3
+
+
+def test_stillness_counts_only_between_two_looks_at_the_same_thing() -> None:
+    still = Stillness()
+    assert still.look({"a": 1}, 5.0) == {"a": 0.0}
+    assert still.look({"a": 1, "b": 1}, 2.0) == {"a": 2.0, "b": 0.0}
+    assert still.look({"a": 2, "b": 1}, 2.0) == {"a": 0.0, "b": 2.0}
+    assert still.look({"b": 1}, 1.0) == {"b": 3.0}
+    assert still.look({"a": 2}, 1.0) == {"a": 0.0}
+
+
+def test_last_words_are_the_end_of_what_was_written(tmp_path: Path) -> None:
+    settings = Settings(data=tmp_path)
+    assert last_words(settings, "t-1") == []
+    directory = working_directory(settings, "t-1")
+    directory.mkdir(parents=True)
+    (directory / "output.log").write_text("".join(f"line {number}\n" for number in range(5000)))
+    words = last_words(settings, "t-1")
+    assert (len(words), words[-1]) == (100, "line 4999")
+    clean_up(settings, "t-1")
+    clean_up(settings, "t-1")
+    assert not directory.exists()

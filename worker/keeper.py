@@ -1,0 +1,180 @@
+"""The keeper: gives lost jobs to another worker, queues forgotten ones again, removes what has expired.
+
+Any number of keepers may run; every change is a compare-and-set, so the second one to act finds nothing to do.
+
+A running job is lost when its count of signs of life stood still for `Settings.lost_after` seconds *of watching*:
+the keeper adds up the time between two looks that both succeeded, each gap counted as at most twice its usual length. So
+neither a clock that jumps, nor a store that is away for minutes, nor a machine that slept makes a job look lost.
+"""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from datetime import timedelta
+from functools import partial
+
+from pliant.client.schemas import Status
+from pliant.worker import lifecycle
+from pliant.worker.errors import StaleAttempt, StoreUnavailable, UnknownJob
+from pliant.worker.files import clean_up
+from pliant.worker.jobs import Jobs
+from pliant.worker.problems import worker_lost
+from pliant.worker.records import Beat, new_token
+
+logger = logging.getLogger(__name__)
+
+LOOK_EVERY = 1.0
+"""Seconds between two looks at the running and queued jobs."""
+
+TIDY_EVERY = 30.0
+"""Seconds between two looks for what has expired."""
+
+SWEEP_EVERY = 3600.0
+"""Seconds between two looks for files that belong to no job."""
+
+FORGOTTEN_AFTER = 3.0
+"""Seconds of watching after which a queued job that the queue does not hold is queued again."""
+
+ORPHAN_AGE = timedelta(hours=6)
+"""A file that belongs to no job is removed when it is older: younger ones may be an upload that has no record yet."""
+
+
+@dataclass(slots=True)
+class Stillness:
+    """For how long each thing has not changed, by our own watch."""
+
+    _seen: dict[str, tuple[object, float]] = field(default_factory=dict)
+
+    def look(self, things: dict[str, object], gap: float) -> dict[str, float]:
+        """Take a look, `gap` seconds after the one before; return each thing's seconds without a change."""
+        still: dict[str, tuple[object, float]] = {}
+        for name, value in things.items():
+            before, seconds = self._seen.get(name, (None, 0.0))
+            still[name] = (value, seconds + gap if before == value and name in self._seen else 0.0)
+        self._seen = still
+        return {name: seconds for name, (_, seconds) in still.items()}
+
+
+@dataclass(slots=True, kw_only=True)
+class Keeper:
+    """Looks after the jobs of one installation."""
+
+    jobs: Jobs
+    clock: Callable[[], float] = time.monotonic
+    _running: Stillness = field(default_factory=Stillness)
+    _queued: Stillness = field(default_factory=Stillness)
+    _looked: float | None = None
+    _tidied: float | None = None
+    _swept: float | None = None
+
+    def tick(self) -> None:
+        """Do what is due.
+
+        Raises
+        ------
+        StoreUnavailable
+            The store does not answer; what was due stays due.
+        """
+        now = self.clock()
+        gap = 0.0 if self._looked is None else min(now - self._looked, 2 * LOOK_EVERY)
+        self._looked = now
+        self._take_from_lost_workers(gap)
+        self._queue_forgotten(gap)
+        if self._tidied is None or now >= self._tidied + TIDY_EVERY:
+            self._expire()
+            self.jobs.queue.tidy()
+            self._tidied = now
+        if self._swept is None or now >= self._swept + SWEEP_EVERY:
+            self._sweep()
+            self._swept = now
+
+    def run(self, should_stop: Callable[[], bool]) -> None:
+        """Tick until told to stop; a store that does not answer is waited for."""
+        while not should_stop():
+            try:
+                self.tick()
+            except StoreUnavailable as error:
+                logger.warning("%s", error)
+            time.sleep(LOOK_EVERY)
+
+    def _take_from_lost_workers(self, gap: float) -> None:
+        records, settings = self.jobs.records, self.jobs.settings
+        beats = records.beats([*records.ids(Status.RUNNING), *records.ids(Status.CANCELLING)])
+        for id, still in self._running.look(dict(beats), gap).items():
+            if still < settings.lost_after:
+                continue
+            beat: Beat = beats[id]
+            fresh = new_token(id)
+            change = partial(
+                lifecycle.requeue,
+                token=beat.token,
+                fresh=fresh,
+                problem=worker_lost("The worker that had the job gave no sign of life any more."),
+                now=self.jobs.clock(),
+                max_attempts=settings.max_attempts,
+                retention=settings.retention,
+            )
+            with suppress(StaleAttempt, UnknownJob):
+                after = records.update(id, change)
+                clean_up(settings, beat.token)
+                self._say(id, f"Lost its worker; it is {after.job.status.value} now.")
+                if after.job.status is Status.QUEUED:
+                    self.jobs.queue.push(id, fresh)
+
+    def _queue_forgotten(self, gap: float) -> None:
+        records, queue = self.jobs.records, self.jobs.queue
+        ids = records.ids(Status.QUEUED)
+        waiting = set(queue.waiting())
+        absent = {id: beat.token for id, beat in records.beats(ids).items() if beat.token not in waiting}
+        for id, still in self._queued.look(dict(absent), gap).items():
+            if still < FORGOTTEN_AFTER:
+                continue
+            old, fresh = absent[id], new_token(id)
+            with suppress(StaleAttempt, UnknownJob):
+                records.update(id, partial(lifecycle.redeliver, token=old, fresh=fresh))
+                queue.remove(old)
+                queue.push(id, fresh)
+                self._say(id, "The queue had forgotten it; queued again.")
+
+    def _expire(self) -> None:
+        """Remove the jobs whose time is over. Nothing that is not finished, or has no `expires_at`, is ever touched."""
+        for status in lifecycle.FINAL:
+            for id in self.jobs.records.ids(status):
+                with suppress(UnknownJob):
+                    expires = self.jobs.records.get(id).job.expires_at
+                    if expires is not None and expires <= self.jobs.clock():
+                        self.jobs.delete(id)
+                        logger.info("job %s: expired and removed", id)
+
+    def _sweep(self) -> None:
+        """Remove files that belong to no job: of submissions that died before their record, of attempts that were killed."""
+        oldest = self.jobs.clock() - ORPHAN_AGE
+        for key, written in self.jobs.blobs.list("jobs/"):
+            if written < oldest and not self._wanted(key):
+                self.jobs.blobs.delete(key)
+                logger.info("removed %s, which belongs to no job", key)
+        work = self.jobs.settings.work
+        for directory in work.iterdir() if work.exists() else ():
+            if directory.stat().st_mtime < oldest.timestamp() and not self._running_here(directory.name):
+                shutil.rmtree(directory, ignore_errors=True)
+
+    def _wanted(self, key: str) -> bool:
+        try:
+            held = self.jobs.records.get(key.split("/")[1])
+        except UnknownJob:
+            return False
+        running = held.job.status in lifecycle.ACTIVE and f"/{held.token}/" in key
+        published = held.prefix is not None and key.startswith(held.prefix)
+        return key == held.inputs or running or published
+
+    def _running_here(self, token: str) -> bool:
+        return self.jobs.records.look(token.rpartition("-")[0], token) in lifecycle.ACTIVE
+
+    def _say(self, id: str, sentence: str) -> None:
+        logger.warning("job %s: %s", id, sentence)
+        self.jobs.records.append_log(id, [sentence])

@@ -1,0 +1,69 @@
+"""Small dealings with the operating system: dying with one's parent, and the traces of the out-of-memory killer."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+_PR_SET_PDEATHSIG = 1
+_libc = ctypes.CDLL(None, use_errno=True) if sys.platform == "linux" else None
+
+
+def die_with_parent(parent: int, *, how: signal.Signals = signal.SIGKILL) -> None:
+    """Ask the kernel to signal this process when its parent ends (Linux; elsewhere the parent's id is polled).
+
+    Parameters
+    ----------
+    parent : int
+        Process id of the parent, taken before the fork: it may have ended since.
+    how : signal
+        What to be sent.
+    """
+    if _libc is not None:
+        _libc.prctl(_PR_SET_PDEATHSIG, int(how), 0, 0, 0)
+    if os.getppid() != parent:
+        os.kill(os.getpid(), how)
+
+
+@dataclass(frozen=True, slots=True)
+class OomKills:
+    """How often the kernel has killed for want of memory: in our control group, and on the whole machine."""
+
+    group: int
+    machine: int
+
+    @classmethod
+    def now(cls) -> OomKills:
+        """Read the kernel's counters; 0 where there are none."""
+        return cls(_counter(_group_events(), "oom_kill"), _counter(Path("/proc/vmstat"), "oom_kill"))
+
+    def since(self, before: OomKills) -> bool:
+        """Tell whether there was one between two readings."""
+        return self.group > before.group or self.machine > before.machine
+
+
+def _group_events() -> Path:
+    try:
+        lines = Path("/proc/self/cgroup").read_text().splitlines()
+    except OSError:
+        return Path("/nonexistent")
+    for line in lines:
+        if line.startswith("0::"):
+            return Path("/sys/fs/cgroup") / line[3:].strip().lstrip("/") / "memory.events"
+    return Path("/sys/fs/cgroup/memory/memory.oom_control")
+
+
+def _counter(file: Path, name: str) -> int:
+    try:
+        lines = file.read_text().splitlines()
+    except OSError:
+        return 0
+    for line in lines:
+        key, _, value = line.partition(" ")
+        if key == name:
+            return int(value)
+    return 0

@@ -1,0 +1,170 @@
+"""Watching over one attempt from outside: signs of life, reasons to kill it, and the last word if it had none."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from enum import StrEnum
+
+from pliant.client.schemas import Problem, Status
+from pliant.worker import lifecycle
+from pliant.worker.errors import StaleAttempt, StoreUnavailable, UnknownJob
+from pliant.worker.problems import how_it_ended, out_of_memory, timed_out, worker_lost
+from pliant.worker.processes import OomKills
+from pliant.worker.records import Records, Stored, new_token
+from pliant.worker.settings import Settings
+
+logger = logging.getLogger(__name__)
+
+BEAT = 1.0
+"""Seconds between signs of life; each also tells how the job stands."""
+
+
+class Reason(StrEnum):
+    """Why an attempt is ended from outside."""
+
+    CANCELLED = "cancelled"
+    TIMED_OUT = "timed_out"
+    STOPPING = "stopping"
+    STALE = "stale"
+
+
+@dataclass(slots=True)
+class Watch:
+    """What the worker knows of the attempt that its horse is at."""
+
+    settings: Settings
+    records: Records
+    id: str
+    token: str
+    worker: str
+    """Name of the worker that watches."""
+    clock: Callable[[], float] = time.monotonic
+    reason: Reason | None = None
+    """Why it was killed, once it was."""
+    began: float = field(init=False)
+    kills: OomKills = field(init=False)
+    _next_beat: float = field(init=False)
+    _cancelled: float | None = None
+
+    def __post_init__(self) -> None:
+        self.began = self._next_beat = self.clock()
+        self.kills = OomKills.now()
+
+    def must_end(self, *, stop_by: float | None) -> Reason | None:
+        """Give a sign of life if one is due, and return why the horse must be killed now, or None.
+
+        Parameters
+        ----------
+        stop_by : float or None
+            Until when the worker's own shutdown lets the job go on.
+        """
+        now = self.clock()
+        if now >= self._next_beat:
+            self._next_beat = now + BEAT
+            self._look(now)
+        grace, limit = self.settings.cancel_grace, self.settings.time_limit
+        if self.reason is Reason.STALE:
+            return self.reason
+        if self._cancelled is not None and now >= self._cancelled + grace:
+            self.reason = Reason.CANCELLED
+        elif limit > 0 and now >= self.began + limit + grace:
+            self.reason = Reason.TIMED_OUT
+        elif stop_by is not None and now >= stop_by:
+            self.reason = Reason.STOPPING
+        return self.reason
+
+    def _look(self, now: float) -> None:
+        try:
+            status = self.records.beat(self.id, self.token)
+        except StoreUnavailable:
+            return  # the job goes on; it needs no store until it writes its result
+        if status is None:
+            self.reason = Reason.STALE
+        elif status is Status.CANCELLING and self._cancelled is None:
+            self._cancelled = now
+
+
+def settle(watch: Watch, *, status: int, peak: int, patience: float) -> Stored | None:
+    """Write the record's last word for a horse that ended without one; one that spoke is left alone.
+
+    Returns the record if there was something to write.
+
+    Parameters
+    ----------
+    status : int
+        As `os.wait4` returns it.
+    peak : int
+        The horse's largest resident size, bytes.
+    patience : float
+        Seconds to wait for a store that does not answer.
+
+    Raises
+    ------
+    StoreUnavailable
+        The store does not answer.
+    """
+    change = _verdict(watch, status=status, peak=peak)
+    try:
+        settled = patiently(lambda: watch.records.update(watch.id, change), seconds=patience)
+    except (StaleAttempt, UnknownJob):
+        return None
+    sentence = f"Ended from outside: {watch.reason}." if watch.reason is not None else how_it_ended(status)
+    logger.warning("job %s: %s", watch.id, sentence)
+    watch.records.append_log(watch.id, [sentence])
+    return settled
+
+
+def patiently(call: Callable[[], Stored], *, seconds: float) -> Stored:
+    """Repeat a write until the store answers, for a while."""
+    deadline = time.monotonic() + seconds
+    while True:
+        try:
+            return call()
+        except StoreUnavailable:
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(0.5)
+
+
+def _verdict(watch: Watch, *, status: int, peak: int) -> Callable[[Stored], Stored]:
+    settings, token, now = watch.settings, watch.token, datetime.now(UTC)
+
+    def change(stored: Stored) -> Stored:
+        if stored.worker != watch.worker:  # a second delivery of one attempt must not end the first
+            raise StaleAttempt(watch.id)
+        if watch.reason is Reason.CANCELLED:
+            return lifecycle.stop(stored, token=token, now=now, retention=settings.retention)
+        if watch.reason is Reason.STOPPING:
+            problem = worker_lost("The worker was shut down.")
+            fresh = new_token(watch.id)
+            return lifecycle.requeue(
+                stored,
+                token=token,
+                fresh=fresh,
+                problem=problem,
+                now=now,
+                max_attempts=None,
+                retention=settings.retention,
+            )
+        if watch.reason is Reason.TIMED_OUT:
+            problem = timed_out(settings.time_limit)
+        else:
+            problem = _death(watch, status=status, peak=peak)
+        return lifecycle.fail(stored, token=token, problem=problem, now=now, retention=settings.retention)
+
+    return change
+
+
+def _death(watch: Watch, *, status: int, peak: int) -> Problem:
+    """Tell a death for want of memory from the others: by the kernel's counters, or by a limit that was nearly full."""
+    killed = os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL
+    limit = watch.settings.memory_limit
+    if (killed and OomKills.now().since(watch.kills)) or (limit > 0 and peak > 0.9 * limit):
+        return out_of_memory(limit)
+    return worker_lost(how_it_ended(status))
