@@ -41,7 +41,8 @@ def test_the_wheel_holds_every_package_under_pliant_and_nothing_else(archives: t
 
 
 def test_the_source_archive_holds_no_leftovers(archives: tuple[Path, Path]) -> None:
-    names = tarfile.open(archives[0]).getnames()
+    with tarfile.open(archives[0]) as archive:
+        names = archive.getnames()
     assert not [name for name in names if "node_modules" in name or "__pycache__" in name or ".venv" in name]
     assert [name for name in names if name.endswith("/LICENSE")]
 
