@@ -26,7 +26,7 @@ class Options(BaseModel):
     method: Literal["pseudo_inverse", "temporal", "spatio_temporal", "robust"] = Field(
         "robust",
         description="pseudo_inverse: rotations' pseudo-inverse times the tracks. temporal: closed form with smoothness in time. "
-        "spatio_temporal: smoothness in time and space, least squares. robust: the same with a loss that resists outliers.",
+        "spatio_temporal: smoothness in time and space, least squares. robust: in time and space, with a loss that resists outliers.",
     )
     camera: Literal["scaled_orthographic", "orthographic"] = Field(
         "scaled_orthographic",
@@ -39,7 +39,7 @@ class Options(BaseModel):
     refine_rotations: bool = Field(True, description="Refine the cameras against the smoothness of the shapes.")
     preset: Literal["auto", "paper"] = Field(
         "auto",
-        description="Where weights that are not given come from: auto measures noise and motion; paper is the published setting.",
+        description="Where weights that are not given come from. auto: measured from noise and motion. paper: the published setting.",
     )
     temporal_weight: Weight | None = Field(
         None, description="λ1, weight of smoothness in time, dimensionless; null: the preset's."

@@ -76,7 +76,18 @@ export const retryJob = (id: string): Promise<Job> => json(`${at(id)}/retry`, { 
 export const deleteJob = async (id: string): Promise<void> => {
   await call(at(id), { method: "DELETE" });
 };
-export const getOptions = (): Promise<Schema> => json("v1/options");
+
+let options: Promise<Schema> | null = null;
+
+/** The options' schema, asked for once. */
+export function getOptions(): Promise<Schema> {
+  options ??= json<Schema>("v1/options").catch((error: unknown) => {
+    options = null;
+    throw error;
+  });
+  return options;
+}
+
 export const artifactPath = (id: string, name: string): string => `${at(id)}/artifacts/${encodeURIComponent(name)}`;
 export const getReport = (id: string): Promise<Record<string, unknown>> => json(artifactPath(id, "report.json"));
 

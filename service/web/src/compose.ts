@@ -1,6 +1,6 @@
 // The form for a new job: files by drop or by choice, what is in them, options, and the service's answer if it says no.
 
-import { type Example, Refusal, exampleFile, listExamples, submit } from "./api";
+import { type Example, Refusal, exampleFile, getOptions, listExamples, submit } from "./api";
 import { button, h, uniqueId } from "./dom";
 import { OptionsForm } from "./options";
 import { type Entry, describe, peek } from "./peek";
@@ -9,10 +9,10 @@ import { type Job, PARTS, type Part } from "./types";
 import { bytes, percent } from "./words";
 
 const SLOTS: Record<Part, { label: string; hint: string }> = {
-  tracks: { label: "Tracks", hint: "npz, npy, mat or csv: where each point is in each frame" },
-  mesh: { label: "Mesh", hint: "optional: which points are neighbours" },
-  ground_truth: { label: "Ground truth", hint: "optional: true shapes, to measure errors" },
-  rotations: { label: "Cameras", hint: "optional: known rotations" },
+  tracks: { label: "Tracks", hint: "npz, npy, mat, csv" },
+  mesh: { label: "Mesh", hint: "optional, obj, ply, npz" },
+  ground_truth: { label: "Ground truth", hint: "optional, for errors" },
+  rotations: { label: "Cameras", hint: "optional, if known" },
 };
 
 interface Slot {
@@ -24,7 +24,7 @@ interface Slot {
 }
 
 export class Compose {
-  readonly element: HTMLElement;
+  readonly element: HTMLDetailsElement;
   private readonly options = new OptionsForm();
   private readonly slots = new Map<Part, Slot>();
   private readonly grid = h("input", { type: "text", id: "grid", placeholder: "rows×columns", size: 10, autocomplete: "off" });
@@ -34,13 +34,14 @@ export class Compose {
   private readonly answer = h("div", { class: "answer", "aria-live": "assertive" });
   private readonly examples = h("p", { class: "examples" });
   private sending: AbortController | null = null;
+  private offered: Example[] = [];
 
   constructor(private readonly onJob: (job: Job) => void) {
     const zone = h(
       "div",
       { class: "zone" },
-      h("p", { class: "zone-title" }, "Drop a track file here, and a mesh if you have one"),
-      h("p", { class: "hint" }, "They stay on this service; nothing is sent anywhere else."),
+      h("p", { class: "zone-title" }, "Drop tracks here, and a mesh"),
+      h("p", { class: "hint" }, "Files stay on this service; nothing is sent elsewhere."),
       ...PARTS.map((part) => this.slot(part)),
     );
     const form = h(
@@ -54,15 +55,17 @@ export class Compose {
       h("div", { class: "row" }, this.send, this.stop),
       this.answer,
     );
-    this.element = h("section", { class: "card" }, h("h2", { id: "compose-title" }, "New reconstruction"), form);
+    const summary = h("summary", {}, h("h2", { id: "compose-title" }, "New reconstruction"));
+    this.element = h("details", { class: "card", open: true }, summary, form);
     this.acceptDrops();
   }
 
   /** Fetch what the service knows about options and examples. */
   async load(): Promise<void> {
-    await this.options.load();
+    this.options.load(await getOptions());
     try {
       const { examples } = await listExamples();
+      this.offered = examples;
       this.examples.replaceChildren(...this.exampleButtons(examples));
     } catch (error) {
       if (!(error instanceof Refusal)) throw error;
@@ -76,7 +79,21 @@ export class Compose {
       index > 0 ? ", " : "",
       button(example.title, () => void this.takeExample(example), { class: "link" }),
     ]);
-    return ["Nothing at hand? Try a made-up ", ...buttons, "."];
+    return ["Nothing at hand? Try a ", ...buttons, "."];
+  }
+
+  /** Take the first example and send it: the shortest way to a moving mesh. */
+  async tryOut(): Promise<void> {
+    const example = this.offered[0];
+    if (example === undefined) return;
+    this.element.open = true;
+    await this.takeExample(example);
+    if (this.slots.get("tracks")?.file) this.send.form?.requestSubmit();
+  }
+
+  /** True where the service makes examples. */
+  get hasExamples(): boolean {
+    return this.offered.length > 0;
   }
 
   private async takeExample(example: Example): Promise<void> {
@@ -97,8 +114,8 @@ export class Compose {
   private slot(part: Part): HTMLElement {
     const id = uniqueId("file");
     const input = h("input", { type: "file", id, class: "visually-hidden", "aria-describedby": `${id}-hint` });
-    const name = h("span", { class: "file-name" });
-    const contents = h("span", { class: "hint", id: `${id}-hint` }, SLOTS[part].hint);
+    const name = h("span", { class: "file-name hint", id: `${id}-hint` }, SLOTS[part].hint);
+    const contents = h("span", { class: "contents hint" });
     const remove = button("×", () => void this.put(part, null).then(() => input.focus()), {
       class: "quiet",
       hidden: true,
@@ -108,7 +125,7 @@ export class Compose {
     this.slots.set(part, { input, name, contents, remove, file: null });
     const choose = h("label", { for: id, class: "choose" }, h("span", { class: "slot-label" }, SLOTS[part].label), name);
     const row = h("div", { class: "slot", "data-part": part }, input, choose, remove, contents);
-    if (part === "mesh") row.append(h("span", { class: "grid-size" }, h("label", { for: "grid" }, "or a grid of "), this.grid));
+    if (part === "mesh") row.append(h("span", { class: "grid-size" }, h("label", { for: "grid" }, "or points on a grid"), this.grid));
     return row;
   }
 
@@ -116,8 +133,9 @@ export class Compose {
     const slot = this.slots.get(part) as Slot;
     slot.file = file;
     slot.remove.hidden = file === null;
-    slot.name.textContent = file === null ? "" : `${file.name}, ${bytes(file.size)}`;
-    slot.contents.textContent = SLOTS[part].hint;
+    slot.name.textContent = file === null ? SLOTS[part].hint : `${file.name}, ${bytes(file.size)}`;
+    slot.name.classList.toggle("hint", file === null);
+    slot.contents.textContent = "";
     if (part === "mesh") this.grid.disabled = file !== null;
     if (file === null) {
       slot.input.value = "";

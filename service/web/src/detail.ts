@@ -52,7 +52,8 @@ export class Detail {
       this.failure,
       this.stage,
       this.curves.element,
-      h("div", { class: "panels" }, this.metrics.element, this.understood.element, this.files.element, this.snippets.element),
+      h("div", { class: "panels" }, h("div", {}, this.metrics.element), h("div", {}, this.understood.element, this.files.element)),
+      this.snippets.element,
     );
     void this.follow();
   }

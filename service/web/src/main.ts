@@ -28,6 +28,8 @@ function show(id: string | null, byPerson: boolean): void {
   detail = null;
   list.select(id);
   welcome.hidden = id !== null;
+  // On a telephone the form folds away in favour of the job.
+  compose.element.open = id === null || !matchMedia("(max-width: 56rem)").matches;
   if (id === null) return;
   detail = new Detail(id, {
     onJob: (job) => list.update(job),
@@ -66,12 +68,20 @@ function tokenForm(): HTMLElement {
   return form;
 }
 
+/** The shortest way to see it work, where there is nothing else to look at yet. */
+function offer(): void {
+  const place = document.getElementById("try") as HTMLElement;
+  place.hidden = !compose.hasExamples;
+  place.replaceChildren(button("Show me with a made-up face", () => void compose.tryOut()));
+}
+
 let loaded = false;
 
 async function start(): Promise<void> {
   try {
     if (!loaded) await compose.load();
     loaded = true;
+    offer();
     await list.refresh();
     trouble.replaceChildren();
   } catch (error) {

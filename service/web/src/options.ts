@@ -1,6 +1,5 @@
 // The form for a job's options, made from the service's own schema: a new option appears here by itself.
 
-import { getOptions } from "./api";
 import { h, uniqueId } from "./dom";
 import type { Options, Schema } from "./types";
 
@@ -28,9 +27,9 @@ export class OptionsForm {
   readonly more = h("details", { class: "more" });
   private fields: Field[] = [];
 
-  /** Ask the service for its options and build the form. Until then, and if that fails, a job is sent with the defaults. */
-  async load(): Promise<void> {
-    const properties = (await getOptions()).properties ?? {};
+  /** Build the form from the schema. Until then a job is sent with the defaults. */
+  load(schema: Schema): void {
+    const properties = schema.properties ?? {};
     const names = Object.keys(properties);
     const rest = names.filter((name) => !FIRST.includes(name));
     this.fields = [];

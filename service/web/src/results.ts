@@ -17,7 +17,9 @@ const METRICS: Record<string, string> = {
   e3d_frame: "3-D error, each frame turned to fit best; relative",
   e3d_frame_similarity: "3-D error, each frame turned, mirrored and scaled to fit; relative",
   e3d_mocap: "3-D error in the motion-capture literature's way; relative to the shape's spread",
-  rotation: "Angle between estimated and true cameras, degrees",
+  reprojection_median: "Distance between a seen track and the projected shape, median; the tracks' unit",
+  reprojection_rms: "The same, root mean square: outliers count here",
+  rotation_degrees: "Angle between estimated and true cameras, mean; degrees",
 };
 
 /** The panel "Understood as". */

@@ -1,7 +1,8 @@
 // "Do this from code", for the very job shown: the same options, the same parts, this service's address.
 
+import { getOptions } from "./api";
 import { button, fill, h } from "./dom";
-import type { Job } from "./types";
+import type { Job, Schema } from "./types";
 
 type Language = "Python" | "Shell" | "curl";
 
@@ -30,7 +31,14 @@ export class Snippets {
 
   show(job: Job): void {
     this.job = job;
-    const text = snippet(job, this.language, new URL(".", document.baseURI).href.replace(/\/$/, ""));
+    void getOptions().then(
+      (schema) => this.write(job, schema),
+      () => this.write(job, {}), // without the defaults every option is written out, which is as right
+    );
+  }
+
+  private write(job: Job, schema: Schema): void {
+    const text = snippet(job, given(job, schema), this.language, new URL(".", document.baseURI).href.replace(/\/$/, ""));
     fill(this.code, text, () => [text]);
   }
 
@@ -53,9 +61,12 @@ export class Snippets {
   }
 }
 
-/** The options a job was given, without those that say what the default says anyway (null is "choose for me"). */
-function given(job: Job): [string, unknown][] {
-  return Object.entries(job.options).filter(([, value]) => value !== null);
+type Given = [string, unknown][];
+
+/** The options in which a job differs from the defaults. */
+function given(job: Job, schema: Schema): Given {
+  const differs = (name: string, value: unknown): boolean => JSON.stringify(value) !== JSON.stringify(schema.properties?.[name]?.default ?? null);
+  return Object.entries(job.options).filter(([name, value]) => differs(name, value));
 }
 
 function parts(job: Job): [string, string][] {
@@ -68,45 +79,43 @@ function parts(job: Job): [string, string][] {
 }
 
 /** Write the job as a program. */
-export function snippet(job: Job, language: Language, url: string): string {
-  if (language === "Python") return python(job, url);
-  if (language === "Shell") return shell(job, url);
-  return curl(job, url);
+export function snippet(job: Job, options: Given, language: Language, url: string): string {
+  if (language === "Python") return python(job, options, url);
+  if (language === "Shell") return shell(job, options, url);
+  return curl(job, options, url);
 }
 
-function python(job: Job, url: string): string {
+function python(job: Job, chosen: Given, url: string): string {
   const literal = (value: unknown): string =>
     value === true ? "True" : value === false ? "False" : JSON.stringify(value);
-  const options = given(job).map(([name, value]) => `    ${JSON.stringify(name)}: ${literal(value)},\n`);
+  const options = chosen.map(([name, value]) => `${JSON.stringify(name)}: ${literal(value)}`).join(", ");
   const files = parts(job)
     .slice(1)
     .map(([part, file]) => `    ${part}=${JSON.stringify(file)},\n`);
   const name = job.name ? `    name=${JSON.stringify(job.name)},\n` : "";
   return (
     `from pliant.client import Client\n\n` +
-    `options = {\n${options.join("")}}\n` +
-    `job = Client(${JSON.stringify(url)}).submit(\n    "tracks.npz",\n${files.join("")}${name}    options=options,\n)\n` +
+    `job = Client(${JSON.stringify(url)}).submit(\n    "tracks.npz",\n${files.join("")}${name}${options ? `    options={${options}},\n` : ""})\n` +
     `shapes = job.wait(timeout=3600).shapes  # array (${job.interpretation.num_frames}, ${job.interpretation.num_points}, 3)\n`
   );
 }
 
 const quote = (text: string): string => (/^[\w@%+=:,./-]+$/.test(text) ? text : `'${text.replaceAll("'", "'\\''")}'`);
 
-function shell(job: Job, url: string): string {
+function shell(job: Job, chosen: Given, url: string): string {
   const files = parts(job)
     .slice(1)
     .map(([part, file]) => `--${part.replace("_", "-")} ${file}`);
-  const options = given(job).map(([name, value]) => `--option ${quote(`${name}=${String(value)}`)}`);
+  const options = chosen.map(([name, value]) => `--option ${quote(`${name}=${String(value)}`)}`);
   const name = job.name ? [`--name ${quote(job.name)}`] : [];
   return `${["pliant submit tracks.npz", ...files, ...name, `--url ${quote(url)}`, ...options].join(" \\\n  ")}\n`;
 }
 
-function curl(job: Job, url: string): string {
-  const options = JSON.stringify(Object.fromEntries(given(job)));
+function curl(job: Job, chosen: Given, url: string): string {
   const fields = [
     ...parts(job).map(([part, file]) => `-F ${part}=@${file}`),
     ...(job.name ? [`-F ${quote(`name=${job.name}`)}`] : []),
-    `-F ${quote(`options=${options}`)}`,
+    ...(chosen.length > 0 ? [`-F ${quote(`options=${JSON.stringify(Object.fromEntries(chosen))}`)}`] : []),
   ];
   return (
     `${[`curl ${quote(`${url}/v1/jobs`)}`, ...fields].join(" \\\n  ")}\n\n` +

@@ -60,7 +60,7 @@ export class Body {
   private readonly geometry = new BufferGeometry();
   private readonly slots: [Slot, Slot];
   private readonly materials: ShaderMaterial[] = [];
-  private readonly wire = new LineSegments(new BufferGeometry(), this.material({ lit: 0 }));
+  private readonly wire: LineSegments<BufferGeometry, ShaderMaterial>;
   private values: Values | null = null;
   private readonly accumulated: Float32Array;
 
@@ -86,6 +86,7 @@ export class Body {
       cloud.frustumCulled = false;
       this.group.add(cloud);
     }
+    this.wire = new LineSegments(new BufferGeometry(), this.material({ lit: 0 }));
     this.wire.frustumCulled = false;
     this.wire.visible = false;
     this.group.add(this.wire);
@@ -118,13 +119,13 @@ export class Body {
     this.values = values;
     for (const slot of this.slots) slot.frame = -1;
     for (const material of this.materials) material.uniforms["coloured"]!.value = values === null ? 0 : 1;
-    this.wireTint();
+    this.wire.material.uniforms["coloured"]!.value = 0;
   }
 
   /** The plain colour and that of the wires, from the page's theme. */
   theme(plain: string, wire: string): void {
     for (const material of this.materials) (material.uniforms["plain"]!.value as Color).set(plain);
-    (this.wire.material as ShaderMaterial).uniforms["plain"]!.value = new Color(wire);
+    (this.wire.material.uniforms["plain"]!.value as Color).set(wire);
   }
 
   /** Draw the mesh's edges over the surface. */
@@ -139,10 +140,6 @@ export class Body {
     this.geometry.dispose();
     this.wire.geometry.dispose();
     for (const material of this.materials) material.dispose();
-  }
-
-  private wireTint(): void {
-    (this.wire.material as ShaderMaterial).uniforms["coloured"]!.value = 0;
   }
 
   private material(options: { lit: number; dot_size?: number }): ShaderMaterial {

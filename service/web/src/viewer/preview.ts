@@ -20,7 +20,10 @@ interface Header {
   num_points: number;
   num_faces: number;
   fps: number;
+  frame_stride: number;
   y_axis: string;
+  /** Ground truth says that the result's depth has the other sign, which the tracks alone cannot tell. */
+  mirrored: boolean;
   origin: [number, number, number];
   step: number;
   residual_step: number;

@@ -21,6 +21,7 @@ export class Stage {
   private readonly centre = new Vector3();
   private readonly resizing = new ResizeObserver(() => this.resize());
   private readonly down: boolean;
+  private flipped = false;
   private radius = 1;
   private requested = 0;
   private divided = false;
@@ -71,6 +72,16 @@ export class Stage {
     return this.holder.clientWidth < this.holder.clientHeight * 1.1;
   }
 
+  /** Show the other of the two depths that explain the same orthographic tracks. */
+  flip(flipped: boolean): void {
+    if (flipped === this.flipped) return;
+    this.flipped = flipped;
+    for (const world of this.worlds) world.scale.z = flipped ? -1 : 1;
+    this.centre.z *= -1;
+    this.orbit.target.z *= -1;
+    this.redraw();
+  }
+
   /** Look along the first frame's camera, a little from the side, so that depth shows at once. */
   reset(): void {
     this.orbit.target.copy(this.centre);
@@ -83,6 +94,8 @@ export class Stage {
   through(rotation: Float32Array): void {
     const row = (index: number, sign: number): Vector3 => {
       const axis = new Vector3(rotation[3 * index], rotation[3 * index + 1], rotation[3 * index + 2]).multiplyScalar(sign);
+      // With the mirror J = diag(1, 1, −1), the camera R that saw S sees J S as J R J.
+      if (this.flipped) axis.set(axis.x, axis.y, -axis.z).multiplyScalar(index === 2 ? -1 : 1);
       return this.down ? axis.set(axis.x, -axis.y, -axis.z) : axis;
     };
     // The camera's rows are right, down and away where y runs down; right, up and towards the viewer where it runs up.

@@ -4,7 +4,7 @@
 import { BufferAttribute, BufferGeometry, DynamicDrawUsage, Group, LineBasicMaterial, LineSegments, Points, PointsMaterial } from "three";
 import { type Preview, isHidden } from "./preview";
 
-const MOST = 3000;
+const MOST = 1500;
 
 export class TrackDots {
   readonly group = new Group();

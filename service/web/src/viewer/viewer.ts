@@ -45,6 +45,8 @@ export class Viewer {
     this.stage.add(this.body.group);
     this.player = new Player(preview.frames, preview.header.fps, () => this.moved(), () => this.showState());
     this.scrub.max = String(preview.frames - 1);
+    this.stage.flip(preview.header.mirrored);
+    this.stage.reset();
     this.build(holder);
     this.stage.onDraw = () => this.place();
     this.stage.onTurn = () => this.follow(false);
@@ -58,6 +60,7 @@ export class Viewer {
   }
 
   private build(holder: HTMLElement): void {
+    const { preview } = this;
     const { canvas } = this.stage;
     canvas.tabIndex = 0;
     canvas.setAttribute("role", "application");
@@ -70,13 +73,14 @@ export class Viewer {
     });
     this.view.append(canvas, this.labels, this.legend);
     const time = h("div", { class: "timeline" }, this.play, this.scrub, this.clock);
-    holder.replaceChildren(this.view, time, this.tools(), this.trouble);
+    const thinned = preview.header.frame_stride > 1 ? `Every ${ordinal(preview.header.frame_stride)} frame is shown; the files hold them all.` : "";
+    holder.replaceChildren(this.view, time, this.tools(), h("p", { class: "hint", hidden: !thinned }, thinned), this.trouble);
   }
 
   private tools(): HTMLElement {
     const { preview } = this;
     const colours: [Colouring, string][] = [["plain", "plain"], ["displacement", "displacement"], ["residual", "residual"]];
-    if (preview.has("truth")) colours.push(["error", "error against ground truth"]);
+    if (preview.has("truth")) colours.push(["error", "3-D error"]);
     const tools = h(
       "div",
       { class: "tools" },
@@ -87,6 +91,7 @@ export class Viewer {
       toggle("Input tracks", (on) => void this.tracks(on)),
       preview.has("truth") && toggle("Ground truth beside it", (on) => void this.beside(on)),
       toggle("Through the camera", (on) => this.follow(on), "follow"),
+      toggle("Flip depth", (on) => this.stage.flip(on), "flip", preview.header.mirrored),
       button("Reset view", () => {
         this.follow(false);
         this.stage.reset();
@@ -237,6 +242,10 @@ const LEGENDS: Record<Colouring, string> = {
   residual: "between track and projection, the tracks' unit",
 };
 
+function ordinal(value: number): string {
+  return `${value}${value === 2 ? "nd" : value === 3 ? "rd" : "th"}`;
+}
+
 function choice(label: string, values: [string, string][], onValue: (value: string) => void): HTMLElement {
   const id = uniqueId("tool");
   const select = h("select", { id }, ...values.map(([value, words]) => h("option", { value }, words)));
@@ -244,8 +253,9 @@ function choice(label: string, values: [string, string][], onValue: (value: stri
   return h("span", { class: "tool" }, h("label", { for: id }, label), select);
 }
 
-function toggle(label: string, onChange: (on: boolean) => void, name = ""): HTMLElement {
+function toggle(label: string, onChange: (on: boolean) => void, name = "", on = false): HTMLElement {
   const box = h("input", { type: "checkbox", "data-tool": name || null });
+  box.checked = on;
   box.addEventListener("change", () => onChange(box.checked));
   return h("label", { class: "tool" }, box, label);
 }
