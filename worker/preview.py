@@ -24,8 +24,7 @@ from __future__ import annotations
 import json
 import struct
 from dataclasses import dataclass
-from pathlib import Path
-from typing import BinaryIO
+from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,7 +65,7 @@ class Box:
 
 
 def write_preview(
-    path: Path,
+    file: IO[bytes],
     *,
     tracks: Tracks,
     mesh: Mesh | None,
@@ -79,8 +78,8 @@ def write_preview(
 
     Parameters
     ----------
-    path : Path
-        Replaced if it exists; the caller sees to writing aside and renaming.
+    file : binary file
+        Open for writing, at its beginning.
     tracks, mesh, solution
         What went in, and what came out.
     truth : array, shape (F, P, 3), optional
@@ -117,16 +116,15 @@ def write_preview(
         "step": box.step,
         "residual_step": residual_step,
     }
-    with path.open("wb") as file:
-        _begin(file, header, sizes)
-        _section(file, faces.tobytes())
-        camera = solution.camera
-        table = np.column_stack([camera.rotations.reshape(-1, 9), camera.scales])[kept]
-        _section(file, table.astype("<f4").tobytes())
-        _section(file, *(box.rounded(solution.shapes[frame]).tobytes() for frame in kept))
-        _section(file, *(_residuals(tracks, solution, frame, residual_step).tobytes() for frame in kept))
-        if facing is not None:
-            _section(file, *(box.rounded(facing[frame]).tobytes() for frame in kept))
+    _begin(file, header, sizes)
+    _section(file, faces.tobytes())
+    camera = solution.camera
+    table = np.column_stack([camera.rotations.reshape(-1, 9), camera.scales])[kept]
+    _section(file, table.astype("<f4").tobytes())
+    _section(file, *(box.rounded(solution.shapes[frame]).tobytes() for frame in kept))
+    _section(file, *(_residuals(tracks, solution, frame, residual_step).tobytes() for frame in kept))
+    if facing is not None:
+        _section(file, *(box.rounded(facing[frame]).tobytes() for frame in kept))
 
 
 def triangles(mesh: Mesh | None) -> NDArray[np.uint32]:
@@ -175,7 +173,7 @@ def _residuals(tracks: Tracks, solution: Solution, frame: int, step: float) -> N
     return scaled
 
 
-def _begin(file: BinaryIO, header: dict[str, object], sizes: dict[str, int]) -> None:
+def _begin(file: IO[bytes], header: dict[str, object], sizes: dict[str, int]) -> None:
     """Write magic, version and header; the offsets in it depend on its own length, so it is padded to a fixed one."""
     room = 1024
     offset = 16 + room
@@ -189,7 +187,7 @@ def _begin(file: BinaryIO, header: dict[str, object], sizes: dict[str, int]) -> 
     file.write(MAGIC + struct.pack("<II", VERSION, room) + text)
 
 
-def _section(file: BinaryIO, *parts: bytes) -> None:
+def _section(file: IO[bytes], *parts: bytes) -> None:
     written = 0
     for part in parts:
         file.write(part)

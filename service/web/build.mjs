@@ -1,5 +1,5 @@
 // Bundles src/ into dist/: one script, one stylesheet, names that change with their content, and a gzip twin of each.
-// index.html keeps its name; it is the only file a browser has to ask for again.
+// The two HTML files keep their names; they are the only files that a browser has to ask for again.
 
 import { build } from "esbuild";
 import { mkdir, readFile, readdir, rename, rm, writeFile } from "node:fs/promises";
@@ -14,7 +14,7 @@ const final = join(here, "dist");
 await rm(next, { recursive: true, force: true });
 await mkdir(next, { recursive: true });
 
-const entries = ["src/main.ts", "src/page.css", "src/icon.svg"];
+const entries = ["src/main.ts", "src/docs.ts", "src/page.css", "src/icon.svg"];
 const bundled = await build({
   absWorkingDir: here,
   entryPoints: entries,
@@ -39,13 +39,14 @@ for (const [path, output] of Object.entries(bundled.metafile.outputs)) {
   if (entries.includes(output.entryPoint)) produced[basename(output.entryPoint)] = basename(path);
 }
 
-let html = await readFile(join(here, "src/index.html"), "utf8");
-for (const [source, name] of Object.entries(produced)) {
-  const mention = `"page/${source}"`;
-  if (!html.includes(mention)) throw new Error(`src/index.html does not mention ${mention}`);
-  html = html.replaceAll(mention, `"page/${name}"`);
+for (const document of ["index.html", "docs.html"]) {
+  const html = await readFile(join(here, "src", document), "utf8");
+  const linked = html.replace(/"page\/([^"]+)"/g, (_, source) => {
+    if (!(source in produced)) throw new Error(`src/${document} mentions page/${source}, which is not bundled`);
+    return `"page/${produced[source]}"`;
+  });
+  await writeFile(join(next, document), linked);
 }
-await writeFile(join(next, "index.html"), html);
 
 for (const name of await readdir(next)) {
   const packed = gzipSync(await readFile(join(next, name)), { level: 9 });

@@ -15,20 +15,22 @@ SCRIPT = "export const answer = 42;\n"
 
 @pytest.fixture
 def built(tmp_path: Path) -> TestClient:
-    for name, text in (("index.html", "<!doctype html><title>Pliant</title>"), ("main-ABC.js", SCRIPT)):
+    html = "<!doctype html><title>Pliant</title>"
+    for name, text in (("index.html", html), ("docs.html", html), ("main-ABC.js", SCRIPT)):
         (tmp_path / name).write_text(text)
         (tmp_path / f"{name}.gz").write_bytes(gzip.compress(text.encode()))
     (tmp_path / "notes.txt").write_text("not a part of the page")
-    app = FastAPI()
+    app = FastAPI(docs_url=None)
     mount_page(app, tmp_path)
     return TestClient(app)
 
 
 def test_the_page_is_asked_for_again_and_its_files_are_kept_for_ever(built: TestClient) -> None:
-    index = built.get("/")
-    assert index.status_code == 200
-    assert index.headers["cache-control"] == "no-cache"
-    assert index.headers["content-type"] == "text/html; charset=utf-8"
+    for address in ("/", "/docs"):
+        index = built.get(address)
+        assert index.status_code == 200
+        assert index.headers["cache-control"] == "no-cache"
+        assert index.headers["content-type"] == "text/html; charset=utf-8"
     script = built.get("/page/main-ABC.js")
     assert script.text == SCRIPT
     assert script.headers["cache-control"] == "public, max-age=31536000, immutable"
@@ -71,10 +73,11 @@ def test_head_tells_the_same_without_a_body(built: TestClient) -> None:
     assert head.headers["content-length"] == str(len(SCRIPT))
 
 
-def test_without_a_built_page_a_sentence_says_how_to_build_it(tmp_path: Path) -> None:
-    app = FastAPI()
+@pytest.mark.parametrize("address", ["/", "/docs"])
+def test_without_a_built_page_a_sentence_says_how_to_build_it(tmp_path: Path, address: str) -> None:
+    app = FastAPI(docs_url=None)
     mount_page(app, tmp_path / "absent")
-    answer = TestClient(app).get("/")
+    answer = TestClient(app).get(address)
     assert answer.status_code == 503
     assert "<code>make page</code>" in answer.text
     assert answer.headers["cache-control"] == "no-store"

@@ -37,6 +37,11 @@ def solution_of(sequence: Sequence, *, mirrored: bool = False) -> Solution:
     return Solution(shapes=shapes, camera=camera, **rest)
 
 
+def write(path: Path, **given: Any) -> None:
+    with path.open("wb") as file:
+        preview.write_preview(file, **given)
+
+
 def read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     raw = path.read_bytes()
     assert raw[:8] == b"PLIANTPV"
@@ -67,7 +72,7 @@ def world(header: dict[str, Any], values: NDArray[Any]) -> NDArray[np.float64]:
 def test_positions_come_back_within_half_a_step(sequence: Sequence, tmp_path: Path) -> None:
     solution = solution_of(sequence)
     path = tmp_path / preview.NAME
-    preview.write_preview(path, tracks=sequence.tracks, mesh=sequence.mesh, solution=solution, y_axis="up", fps=12)
+    write(path, tracks=sequence.tracks, mesh=sequence.mesh, solution=solution, y_axis="up", fps=12)
     header, arrays = read(path)
     error = np.abs(world(header, arrays["positions"]) - solution.shapes).max()
     assert 0 < error <= 0.5001 * header["step"]
@@ -81,7 +86,7 @@ def test_positions_come_back_within_half_a_step(sequence: Sequence, tmp_path: Pa
 def test_residuals_lead_from_the_projection_to_the_track(sequence: Sequence, tmp_path: Path) -> None:
     solution = solution_of(sequence)
     path = tmp_path / preview.NAME
-    preview.write_preview(path, tracks=sequence.tracks, mesh=None, solution=solution)
+    write(path, tracks=sequence.tracks, mesh=None, solution=solution)
     header, arrays = read(path)
     hidden = sequence.tracks.visible == 0
     assert (arrays["residuals"][hidden] == -32768).all()
@@ -107,7 +112,7 @@ def test_truth_stands_where_e3d_frame_compares_it(sequence: Sequence, tmp_path: 
     truth[:, 7] = np.nan
     solution = solution_of(sequence, mirrored=mirrored)
     path = tmp_path / preview.NAME
-    preview.write_preview(path, tracks=sequence.tracks, mesh=sequence.mesh, solution=solution, truth=truth)
+    write(path, tracks=sequence.tracks, mesh=sequence.mesh, solution=solution, truth=truth)
     header, arrays = read(path)
     assert header["mirrored"] is mirrored
     known = np.arange(P) != 7
@@ -121,7 +126,7 @@ def test_truth_of_too_few_points_is_left_out(sequence: Sequence, tmp_path: Path)
     truth = np.full((F, P, 3), np.nan)
     truth[:, :2] = 1.0
     path = tmp_path / preview.NAME
-    preview.write_preview(path, tracks=sequence.tracks, mesh=None, solution=solution_of(sequence), truth=truth)
+    write(path, tracks=sequence.tracks, mesh=None, solution=solution_of(sequence), truth=truth)
     assert "truth" not in read(path)[0]["sections"]
 
 
@@ -131,7 +136,7 @@ def test_a_long_sequence_is_thinned_evenly_and_keeps_its_pace(
     monkeypatch.setattr(preview, "MOST_OBSERVATIONS", F * P // 2)
     path = tmp_path / preview.NAME
     solution = solution_of(sequence)
-    preview.write_preview(path, tracks=sequence.tracks, mesh=None, solution=solution, fps=30)
+    write(path, tracks=sequence.tracks, mesh=None, solution=solution, fps=30)
     header, arrays = read(path)
     assert (header["num_frames"], header["frame_stride"], header["fps"]) == (3, 2, 15)
     np.testing.assert_allclose(world(header, arrays["positions"]), solution.shapes[::2], atol=header["step"])
@@ -152,7 +157,7 @@ def test_a_perfect_fit_has_a_step_all_the_same(tmp_path: Path) -> None:
     projected = exact.camera.scales[:, None, None] * exact.shapes @ exact.camera.rotations[:, :2].transpose(0, 2, 1)
     tracks = Tracks.from_arrays(projected + exact.camera.translations[:, None])
     path = tmp_path / preview.NAME
-    preview.write_preview(path, tracks=tracks, mesh=None, solution=exact)
+    write(path, tracks=tracks, mesh=None, solution=exact)
     header, arrays = read(path)
     assert header["residual_step"] > 0
     assert np.abs(header["residual_step"] * arrays["residuals"]).max() < 1e-9

@@ -73,16 +73,29 @@ export class Detail {
 
   private async follow(): Promise<void> {
     const follower = {
-      onJob: (job: Job) => this.show(job),
-      onProgress: (progress: Progress) => this.job && this.show({ ...this.job, status: this.runningStatus(), progress }),
+      onJob: (job: Job) => this.isNews(job) && this.show(job),
+      onProgress: (progress: Progress) => this.progress(progress),
       onTrouble: (refusal: Refusal | null) => this.trouble.replaceChildren(...(refusal ? [refusalBox(refusal.problem)] : [])),
     };
     await follow(this.id, follower, this.leaving.signal);
   }
 
-  /** Progress of a job that is not known to run yet means that it runs. */
-  private runningStatus(): Job["status"] {
-    return this.job?.status === "queued" ? "running" : (this.job?.status ?? "running");
+  /** A stream of events begins with those of the past: they make the curves whole, but do not turn the clock back. */
+  private progress(progress: Progress): void {
+    this.curves.progress(progress);
+    const job = this.job;
+    if (job === null || isFinal(job.status)) return;
+    if (job.progress !== null && job.progress.updated_at >= progress.updated_at) return;
+    this.show({ ...job, status: job.status === "queued" ? "running" : job.status, place_in_queue: null, progress });
+  }
+
+  private isNews(job: Job): boolean {
+    const known = this.job;
+    if (known === null || job.attempt !== known.attempt) return known === null || job.attempt > known.attempt;
+    const order: Job["status"][] = ["queued", "running", "cancelling"];
+    const rank = (status: Job["status"]): number => (isFinal(status) ? 3 : order.indexOf(status));
+    if (rank(job.status) !== rank(known.status)) return rank(job.status) > rank(known.status);
+    return (job.progress?.updated_at ?? "") >= (known.progress?.updated_at ?? "");
   }
 
   show(job: Job): void {
@@ -161,7 +174,7 @@ export class Detail {
     const wasFinal = this.job !== null && isFinal(this.job.status);
     this.show(job);
     this.heading.focus({ preventScroll: true });
-    if (wasFinal) void this.follow();
+    if (wasFinal) void this.follow(); // the old loop ended with the old attempt
   }
 
   private async showResult(job: Job): Promise<void> {
