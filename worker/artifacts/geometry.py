@@ -1,0 +1,44 @@
+"""What several writers need of a surface: triangles, normals, axes, a sensible size for viewers."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
+Ints = NDArray[np.int32]
+
+
+def triangles_of(faces: Ints) -> Ints:
+    """Split quads along the diagonal of their corners 0 and 2; triangles stay as they are."""
+    if faces.shape[1] == 3:
+        return faces
+    return np.stack([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]], axis=1).reshape(-1, 3)
+
+
+def upright(shapes: Floats, y_axis: str) -> Floats:
+    """Turn shapes to y up, right-handed: half a turn about x where y points down, so nothing is mirrored."""
+    return shapes if y_axis == "up" else shapes * np.array([1.0, -1.0, -1.0])
+
+
+def vertex_normals(points: Floats | Singles, triangles: Ints) -> Singles:
+    """Area-weighted unit normals `(P, 3)`; points of no face, or of faces without area, get (0, 0, 1)."""
+    one, two, three = (points[triangles[:, i]].astype(np.float64) for i in range(3))
+    doubled = np.cross(two - one, three - one)
+    total = np.zeros((len(points), 3))
+    for axis in range(3):
+        for corner in range(3):
+            total[:, axis] += np.bincount(triangles[:, corner], doubled[:, axis], len(points))
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    usable = length[:, 0] > 1e-12 * max(float(length.max(initial=0.0)), 1e-300)
+    total[usable] /= length[usable]
+    total[~usable] = (0.0, 0.0, 1.0)
+    return total.astype(np.float32)
+
+
+def viewer_scale(shapes: Floats) -> float:
+    """Power of ten that brings the bounding box's diagonal between 1 and 10, for viewers that take units for metres."""
+    low, high = shapes.min(axis=(0, 1)), shapes.max(axis=(0, 1))
+    diagonal = float(np.linalg.norm(high - low))
+    return 1.0 if diagonal == 0 or not np.isfinite(diagonal) else float(10.0 ** -np.floor(np.log10(diagonal)))

@@ -1,0 +1,204 @@
+"""Write an animated binary glTF 2.0 (.glb): one mesh, morph targets, one animation of their weights.
+
+The file is streamed: the JSON comes first, so sizes, offsets, minima and maxima are settled before any array is written.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Callable
+from importlib.metadata import version
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pliant.worker.artifacts.animation import Animation
+from pliant.worker.artifacts.geometry import Ints, Singles, vertex_normals
+
+COMPONENTS = {"int8": 5120, "uint8": 5121, "int16": 5122, "uint16": 5123, "uint32": 5125, "float32": 5126}
+TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+VERTICES, INDICES = 34962, 34963
+POINTS, TRIANGLES = 0, 4
+CLAY = [0.74, 0.62, 0.55, 1.0]
+
+
+class Buffer:
+    """Arrays in the order they will be written, and the glTF objects that point at them."""
+
+    def __init__(self) -> None:
+        self.parts: list[NDArray[np.generic]] = []
+        self.views: list[dict[str, Any]] = []
+        self.accessors: list[dict[str, Any]] = []
+        self.bytes = 0
+
+    def add(
+        self, array: NDArray[np.generic], *, target: int | None = None, bounds: bool = False, normalised: bool = False
+    ) -> int:
+        """Append an array `(N,)` or `(N, width)` as a view of its own; returns the accessor's index.
+
+        Rows of vertex data start at multiples of four bytes, so rows of other lengths are padded with zeros.
+        """
+        rows = array.reshape(len(array), -1)
+        width = rows.shape[1]
+        size = rows.dtype.itemsize
+        padded = rows
+        view: dict[str, Any] = {"buffer": 0, "byteOffset": self.bytes}
+        if target == VERTICES and (width * size) % 4:
+            stride = -(-width * size // 4) * 4
+            padded = np.zeros((len(rows), stride // size), dtype=rows.dtype)
+            padded[:, :width] = rows
+            view["byteStride"] = stride
+        if target is not None:
+            view["target"] = target
+        view["byteLength"] = padded.nbytes
+        accessor: dict[str, Any] = {
+            "bufferView": len(self.views), "componentType": COMPONENTS[rows.dtype.name], "count": len(rows), "type": TYPES[width],
+        }  # fmt: skip
+        if normalised:
+            accessor["normalized"] = True
+        if bounds:
+            accessor["min"], accessor["max"] = rows.min(axis=0).tolist(), rows.max(axis=0).tolist()
+        self.views.append(view)
+        self.accessors.append(accessor)
+        self.parts.append(padded)
+        self.bytes += -(-padded.nbytes // 4) * 4
+        return len(self.accessors) - 1
+
+
+def write_glb(
+    file: IO[bytes], animation: Animation, triangles: Ints, *, fps: float, node: dict[str, Any], normals: str = "static",
+    quantized: bool = False, colours: NDArray[np.uint8] | None = None, on_progress: Callable[[float], None] | None = None,
+) -> None:  # fmt: skip
+    """Write the animation.
+
+    Parameters
+    ----------
+    file : binary file
+        Written from its position on, not closed.
+    animation : Animation
+        y up, right-handed.
+    triangles : array of int, shape (T, 3)
+        T = 0 writes a cloud of points.
+    fps : float
+        Frames per second; frame f is at f / fps seconds, with linear interpolation between.
+    node : dict
+        What the node carries besides the mesh, e.g. `scale`.
+    normals : str
+        `static`: of the base shape; `animated`: displaced with every target; `none`.
+    quantized : bool
+        16-bit positions by KHR_mesh_quantization.
+    colours : array of uint8, shape (P, 4), optional
+        RGBA of every point.
+    on_progress : callable, optional
+        Told the share of bytes written.
+    """
+    buffer = Buffer()
+    placed = dict(node)
+    positions, targets = animation.base, animation.targets
+    if quantized:
+        positions, targets, placed = _quantize(animation, node)  # type: ignore[assignment]
+    smooth = normals if len(triangles) else "none"
+    attributes = {"POSITION": buffer.add(positions, target=VERTICES, bounds=True, normalised=quantized)}
+    base_normals = vertex_normals(animation.base, triangles) if smooth != "none" else None
+    if base_normals is not None:
+        attributes["NORMAL"] = buffer.add(base_normals, target=VERTICES)
+    if colours is not None:
+        attributes["COLOR_0"] = buffer.add(colours, target=VERTICES, normalised=True)
+    primitive: dict[str, Any] = {
+        "attributes": attributes,
+        "material": 0,
+        "mode": TRIANGLES if len(triangles) else POINTS,
+    }
+    if len(triangles):
+        short = len(animation.base) < 0xFFFF
+        primitive["indices"] = buffer.add(
+            triangles.reshape(-1).astype(np.uint16 if short else np.uint32), target=INDICES
+        )
+    primitive["targets"] = _targets(
+        buffer, animation, targets, quantized, triangles, base_normals if smooth == "animated" else None
+    )
+    times = (np.arange(len(animation.weights)) / fps).astype(np.float32)
+    sampler = {
+        "input": buffer.add(times, bounds=True),
+        "output": buffer.add(animation.weights.reshape(-1)),
+        "interpolation": "LINEAR",
+    }
+    document = {
+        "asset": {"version": "2.0", "generator": f"Pliant {version('pliant')}"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"name": "shape", "mesh": 0, **placed}],
+        "meshes": [
+            {
+                "name": "shape",
+                "primitives": [primitive],
+                "weights": animation.weights[0].tolist(),
+                "extras": {"targetNames": animation.names, "pliant": animation.extras},
+            }
+        ],
+        "materials": [_material(colours is not None)],
+        "animations": [{"name": "motion", "samplers": [sampler], "channels": [{"sampler": 0, "target": {"node": 0, "path": "weights"}}]}],
+        "buffers": [{"byteLength": buffer.bytes}],
+        "bufferViews": buffer.views,
+        "accessors": buffer.accessors,
+    }  # fmt: skip
+    if quantized:
+        document["extensionsUsed"] = document["extensionsRequired"] = ["KHR_mesh_quantization"]
+    _write(file, document, buffer, on_progress)
+
+
+def _targets(
+    buffer: Buffer,
+    animation: Animation,
+    targets: NDArray[np.generic],
+    quantized: bool,
+    triangles: Ints,
+    base: Singles | None,
+) -> list[dict[str, int]]:
+    found = []
+    for index, target in enumerate(targets):
+        entry = {"POSITION": buffer.add(target, target=VERTICES, bounds=True, normalised=quantized)}
+        if base is not None:
+            # A mode's normals are those of the base moved by the whole mode: first order in the motion, as viewers blend them.
+            turned = vertex_normals(animation.base + animation.targets[index], triangles)
+            entry["NORMAL"] = buffer.add(turned - base, target=VERTICES)
+        found.append(entry)
+    return found
+
+
+def _quantize(
+    animation: Animation, node: dict[str, Any]
+) -> tuple[NDArray[np.int16], NDArray[np.int16], dict[str, Any]]:
+    """Positions and displacements as 16-bit fractions of one common size, which the node's scale undoes."""
+    low, high = animation.base.min(axis=0), animation.base.max(axis=0)
+    centre = ((low + high) / 2).astype(np.float64)
+    size = max(float(np.abs(animation.base - centre).max()), float(np.abs(animation.targets).max(initial=0.0)), 1e-30)
+    positions = np.rint((animation.base - centre) / size * 32767).astype(np.int16)
+    targets = np.rint(animation.targets / size * 32767).astype(np.int16)
+    scale = float(node.get("scale", [1.0])[0])
+    placed = {**node, "scale": [scale * size] * 3, "translation": (scale * centre).tolist()}
+    return positions, targets, placed
+
+
+def _material(coloured: bool) -> dict[str, Any]:
+    base = [1.0, 1.0, 1.0, 1.0] if coloured else CLAY
+    return {
+        "name": "clay", "doubleSided": True,
+        "pbrMetallicRoughness": {"baseColorFactor": base, "metallicFactor": 0.0, "roughnessFactor": 0.75},
+    }  # fmt: skip
+
+
+def _write(
+    file: IO[bytes], document: dict[str, Any], buffer: Buffer, on_progress: Callable[[float], None] | None
+) -> None:
+    text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    file.write(struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + buffer.bytes))
+    file.write(struct.pack("<I4s", len(text), b"JSON") + text)
+    file.write(struct.pack("<I4s", buffer.bytes, b"BIN\0"))
+    for index, part in enumerate(buffer.parts):
+        file.write(np.ascontiguousarray(part, dtype=part.dtype.newbyteorder("<")).data)
+        file.write(b"\0" * (-part.nbytes % 4))
+        if on_progress is not None:
+            on_progress((index + 1) / len(buffer.parts))

@@ -1,0 +1,88 @@
+"""report.json: everything known about how a result came to be."""
+
+from __future__ import annotations
+
+import math
+import platform
+import resource
+import sys
+from collections.abc import Mapping
+from dataclasses import asdict
+from importlib.metadata import version
+from typing import Any
+
+from pliant.client.options import Options
+from pliant.solver import Solution
+from pliant.worker.formats import Inputs
+
+REPORT_VERSION = 1
+
+
+def build_report(
+    inputs: Inputs,
+    solution: Solution,
+    options: Options,
+    *,
+    metrics: Mapping[str, float],
+    seconds: Mapping[str, float] | None = None,
+) -> dict[str, Any]:
+    """Gather what `report.json` says; plain values, ready for JSON.
+
+    Parameters
+    ----------
+    inputs, solution, options
+        Of the job.
+    metrics : mapping
+        By documented name; a number that is not finite is written as null.
+    seconds : mapping, optional
+        Wall time of stages outside the solver, e.g. `loading`; the solver's own come with the solution.
+    """
+    choices = asdict(solution.choices)
+    reasons, warnings = choices.pop("reasons"), choices.pop("warnings")
+    report = {
+        "report_version": REPORT_VERSION,
+        "outcome": solution.outcome.value,
+        "sentence": solution.outcome.sentence,
+        "warnings": list(warnings),
+        "metrics": dict(metrics),
+        "choices": {
+            name: {"value": value} | ({"reason": reasons[name]} if name in reasons else {})
+            for name, value in choices.items()
+        },
+        "reasons": reasons,
+        "options": options.model_dump(mode="json"),
+        "interpretation": inputs.interpretation.model_dump(mode="json"),
+        "trace": {
+            "objective": solution.trace.objective.tolist(),
+            "residual": solution.trace.residual.tolist(),
+            "iterations": solution.trace.iterations.tolist(),
+        },
+        "seconds": {**(seconds or {}), **solution.seconds},
+        "peak_memory_bytes": peak_memory(),
+        "versions": versions(),
+    }
+    plain: dict[str, Any] = _plain(report)
+    return plain
+
+
+def peak_memory() -> int:
+    """Largest resident size of this process so far, bytes."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
+
+
+def versions() -> dict[str, str]:
+    """Versions of what computed the numbers."""
+    libraries = {name: version(name) for name in ("pliant", "numpy", "scipy")}
+    return {**libraries, "python": platform.python_version(), "system": f"{platform.system()} {platform.machine()}"}
+
+
+def _plain(value: Any) -> Any:
+    """JSON has no NaN and no infinity: they become null."""
+    if isinstance(value, Mapping):
+        return {str(name): _plain(item) for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value.item() if hasattr(value, "item") else value
