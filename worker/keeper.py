@@ -22,7 +22,7 @@ from pliant.client.schemas import Status
 from pliant.worker import lifecycle
 from pliant.worker.errors import StaleAttempt, StoreUnavailable, UnknownJob
 from pliant.worker.files import clean_up
-from pliant.worker.jobs import Jobs
+from pliant.worker.jobs import LARGEST_PAGE, Jobs
 from pliant.worker.problems import worker_lost
 from pliant.worker.records import Beat, new_token
 
@@ -143,13 +143,17 @@ class Keeper:
 
     def _expire(self) -> None:
         """Remove the jobs whose time is over. Nothing that is not finished, or has no `expires_at`, is ever touched."""
-        for status in lifecycle.FINAL:
-            for id in self.jobs.records.ids(status):
-                with suppress(UnknownJob):
-                    expires = self.jobs.records.get(id).job.expires_at
-                    if expires is not None and expires <= self.jobs.clock():
-                        self.jobs.delete(id)
-                        logger.info("job %s: expired and removed", id)
+        now, cursor = self.jobs.clock(), None
+        while True:
+            page = self.jobs.page(cursor=cursor, limit=LARGEST_PAGE, statuses=lifecycle.FINAL)
+            for job in page.jobs:
+                if job.expires_at is not None and job.expires_at <= now:
+                    with suppress(UnknownJob):
+                        self.jobs.delete(job.id)
+                        logger.info("job %s: expired and removed", job.id)
+            cursor = page.next
+            if cursor is None:
+                return
 
     def _sweep(self) -> None:
         """Remove files that belong to no job: of submissions that died before their record, of attempts that were killed."""

@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 
 from pliant.client.schemas import Problem
 from pliant.worker.errors import StoreUnavailable
 
+_NO_ROOM_FOR_A_THREAD = ("can't start new thread", os.strerror(errno.EAGAIN))
+"""What Python and SciPy's pool say when a thread's stack does not fit into the address space."""
 
-def problem_of(error: BaseException) -> Problem:
-    """Return the problem that an exception in a job is. The traceback belongs into the log, never into the record."""
+
+def problem_of(error: BaseException, *, memory_limit: int = 0) -> Problem:
+    """Return the problem that an exception in a job is. The traceback belongs into the log, never into the record.
+
+    Parameters
+    ----------
+    memory_limit : int
+        Address space the job may take, bytes; 0: no limit.
+    """
     from pliant.solver import (
         InvalidInput,
     )  # here, because it loads NumPy, which the keeper has no use for
@@ -20,8 +30,10 @@ def problem_of(error: BaseException) -> Problem:
             title="The input cannot be solved", status=422, detail=_sentence(str(error)), code=error.code,
             field=error.field, expected=error.expected, got=error.got, hint=error.hint,
         )  # fmt: skip
-    if isinstance(error, MemoryError):
-        return out_of_memory()
+    if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
+        return out_of_memory(memory_limit)
+    if memory_limit and isinstance(error, RuntimeError) and str(error) in _NO_ROOM_FOR_A_THREAD:
+        return out_of_memory(memory_limit)
     if isinstance(error, StoreUnavailable):
         return Problem(title="Storage failed", status=503, detail=str(error), code=error.code, retryable=True)
     if isinstance(error, OSError) and error.errno is not None:

@@ -49,7 +49,7 @@ class Settings:
     """Longest time one attempt may take; 0: no limit."""
 
     memory_limit: int = 0
-    """Address space one job may take; 0: no limit but the machine's."""
+    """Address space one job may take; 0: no limit but the machine's. The libraries alone need half a gigabyte."""
 
     cancel_grace: float = 10.0
     """After a cancel or a passed time limit: how long the job may take to stop by itself before it is killed."""

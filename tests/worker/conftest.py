@@ -17,6 +17,7 @@ from pliant.worker.queue import RedisQueue
 from pliant.worker.redis_records import RedisRecords
 from pliant.worker.settings import Settings
 from pliant.worker.valkey import Valkey
+from worker_house import make_inputs
 
 
 @pytest.fixture(scope="session")
@@ -85,3 +86,12 @@ def inputs_file(tmp_path: Path) -> Path:
 @pytest.fixture
 def options() -> Options:
     return Options()
+
+
+@pytest.fixture(scope="session")
+def inputs_files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Canonical inputs of a job of a moment and of a job of minutes."""
+    folder = tmp_path_factory.mktemp("inputs")
+    make_inputs(folder / "short.npz", frames=6, points=40)
+    make_inputs(folder / "long.npz", frames=60, points=1500)
+    return folder / "short.npz", folder / "long.npz"

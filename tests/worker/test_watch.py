@@ -165,6 +165,7 @@ def test_patience_repeats_until_the_store_answers(jobs: Jobs, running: Callable[
     [
         (InvalidInput("wrong_shape", field="tracks", expected="a", got="b", hint="Do c"), "wrong_shape", 422, False),
         (MemoryError("Unable to allocate"), "out_of_memory", 507, True),
+        (OSError(12, "Cannot allocate memory"), "out_of_memory", 507, True),
         (OSError(28, "No space left on device"), "storage_failed", 503, True),
         (StoreUnavailable("The blob store", reason="gone"), "store_unavailable", 503, True),
         (ZeroDivisionError("secret detail"), "internal_error", 500, False),
@@ -178,6 +179,13 @@ def test_every_error_becomes_a_sentence(error: BaseException, code: str, status:
     assert "secret" not in problem.detail
     if isinstance(error, InvalidInput):
         assert (problem.field, problem.expected, problem.got, problem.hint) == ("tracks", "a", "b", "Do c")
+
+
+def test_a_thread_that_does_not_fit_is_want_of_memory_only_under_a_limit() -> None:
+    error = RuntimeError("can't start new thread")
+    assert problem_of(error, memory_limit=2**30).code == "out_of_memory"
+    assert "1.0 GiB" in problem_of(error, memory_limit=2**30).detail
+    assert problem_of(error).code == "internal_error"
 
 
 def test_limits_are_named_in_words() -> None:

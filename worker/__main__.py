@@ -1,0 +1,86 @@
+"""`python -m pliant.worker [work|keep]`: one worker, or one keeper, set up by the `PLIANT_…` environment."""
+
+from __future__ import annotations
+
+import gc
+import importlib
+import logging
+import os
+import secrets
+import signal
+import sys
+from types import FrameType
+
+from pliant.worker.connection import connect
+from pliant.worker.errors import WorkerError
+from pliant.worker.jobs import Jobs
+from pliant.worker.keeper import Keeper
+from pliant.worker.queue import RedisQueue
+from pliant.worker.redis_records import RedisRecords
+from pliant.worker.rq_worker import PliantWorker
+from pliant.worker.settings import NUMERICAL_THREADS, Settings
+
+USAGE = "usage: python -m pliant.worker [work|keep]"
+
+PRELOADED = ("pliant.worker.formats", "pliant.worker.run")
+
+WATCH_ANSWERS_WITHIN = 2.0
+"""Seconds a sign of life may take: the watcher must go on watching when the store hangs."""
+
+
+def work(settings: Settings) -> None:
+    """Take jobs until told to stop.
+
+    What a job needs is loaded before the first fork, once for all of them. That is safe as long as this process
+    computes nothing: the numerical library shuts its threads down in the fork and starts them anew in the horse.
+    """
+    for variable in NUMERICAL_THREADS:
+        os.environ.setdefault(variable, str(settings.threads_per_job))
+    for module in PRELOADED:
+        importlib.import_module(module)
+    gc.collect()
+    gc.freeze()  # or every horse's first collection would copy all the pages it shares with us
+    settings.work.mkdir(parents=True, exist_ok=True)
+    quick = connect(settings.redis, decode=True, retries=0, answer_within=WATCH_ANSWERS_WITHIN)
+    connection = connect(settings.redis, decode=False)
+    PliantWorker(
+        settings=settings,
+        connection=connection,
+        records=RedisRecords(quick, prefix=settings.queue),
+        queue=RedisQueue(connection, name=settings.queue),
+        name=secrets.token_hex(6),
+    ).work(logging_level=None)
+
+
+def keep(settings: Settings) -> None:
+    """Look after the jobs until told to stop."""
+    told = False
+
+    def stop(signum: int, frame: FrameType | None) -> None:  # noqa: ARG001
+        nonlocal told
+        told = True
+
+    signal.signal(signal.SIGTERM, stop)
+    signal.signal(signal.SIGINT, stop)
+    Keeper(jobs=Jobs.open(settings)).run(lambda: told)
+
+
+def main(arguments: list[str]) -> int:
+    """Run one process; return its exit code."""
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(processName)s %(name)s %(levelname)s %(message)s")
+    logging.getLogger("rq.worker").setLevel(logging.WARNING)
+    tasks = {"work": work, "keep": keep}
+    task = tasks.get(arguments[0] if arguments else "work")
+    if task is None or len(arguments) > 1:
+        sys.stderr.write(f"{USAGE}\n")
+        return 2
+    try:
+        task(Settings.from_environment(os.environ))
+    except WorkerError as error:
+        sys.stderr.write(f"{error}\n")
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

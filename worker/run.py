@@ -1,0 +1,129 @@
+"""A whole job as a plain call: inputs in, files out. `pliant solve` and the queue's worker both call exactly this."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from pliant.client.options import SOLVER_FIELDS, Options
+from pliant.client.schemas import Artifact, Progress
+from pliant.solver import Outcome, Settings, Solution, Step, solve
+from pliant.solver.metrics import evaluate
+from pliant.worker.artifacts import build_report, write_artifacts
+from pliant.worker.errors import Interrupted
+from pliant.worker.formats import Inputs
+from pliant.worker.progress import Teller
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Finished:
+    """How a job ended, and what it left in its directory."""
+
+    metrics: dict[str, float]
+    """Every metric that the inputs allow and that is finite, by its documented name."""
+
+    outcome: str
+    """How the solver ended: `converged` or `max_reweightings`."""
+
+    sentence: str
+    """The outcome in words."""
+
+    warnings: tuple[str, ...]
+    """Sentences the user should read about this result."""
+
+    artifacts: tuple[Artifact, ...]
+    """The files, named as they lie in the directory."""
+
+
+def solver_settings(options: Options) -> Settings:
+    """Return the solver's part of a job's options."""
+    return Settings(**{name: getattr(options, name) for name in SOLVER_FIELDS})
+
+
+def reconstruct(
+    inputs: Inputs,
+    options: Options,
+    directory: Path,
+    *,
+    on_progress: Callable[[Progress], None] | None = None,
+    should_stop: Callable[[], bool] | None = None,
+) -> Finished:
+    """Solve, measure, write the files.
+
+    Parameters
+    ----------
+    inputs : Inputs
+        As the readers give them.
+    options : Options
+        How to solve and write.
+    directory : Path
+        Where the files go; made if need be.
+    on_progress : callable, optional
+        Told often; whoever cannot listen so often drops some.
+    should_stop : callable, optional
+        Asked often; once it says True, the job ends with `Interrupted` and no files.
+
+    Raises
+    ------
+    Interrupted
+        `should_stop` said so.
+    InvalidInput
+        The inputs and the options do not fit together.
+    """
+    teller = Teller(on_progress if on_progress is not None else _silent)
+    directory.mkdir(parents=True, exist_ok=True)
+    teller.part("loading", 1.0)
+    began = time.perf_counter()
+    solution = solve(
+        inputs.tracks,
+        inputs.mesh,
+        cameras=inputs.cameras,
+        settings=solver_settings(options),
+        on_step=lambda step: _told(teller, step),
+        should_stop=should_stop,
+    )
+    if solution.outcome is Outcome.STOPPED:
+        raise Interrupted
+    solved = time.perf_counter()
+    metrics = _metrics(inputs, solution)
+    seconds = {"solve": solved - began, "metrics": time.perf_counter() - solved}
+    report = build_report(inputs, solution, options, metrics=metrics, seconds=seconds)
+    artifacts = write_artifacts(
+        inputs, solution, options, report, directory, on_progress=lambda done: teller.part("exporting", done)
+    )
+    if should_stop is not None and should_stop():
+        raise Interrupted
+    teller.part("exporting", 1.0)
+    return Finished(
+        metrics=metrics,
+        outcome=solution.outcome.value,
+        sentence=solution.outcome.sentence,
+        warnings=tuple(solution.choices.warnings),
+        artifacts=tuple(artifacts),
+    )
+
+
+def _metrics(inputs: Inputs, solution: Solution) -> dict[str, float]:
+    truth = inputs.ground_truth
+    rotations = None if truth is None else truth.rotations
+    values = evaluate(solution, inputs.tracks, None if truth is None else truth.shapes, rotations)
+    return {name: value for name, value in values.items() if math.isfinite(value)}
+
+
+def _told(teller: Teller, step: Step) -> None:
+    teller.part(
+        "solving",
+        step.fraction,
+        stage=step.stage,
+        reweighting=step.reweighting,
+        max_reweightings=step.max_reweightings,
+        objective=step.objective,
+        residual=step.residual,
+    )
+
+
+def _silent(progress: Progress) -> None:
+    del progress
