@@ -39,6 +39,7 @@ if TYPE_CHECKING:
         Job,
         Problem,
         Progress,
+        ServiceLimits,
         Status,
     )
     from pliant.client.sync import Client, RemoteJob, Result
@@ -51,7 +52,7 @@ _HOMES = {
     ),
     "options": ("Options",),
     "policy": ("Policy",),
-    "schemas": ("Artifact", "Interpretation", "Job", "Problem", "Progress", "Status"),
+    "schemas": ("Artifact", "Interpretation", "Job", "Problem", "Progress", "ServiceLimits", "Status"),
     "asynchronous": ("AsyncClient", "AsyncRemoteJob", "AsyncResult"),
     "sync": ("Client", "RemoteJob", "Result"),
 }  # fmt: skip
@@ -59,7 +60,7 @@ _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 
 __all__ = [  # noqa: RUF022 - by use, not by alphabet
     "Client", "RemoteJob", "Result", "AsyncClient", "AsyncRemoteJob", "AsyncResult", "Policy", "Options",
-    "Artifact", "Interpretation", "Job", "Problem", "Progress", "Status",
+    "Artifact", "Interpretation", "Job", "Problem", "Progress", "ServiceLimits", "Status",
     "PliantError", "Unreachable", "TimeIsUp", "UnexpectedAnswer", "CorruptDownload", "BadArgument", "NotLoaded",
     "Refused", "InvalidRequest", "NotAuthorized", "NotFound", "NotAllowedNow", "TooManyRequests", "ServiceFailed",
     "JobEnded", "JobFailed", "JobCancelled",

@@ -17,7 +17,7 @@ from pliant.client.parts import OnBytes, Source
 from pliant.client.policy import Attempts, Contact, Policy
 from pliant.client.request import base_of, headers_of
 from pliant.client.result import ANIMATION, LOADED, Reconstruction, copied
-from pliant.client.schemas import Job, Status
+from pliant.client.schemas import Job, ServiceLimits, Status
 from pliant.client.verbs import OnJob
 
 DEFAULT_URL = "http://127.0.0.1:8000"
@@ -129,6 +129,11 @@ class AsyncClient:
             await arun(self._http, verbs.fetch(attempts, final, result.folder, names=LOADED, on_download=None))
         return result
 
+    async def events(self, job: str, *, timeout: float | None = None) -> AsyncIterator[Job]:
+        """As `Client.events`."""
+        async for now in aiterate(self._http, verbs.events(self._attempts(timeout, f"job {job}"), job)):
+            yield now
+
     async def result(
         self, job: str, *, folder: Path | str | None = None, load: bool = True, timeout: float | None = None
     ) -> AsyncResult:
@@ -170,9 +175,13 @@ class AsyncClient:
         """As `Client.options`."""
         return await arun(self._http, verbs.document(self._attempts(timeout), "/v1/options"))
 
-    async def limits(self, *, timeout: float | None = None) -> dict[str, Any]:
+    async def limits(self, *, timeout: float | None = None) -> ServiceLimits:
         """As `Client.limits`."""
-        return await arun(self._http, verbs.document(self._attempts(timeout), "/v1/limits"))
+        return await arun(self._http, verbs.limits(self._attempts(timeout)))
+
+    async def ready(self, *, timeout: float | None = None) -> dict[str, Any]:
+        """As `Client.ready`."""
+        return await arun(self._http, verbs.document(self._attempts(timeout), "/readyz"))
 
     def _attempts(self, timeout: float | None, doing: str = "this call") -> Attempts:
         return Attempts(policy=self._policy, contact=self._contact, timeout=timeout, doing=doing)
@@ -220,15 +229,20 @@ class AsyncRemoteJob:
         """As `RemoteJob.wait`."""
         return await self._client.wait(self.id, on_progress=on_progress, folder=folder, load=load, timeout=timeout)
 
+    async def events(self, *, timeout: float | None = None) -> AsyncIterator[Job]:
+        """As `RemoteJob.events`."""
+        async for job in self._client.events(self.id, timeout=timeout):
+            self.record = job
+            yield job
+
     async def cancel(self, *, timeout: float | None = None) -> Self:
         """As `RemoteJob.cancel`."""
         self.record = (await self._client.cancel(self.id, timeout=timeout)).record
         return self
 
-    async def retry(self, *, timeout: float | None = None) -> Self:
+    async def retry(self, *, timeout: float | None = None) -> AsyncRemoteJob:
         """As `RemoteJob.retry`."""
-        self.record = (await self._client.retry(self.id, timeout=timeout)).record
-        return self
+        return await self._client.retry(self.id, timeout=timeout)
 
     async def delete(self, *, timeout: float | None = None) -> None:
         """As `RemoteJob.delete`."""

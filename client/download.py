@@ -38,7 +38,8 @@ def download(
         return whole
     part = folder / f".{whole.name}.{artifact.sha256[:16]}.part"
     for _ in range(2):
-        yield from _fill(attempts, path, artifact, part, on_download)
+        if not part.is_file() or part.stat().st_size < artifact.bytes or artifact.bytes == 0:
+            yield from _fill(attempts, path, artifact, part, on_download)
         if (yield Do(lambda: sha256(part))) == artifact.sha256:
             part.replace(whole)
             return whole
@@ -50,18 +51,18 @@ def download(
 
 
 def _fill(attempts: Attempts, path: str, artifact: Artifact, part: Path, on_download: OnBytes | None) -> Flow[None]:
-    """Append to the part until it has all its bytes."""
-    etag: str | None = None
+    """Append to the part until it has all its bytes.
+
+    The service's entity tag is the SHA-256, so `If-Range` holds over restarts of both sides: if the file is not the same
+    any more, it comes whole.
+    """
     with part.open("ab") as file:
-        while file.tell() < artifact.bytes or (file.tell() == 0 and etag is None):
+        while True:
             headers = {"Accept-Encoding": "identity"}
             if file.tell() > 0:
-                headers["Range"] = f"bytes={file.tell()}-"
-                if etag is not None:
-                    headers["If-Range"] = etag
+                headers |= {"Range": f"bytes={file.tell()}-", "If-Range": f'"{artifact.sha256}"'}
             call = Call(method="GET", path=path, headers=headers)
             head = yield from opened(attempts, call)
-            etag = _strong(head.headers.get("etag"))
             if _begins_at(head) != file.tell():
                 file.seek(0)
                 file.truncate()
@@ -74,6 +75,8 @@ def _fill(attempts: Attempts, path: str, artifact: Artifact, part: Path, on_down
                         on_download(file.tell(), artifact.bytes)
             except httpx.TransportError as lost:
                 yield from pause_or_raise(attempts, call, lost)
+                if file.tell() >= artifact.bytes:
+                    return
             else:
                 return
 
@@ -84,11 +87,6 @@ def _begins_at(head: Head) -> int:
         return 0
     match = re.match(r"bytes (\d+)-", head.headers.get("content-range", ""))
     return int(match.group(1)) if match is not None else -1
-
-
-def _strong(etag: str | None) -> str | None:
-    """If-Range needs a strong validator."""
-    return etag if etag is not None and not etag.startswith("W/") else None
 
 
 def sha256(path: Path) -> str:

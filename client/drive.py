@@ -103,8 +103,8 @@ async def arun(http: httpx.AsyncClient, flow: Flow[T]) -> T:
             flow.close()
 
 
-async def aiterate(http: httpx.AsyncClient, flow: Flow[None]) -> AsyncGenerator[Any, None]:
-    """Drive a flow, handing on what it emits; an asynchronous generator cannot return a value, so such a flow has none."""
+async def aiterate(http: httpx.AsyncClient, flow: Flow[Any]) -> AsyncGenerator[Any, None]:
+    """Drive a flow, handing on what it emits; an asynchronous generator cannot return a value, so the flow's own is lost."""
     async with AsyncWire(http) as wire:
         try:
             wish = next(flow)

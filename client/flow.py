@@ -23,7 +23,7 @@ class Call:
     method: str
     path: str
     """From the service's address on, e.g. ``/v1/jobs``."""
-    params: Mapping[str, str] = field(default_factory=dict)
+    params: Mapping[str, str | list[str]] = field(default_factory=dict)
     headers: Mapping[str, str] = field(default_factory=dict)
     form: Form | None = None
     """Multipart body; its files are opened anew for every sending."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -104,17 +104,15 @@ def tracks_file(tracks: Source, visible: ArrayLike | None, folder: Path) -> Path
 
 
 def mesh_part(mesh: Source | tuple[int, int], folder: Path) -> Path | str:
-    """Return a file of faces, or the text of a grid size such as ``"12x20"``.
+    """Return a file of faces, or a text: a grid size such as ``"12x20"``, or ``"none"``.
 
     Raises
     ------
     BadArgument
-        Neither faces, nor a file, nor a grid size.
+        Neither faces, nor a file, nor such a text.
     """
-    if isinstance(mesh, str):
-        rows, _, columns = mesh.lower().partition("x")
-        if rows.strip().isdigit() and columns.strip().isdigit():
-            return f"{int(rows)}x{int(columns)}"
+    if isinstance(mesh, str) and re.fullmatch(r"none|\s*\d{1,6}\s*x\s*\d{1,6}\s*", mesh.lower()) is not None:
+        return mesh.lower().replace(" ", "")
     if isinstance(mesh, str | Path):
         return _existing(mesh, "mesh")
     if isinstance(mesh, tuple) and len(mesh) == 2 and all(isinstance(size, int) for size in mesh):
@@ -132,24 +130,21 @@ def array_part(value: Source, name: str, key: str, folder: Path) -> Path:
     return _npz(folder / f"{name}.npz", {str(k): _array(v, f"{name}.{k}") for k, v in arrays.items()})
 
 
-def checked_options(options: Options | Mapping[str, Any] | None) -> str:
-    """Return the options as JSON, refusing unknown names and values before anything is sent.
+def checked_options(options: Options | Mapping[str, Any] | None) -> Options:
+    """Check options before anything is sent or solved.
 
     Raises
     ------
     BadArgument
         With the names at fault and what is allowed.
     """
-    if options is None:
-        return "{}"
     if isinstance(options, Options):
-        return options.model_dump_json(exclude_unset=True)
+        return options
     try:
-        Options.model_validate(dict(options))
+        return Options.model_validate(dict(options or {}))
     except ValidationError as fault:
         said = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}, got {e['input']!r}" for e in fault.errors())
         raise BadArgument(f"options: {said}. `pliant options` lists every option.") from fault
-    return json.dumps(dict(options))
 
 
 def _alone(visible: ArrayLike | None) -> None:

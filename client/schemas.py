@@ -123,3 +123,17 @@ class JobPage(Record):
 
     jobs: list[Job]
     next: str | None = Field(None, description="Pass as `cursor` for the page after this one; null at the end.")
+
+
+class ServiceLimits(Record):
+    """What a service accepts; beyond these it refuses."""
+
+    max_body_bytes: int = Field(description="Largest body of one request.")
+    max_text_bytes: int = Field(description="Largest text field of a form.")
+    max_bytes: int = Field(description="Largest file, and all arrays read from it, inflated.")
+    max_frames: int
+    max_points: int
+    max_observations: int = Field(description="Frames times points.")
+    max_faces: int
+    max_wait_seconds: int = Field(description="Longest `Prefer: wait=n` that is honoured.")
+    max_page: int = Field(description="Most jobs on one page.")

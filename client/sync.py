@@ -17,7 +17,7 @@ from pliant.client.parts import OnBytes, Source
 from pliant.client.policy import Attempts, Contact, Policy
 from pliant.client.request import base_of, headers_of
 from pliant.client.result import ANIMATION, LOADED, Reconstruction, copied
-from pliant.client.schemas import Job, Status
+from pliant.client.schemas import Job, ServiceLimits, Status
 from pliant.client.verbs import OnJob
 
 DEFAULT_URL = "http://127.0.0.1:8000"
@@ -92,7 +92,8 @@ class Client:
         visible : array_like, optional
             Shape (F, P), bool or confidence in [0, 1]; with an array of tracks only.
         mesh : array_like, (rows, columns), path, optional
-            Faces (T, 3) or (T, 4); or the size of a grid; or a mesh file. Vertex i is point i.
+            Faces (T, 3) or (T, 4); or the size of a grid; or a mesh file; or ``"none"``. Vertex i is point i.
+            Made from the tracks when not given.
         ground_truth : array_like or path, optional
             True shapes (F, P, 3): metrics come by themselves.
         rotations : array_like or path, optional
@@ -185,6 +186,13 @@ class Client:
             run(self._http, verbs.fetch(attempts, final, result.folder, names=LOADED, on_download=None))
         return result
 
+    def events(self, job: str, *, timeout: float | None = None) -> Iterator[Job]:
+        """Iterate over a job's record each time something about it is new; the last one is final.
+
+        The connection may break and the service be restarted meanwhile: the client goes on from the last event.
+        """
+        yield from iterate(self._http, verbs.events(self._attempts(timeout, f"job {job}"), job))
+
     def result(
         self, job: str, *, folder: Path | str | None = None, load: bool = True, timeout: float | None = None
     ) -> Result:
@@ -201,7 +209,7 @@ class Client:
         return RemoteJob(self, run(self._http, verbs.cancel(self._attempts(timeout), job)))
 
     def retry(self, job: str, *, timeout: float | None = None) -> RemoteJob:
-        """Queue a failed or cancelled job again, with the inputs it had."""
+        """Queue a new job with the inputs and options of one that failed or was cancelled, and return it."""
         return RemoteJob(self, run(self._http, verbs.retry(self._attempts(timeout), job)))
 
     def delete(self, job: str, *, timeout: float | None = None) -> None:
@@ -234,9 +242,13 @@ class Client:
         """Return the JSON Schema of the options: names, meanings, bounds, defaults."""
         return run(self._http, verbs.document(self._attempts(timeout), "/v1/options"))
 
-    def limits(self, *, timeout: float | None = None) -> dict[str, Any]:
+    def limits(self, *, timeout: float | None = None) -> ServiceLimits:
         """Return what the service accepts at most."""
-        return run(self._http, verbs.document(self._attempts(timeout), "/v1/limits"))
+        return run(self._http, verbs.limits(self._attempts(timeout)))
+
+    def ready(self, *, timeout: float | None = None) -> dict[str, Any]:
+        """Return how the parts of the service are: queue, storage, workers."""
+        return run(self._http, verbs.document(self._attempts(timeout), "/readyz"))
 
     def _attempts(self, timeout: float | None, doing: str = "this call") -> Attempts:
         return Attempts(policy=self._policy, contact=self._contact, timeout=timeout, doing=doing)
@@ -284,15 +296,20 @@ class RemoteJob:
         """Wait until the job is over, and return its result: see `Client.wait`."""
         return self._client.wait(self.id, on_progress=on_progress, folder=folder, load=load, timeout=timeout)
 
+    def events(self, *, timeout: float | None = None) -> Iterator[Job]:
+        """Iterate over the record each time something about it is new; the last one is final."""
+        for job in self._client.events(self.id, timeout=timeout):
+            self.record = job
+            yield job
+
     def cancel(self, *, timeout: float | None = None) -> Self:
         """Ask for the job to be stopped."""
         self.record = self._client.cancel(self.id, timeout=timeout).record
         return self
 
-    def retry(self, *, timeout: float | None = None) -> Self:
-        """Queue it again after it failed or was cancelled."""
-        self.record = self._client.retry(self.id, timeout=timeout).record
-        return self
+    def retry(self, *, timeout: float | None = None) -> RemoteJob:
+        """Queue a new job with the same inputs and options after this one failed or was cancelled; return the new one."""
+        return self._client.retry(self.id, timeout=timeout)
 
     def delete(self, *, timeout: float | None = None) -> None:
         """Remove the job and its files."""

@@ -13,12 +13,14 @@ from urllib.parse import quote
 from numpy.typing import ArrayLike
 from pliant.client.download import download
 from pliant.client.errors import BadArgument, JobCancelled, JobFailed, NotAllowedNow, NotFound
+from pliant.client.events import events as follow
+from pliant.client.events import told
 from pliant.client.exchange import answered, parse, record
 from pliant.client.flow import Call, Do, Emit, Flow, Pause
 from pliant.client.options import Options
 from pliant.client.parts import Form, OnBytes, Source, array_part, checked_options, mesh_part, tracks_file
 from pliant.client.policy import Attempts
-from pliant.client.schemas import Job, JobPage, Problem, Status
+from pliant.client.schemas import Job, JobPage, Problem, ServiceLimits, Status
 
 OnJob = Callable[[Job], None]
 """Told the job each time something about it is new."""
@@ -42,7 +44,7 @@ def submit(
     on_upload: OnBytes | None,
 ) -> Flow[Job]:
     """Send inputs; the answer is the new job. Temporary files go into `folder`, which the caller removes."""
-    fields = {"options": checked_options(options)}
+    fields = {"options": checked_options(options).model_dump_json(exclude_unset=True)}
     if name != "":
         fields["name"] = name
 
@@ -81,9 +83,7 @@ def jobs(attempts: Attempts, *, statuses: Iterable[Status | str], page_size: int
     wanted = [Status(status).value for status in statuses]
     cursor: str | None = None
     while True:
-        params = {"limit": str(page_size)}
-        if len(wanted) > 0:
-            params["status"] = ",".join(wanted)
+        params: dict[str, str | list[str]] = {"limit": str(page_size), "status": wanted}
         if cursor is not None:
             params["cursor"] = cursor
         page = yield from record(attempts, Call(method="GET", path="/v1/jobs", params=params), JobPage)
@@ -94,26 +94,28 @@ def jobs(attempts: Attempts, *, statuses: Iterable[Status | str], page_size: int
             return
 
 
+def events(attempts: Attempts, job: str) -> Flow[Job]:
+    """Emit the job each time something about it is new, until it is over."""
+    return (yield from follow(attempts, _path(job)))
+
+
 def wait(attempts: Attempts, job: str, *, on_progress: OnJob | None) -> Flow[Job]:
     """Return the job once its status is final.
 
-    The service is asked to hold its answer back (`Prefer: wait`); while somebody watches, and where the service does not
-    do so, the job is looked at again and again instead.
+    While somebody watches, events tell what is new. Otherwise the service is asked to hold its answer back (`Prefer: wait`),
+    and where it does not do so, the job is looked at again and again.
     """
-    last: Job | None = None
+    if on_progress is not None:
+        return (yield from told(follow(attempts, _path(job)), on_progress))
     pause = attempts.policy.poll_interval / 4
     while True:
-        headers = {}
-        if on_progress is None:
-            headers["Prefer"] = f"wait={max(1, int(min(attempts.policy.long_poll, attempts.remaining())))}"
-        head, body = yield from answered(attempts, Call(method="GET", path=_path(job), headers=headers))
+        seconds = max(1, int(min(attempts.policy.long_poll, attempts.remaining())))
+        call = Call(method="GET", path=_path(job), headers={"Prefer": f"wait={seconds}"})
+        head, body = yield from answered(attempts, call)
         now = parse(Job, body, head)
-        if on_progress is not None and now != last:
-            on_progress(now)
         if now.status.final:
             return now
-        last = now
-        if on_progress is not None or "wait" not in head.headers.get("preference-applied", ""):
+        if "wait" not in head.headers.get("preference-applied", ""):
             attempts.remaining()
             yield Pause(pause)
             pause = min(attempts.policy.poll_interval, 1.5 * pause)
@@ -126,7 +128,7 @@ def cancel(attempts: Attempts, job: str) -> Flow[Job]:
 
 
 def retry(attempts: Attempts, job: str) -> Flow[Job]:
-    """Queue a failed or cancelled job again."""
+    """Queue a new job with the inputs and options of one that failed or was cancelled."""
     return (yield from record(attempts, Call(method="POST", path=f"{_path(job)}/retry"), Job))
 
 
@@ -137,6 +139,11 @@ def delete(attempts: Attempts, job: str) -> Flow[None]:
     except NotFound:
         if attempts.failures == 0:  # else an earlier try did it, and only its answer was lost
             raise
+
+
+def limits(attempts: Attempts) -> Flow[ServiceLimits]:
+    """Read what the service accepts at most."""
+    return (yield from record(attempts, Call(method="GET", path="/v1/limits"), ServiceLimits))
 
 
 def document(attempts: Attempts, path: str) -> Flow[dict[str, Any]]:

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Annotated
 
 import typer
 from pliant.client.cli import jobs
+from pliant.client.cli.demo import demo
+from pliant.client.cli.doctor import doctor
 from pliant.client.cli.exits import Guarded
 from pliant.client.cli.session import Session
+from pliant.client.cli.solve import inspect, solve
+from pliant.client.cli.up import up, work
 
 app = typer.Typer(
     name="pliant",
@@ -38,14 +43,19 @@ def _begin(
         ctx.obj = Session()
 
 
-_SERVICE = "Talk to a service"
-for command, name in (
-    (jobs.submit, "submit"), (jobs.status, "status"), (jobs.watch, "watch"), (jobs.result, "result"), (jobs.list_jobs, "list"),
-    (jobs.cancel, "cancel"), (jobs.retry, "retry"), (jobs.delete, "delete"), (jobs.options, "options"),
-):  # fmt: skip
-    app.command(name, rich_help_panel=_SERVICE)(command)
+_COMMANDS: dict[str, dict[str, Callable[..., None]]] = {
+    "Here": {"solve": solve, "inspect": inspect, "demo": demo, "doctor": doctor},
+    "Run a service": {"up": up, "work": work},
+    "Talk to a service": {
+        "submit": jobs.submit, "status": jobs.status, "watch": jobs.watch, "result": jobs.result, "list": jobs.list_jobs,
+        "cancel": jobs.cancel, "retry": jobs.retry, "delete": jobs.delete, "options": jobs.options,
+    },
+}  # fmt: skip
+for panel, commands in _COMMANDS.items():
+    for name, command in commands.items():
+        app.command(name, rich_help_panel=panel)(command)
 
 
 def main() -> None:
     """Run the command line."""
-    app()
+    app(prog_name="pliant")

@@ -141,7 +141,7 @@ def cancel(ctx: typer.Context, job: JobId, url: Url = HOME, as_json: Json = Fals
 
 
 def retry(ctx: typer.Context, job: JobId, url: Url = HOME, as_json: Json = False) -> None:
-    """Queue a failed or cancelled job again."""
+    """Queue a new job with what a failed or cancelled one had; prints the new job."""
     with ctx.obj.client(url, as_json=as_json) as client:
         show_job(client.retry(job).record, as_json=as_json)
 

@@ -28,10 +28,16 @@ class Entry:
     content: bytes
     looks: int = 0
     files: dict[str, bytes] = field(default_factory=dict)
+    history: list[str] = field(default_factory=list)
+    """The record as JSON after each change: the job's events."""
+
+    def __post_init__(self) -> None:
+        self.history.append(self.job.model_dump_json())
 
     def change(self, **fields: object) -> None:
         """Replace fields of the record."""
         self.job = self.job.model_copy(update=fields)
+        self.history.append(self.job.model_dump_json())
 
     def sha256(self, name: str) -> str:
         """Hash of a file."""
@@ -136,13 +142,22 @@ class Ledger:
         return entry
 
     def retry(self, job_id: str) -> Entry:
-        """Queue a failed or cancelled job again."""
+        """Queue a new job with what a failed or cancelled one had."""
         entry = self.find(job_id)
         if entry.job.status not in (Status.FAILED, Status.CANCELLED):
             raise Refusal(409, "not_allowed_now", f"Job {job_id} is {entry.job.status}. Wait for it to end.")
-        entry.looks = 0
-        entry.change(status=Status.QUEUED, error=None, finished_at=None, place_in_queue=0)
-        return entry
+        fresh = Job(
+            id=secrets.token_hex(8),
+            name=entry.job.name,
+            status=Status.QUEUED,
+            created_at=datetime.now(UTC),
+            retry_of=job_id,
+            place_in_queue=0,
+            options=entry.job.options,
+            interpretation=entry.job.interpretation,
+        )
+        again = self._entries[fresh.id] = Entry(job=fresh, points=entry.points, content=entry.content)
+        return again
 
     def delete(self, job_id: str) -> None:
         """Remove a job that is over."""

@@ -13,15 +13,25 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.client.errors import PROBLEM_TYPE
 from pliant.client.options import Options
-from pliant.client.schemas import JobPage, Problem, Status
+from pliant.client.schemas import JobPage, Problem, ServiceLimits, Status
 from pliant.client.testing.ledger import Entry, Ledger
 from pliant.client.testing.reading import Refusal, multipart, options_of, tracks_of
 
 Reconstruct = Callable[[NDArray[np.float64], Options], NDArray[np.float64]]
 """From points (F, P, 2) and options to shapes (F, P, 3)."""
 
-LIMITS = {"max_frames": 1000, "max_points": 100_000, "max_bytes": 1 << 30}
 WHOLE_PAGE = 200
+LIMITS = ServiceLimits(
+    max_body_bytes=1 << 30,
+    max_text_bytes=1 << 20,
+    max_bytes=1 << 30,
+    max_frames=1000,
+    max_points=100_000,
+    max_observations=10_000_000,
+    max_faces=200_000,
+    max_wait_seconds=60,
+    max_page=WHOLE_PAGE,
+)
 
 
 def flat(points: NDArray[np.float64], options: Options) -> NDArray[np.float64]:  # noqa: ARG001 - the signature of `Reconstruct`
@@ -111,8 +121,18 @@ class FakeService(httpx.MockTransport):
             self._ledger.look(entry)
         return self._job(entry, headers={"Preference-Applied": f"wait={asked.group(1)}"})
 
+    def _events(self, request: httpx.Request, job_id: str) -> httpx.Response:
+        """Tell what is new since the last event, up to the job's end; of an endless job, one step at a time."""
+        entry = self._ledger.find(job_id)
+        self._ledger.look(entry)
+        while not entry.job.status.final and math.isfinite(self._ledger.looks):
+            self._ledger.look(entry)
+        first = int(request.headers.get("last-event-id", "-1")) + 1
+        told = [f"id: {n}\nevent: job\ndata: {data}\n\n" for n, data in enumerate(entry.history) if n >= first]
+        return httpx.Response(200, content="".join(told), headers={"Content-Type": "text/event-stream"})
+
     def _list(self, request: httpx.Request) -> httpx.Response:
-        wanted = [Status(name) for name in request.url.params.get("status", "").split(",") if name != ""]
+        wanted = [Status(name) for name in request.url.params.get_list("status")]
         entries = [entry for entry in self._ledger.newest_first() if len(wanted) == 0 or entry.job.status in wanted]
         first = int(request.url.params.get("cursor", "0"))
         count = min(int(request.url.params.get("limit", "50")), WHOLE_PAGE)
@@ -123,10 +143,11 @@ class FakeService(httpx.MockTransport):
         return _json(200, page.model_dump_json())
 
     def _cancel(self, _request: httpx.Request, job_id: str) -> httpx.Response:
-        return self._job(self._ledger.cancel(job_id), status=202)
+        return self._job(self._ledger.cancel(job_id))
 
     def _retry(self, _request: httpx.Request, job_id: str) -> httpx.Response:
-        return self._job(self._ledger.retry(job_id), status=202)
+        entry = self._ledger.retry(job_id)
+        return self._job(entry, status=202, headers={"Location": f"/v1/jobs/{entry.job.id}"})
 
     def _delete(self, _request: httpx.Request, job_id: str) -> httpx.Response:
         self._ledger.delete(job_id)
@@ -146,10 +167,13 @@ class FakeService(httpx.MockTransport):
         return _json(200, json.dumps(Options.model_json_schema()))
 
     def _limits(self, _request: httpx.Request) -> httpx.Response:
-        return _json(200, json.dumps(LIMITS))
+        return _json(200, LIMITS.model_dump_json())
 
     def _healthy(self, _request: httpx.Request) -> httpx.Response:
         return _json(200, '{"status": "ok"}')
+
+    def _ready(self, _request: httpx.Request) -> httpx.Response:
+        return _json(200, '{"redis": "ok", "blobs": "ok", "workers": "ok"}')
 
     def _job(self, entry: Entry, *, status: int = 200, headers: Mapping[str, str] | None = None) -> httpx.Response:
         return _json(status, entry.job.model_dump_json(), headers)
@@ -162,6 +186,7 @@ _ROUTES: tuple[tuple[str, str, Callable[..., httpx.Response]], ...] = (
     ("PUT", _JOB, FakeService._submit),
     ("GET", _JOB, FakeService._get),
     ("DELETE", _JOB, FakeService._delete),
+    ("GET", _JOB + "/events", FakeService._events),
     ("POST", _JOB + "/cancel", FakeService._cancel),
     ("POST", _JOB + "/retry", FakeService._retry),
     ("GET", _JOB + "/artifacts", FakeService._artifacts),
@@ -169,7 +194,7 @@ _ROUTES: tuple[tuple[str, str, Callable[..., httpx.Response]], ...] = (
     ("GET", r"/v1/options", FakeService._options),
     ("GET", r"/v1/limits", FakeService._limits),
     ("GET", r"/healthz", FakeService._healthy),
-    ("GET", r"/readyz", FakeService._healthy),
+    ("GET", r"/readyz", FakeService._ready),
 )
 
 

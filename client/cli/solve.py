@@ -1,0 +1,107 @@
+"""`pliant solve` and `pliant inspect`: files in, files out, in this very process."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from pliant.client.cli.session import GroundTruth, Json, Mesh, OptionPairs, Rotations, Tracks, parse_options
+from pliant.client.cli.show import err, metrics_table, out, print_json, understood
+
+if TYPE_CHECKING:
+    from pliant.worker.formats import Inputs
+
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
+"""Read by the numerical libraries when they are loaded, which is after this."""
+
+Threads = Annotated[
+    int | None,
+    typer.Option("--threads", help="Threads of the numerical libraries; all cores if not given.", min=1),
+]
+
+
+def solve(
+    ctx: typer.Context,
+    tracks: Tracks,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the files.", show_default=False)],
+    mesh: Mesh = None,
+    ground_truth: GroundTruth = None,
+    rotations: Rotations = None,
+    option: OptionPairs = None,
+    threads: Threads = None,
+    as_json: Json = False,
+) -> None:
+    """Reconstruct without a service: the same code, the same files."""
+    ctx.obj.json = as_json
+    if threads is not None:
+        os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(threads)))
+    from pliant.client.parts import checked_options
+    from pliant.client.progress import progress_bar
+    from pliant.worker.formats import read_inputs
+    from pliant.worker.run import reconstruct
+
+    options = checked_options(parse_options(option))
+    inputs = read_inputs(
+        tracks=tracks, mesh=file_or_word(mesh), ground_truth=ground_truth, rotations=rotations, options=options
+    )
+    if not as_json:
+        show_understood(inputs)
+    with progress_bar() as bar:
+        done = reconstruct(inputs, options, output, on_progress=bar.on_step, should_stop=None)
+    if as_json:
+        print_json(
+            {
+                "outcome": done.outcome, "sentence": done.sentence, "metrics": done.metrics, "warnings": list(done.warnings),
+                "files": {artifact.name: str(output / artifact.name) for artifact in done.artifacts},
+            }
+        )  # fmt: skip
+        return
+    screen = out()
+    for warning in done.warnings:
+        err().print(f"[yellow]warning[/yellow] {warning}")
+    screen.print(done.sentence, markup=False)
+    screen.print(metrics_table(done.metrics))
+    for artifact in done.artifacts:
+        screen.print(f"{output / artifact.name}  {artifact.bytes / 1e6:.2f} MB", markup=False)
+
+
+def inspect(
+    ctx: typer.Context,
+    file: Annotated[Path, typer.Argument(help="Track file.", show_default=False)],
+    mesh: Mesh = None,
+    ground_truth: GroundTruth = None,
+    rotations: Rotations = None,
+    option: OptionPairs = None,
+    as_json: Json = False,
+) -> None:
+    """Say how a track file is understood, without solving anything."""
+    ctx.obj.json = as_json
+    from pliant.client.parts import checked_options
+    from pliant.worker.formats import read_inputs
+
+    options = checked_options(parse_options(option))
+    inputs = read_inputs(
+        tracks=file, mesh=file_or_word(mesh), ground_truth=ground_truth, rotations=rotations, options=options
+    )
+    if as_json:
+        print_json(inputs.interpretation.model_dump(mode="json"))
+    else:
+        show_understood(inputs)
+
+
+def file_or_word(mesh: str | None) -> Path | str | None:
+    """Tell the name of a mesh file from a grid size or `none`."""
+    return Path(mesh) if mesh is not None and Path(mesh).is_file() else mesh
+
+
+def show_understood(inputs: Inputs) -> None:
+    """Show how inputs were read."""
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table.grid(padding=(0, 2))
+    for name, words in understood(inputs.interpretation):
+        table.add_row(Text(name, "dim"), Text(words))
+    out().print(table)

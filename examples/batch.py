@@ -1,0 +1,29 @@
+"""Reconstruct every track file of a folder, as many at once as the service has workers; run it again to go on.
+
+python examples/batch.py FOLDER OUT
+"""
+
+import os
+import sys
+from pathlib import Path
+
+from pliant.client import Client, InvalidRequest, JobEnded
+
+folder, out = Path(sys.argv[1]), Path(sys.argv[2])
+
+with Client(os.environ.get("PLIANT_URL", "http://127.0.0.1:8000")) as client:
+    jobs = {}
+    for path in sorted(folder.glob("*.npz")):
+        try:
+            # The same key for the same file: running this script again finds the jobs of the first time, and makes no new ones.
+            jobs[path.stem] = client.submit(
+                path, name=path.stem, idempotency_key=f"batch/{path.resolve()}/{path.stat().st_mtime_ns}"
+            )
+        except InvalidRequest as refusal:
+            print(f"{path.name}: {refusal}")
+    for name, job in jobs.items():
+        try:
+            files = job.wait(load=False, timeout=3600).download(out / name)
+            print(f"{name}: {len(files)} files in {out / name}")
+        except JobEnded as end:
+            print(f"{name}: {end}")
