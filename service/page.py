@@ -82,21 +82,31 @@ def mount_page(app: FastAPI, directory: Path = BUILT) -> None:
     directory : Path
         Where the build put index.html.
     """
-    files = page_files(directory)
+    built: dict[str, PageFile] = {}
+    read_at = -1
+
+    def files() -> dict[str, PageFile]:
+        # The page can be built while the service runs; a look at one date tells.
+        nonlocal built, read_at
+        index = directory / "index.html"
+        dated = index.stat().st_mtime_ns if index.is_file() else 0
+        if dated != read_at:
+            built, read_at = page_files(directory), dated
+        return built
 
     def document(name: str) -> Callable[[Request], Awaitable[Response]]:
         async def answer(request: Request) -> Response:
-            if name not in files:
+            if name not in files():
                 return HTMLResponse(NOT_BUILT, status_code=503, headers=HEADERS | {"Cache-Control": "no-store"})
-            return _answer(files[name], request)
+            return _answer(files()[name], request)
 
         return answer
 
     async def asset(request: Request) -> Response:
         name = str(request.path_params["name"])
-        if name not in files:
+        if name not in files():
             return Response(f"The page has no file {name!r}; reload it.\n", status_code=404, media_type="text/plain")
-        return _answer(files[name], request)
+        return _answer(files()[name], request)
 
     for path, endpoint in (("/", document("index.html")), ("/docs", document("docs.html")), ("/page/{name}", asset)):
         app.add_route(path, endpoint, methods=["GET", "HEAD"], include_in_schema=False)

@@ -83,5 +83,14 @@ def test_without_a_built_page_a_sentence_says_how_to_build_it(tmp_path: Path, ad
     assert answer.headers["cache-control"] == "no-store"
 
 
+def test_a_page_built_meanwhile_is_served_without_a_restart(tmp_path: Path) -> None:
+    app = FastAPI(docs_url=None)
+    mount_page(app, tmp_path)
+    client = TestClient(app)
+    assert client.get("/").status_code == 503
+    (tmp_path / "index.html").write_text("<!doctype html><title>Pliant</title>")
+    assert client.get("/").text == "<!doctype html><title>Pliant</title>"
+
+
 def test_the_page_stays_out_of_the_api_description(built: TestClient) -> None:
     assert built.get("/openapi.json").json()["paths"] == {}

@@ -1,0 +1,373 @@
+"""The page in a real browser against the whole service: API, queue, worker, embedded Valkey."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from browsing import Browsing, differing_pixels, why_not
+from playwright.sync_api import Browser, Page, Route, expect
+from pliant.solver import Camera, Solution
+from pliant.solver.gallery import corrupt, face
+from pliant.worker import preview
+
+pytestmark = [
+    pytest.mark.chromium,
+    pytest.mark.skipif(why_not() is not None and not os.environ.get("CI"), reason=str(why_not())),
+]
+
+TRACKS = "tracks.npz"
+DONE = 90_000
+
+
+@pytest.fixture(scope="module")
+def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Start everything as a user does, on a free port."""
+    data = tmp_path_factory.mktemp("data")
+    command = [
+        sys.executable,
+        "-m",
+        "pliant.client.cli",
+        "up",
+        "--port",
+        "0",
+        "--workers",
+        "1",
+        "--json",
+        "--data",
+        str(data),
+    ]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as up:
+        assert up.stdout is not None
+        try:
+            yield json.loads(up.stdout.readline())["url"]
+        finally:
+            up.send_signal(signal.SIGINT)
+            up.wait(30)
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with Browsing() as browsing:
+        yield browsing
+
+
+@pytest.fixture
+def page(browser: Browser, url: str) -> Iterator[Page]:
+    """A page of its own on the front page; a script error or a blocked request fails the test."""
+    context = browser.new_context(viewport={"width": 1280, "height": 900}, reduced_motion="reduce")
+    context.add_init_script(
+        "addEventListener('securitypolicyviolation', (event) => console.error('CSP blocked ' + event.blockedURI));"
+    )
+    page = context.new_page()
+    troubles: list[str] = []
+    page.on("pageerror", lambda error: troubles.append(str(error)))
+    page.on("console", lambda message: troubles.append(message.text) if "CSP" in message.text else None)
+    page.goto(url)
+    yield page
+    context.close()
+    assert troubles == []
+
+
+def packed(**arrays: Any) -> bytes:
+    file = io.BytesIO()
+    np.savez(file, allow_pickle=False, **arrays)
+    return file.getvalue()
+
+
+@pytest.fixture(scope="module")
+def small() -> dict[str, bytes]:
+    """A face of a few hundred points: a result within seconds."""
+    sequence = corrupt(face(10, 300, degrees=40), outliers=0.02)
+    return {
+        TRACKS: packed(tracks=sequence.tracks.points, visibility=sequence.tracks.visible > 0),
+        "mesh.npz": packed(faces=sequence.mesh.faces),
+        "truth.npz": packed(shapes=sequence.shapes),
+    }
+
+
+@pytest.fixture(scope="module")
+def long_job(url: str) -> Callable[[str], str]:
+    """Queue a job that would run for minutes."""
+
+    def submit(name: str) -> str:
+        sequence = corrupt(face(60, 4000), outliers=0.05)
+        answer = httpx.post(
+            f"{url}/v1/jobs",
+            files={"tracks": packed(tracks=sequence.tracks.points), "mesh": packed(faces=sequence.mesh.faces)},
+            data={"name": name, "options": json.dumps({"max_reweightings": 1000, "tolerance": 1e-12})},
+            timeout=60,
+        )
+        assert answer.status_code == 202, answer.text
+        return str(answer.json()["id"])
+
+    return submit
+
+
+@pytest.fixture(scope="module")
+def finished(url: str, small: dict[str, bytes]) -> str:
+    """The id of a finished job with ground truth."""
+    answer = httpx.post(
+        f"{url}/v1/jobs",
+        files={"tracks": small[TRACKS], "mesh": small["mesh.npz"], "ground_truth": small["truth.npz"]},
+        data={"name": "a finished face"},
+        timeout=60,
+    )
+    assert answer.status_code == 202, answer.text
+    id = str(answer.json()["id"])
+    while (job := httpx.get(f"{url}/v1/jobs/{id}", headers={"Prefer": "wait=20"}, timeout=60).json())["status"] in (
+        "queued",
+        "running",
+    ):
+        pass
+    assert job["status"] == "succeeded", job["error"]
+    return id
+
+
+def choose(page: Page, files: dict[str, bytes]) -> None:
+    for label, name in (("Tracks", TRACKS), ("Mesh", "mesh.npz"), ("Ground truth", "truth.npz")):
+        if name in files:
+            given = {"name": name, "mimeType": "application/octet-stream", "buffer": files[name]}
+            page.get_by_label(label, exact=True).set_input_files(given)  # type: ignore[arg-type]
+
+
+def seek(page: Page, frame: float) -> None:
+    page.get_by_label("Frame").evaluate("(it, at) => { it.value = at; it.dispatchEvent(new Event('input')); }", frame)
+    page.wait_for_timeout(300)
+
+
+def test_from_an_upload_to_a_playing_mesh(page: Page, url: str, small: dict[str, bytes]) -> None:
+    choose(page, small)
+    expect(page.locator("[data-part=tracks]")).to_contain_text("tracks 10 × 300 × 2 float64")
+    page.get_by_label("name (optional)").fill("my face")
+    page.get_by_role("button", name="Reconstruct").click()
+    expect(page.get_by_role("heading", name="my face")).to_be_focused()
+    expect(page.get_by_role("article").get_by_text("10 frames of 300 points")).to_be_visible()
+    canvas = page.locator("canvas")
+    canvas.wait_for(timeout=DONE)
+    expect(page.get_by_role("article").get_by_text("Done", exact=True)).to_be_visible()
+
+    seek(page, 0)
+    first, again = canvas.screenshot(), canvas.screenshot()
+    seek(page, 5)
+    later = canvas.screenshot()
+    assert differing_pixels(page, first, again) == 0
+    assert differing_pixels(page, first, later) > 0.01
+
+    page.get_by_role("button", name="Play").click()
+    shown = page.get_by_label("Frame").input_value()
+    page.wait_for_function("shown => document.querySelector('[aria-label=Frame]').value !== shown", arg=shown)
+    page.get_by_role("button", name="Pause").click()
+
+    id = re.search(r"job=(\w+)", page.url)
+    assert id is not None
+    job = httpx.get(f"{url}/v1/jobs/{id[1]}").json()
+    rows = page.locator("tbody tr")
+    assert rows.count() == len(job["metrics"])
+    for name, value in job["metrics"].items():
+        text = rows.filter(has=page.get_by_text(name, exact=True)).locator("td").inner_text()
+        assert float(text) == pytest.approx(value, rel=0.01, abs=1e-9)
+    names = {artifact["name"] for artifact in job["artifacts"]}
+    assert {"shapes.npz", "shapes.glb", "report.json", "preview.bin"} <= names
+    assert set(page.get_by_role("region", name="Files").get_by_role("link").all_inner_texts()) == names
+    with page.expect_download() as download:
+        page.get_by_role("link", name="report.json").click()
+    assert json.loads(Path(download.value.path()).read_text())["metrics"] == job["metrics"]
+
+
+def test_every_view_of_a_result_shows_something_else(page: Page, url: str, finished: str) -> None:
+    page.goto(f"{url}/#job={finished}")
+    canvas = page.locator("canvas")
+    canvas.wait_for(timeout=DONE)
+    page.get_by_role("checkbox", name="Wireframe").wait_for()
+    seek(page, 3)
+    plain = canvas.screenshot()
+    for colour in ("displacement", "residual", "3-D error"):
+        page.get_by_label("Colour").select_option(label=colour)
+        expect(page.locator(".legend")).to_be_visible()
+        page.wait_for_timeout(200)
+        assert differing_pixels(page, plain, canvas.screenshot()) > 0.02, colour
+    page.get_by_label("Colour").select_option("plain")
+    expect(page.locator(".legend")).to_be_hidden()
+    for name in ("Wireframe", "Input tracks", "Ground truth beside it", "Flip depth"):
+        page.get_by_label(name).click()
+        page.wait_for_timeout(300)
+        assert differing_pixels(page, plain, canvas.screenshot()) > 0.005, name
+        page.get_by_label(name).click()
+        page.wait_for_timeout(300)
+        assert differing_pixels(page, plain, canvas.screenshot()) == 0, name
+    page.get_by_label("Through the camera").check()
+    page.wait_for_timeout(300)
+    assert differing_pixels(page, plain, canvas.screenshot()) > 0.01
+    page.get_by_role("button", name="Reset view").click()
+    page.wait_for_timeout(300)
+    assert differing_pixels(page, plain, canvas.screenshot()) == 0
+
+
+def test_a_refusal_is_shown_as_the_services_own_sentence(page: Page, url: str) -> None:
+    said = httpx.post(f"{url}/v1/jobs", files={"tracks": ("tracks.npz", b"hello, I am not tracks")}).json()
+    choose(page, {TRACKS: b"hello, I am not tracks"})
+    page.get_by_role("button", name="Reconstruct").click()
+    alert = page.get_by_role("alert")
+    expect(alert).to_contain_text(said["detail"])
+    expect(alert).to_contain_text(said["code"])
+    assert "#job" not in page.url
+    choose(page, {TRACKS: packed(tracks=np.zeros((2, 50, 2)))})
+    page.get_by_role("button", name="Reconstruct").click()
+    expect(alert).to_contain_text("too_few_frames")
+
+
+def test_sending_nothing_says_what_is_missing(page: Page) -> None:
+    page.get_by_role("button", name="Reconstruct").click()
+    expect(page.get_by_text("Choose a track file first")).to_be_visible()
+    expect(page.get_by_label("Tracks", exact=True)).to_be_focused()
+
+
+def test_a_running_job_survives_a_reload_and_can_be_cancelled(
+    page: Page, url: str, long_job: Callable[[str], str]
+) -> None:
+    id = long_job("a long job")
+    waiting = long_job("a job behind it")
+    page.goto(f"{url}/#job={id}")
+    objective = page.get_by_role("img", name=re.compile("^Objective from"))
+    objective.wait_for(timeout=DONE)
+    page.wait_for_function(
+        "document.querySelector('.curve svg').getAttribute('aria-label').match(/in (\\d+) steps/)[1] >= 4"
+    )
+    page.reload()
+    # The events of before the reload are told again: the curve is whole.
+    objective.wait_for(timeout=10_000)
+    steps = re.search(r"in (\d+) steps", objective.get_attribute("aria-label") or "")
+    assert steps is not None
+    assert int(steps[1]) >= 4
+    expect(page.get_by_text(re.compile(r"reweighting \d+ of at most 1000"))).to_be_visible()
+
+    page.get_by_role("link", name="a job behind it").click()
+    expect(page.get_by_text("Next in the queue.")).to_be_visible()
+    page.get_by_role("button", name="Cancel").click()
+    expect(page.get_by_role("article").get_by_text("Cancelled", exact=True)).to_be_visible()
+    page.get_by_role("link", name="a long job").click()
+    page.get_by_role("button", name="Cancel").click()
+    expect(page.get_by_role("article").get_by_text("Cancelled", exact=True)).to_be_visible(timeout=30_000)
+    assert httpx.get(f"{url}/v1/jobs/{id}").json()["status"] == "cancelled"
+
+    page.get_by_role("button", name="Delete").click()
+    page.get_by_role("button", name="Delete it for good?").click()
+    expect(page.get_by_role("link", name="a long job")).to_have_count(0)
+    assert httpx.get(f"{url}/v1/jobs/{id}").status_code == 404
+    assert httpx.get(f"{url}/v1/jobs/{waiting}").json()["status"] == "cancelled"
+
+
+def test_the_example_by_keyboard_alone(page: Page) -> None:
+    def tab_to(name: str, most: int = 60) -> None:
+        for _ in range(most):
+            page.keyboard.press("Tab")
+            if page.evaluate("document.activeElement?.textContent || document.activeElement?.ariaLabel") == name:
+                return
+        pytest.fail(f"the Tab key does not reach {name!r}")
+
+    tab_to("breathing sphere")
+    page.keyboard.press("Enter")
+    expect(page.get_by_role("button", name="Reconstruct")).to_be_focused()
+    page.keyboard.press("Enter")
+    expect(page.get_by_role("heading", name="breathing sphere")).to_be_focused()
+    canvas = page.locator("canvas")
+    canvas.wait_for(timeout=DONE)
+    tab_to("Play")
+    page.keyboard.press("Space")
+    page.wait_for_function("Number(document.querySelector('[aria-label=Frame]').value) > 1")
+    page.keyboard.press("Space")
+    page.keyboard.press("Shift+Tab")
+    before = canvas.screenshot()
+    for _ in range(4):
+        page.keyboard.press("ArrowRight")
+    page.wait_for_timeout(300)
+    assert differing_pixels(page, before, canvas.screenshot()) > 0.01
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [1280, 390])
+def test_no_accessibility_finding_and_nothing_wider_than_the_screen(
+    page: Page, url: str, finished: str, scheme: str, width: int
+) -> None:
+    axe = Path(__file__).parents[2] / "service" / "web" / "node_modules" / "axe-core" / "axe.min.js"
+    if not axe.is_file() and not os.environ.get("CI"):
+        pytest.skip("axe-core is not installed; say `make page`")
+    page.emulate_media(color_scheme=scheme, reduced_motion="reduce")  # type: ignore[arg-type]
+    page.set_viewport_size({"width": width, "height": 844})
+    for address, landmark in (("", "Point tracks in"), (f"#job={finished}", "a finished face"), ("docs", "Pliant API")):
+        page.goto(f"{url}/{address}")
+        page.get_by_role("heading", name=landmark).wait_for()
+        if "#" in address:
+            page.locator("canvas").wait_for(timeout=DONE)
+        if address == "":
+            page.get_by_text("More options").click()
+        page.evaluate(axe.read_text())
+        found = page.evaluate("axe.run().then((found) => found.violations)")
+        said = [f"{one['id']} ({one['impact']}): {[node['html'] for node in one['nodes']][:3]}" for one in found]
+        assert said == [], address
+        assert page.evaluate("document.documentElement.scrollWidth") <= width, address
+
+
+def test_no_request_leaves_the_host(page: Page, url: str, finished: str) -> None:
+    asked: list[str] = []
+    page.context.on("request", lambda request: asked.append(request.url))
+    for address in (f"#job={finished}", "docs"):
+        answer = page.goto(f"{url}/{address}")
+        page.reload()
+        page.wait_for_timeout(1500)
+        assert answer is None or answer.headers["content-security-policy"].startswith("default-src 'self';")
+    assert len(asked) > 10
+    assert [address for address in asked if not address.startswith(f"{url}/")] == []
+
+
+def test_a_service_that_is_away_is_said_and_its_return_noticed(page: Page, url: str, finished: str) -> None:
+    page.route("**/v1/**", lambda route: route.abort())
+    page.goto(f"{url}/#job={finished}")
+    page.reload()
+    expect(page.get_by_role("alert").first).to_contain_text("The service does not answer.")
+    page.unroute_all()
+    page.locator("canvas").wait_for(timeout=30_000)
+    expect(page.get_by_role("alert")).to_have_count(0, timeout=15_000)
+
+
+def test_a_dense_result_plays_within_time_and_memory(page: Page, url: str, finished: str, tmp_path: Path) -> None:
+    """99 frames of 29,000 points, put in the place of a small job's preview."""
+    sequence = face(99, 29_000)
+    shapes = sequence.shapes - sequence.shapes.mean(axis=1, keepdims=True)
+    camera = Camera(sequence.rotations, sequence.scales, np.zeros((99, 2)))
+    rest: dict[str, Any] = dict.fromkeys(("residuals", "weights", "trace", "outcome", "choices", "seconds"))
+    with (tmp_path / "preview.bin").open("w+b") as file:
+        preview.write_preview(
+            file, tracks=sequence.tracks, mesh=sequence.mesh, solution=Solution(shapes=shapes, camera=camera, **rest)
+        )
+        file.seek(0)
+        whole = file.read()
+
+    def dense(route: Route) -> None:
+        start, end = (int(part) for part in route.request.headers["range"].removeprefix("bytes=").split("-"))
+        headers = {"Content-Range": f"bytes {start}-{min(end, len(whole) - 1)}/{len(whole)}"}
+        route.fulfill(status=206, headers=headers, body=whole[start : end + 1])
+
+    page.route("**/artifacts/preview.bin", dense)
+    page.goto(f"{url}/#job={finished}")
+    page.reload()
+    page.locator("canvas").wait_for(timeout=20_000)
+    expect(page.locator(".clock")).to_have_text("1 / 99")
+    page.get_by_role("button", name="Play").click()
+    page.wait_for_function("Number(document.querySelector('[aria-label=Frame]').value) > 20", timeout=20_000)
+    page.get_by_role("button", name="Pause").click()
+    megabytes = page.evaluate("performance.memory.usedJSHeapSize") / 1e6
+    positions = 99 * 29_000 * 6 / 1e6
+    assert positions < megabytes < 6 * positions
