@@ -15,6 +15,7 @@ import numpy as np
 from pliant.client.options import Options
 from pliant.client.schemas import Artifact
 from pliant.solver import Solution
+from pliant.worker import preview
 from pliant.worker.artifacts.animation import animate
 from pliant.worker.artifacts.frames_zip import write_ply_zip
 from pliant.worker.artifacts.geometry import Ints, triangles_of, upright, viewer_scale
@@ -154,9 +155,25 @@ def _write_ply(result: Result, file: IO[bytes], on_progress: OnProgress) -> dict
     return {}
 
 
+def _write_preview(result: Result, file: IO[bytes], on_progress: OnProgress) -> dict[str, Any]:
+    inputs = result.inputs
+    preview.write_preview(
+        file,
+        tracks=inputs.tracks,
+        mesh=inputs.mesh,
+        solution=result.solution,
+        truth=None if inputs.ground_truth is None else inputs.ground_truth.shapes,
+        y_axis=inputs.interpretation.y_axis,
+        fps=result.options.fps,
+    )
+    on_progress(1.0)
+    return {}
+
+
 REPORT = "How the result came to be: options, choices with reasons, metrics, trace, timings, versions."
 KINDS = (
     Kind("shapes.npz", "application/zip", "All arrays: shapes (F, P, 3), cameras, faces, residuals, weights, trace.", 2, _write_npz),
     Kind("shapes.glb", "model/gltf-binary", "The moving mesh as animated glTF, y up.", 2, _write_glb),
     Kind("shapes_ply.zip", "application/zip", "One binary PLY for each frame.", 6, _write_ply),
+    Kind(preview.NAME, preview.MEDIA_TYPE, preview.DESCRIPTION, 1, _write_preview),
 )  # fmt: skip
