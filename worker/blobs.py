@@ -115,6 +115,12 @@ class Blobs:
                 for each in batch
             ]
 
+    def sizes(self, prefix: str = "") -> dict[str, int]:
+        """Return the size in bytes of everything under a prefix, by key."""
+        with answering():
+            batches = obstore.list(self._store, prefix.rstrip("/") or None)
+            return {str(each["path"]): int(each["size"]) for batch in batches for each in batch}
+
     def check(self) -> None:
         """Return if the store answers."""
         with answering():

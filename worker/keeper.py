@@ -41,7 +41,7 @@ FORGOTTEN_AFTER = 3.0
 """Seconds of watching after which a queued job that the queue does not hold is queued again."""
 
 ORPHAN_AGE = timedelta(hours=6)
-"""A file that belongs to no job is removed when it is older: younger ones may be an upload that has no record yet."""
+"""A file of a job that is not known is removed when it is older: younger ones may be a submission that has no record yet."""
 
 
 @dataclass(slots=True)
@@ -71,6 +71,7 @@ class Keeper:
     _looked: float | None = None
     _tidied: float | None = None
     _swept: float | None = None
+    _cleaned: set[str] = field(default_factory=set)
 
     def tick(self) -> None:
         """Do what is due.
@@ -87,6 +88,7 @@ class Keeper:
         self._queue_forgotten(gap)
         if self._tidied is None or now >= self._tidied + TIDY_EVERY:
             self._expire()
+            self._clean_up_after_failures()
             self.jobs.queue.tidy()
             self._tidied = now
         if self._swept is None or now >= self._swept + SWEEP_EVERY:
@@ -155,23 +157,34 @@ class Keeper:
             if cursor is None:
                 return
 
+    def _clean_up_after_failures(self) -> None:
+        """Remove what attempts had uploaded when they were killed, once for each job that ended badly of late."""
+        page = self.jobs.page(limit=LARGEST_PAGE, statuses=(Status.FAILED, Status.CANCELLED))
+        for id in [job.id for job in page.jobs if job.id not in self._cleaned]:
+            for key, _ in self.jobs.blobs.list(f"jobs/{id}/"):
+                if self._wanted(key) is False:
+                    self.jobs.blobs.delete(key)
+        self._cleaned = {job.id for job in page.jobs}
+
     def _sweep(self) -> None:
         """Remove files that belong to no job: of submissions that died before their record, of attempts that were killed."""
         oldest = self.jobs.clock() - ORPHAN_AGE
         for key, written in self.jobs.blobs.list("jobs/"):
-            if written < oldest and not self._wanted(key):
+            wanted = self._wanted(key)
+            if wanted is False or (wanted is None and written < oldest):
                 self.jobs.blobs.delete(key)
-                logger.info("removed %s, which belongs to no job", key)
+                logger.info("removed %s, which belongs to no job or attempt", key)
         work = self.jobs.settings.work
         for directory in work.iterdir() if work.exists() else ():
             if directory.stat().st_mtime < oldest.timestamp() and not self._running_here(directory.name):
                 shutil.rmtree(directory, ignore_errors=True)
 
-    def _wanted(self, key: str) -> bool:
+    def _wanted(self, key: str) -> bool | None:
+        """Tell whether a job wants a file; None: there is no such job, or not yet."""
         try:
             held = self.jobs.records.get(key.split("/")[1])
         except UnknownJob:
-            return False
+            return None
         running = held.job.status in lifecycle.ACTIVE and f"/{held.token}/" in key
         published = held.prefix is not None and key.startswith(held.prefix)
         return key == held.inputs or running or published

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pliant.client.schemas import Status
+from pliant.worker.audit import findings
 from pliant.worker.connection import connect
 from pliant.worker.formats import load_inputs
 from pliant.worker.run import reconstruct
@@ -41,8 +42,9 @@ def house(
 
 
 def settled(house: House) -> None:
-    """No horse runs, and no working file is left."""
+    """No horse runs, no working file is left, and everything stored is as the records say."""
     house.until(lambda: not house.horses() and not house.files_at_work(), "nothing is left behind")
+    assert findings(house.jobs, settle=0.5) == []
 
 
 def test_the_queue_gives_the_same_bits_as_a_plain_call(house: House, tmp_path: Path) -> None:
@@ -241,6 +243,10 @@ def test_lost_inputs_are_an_internal_error_whose_trace_is_in_the_log(house: Hous
     assert "Traceback" in house.jobs.log(id)
     house.final(first)
     house.final(second)
+    (finding,) = findings(house.jobs, settle=0.1)
+    assert finding == f"Job {id} (failed) has lost its inputs."
+    house.jobs.delete(id)
+    settled(house)
 
 
 def test_a_job_that_takes_too_long_says_so(house: House, tmp_path: Path) -> None:
@@ -303,6 +309,9 @@ def test_killing_valkey_loses_nothing(tmp_path: Path, inputs_files: tuple[Path, 
         assert [job.status for job in jobs] == [Status.SUCCEEDED] * 20
         assert max(job.attempt for job in jobs) <= 2
         assert len(house.jobs.page().jobs) == 20
+        rest = connect(house.settings.redis, decode=True)
+        assert rest.keys("rq:job:*") == [], "RQ keeps nothing of jobs that are done"
+        rest.close()
         settled(house)
 
 

@@ -11,8 +11,9 @@ from pathlib import Path
 
 import pytest
 from pliant.client.options import Options
-from pliant.client.schemas import Interpretation, Status
+from pliant.client.schemas import Interpretation, Problem, Status
 from pliant.worker import lifecycle
+from pliant.worker.audit import findings
 from pliant.worker.blobs import Blobs
 from pliant.worker.errors import StoreUnavailable, UnknownJob
 from pliant.worker.files import clean_up, last_words, working_directory
@@ -169,9 +170,29 @@ def test_files_of_no_job_are_removed_once_they_are_old(
         world.pass_seconds(1, meanwhile=beat)
         return {key for key, _ in world.jobs.blobs.list("jobs/")}
 
-    assert sweep_at(datetime.now(UTC) + timedelta(hours=5)) == wanted | stray
+    unknown = {"jobs/nobody/nobody-1/inputs.npz"}
+    assert sweep_at(datetime.now(UTC) + timedelta(hours=5)) == wanted | unknown
     assert sweep_at(datetime.now(UTC) + timedelta(hours=7)) == wanted
     assert [directory.exists() for directory in directories] == [True, False]
+
+
+def test_what_a_killed_attempt_had_uploaded_is_removed(
+    world: World, submit: Callable[[World], str], tmp_path: Path
+) -> None:
+    id = submit(world)
+    token = world.claim(id)
+    half = f"jobs/{id}/{token}/artifacts/shapes.npz"
+    world.jobs.blobs.put(half, tmp_path / "some-inputs.npz")
+    world.pass_seconds(31, meanwhile=lambda: world.jobs.records.beat(id, token))
+    assert half in dict(world.jobs.blobs.list("jobs/"))
+    problem = Problem(title="t", status=503, detail="d.", code="worker_lost")
+    world.jobs.records.update(
+        id, lambda held: lifecycle.fail(held, token=token, problem=problem, now=world.now, retention=0)
+    )
+    assert any("belongs to no attempt" in each for each in findings(world.jobs, settle=0))
+    world.pass_seconds(31)
+    assert findings(world.jobs, settle=0) == []
+    assert [key for key, _ in world.jobs.blobs.list("jobs/")] == [world.jobs.records.get(id).inputs]
 
 
 def test_a_store_that_is_away_is_waited_for(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
