@@ -43,8 +43,10 @@ class Blob:
             return
         with answering():
             got = obstore.get(self._store, self.key, options={"range": (start, stop)})
-            for chunk in got.stream(min_chunk_size=CHUNK):
-                yield bytes(chunk)
+            for batch in got.stream(min_chunk_size=CHUNK):
+                whole = memoryview(batch)
+                for offset in range(0, len(whole), CHUNK):
+                    yield bytes(whole[offset : offset + CHUNK])
 
 
 class Blobs:

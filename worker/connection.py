@@ -48,3 +48,7 @@ def reachable() -> Iterator[None]:
         raise StoreUnavailable("The job store", reason=type(error).__name__) from error
     except redis.OutOfMemoryError as error:
         raise StoreUnavailable("The job store", reason="its memory limit is reached") from error
+    except redis.ResponseError as error:
+        if not str(error).startswith(("MISCONF", "LOADING", "READONLY")):
+            raise
+        raise StoreUnavailable("The job store", reason=str(error)[:200]) from error

@@ -9,7 +9,7 @@
     ├── InvalidRequest          an id or cursor that cannot be one
     ├── InvalidSetting          a setting does not parse or is out of its range
     ├── QuotaExceeded           the jobs together hold as many bytes as they may
-    ├── StoreUnavailable        Redis or the blob store does not answer
+    ├── StoreUnavailable        Redis or the blob store does not answer, or is full
     ├── DataDirectoryInUse      another Pliant runs on the data directory
     ├── ServerFailed            the embedded Valkey does not start
     ├── Interrupted             a reconstruction was asked to stop, and did
@@ -120,13 +120,13 @@ class QuotaExceeded(WorkerError):
 
 
 class StoreUnavailable(WorkerError):
-    """Redis or the blob store does not answer."""
+    """Redis or the blob store does not answer, or is full."""
 
     code = "store_unavailable"
     retryable = True
 
     def __init__(self, what: str, *, reason: str) -> None:
-        super().__init__(f"{what} does not answer ({reason}). Nothing was lost; try again in a few seconds.")
+        super().__init__(f"{what} cannot be used now ({reason}). Nothing was lost; try again in a few seconds.")
         self.what, self.reason = what, reason
 
 

@@ -10,10 +10,11 @@ from pathlib import Path
 from pliant.client.options import Options
 from pliant.client.schemas import Interpretation, Job, Status
 from pliant.solver import gallery
+from pliant.worker.audit import findings
 from pliant.worker.formats import GroundTruth, Inputs, save_inputs
 from pliant.worker.jobs import Jobs
 from pliant.worker.settings import Settings
-from pliant.worker.supervisor import Supervisor, valkey_child, worker_children
+from pliant.worker.supervisor import Child, Supervisor, valkey_child, worker_children
 from pliant.worker.valkey import Valkey
 
 SHORT = Options(max_reweightings=3)
@@ -41,17 +42,26 @@ def make_inputs(path: Path, *, frames: int, points: int) -> Inputs:
 class House:
     """Starts in `with`, and must leave no process behind."""
 
-    def __init__(self, settings: Settings, *, own_valkey: bool = False, inputs: tuple[Path, Path]) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        *,
+        own_valkey: bool = False,
+        inputs: tuple[Path, Path],
+        children: list[Child] | None = None,
+    ) -> None:
         self.settings = settings
         self.short_inputs, self.long_inputs = inputs
         self._valkey = Valkey.claim(settings.data) if own_valkey else None
         first = [] if self._valkey is None else [valkey_child(self._valkey)]
-        self.supervisor = Supervisor([*first, *worker_children(settings)])
+        workers = worker_children(settings) if children is None else children
+        self._num_workers = sum(child.name.startswith("worker") for child in workers)
+        self.supervisor = Supervisor([*first, *workers])
         self.jobs = Jobs.open(settings)
 
     def __enter__(self) -> House:
         self.supervisor.start()
-        self.until(lambda: len(self.jobs.queue.workers()) == self.settings.workers, "workers are up", seconds=60)
+        self.until(lambda: len(self.jobs.queue.workers()) >= self._num_workers, "workers are up", seconds=60)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -128,3 +138,9 @@ def running(pid: int) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
     except OSError:
         return False
+
+
+def settled(house: House) -> None:
+    """No horse runs, no working file is left, and everything stored is as the records say."""
+    house.until(lambda: not house.horses() and not house.files_at_work(), "nothing is left behind")
+    assert findings(house.jobs, settle=0.5) == []

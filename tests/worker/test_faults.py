@@ -23,7 +23,7 @@ from pliant.worker.run import reconstruct
 from pliant.worker.settings import Settings
 from rq import Queue as RqQueue
 from rq.serializers import JSONSerializer
-from worker_house import SHORT, House, children, make_inputs, running
+from worker_house import SHORT, House, children, make_inputs, running, settled
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="finds processes in /proc")
 
@@ -39,12 +39,6 @@ def house(
     )  # fmt: skip
     with House(settings, inputs=inputs_files) as house:
         yield house
-
-
-def settled(house: House) -> None:
-    """No horse runs, no working file is left, and everything stored is as the records say."""
-    house.until(lambda: not house.horses() and not house.files_at_work(), "nothing is left behind")
-    assert findings(house.jobs, settle=0.5) == []
 
 
 def test_the_queue_gives_the_same_bits_as_a_plain_call(house: House, tmp_path: Path) -> None:
@@ -274,45 +268,6 @@ def test_a_job_that_needs_too_much_memory_says_so(house: House, tmp_path: Path) 
         assert "0.6 GiB" in job.error.detail
         assert lean.final(lean.submit()).status is Status.SUCCEEDED
         settled(lean)
-
-
-def test_a_job_lives_through_an_outage_of_the_store(tmp_path: Path, inputs_files: tuple[Path, Path]) -> None:
-    settings = Settings(data=tmp_path, workers=1, threads=1, lost_after=2.0)
-    with House(settings, own_valkey=True, inputs=inputs_files) as house:
-        id = house.submit(long=True)
-        house.solving(id)
-        (horse,) = house.horses()
-        server = house.supervisor.pids()["valkey"]
-        os.kill(server, signal.SIGSTOP)  # it neither answers nor refuses, for longer than a lease
-        time.sleep(3.5)
-        os.kill(server, signal.SIGCONT)
-        before = house.jobs.get(id).progress
-        house.until(lambda: house.jobs.get(id).progress != before, "it goes on telling", seconds=10)
-        assert (house.jobs.get(id).attempt, house.horses()) == (1, [horse])
-        os.kill(server, signal.SIGKILL)
-        house.until(lambda: house.supervisor.pids().get("valkey", server) != server, "it is started again")
-        house.until(lambda: house.jobs.get(id).progress != before, "it goes on telling", seconds=10)
-        assert (house.jobs.get(id).attempt, house.horses()) == (1, [horse])
-        house.jobs.cancel(id)
-        assert house.final(id).status is Status.CANCELLED
-        settled(house)
-
-
-def test_killing_valkey_loses_nothing(tmp_path: Path, inputs_files: tuple[Path, Path]) -> None:
-    settings = Settings(data=tmp_path, workers=2, threads=1)
-    with House(settings, own_valkey=True, inputs=inputs_files) as house:
-        ids = [house.submit() for _ in range(20)]
-        old = house.supervisor.pids()["valkey"]
-        os.kill(old, signal.SIGKILL)
-        house.until(lambda: house.supervisor.pids().get("valkey", old) != old, "it is started again", seconds=5)
-        jobs = [house.final(id, seconds=60) for id in ids]
-        assert [job.status for job in jobs] == [Status.SUCCEEDED] * 20
-        assert max(job.attempt for job in jobs) <= 2
-        assert len(house.jobs.page().jobs) == 20
-        rest = connect(house.settings.redis, decode=True)
-        assert rest.keys("rq:job:*") == [], "RQ keeps nothing of jobs that are done"
-        rest.close()
-        settled(house)
 
 
 def test_wrong_arguments_and_settings_are_said() -> None:

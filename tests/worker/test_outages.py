@@ -1,0 +1,145 @@
+"""The store goes away, the supervisor is killed, the disk is full: what was acknowledged is done all the same."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from pliant.client.schemas import Status
+from pliant.worker.audit import findings
+from pliant.worker.connection import connect
+from pliant.worker.errors import StoreUnavailable
+from pliant.worker.settings import Settings
+from worker_house import House, running, settled
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="finds processes in /proc")
+
+
+def test_a_job_lives_through_an_outage_of_the_store(tmp_path: Path, inputs_files: tuple[Path, Path]) -> None:
+    settings = Settings(data=tmp_path, workers=1, threads=1, lost_after=2.0)
+    with House(settings, own_valkey=True, inputs=inputs_files) as house:
+        id = house.submit(long=True)
+        house.solving(id)
+        (horse,) = house.horses()
+        server = house.supervisor.pids()["valkey"]
+        os.kill(server, signal.SIGSTOP)  # it neither answers nor refuses, for longer than a lease
+        time.sleep(3.5)
+        os.kill(server, signal.SIGCONT)
+        before = house.jobs.get(id).progress
+        house.until(lambda: house.jobs.get(id).progress != before, "it goes on telling", seconds=10)
+        assert (house.jobs.get(id).attempt, house.horses()) == (1, [horse])
+        os.kill(server, signal.SIGKILL)
+        house.until(lambda: house.supervisor.pids().get("valkey", server) != server, "it is started again")
+        house.until(lambda: house.jobs.get(id).progress != before, "it goes on telling", seconds=10)
+        assert (house.jobs.get(id).attempt, house.horses()) == (1, [horse])
+        house.jobs.cancel(id)
+        assert house.final(id).status is Status.CANCELLED
+        settled(house)
+
+
+def test_killing_valkey_loses_nothing(tmp_path: Path, inputs_files: tuple[Path, Path]) -> None:
+    settings = Settings(data=tmp_path, workers=2, threads=1)
+    with House(settings, own_valkey=True, inputs=inputs_files) as house:
+        ids = [house.submit() for _ in range(20)]
+        old = house.supervisor.pids()["valkey"]
+        os.kill(old, signal.SIGKILL)
+        house.until(lambda: house.supervisor.pids().get("valkey", old) != old, "it is started again", seconds=5)
+        jobs = [house.final(id, seconds=60) for id in ids]
+        assert [job.status for job in jobs] == [Status.SUCCEEDED] * 20
+        assert max(job.attempt for job in jobs) <= 2
+        assert len(house.jobs.page().jobs) == 20
+        rest = connect(house.settings.redis, decode=True)
+        assert rest.keys("rq:job:*") == [], "RQ keeps nothing of jobs that are done"
+        rest.close()
+        settled(house)
+
+
+SUPERVISOR = """
+import os
+from pliant.worker.settings import Settings
+from pliant.worker.supervisor import Supervisor, valkey_child, worker_children
+from pliant.worker.valkey import Valkey
+
+settings = Settings.from_environment(os.environ)
+supervisor = Supervisor([valkey_child(Valkey.claim(settings.data)), *worker_children(settings)])
+supervisor.run(on_started=lambda: print(*supervisor.pids().values(), flush=True))
+"""
+
+
+def test_killing_the_supervisor_kills_all_and_loses_nothing(tmp_path: Path, inputs_files: tuple[Path, Path]) -> None:
+    settings = Settings(data=tmp_path, workers=1, threads=1, lost_after=2.0, stop_grace=1.0)
+    env = {**os.environ, **settings.to_environment()}
+    process = subprocess.Popen([sys.executable, "-c", SUPERVISOR], env=env, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    pids = [int(word) for word in process.stdout.readline().split()]
+    with House(settings, inputs=inputs_files, children=[]) as outside:
+        busy, waiting = outside.submit(long=True), outside.submit()
+        outside.solving(busy)
+        process.kill()
+        process.wait()
+        process.stdout.close()
+        outside.until(lambda: not any(running(pid) for pid in pids), "all its children end", seconds=15)
+        with pytest.raises(StoreUnavailable):
+            outside.jobs.get(busy)
+    with House(settings, own_valkey=True, inputs=inputs_files) as house:
+        house.until(lambda: house.jobs.get(busy).attempt == 2, "the lost job begins again")
+        house.jobs.cancel(busy)
+        assert house.final(busy).status is Status.CANCELLED
+        assert house.final(waiting).status is Status.SUCCEEDED
+        settled(house)
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of three megabytes."""
+    disk = tmp_path / "small"
+    disk.mkdir()
+    made = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=3m", "none", str(disk)], check=False, capture_output=True
+    )
+    if made.returncode != 0:
+        pytest.skip("may not mount a small file system here")
+    yield disk
+    subprocess.run(["umount", str(disk)], check=True)
+
+
+def test_a_full_disk_fails_the_job_and_the_next_one_is_done(
+    small_disk: Path, tmp_path: Path, valkey_data: Path, inputs_files: tuple[Path, Path]
+) -> None:
+    settings = Settings(
+        data=small_disk, redis_url=Settings(data=valkey_data).redis, blob_url=(tmp_path / "blobs").as_uri(),
+        queue=f"full-{secrets.token_hex(3)}", threads=1,
+    )  # fmt: skip
+    with House(settings, inputs=inputs_files) as house:
+        filler = small_disk / "filler"
+        filler.write_bytes(b"x" * (3 * 1024 * 1024 - 40 * 1024))
+        job = house.final(house.submit())
+        assert job.error is not None
+        assert (job.status, job.error.code, job.error.retryable) == (Status.FAILED, "storage_failed", True)
+        assert "No space left on device" in job.error.detail
+        filler.unlink()
+        assert house.final(house.jobs.retry(job.id).id).status is Status.SUCCEEDED
+        settled(house)
+
+
+def test_a_full_blob_store_refuses_the_job_and_keeps_nothing(
+    small_disk: Path, tmp_path: Path, valkey_data: Path, inputs_files: tuple[Path, Path]
+) -> None:
+    settings = Settings(
+        data=tmp_path, redis_url=Settings(data=valkey_data).redis, blob_url=(small_disk / "blobs").as_uri(),
+        queue=f"full-{secrets.token_hex(3)}",
+    )  # fmt: skip
+    with House(settings, inputs=inputs_files, children=[]) as house:
+        (small_disk / "filler").write_bytes(b"x" * (3 * 1024 * 1024 - 20 * 1024))
+        with pytest.raises(StoreUnavailable, match="No space left on device"):
+            house.submit(long=True)
+        assert house.jobs.page().jobs == []
+        assert house.jobs.records.used() == 0
+        assert findings(house.jobs, settle=0) == []
