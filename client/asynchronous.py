@@ -145,6 +145,10 @@ class AsyncClient:
             await arun(self._http, verbs.fetch(attempts, final, result.folder, names=LOADED, on_download=None))
         return result
 
+    async def log(self, job: str, *, timeout: float | None = None) -> str:
+        """As `Client.log`."""
+        return await arun(self._http, verbs.log(self._attempts(timeout), job))
+
     async def cancel(self, job: str, *, timeout: float | None = None) -> AsyncRemoteJob:
         """As `Client.cancel`."""
         return AsyncRemoteJob(self, await arun(self._http, verbs.cancel(self._attempts(timeout), job)))
@@ -234,6 +238,10 @@ class AsyncRemoteJob:
         async for job in self._client.events(self.id, timeout=timeout):
             self.record = job
             yield job
+
+    async def log(self, *, timeout: float | None = None) -> str:
+        """As `RemoteJob.log`."""
+        return await self._client.log(self.id, timeout=timeout)
 
     async def cancel(self, *, timeout: float | None = None) -> Self:
         """As `RemoteJob.cancel`."""

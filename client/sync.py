@@ -204,6 +204,10 @@ class Client:
             run(self._http, verbs.fetch(attempts, final, result.folder, names=LOADED, on_download=None))
         return result
 
+    def log(self, job: str, *, timeout: float | None = None) -> str:
+        """Return what the job's attempts have logged so far, a line an entry."""
+        return run(self._http, verbs.log(self._attempts(timeout), job))
+
     def cancel(self, job: str, *, timeout: float | None = None) -> RemoteJob:
         """Ask for a job to be stopped; it may go on for a moment as `cancelling`."""
         return RemoteJob(self, run(self._http, verbs.cancel(self._attempts(timeout), job)))
@@ -301,6 +305,10 @@ class RemoteJob:
         for job in self._client.events(self.id, timeout=timeout):
             self.record = job
             yield job
+
+    def log(self, *, timeout: float | None = None) -> str:
+        """Return what its attempts have logged so far."""
+        return self._client.log(self.id, timeout=timeout)
 
     def cancel(self, *, timeout: float | None = None) -> Self:
         """Ask for the job to be stopped."""

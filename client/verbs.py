@@ -141,6 +141,12 @@ def delete(attempts: Attempts, job: str) -> Flow[None]:
             raise
 
 
+def log(attempts: Attempts, job: str) -> Flow[str]:
+    """Read what a job's attempts have logged."""
+    _, body = yield from answered(attempts, Call(method="GET", path=f"{_path(job)}/log"))
+    return body.decode("utf-8", "replace")
+
+
 def limits(attempts: Attempts) -> Flow[ServiceLimits]:
     """Read what the service accepts at most."""
     return (yield from record(attempts, Call(method="GET", path="/v1/limits"), ServiceLimits))

@@ -48,7 +48,7 @@ _COMMANDS: dict[str, dict[str, Callable[..., None]]] = {
     "Run a service": {"up": up, "work": work},
     "Talk to a service": {
         "submit": jobs.submit, "status": jobs.status, "watch": jobs.watch, "result": jobs.result, "list": jobs.list_jobs,
-        "cancel": jobs.cancel, "retry": jobs.retry, "delete": jobs.delete, "options": jobs.options,
+        "log": jobs.log,         "cancel": jobs.cancel, "retry": jobs.retry, "delete": jobs.delete, "options": jobs.options,
     },
 }  # fmt: skip
 for panel, commands in _COMMANDS.items():

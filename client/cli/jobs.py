@@ -134,6 +134,17 @@ def list_jobs(
         show_jobs([job.record for job in islice(jobs, limit)], as_json=as_json)
 
 
+def log(ctx: typer.Context, job: JobId, url: Url = HOME, as_json: Json = False) -> None:
+    """Show what a job's attempts have logged."""
+    with ctx.obj.client(url, as_json=as_json) as client:
+        lines = client.log(job).splitlines()
+    if as_json:
+        print_json(lines)
+        return
+    for line in lines:
+        out().print(line, markup=False)
+
+
 def cancel(ctx: typer.Context, job: JobId, url: Url = HOME, as_json: Json = False) -> None:
     """Stop a job."""
     with ctx.obj.client(url, as_json=as_json) as client:

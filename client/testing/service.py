@@ -131,6 +131,10 @@ class FakeService(httpx.MockTransport):
         told = [f"id: {n}\nevent: job\ndata: {data}\n\n" for n, data in enumerate(entry.history) if n >= first]
         return httpx.Response(200, content="".join(told), headers={"Content-Type": "text/event-stream"})
 
+    def _log(self, _request: httpx.Request, job_id: str) -> httpx.Response:
+        lines = [json.loads(record)["status"] for record in self._ledger.find(job_id).history]
+        return httpx.Response(200, text="\n".join(lines))
+
     def _list(self, request: httpx.Request) -> httpx.Response:
         wanted = [Status(name) for name in request.url.params.get_list("status")]
         entries = [entry for entry in self._ledger.newest_first() if len(wanted) == 0 or entry.job.status in wanted]
@@ -187,6 +191,7 @@ _ROUTES: tuple[tuple[str, str, Callable[..., httpx.Response]], ...] = (
     ("GET", _JOB, FakeService._get),
     ("DELETE", _JOB, FakeService._delete),
     ("GET", _JOB + "/events", FakeService._events),
+    ("GET", _JOB + "/log", FakeService._log),
     ("POST", _JOB + "/cancel", FakeService._cancel),
     ("POST", _JOB + "/retry", FakeService._retry),
     ("GET", _JOB + "/artifacts", FakeService._artifacts),

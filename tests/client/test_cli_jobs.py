@@ -80,6 +80,7 @@ def test_every_json_output_is_one_document(run: Run, tracks: Path, tmp_path: Pat
     job = submitted(run, tracks)["id"]
     assert json.loads(run("status", job, "--json").stdout)["id"] == job
     assert json.loads(run("watch", job, "--json").stdout)["status"] == "succeeded"
+    assert json.loads(run("log", job, "--json").stdout)[-1] == run("log", job).stdout.splitlines()[-1] == "succeeded"
     assert [each["id"] for each in json.loads(run("list", "--json").stdout)] == [job]
     paths = json.loads(run("result", job, "-o", tmp_path / "r", "--json").stdout)
     assert all(Path(path).is_file() for path in paths.values())

@@ -63,6 +63,7 @@ def test_a_result_holds_arrays_report_and_job(client: Client, tmp_path: Path) ->
     assert result.report["outcome"] in ("converged", "max_reweightings")
     assert result.job.name == "one"
     assert result.job.status is Status.SUCCEEDED
+    assert len(client.log(result.job.id).splitlines()) >= 2
     assert result.save_glb(tmp_path / "deep" / "it.glb").read_bytes()[:4] == b"glTF"
     assert {path.name for path in (tmp_path / "kept").iterdir()} == {"shapes.npz", "report.json", "shapes.glb"}
     everything = result.download(tmp_path / "all")

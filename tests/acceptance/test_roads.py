@@ -1,0 +1,156 @@
+"""Both roads from tracks to a mesh, as a user walks them: in this process, and through the service. They end in the same place."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pliant.client.cli.demo import GOOD, judge, running
+from pliant.solver.gallery import corrupt, face
+
+ENVIRONMENT = {name: value for name, value in os.environ.items() if not name.startswith("PLIANT_")}
+
+
+def pliant(*arguments: object, folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "pliant.client.cli", *map(str, arguments)]
+    return subprocess.run(
+        command,
+        cwd=folder,
+        env={**ENVIRONMENT, **environment},
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
+    )
+
+
+def arrays(path: Path) -> dict[str, np.ndarray]:
+    with np.load(path, allow_pickle=False) as held:
+        return {name: held[name] for name in held.files}
+
+
+def test_the_demonstration_ends_with_files_that_play_and_an_honest_verdict(tmp_path: Path) -> None:
+    ran = pliant("demo", "--small", "--json", folder=tmp_path)
+    said = json.loads(ran.stdout)
+    assert said["job"]["status"] == "succeeded", ran.stderr
+    assert said["good"] == judge(said["metrics"]) == (ran.returncode == 0)
+    assert set(GOOD) <= set(said["metrics"])
+    assert all(value > 0 for value in said["metrics"].values())
+    files = {name: tmp_path / path for name, path in said["files"].items()}
+    assert files["shapes.glb"].read_bytes()[:4] == b"glTF"
+    shapes = arrays(files["shapes.npz"])["shapes"]
+    np.testing.assert_allclose(shapes.mean(axis=1), 0, atol=1e-6 * np.abs(shapes).max())
+    report = json.loads(files["report.json"].read_text())
+    assert report["options"] == said["job"]["options"]
+    assert list(tmp_path.iterdir()) == [tmp_path / "demo-output"]
+
+
+def test_solve_and_the_service_give_the_same_bits(service_url: str, tmp_path: Path) -> None:
+    sequence = corrupt(face(16, 300), noise=0.005, outliers=0.03, hidden=0.05, seed=5)
+    points = np.where(sequence.tracks.visible[..., None] > 0, sequence.tracks.points, np.nan)
+    np.savez(tmp_path / "tracks.npz", tracks=points)
+    np.savez(tmp_path / "mesh.npz", faces=sequence.mesh.faces)
+    np.savez(tmp_path / "truth.npz", shapes=sequence.shapes, rotations=sequence.rotations)
+    inputs = (
+        "tracks.npz",
+        "--mesh",
+        "mesh.npz",
+        "--ground-truth",
+        "truth.npz",
+        "-O",
+        "seed=3",
+        "-O",
+        "max_reweightings=6",
+    )
+    here = pliant("solve", *inputs, "-o", "here", "--threads", 1, "--json", folder=tmp_path)
+    assert here.returncode == 0, here.stderr
+    there = pliant("submit", *inputs, "-o", "there", "--json", folder=tmp_path, PLIANT_URL=service_url)
+    assert there.returncode == 0, there.stderr
+    one, other = arrays(tmp_path / "here" / "shapes.npz"), arrays(tmp_path / "there" / "shapes.npz")
+    assert set(one) == set(other)
+    assert {
+        name for name in one if not np.array_equal(one[name], other[name], equal_nan=one[name].dtype.kind == "f")
+    } == set()
+    assert json.loads(here.stdout)["metrics"] == json.loads(there.stdout)["metrics"]
+    assert one["shapes"].shape == sequence.shapes.shape
+    for name in ("shapes.glb", "shapes_ply.zip"):
+        assert (tmp_path / "here" / name).is_file()
+        assert (tmp_path / "there" / name).is_file()
+
+
+def test_what_solve_is_refused_is_what_the_service_refuses(tmp_path: Path) -> None:
+    np.savez(tmp_path / "tracks.npz", tracks=np.ones((2, 9, 2)))
+    ran = pliant("solve", "tracks.npz", "-o", "out", "--json", folder=tmp_path)
+    assert ran.returncode == 3
+    assert json.loads(ran.stderr)["code"] == "too_few_frames"
+    assert not (tmp_path / "out").exists()
+
+
+def test_inspect_says_how_a_file_is_understood(tmp_path: Path) -> None:
+    sequence = face(12, 60)
+    tracked = sequence.tracks.points[None].transpose(0, 2, 1, 3)
+    np.savez(tmp_path / "tapir.npz", tracks=tracked, visibles=np.ones(tracked.shape[:3], bool))
+    ran = pliant("inspect", "tapir.npz", "--json", "-O", "layout=points_frames", folder=tmp_path)
+    assert ran.returncode == 0, ran.stderr
+    said = json.loads(ran.stdout)
+    assert (said["num_frames"], said["num_points"]) == sequence.tracks.points.shape[:2]
+    ran = pliant("inspect", "tapir.npz", "-O", "layout=points_frames", folder=tmp_path)
+    assert f"12 frames × {sequence.tracks.num_points} points" in ran.stdout
+
+
+def test_up_stops_all_it_started_on_one_signal_and_refuses_a_second_one(tmp_path: Path) -> None:
+    with running(tmp_path / "one") as url:
+        port = url.rpartition(":")[2]
+        busy = pliant("up", "--port", port, "--data", "other", folder=tmp_path)
+        assert busy.returncode == 3
+        assert "--port 0 takes a free port" in busy.stderr
+        twice = pliant("up", "--port", "0", "--data", tmp_path / "one" / "data", folder=tmp_path)
+        assert twice.returncode != 0
+        assert "already used" in twice.stderr
+    left = [entry for entry in Path("/proc").glob("[0-9]*/cmdline") if str(tmp_path).encode() in _read(entry)]
+    assert left == []
+
+
+def _read(entry: Path) -> bytes:
+    try:
+        return entry.read_bytes()
+    except (FileNotFoundError, ProcessLookupError):
+        return b""
+
+
+def test_the_doctor_finds_a_healthy_house_and_says_what_is_wrong_with_another(tmp_path: Path) -> None:
+    ran = pliant("doctor", "--port", 1, "--url", "http://127.0.0.1:9", "--json", folder=tmp_path)
+    found = {finding["what"]: finding for finding in json.loads(ran.stdout)}
+    assert (found["Python"]["verdict"], found["packages"]["verdict"], found["queue"]["verdict"]) == (
+        "good",
+        "good",
+        "good",
+    )
+    assert found["service"]["verdict"] == "note"
+    assert "pliant up" in found["service"]["advice"]
+    assert ran.returncode == 0
+    (tmp_path / "file").write_text("not a folder")
+    dead = {"PLIANT_REDIS_URL": "redis://127.0.0.1:9"}
+    ran = pliant("doctor", "--data", "file/data", "--url", "http://127.0.0.1:9", folder=tmp_path, **dead)
+    assert ran.returncode == 8
+    assert "redis://127.0.0.1:9 does not answer" in ran.stdout
+    assert "unset PLIANT_REDIS_URL" in " ".join(ran.stdout.split())
+
+
+@pytest.mark.parametrize(
+    ("shell", "asked"),
+    [
+        ("bash", {"COMP_WORDS": "pliant sta", "COMP_CWORD": "1"}),
+        ("zsh", {"_TYPER_COMPLETE_ARGS": "pliant sta"}),
+        ("fish", {"_TYPER_COMPLETE_ARGS": "pliant sta", "_TYPER_COMPLETE_FISH_ACTION": "get-args"}),
+    ],
+)
+def test_a_shell_completes_the_commands(shell: str, asked: dict[str, str], tmp_path: Path) -> None:
+    ran = pliant(folder=tmp_path, _PLIANT_COMPLETE=f"complete_{shell}", **asked)
+    assert "status" in ran.stdout
+    assert "submit" not in ran.stdout

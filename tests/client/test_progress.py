@@ -1,0 +1,87 @@
+"""The ready-made bar: shows a terminal what happens, and is silent elsewhere."""
+
+from __future__ import annotations
+
+import io
+import sys
+from datetime import UTC, datetime
+
+import numpy as np
+import pytest
+from pliant.client import Client, PliantError, Policy, Progress
+from pliant.client.drive import AsyncWire, Wire
+from pliant.client.plot import draw
+from pliant.client.progress import Bar, describe, progress_bar
+from pliant.client.testing import FakeService
+from rich.console import Console
+
+POINTS = np.random.default_rng(1).normal(size=(4, 9, 2))
+
+
+class Bars:
+    """Stands for rich's: remembers what was shown."""
+
+    def __init__(self) -> None:
+        self.shown: list[tuple[str, float]] = []
+
+    def add_task(self, *_: object, **__: object) -> int:
+        return 0
+
+    def update(self, _: int, *, description: str, completed: float, note: str) -> None:
+        self.shown.append((str(description), completed))
+
+
+def test_the_bar_takes_every_callback_of_the_sdk() -> None:
+    bars = Bars()
+    bar = Bar(bars)
+    with Client("http://pliant.test", transport=FakeService(looks=3), policy=Policy(poll_interval=0.01)) as client:
+        result = client.submit(POINTS, on_upload=bar.on_upload).wait(on_progress=bar.on_progress)
+        result.download(result.folder / "more", on_download=bar.on_download)
+    stages = [stage for stage, _ in bars.shown]
+    assert list(dict.fromkeys(stages)) == ["sending", "queued", "reweight", "succeeded", "fetching"]
+    assert all(0 <= fraction <= 1 for _, fraction in bars.shown)
+
+
+def test_a_terminal_sees_it_and_a_file_does_not() -> None:
+    for terminal in (True, False):
+        screen = io.StringIO()
+        with progress_bar(Console(file=screen, force_terminal=terminal)) as bar:
+            bar.on_upload(5, 10)
+        assert ("sending" in screen.getvalue()) == terminal
+
+
+def test_progress_in_words() -> None:
+    now = datetime.now(UTC)
+    assert describe(Progress(stage="loading", fraction=0, updated_at=now)) == ""
+    full = Progress(
+        stage="reweight",
+        fraction=0.5,
+        reweighting=3,
+        max_reweightings=30,
+        residual=0.25,
+        seconds_left=7,
+        updated_at=now,
+    )
+    assert describe(full) == "reweighting 3 of at most 30, residual 0.25, 7 s left"
+
+
+def test_a_plot_without_matplotlib_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(PliantError, match="pip install matplotlib"):
+        draw(np.zeros((4, 9, 3)), 2, title="")
+
+
+def test_a_wire_knows_its_wishes_alone() -> None:
+    import asyncio
+
+    import httpx
+
+    with httpx.Client() as http, pytest.raises(TypeError, match="not a wish"):
+        Wire(http).act("a pony")
+
+    async def use() -> None:
+        async with httpx.AsyncClient() as http:
+            await AsyncWire(http).act("a pony")
+
+    with pytest.raises(TypeError, match="not a wish"):
+        asyncio.run(use())

@@ -1,0 +1,112 @@
+"""The service is killed without warning and started again, and whoever waits or fetches notices nothing."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pliant.client import Client, Policy, Status
+from pliant.client.cli.demo import announced
+from pliant.solver.gallery import face
+
+PATIENT = Policy(shortest_pause=0.1, longest_pause=0.5)
+
+
+class Installation:
+    """`pliant up` on one data directory, to be killed and started again at the same address."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.port = 0
+        self.process: subprocess.Popen[str] | None = None
+        self.url = self.start()
+        self.port = int(self.url.rpartition(":")[2])
+
+    def start(self) -> str:
+        command = [sys.executable, "-m", "pliant.client.cli", "up", "--json", "--port", str(self.port)]
+        with (self.folder / "log").open("ab") as log:
+            self.process = subprocess.Popen(
+                [*command, "--data", str(self.folder / "data")], stdout=subprocess.PIPE, stderr=log, text=True
+            )
+        assert self.process.stdout is not None
+        url = announced(self.process.stdout)
+        assert url is not None, (self.folder / "log").read_text()
+        return url
+
+    def kill(self) -> None:
+        assert self.process is not None
+        self.process.kill()
+        self.end()
+
+    def stop(self) -> None:
+        assert self.process is not None
+        self.process.send_signal(signal.SIGTERM)
+        self.end()
+
+    def end(self) -> None:
+        assert self.process is not None
+        self.process.wait(60)
+        assert self.process.stdout is not None
+        self.process.stdout.close()
+
+    def service_pid(self) -> int:
+        """The API process, which the supervisor starts again by itself."""
+        assert self.process is not None
+        for entry in Path("/proc").iterdir():
+            if not entry.name.isdigit():
+                continue
+            try:
+                parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
+                command = (entry / "cmdline").read_bytes()
+            except (FileNotFoundError, ProcessLookupError):
+                continue
+            if parent == self.process.pid and b"pliant.service" in command:
+                return int(entry.name)
+        raise AssertionError("no service")
+
+
+@pytest.fixture
+def installation(tmp_path: Path):
+    installation = Installation(tmp_path)
+    yield installation
+    installation.stop()
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="finds the service's process through /proc")
+def test_kill_9_in_mid_wait_and_mid_download(installation: Installation, tmp_path: Path) -> None:
+    sequence = face(60, 8000)
+    with Client(installation.url, policy=PATIENT) as client:
+        job = client.submit(sequence.tracks.points, mesh="none", options={"method": "pseudo_inverse"})
+        seen: list[Status] = []
+
+        def kill_all(now: object) -> None:
+            if len(seen) == 0:
+                installation.kill()
+                threading.Thread(target=installation.start).start()
+            seen.append(job.record.status)
+
+        result = job.wait(on_progress=kill_all, load=False, timeout=120)
+        assert result.job.status is Status.SUCCEEDED
+
+        size = next(artifact.bytes for artifact in result.job.artifacts if artifact.name == "shapes.npz")
+        assert size > 10_000_000  # more than the sockets' buffers hold, so that the connection breaks in mid file
+        killed: list[int] = []
+
+        def kill_service(done: int, total: int) -> None:
+            if len(killed) == 0:
+                os.kill(installation.service_pid(), signal.SIGKILL)
+                killed.append(done)
+
+        began = time.monotonic()
+        paths = result.download(tmp_path / "out", names=["shapes.npz"], on_download=kill_service, timeout=120)
+        assert 0 < killed[0] < size
+        assert time.monotonic() - began < 60
+    with np.load(paths["shapes.npz"]) as held:
+        assert held["shapes"].shape == sequence.shapes.shape

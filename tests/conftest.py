@@ -1,0 +1,16 @@
+"""What tests of several folders share: one real service, started once, with its queue and one worker, on a free port."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+
+@pytest.fixture(scope="session")
+def service_url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Address of a running service; its jobs compute with one thread, so that their arrays can be compared bit for bit."""
+    from pliant.client.cli.demo import running
+
+    with running(tmp_path_factory.mktemp("service"), threads=1) as url:
+        yield url

@@ -1,0 +1,178 @@
+"""Every code block of README.md and docs/ runs, and what docs promise about names is so.
+
+A block is run in a folder that holds the files the documents speak of (`tracks.npz`, `mesh.obj` …), against a real service that
+stands where they say `http://127.0.0.1:8000`. Blocks of one document run in order and share their names, as a reader's session does.
+A block that cannot run here says so behind its language, with the reason: ``bash not-run: needs Docker``.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+import textwrap
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pliant.client.cli.exits import Exit
+from pliant.solver.gallery import face
+
+ROOT = Path(__file__).parents[1]
+DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+RUN = {"python", "bash"}
+READ = {"json"}
+SHOWN = {"text", "mermaid", "http"}
+"""Languages that are run, parsed, or only shown."""
+
+ADDRESS = "http://127.0.0.1:8000"
+KNOWN_COMMANDS = {"make", "docker", "pip", "git", "cd", "npm", "npx", "uv"}
+"""First words of shell lines that are looked at instead of run: they install, build or need what is not here."""
+
+
+@dataclass(frozen=True)
+class Block:
+    document: Path
+    line: int
+    language: str
+    note: str
+    text: str
+
+    @property
+    def place(self) -> str:
+        return f"{self.document.relative_to(ROOT)}:{self.line}"
+
+
+def blocks_of(document: Path) -> list[Block]:
+    found, lines = [], document.read_text(encoding="utf-8").splitlines()
+    begin: int | None = None
+    for number, line in enumerate(lines):
+        if not line.lstrip().startswith("```"):
+            continue
+        if begin is None:
+            begin = number
+            continue
+        language, _, note = lines[begin].strip().removeprefix("```").partition(" ")
+        text = textwrap.dedent("\n".join(lines[begin + 1 : number])) + "\n"
+        found.append(Block(document, begin + 1, language, note.strip(), text))
+        begin = None
+    assert begin is None, f"{document.name}:{begin}: a code block is not closed"
+    return found
+
+
+BLOCKS = [block for document in DOCUMENTS for block in blocks_of(document)]
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """The files that documents speak of."""
+    sequence = face(12, 60)
+    points = sequence.tracks.points
+    np.savez(tmp_path / "tracks.npz", tracks=points)
+    np.savez(tmp_path / "mesh.npz", faces=sequence.mesh.faces)
+    np.savez(tmp_path / "truth.npz", shapes=sequence.shapes)
+    np.savez(tmp_path / "cameras.npz", rotations=sequence.rotations)
+    vertices = "".join(f"v {x} {y} {z}\n" for x, y, z in sequence.shapes[0])
+    faces = "".join("f " + " ".join(str(index + 1) for index in face) + "\n" for face in sequence.mesh.faces)
+    (tmp_path / "mesh.obj").write_text(vertices + faces)
+    return tmp_path
+
+
+@pytest.mark.parametrize("block", BLOCKS, ids=lambda block: block.place)
+def test_every_block_says_what_it_is(block: Block) -> None:
+    assert block.language in RUN | READ | SHOWN, (
+        f"{block.place}: name the block's language, one of {RUN | READ | SHOWN}"
+    )
+    if block.note:
+        reason = re.fullmatch(r"not-run: (.{8,})", block.note)
+        assert reason is not None, f"{block.place}: expected 'not-run: REASON' behind the language, got {block.note!r}"
+    if block.language in READ and not block.note:
+        json.loads(block.text)
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_python_runs(document: Path, service_url: str, folder: Path) -> None:
+    blocks = [block for block in BLOCKS if block.document == document and block.language == "python" and not block.note]
+    if not blocks:
+        return
+    lines: list[str] = []
+    for block in blocks:  # at its own line, so that a traceback names the document's
+        lines += [""] * (block.line - len(lines)) + block.text.replace(ADDRESS, service_url).splitlines()
+    runner = "import sys; exec(compile(sys.stdin.read(), sys.argv[1], 'exec'))"
+    ran = run([sys.executable, "-W", "error", "-c", runner, document.name], folder, service_url, given="\n".join(lines))
+    assert ran.returncode == 0, f"{document.name}:\n{ran.stderr}"
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_shell_runs(document: Path, service_url: str, folder: Path) -> None:
+    (folder / "examples").symlink_to(ROOT / "examples")
+    for block in BLOCKS:
+        if block.document != document or block.language != "bash" or block.note:
+            continue
+        for command in commands_of(block):
+            if command.split()[0] in KNOWN_COMMANDS:
+                known(command, block)
+                continue
+            ran = run(["bash", "-ec", command.replace(ADDRESS, service_url)], folder, service_url)
+            assert ran.returncode == 0, f"{block.place}: {command}\n{ran.stdout}\n{ran.stderr}"
+
+
+def commands_of(block: Block) -> list[str]:
+    """Split a block into commands, continued lines joined, comments and the prompt removed."""
+    lines = block.text.replace("\\\n", " ").splitlines()
+    return [line.removeprefix("$ ") for line in map(str.strip, lines) if line and not line.startswith("#")]
+
+
+def known(command: str, block: Block) -> None:
+    """See that a target of the Makefile exists; other tools are not ours to try here."""
+    words = shlex.split(command, comments=True)
+    if words[0] == "make":
+        targets = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+        wanted = {word for word in words[1:] if "=" not in word and not word.startswith("-")}
+        assert wanted <= targets, f"{block.place}: the Makefile has no {wanted - targets}"
+
+
+def run(command: list[str], folder: Path, url: str, *, given: str | None = None) -> subprocess.CompletedProcess[str]:
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    env = {**os.environ, "PATH": path, "PLIANT_URL": url, "MPLCONFIGDIR": str(folder / ".matplotlib")}
+    return subprocess.run(
+        command, cwd=folder, env=env, input=given, capture_output=True, text=True, timeout=180, check=False
+    )
+
+
+def test_every_command_and_exit_code_is_documented() -> None:
+    from pliant.client.cli import app
+
+    text = (ROOT / "docs" / "cli.md").read_text()
+    commands = {command.name for command in app.registered_commands}
+    assert {name for name in commands if not re.search(rf"(pliant {name}|`{name}\b)", text)} == set()
+    assert [int(code) for code in re.findall(r"^\| (\d+) \|", text, re.MULTILINE)] == [int(code) for code in Exit]
+
+
+def test_the_sdks_errors_are_documented_as_they_are() -> None:
+    from pliant.client import errors
+
+    drawn = (ROOT / "docs" / "sdk.md").read_text()
+    names = re.findall(r"^ {4}(?:[│ ]{4})*(?:[├└]── )?(\w+)", errors.__doc__ or "", re.MULTILINE)
+    assert len(names) > 10
+    assert [name for name in names if not re.search(rf"── {name}\b|^{name}$", drawn, re.MULTILINE)] == []
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_every_file_and_test_that_is_named_exists(document: Path) -> None:
+    text = document.read_text()
+    for target in re.findall(r"\]\((?!https?:|#|mailto:)([^)#]+)", text):
+        assert (document.parent / target).exists(), f"{document.name}: no file {target}"
+    tests = {path.name: path.read_text() for path in (ROOT / "tests").rglob("*.py")}
+    for name in re.findall(r"`(test_\w+\.py)`", text):
+        assert name in tests, f"{document.name}: no {name}"
+    last = ""
+    for name, test in re.findall(r"`(test_\w+\.py|…)::(test_\w+)`", text):
+        last = last if name == "…" else name
+        assert f"def {test}(" in tests.get(last, ""), f"{document.name}: no {last}::{test}"
+    for name in re.findall(r"`((?:client|solver|worker|service|tests|examples|benchmarks|docs)/[\w/]*\w\.\w+)`", text):
+        assert (ROOT / name).exists(), f"{document.name}: no file {name}"
