@@ -1,0 +1,130 @@
+"""Files of any size pass through without being held in memory, both ways, in both clients."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import tracemalloc
+from collections.abc import AsyncIterator, Iterator
+from pathlib import Path
+
+import httpx
+import pytest
+from pliant.client import AsyncClient, Client
+from pliant.client.download import download
+from pliant.client.drive import arun, run
+from pliant.client.policy import Attempts, Contact, Policy
+from pliant.client.schemas import Artifact
+from pliant.client.testing import FakeService
+
+SIZE = 64 * 2**20
+ROOM = 4 * 2**20
+"""Bytes of Python memory that moving the file may take at most."""
+
+PIECE = bytes(2**16)
+
+
+class Body(httpx.SyncByteStream, httpx.AsyncByteStream):
+    def __iter__(self) -> Iterator[bytes]:
+        for _ in range(SIZE // len(PIECE)):
+            yield PIECE
+
+    async def __aiter__(self) -> AsyncIterator[bytes]:
+        for piece in self:
+            yield piece
+
+
+class Sink(httpx.BaseTransport, httpx.AsyncBaseTransport):
+    """Swallows what is sent, answers a file to a GET and a job to the rest."""
+
+    def __init__(self) -> None:
+        self.received = 0
+        self.largest = 0
+        fake = Client("http://pliant.test", transport=FakeService())
+        self.job = fake.submit([[[0, 0]] * 9] * 4).record.model_dump_json()
+
+    def take(self, piece: bytes) -> None:
+        self.received += len(piece)
+        self.largest = max(self.largest, len(piece))
+
+    def answer(self, request: httpx.Request) -> httpx.Response:
+        if request.method == "GET":
+            return httpx.Response(200, stream=Body())
+        return httpx.Response(202, text=self.job)
+
+    def handle_request(self, request: httpx.Request) -> httpx.Response:
+        for piece in request.stream:
+            self.take(piece)
+        return self.answer(request)
+
+    async def handle_async_request(self, request: httpx.Request) -> httpx.Response:
+        async for piece in request.stream:
+            self.take(piece)
+        return self.answer(request)
+
+
+@pytest.fixture
+def memory() -> Iterator[None]:
+    tracemalloc.start()
+    yield
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < ROOM
+
+
+@pytest.fixture(scope="module")
+def big(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    Client("http://pliant.test", transport=Sink()).submit([[[0, 0]] * 9] * 4)  # whatever is loaded at the first use
+    path = tmp_path_factory.mktemp("big") / "tracks.npz"
+    with path.open("wb") as file:
+        file.truncate(SIZE)
+    return path
+
+
+@pytest.fixture(scope="module")
+def artifact() -> Artifact:
+    digest = hashlib.sha256()
+    for piece in Body():
+        digest.update(piece)
+    return Artifact(name="big.bin", media_type="", bytes=SIZE, sha256=digest.hexdigest())
+
+
+def attempts() -> Attempts:
+    return Attempts(policy=Policy(), contact=Contact())
+
+
+@pytest.mark.usefixtures("memory")
+def test_upload(big: Path) -> None:
+    sink = Sink()
+    Client("http://pliant.test", transport=sink).submit(big)
+    assert sink.received > SIZE
+    assert sink.largest <= 2**16
+
+
+@pytest.mark.usefixtures("memory")
+def test_upload_asynchronously(big: Path) -> None:
+    sink = Sink()
+
+    async def send() -> None:
+        async with AsyncClient("http://pliant.test", transport=sink) as client:
+            await client.submit(big)
+
+    asyncio.run(send())
+    assert sink.received > SIZE
+    assert sink.largest <= 2**16
+
+
+@pytest.mark.usefixtures("memory")
+def test_download(artifact: Artifact, tmp_path: Path) -> None:
+    with httpx.Client(base_url="http://pliant.test", transport=Sink()) as http:
+        path = run(http, download(attempts(), "/file", artifact, tmp_path, on_download=None))
+    assert path.stat().st_size == SIZE
+
+
+@pytest.mark.usefixtures("memory")
+def test_download_asynchronously(artifact: Artifact, tmp_path: Path) -> None:
+    async def fetch() -> Path:
+        async with httpx.AsyncClient(base_url="http://pliant.test", transport=Sink()) as http:
+            return await arun(http, download(attempts(), "/file", artifact, tmp_path, on_download=None))
+
+    assert asyncio.run(fetch()).stat().st_size == SIZE
