@@ -73,7 +73,7 @@ class Installation:
 
 
 @pytest.fixture
-def installation(tmp_path: Path):
+def installation(service_code: None, tmp_path: Path):
     installation = Installation(tmp_path)
     yield installation
     installation.stop()
