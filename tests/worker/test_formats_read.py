@@ -115,7 +115,7 @@ def test_points_seen_seldom_keep_their_place_and_are_told(tmp_path: Path) -> Non
 def test_inputs_survive_storage_bit_for_bit(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     shapes = rng.normal(size=(F, P, 3))
-    shapes[0, 0] = [np.nan, -0.0, 0.1]
+    shapes[0, 0] = [1e-300, -0.0, 0.1]
     angles = np.linalg.qr(rng.normal(size=(F, 3, 3)))[0]
     got = read_inputs(
         tracks=saved(tmp_path / "t.npz", tracks=waving(), visibility=rng.random((F, P))),
@@ -214,7 +214,8 @@ def test_truth_must_match_the_tracks(tmp_path: Path) -> None:
         "wrong_shape": {"shapes": np.zeros((F, P + 1, 3))},
         "missing_array": {"truth": np.zeros((F, P, 3))},
         "wrong_type": {"shapes": np.zeros((F, P, 3), dtype=bool)},
-        "nothing_visible": {"shapes": np.full((F, P, 3), np.nan)},
+        "not_finite": {"shapes": np.where(np.arange(F * P * 3).reshape(F, P, 3) == 7, np.nan, 1.0)},
+        "no_extent": {"shapes": np.ones((F, P, 3))},
     }.items():
         truth = saved(tmp_path / "g.npz", **arrays)
         error = refused(code, lambda truth=truth: read_inputs(tracks=tracks, ground_truth=truth, options=Options()))
@@ -223,7 +224,11 @@ def test_truth_must_match_the_tracks(tmp_path: Path) -> None:
 
 def test_truth_rotations_must_be_one_a_frame(tmp_path: Path) -> None:
     tracks = saved(tmp_path / "t.npz", tracks=waving())
-    truth = saved(tmp_path / "g.npz", shapes=np.ones((F, P, 3)), rotations=np.tile(np.eye(3), (F - 1, 1, 1)))
+    truth = saved(
+        tmp_path / "g.npz",
+        shapes=np.random.default_rng(0).normal(size=(F, P, 3)),
+        rotations=np.tile(np.eye(3), (F - 1, 1, 1)),
+    )
     error = refused("wrong_shape", lambda: read_inputs(tracks=tracks, ground_truth=truth, options=Options()))
     assert error.field == "ground_truth.rotations"
 

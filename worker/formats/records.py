@@ -48,7 +48,7 @@ class GroundTruth:
     """The right answer, where it is known; used for metrics alone."""
 
     shapes: NDArray[np.float64]
-    """Shape `(F, P, 3)`, any unit; NaN where a point has no truth."""
+    """Shape `(F, P, 3)`, any unit, finite."""
 
     rotations: NDArray[np.float64] | None = None
     """Shape `(F, 3, 3)`, camera from world, or None."""
@@ -60,7 +60,7 @@ class GroundTruth:
         Parameters
         ----------
         shapes : array_like, shape (F, P, 3)
-            True points; NaN marks points without truth.
+            True points.
         rotations : array_like, shape (F, 2, 3) or (F, 3, 3), optional
             True cameras.
         like : tuple of int
@@ -69,7 +69,7 @@ class GroundTruth:
         Raises
         ------
         InvalidInput
-            Wrong type or shape, nothing finite, or rows that are not orthonormal.
+            Wrong type or shape, not finite, a frame without extent, or rows that are not orthonormal.
         """
         given = np.asarray(shapes)
         expected = f"({like[0]}, {like[1]}, 3)"
@@ -84,9 +84,14 @@ class GroundTruth:
                 hint="Truth is (frames, points, 3), with the tracks' frames and points in the tracks' order.",
             )  # fmt: skip
         points = np.array(given, dtype=np.float64)
-        if not np.isfinite(points).any():
+        if not np.isfinite(points).all():
             raise refusal(
-                "nothing_visible", "ground_truth.shapes", expected="finite coordinates", got="none",
+                "not_finite", "ground_truth.shapes", expected="finite coordinates", got=f"{int((~np.isfinite(points)).sum())} that are not",
+                hint="Give truth for every point and frame, or leave it out.",
+            )  # fmt: skip
+        if not (np.ptp(points, axis=1) > 0).any(axis=1).all():
+            raise refusal(
+                "no_extent", "ground_truth.shapes", expected="points that differ in every frame", got="a frame whose points are all one",
                 hint="Leave the ground truth out if it is not known.",
             )  # fmt: skip
         points.flags.writeable = False

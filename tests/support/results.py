@@ -1,0 +1,48 @@
+"""A whole result without solving: a waving sheet as solution and truth, for tests of what is written."""
+
+from __future__ import annotations
+
+import numpy as np
+from pliant.client.options import Options
+from pliant.client.schemas import Interpretation
+from pliant.solver import Camera, Choices, Mesh, Outcome, Solution, Trace, Tracks
+from pliant.worker.formats import Inputs
+
+
+def moving_sheet(frames: int, rows: int, columns: int) -> np.ndarray:
+    """Shapes (F, P, 3): a sheet in pixels, bent by two travelling waves."""
+    y, x = np.mgrid[:rows, :columns].astype(float)
+    time = np.arange(frames)[:, None, None] / 10
+    z = 2.0 * np.sin(x / 3 + time) + np.cos(y / 4 - 2 * time) * np.sin(time)
+    shapes = np.stack(np.broadcast_arrays(10 * x + 0.3 * z, 10 * y - 0.2 * z, 10 * z), axis=-1).reshape(frames, -1, 3)
+    return shapes - shapes.mean(axis=1, keepdims=True)
+
+
+def make_result(
+    frames: int = 7, rows: int = 5, columns: int = 6, *, mesh: str = "grid", y_axis: str = "down"
+) -> tuple[Inputs, Solution, Options]:
+    """Inputs and the solution that belongs to them; `mesh` is grid, triangles or none."""
+    shapes = moving_sheet(frames, rows, columns)
+    points = rows * columns
+    grid = Mesh.from_grid(np.arange(points).reshape(rows, columns))
+    split = np.concatenate([grid.faces[:, [0, 1, 2]], grid.faces[:, [0, 2, 3]]])
+    surface = {"grid": grid, "triangles": Mesh.from_faces(split, points), "none": None}[mesh]
+    interpretation = Interpretation(
+        num_frames=frames, num_points=points, num_faces=0 if surface is None else len(surface.faces), hidden_fraction=0.0,
+        mesh_source=mesh, has_ground_truth=False, has_rotations=False, layout="tracks (F, P, 2)", y_axis=y_axis,
+    )  # fmt: skip
+    inputs = Inputs(Tracks.from_arrays(shapes[..., :2] + 100), surface, None, None, interpretation)
+    solution = Solution(
+        shapes=shapes,
+        camera=Camera(np.tile(np.eye(3), (frames, 1, 1)), np.ones(frames), np.full((frames, 2), 100.0)),
+        residuals=np.linspace(0, 1, frames * points).reshape(frames, points),
+        weights=np.ones((frames, points)),
+        trace=Trace(np.array([3.0, 2.0]), np.array([1.0, 0.5]), np.array([0, 9], dtype=np.int32)),
+        outcome=Outcome.CONVERGED,
+        choices=Choices(
+            basis_size=2, temporal_weight=0.1, spatial_weight=0.2, robust_scale=0.01, temporal_order=1, low_rank_weight=0.0,
+            laplacian="grid8", unit=30.0, noise=float("nan"), reasons={"basis_size": "Two shapes explain it."}, warnings=("Look.",),
+        ),
+        seconds={"cameras": 0.5},
+    )  # fmt: skip
+    return inputs, solution, Options()
