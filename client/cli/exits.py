@@ -26,7 +26,7 @@ class Exit(IntEnum):
     NOT_FOUND = 5
     """There is no such job or file."""
     NOT_NOW = 6
-    """The job's status, or the token, does not allow it."""
+    """The job's status, the token, or another Pliant on the same data does not allow it."""
     TIME_IS_UP = 7
     """The time given was not enough; the job goes on."""
     UNHEALTHY = 8
@@ -46,7 +46,9 @@ _CODES: tuple[tuple[str, str, Exit], ...] = (
     ("pliant.client.errors", "PliantError", Exit.UNREACHABLE),
     ("pliant.solver.errors", "InvalidInput", Exit.REFUSED),
     ("pliant.solver.errors", "SolverError", Exit.FAILED),
-    ("pliant.worker.errors", "WorkerError", Exit.FAILED),
+    ("pliant.worker.errors", "InvalidSetting", Exit.REFUSED),
+    ("pliant.worker.errors", "DataDirectoryInUse", Exit.NOT_NOW),
+    ("pliant.worker.errors", "WorkerError", Exit.UNREACHABLE),
 )
 """The first line that fits counts. By name, so that nothing is loaded that the command did not load itself."""
 

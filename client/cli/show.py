@@ -36,22 +36,29 @@ def print_json(value: object) -> None:
 
 def show_fault(fault: BaseException, code: Exit, *, as_json: bool) -> None:
     """Say what went wrong, on standard error."""
-    from pliant.client.errors import JobFailed, Refused
-
     sentence = str(fault) or ("Interrupted." if isinstance(fault, KeyboardInterrupt) else type(fault).__name__)
-    problem: dict[str, Any] = {}
-    if isinstance(fault, Refused):
-        problem = fault.problem.model_dump(exclude_none=True)
-    elif isinstance(fault, JobFailed) and fault.job.error is not None:
-        problem = fault.job.error.model_dump(exclude_none=True)
+    details = details_of(fault)
     if as_json:
-        named = {"detail": sentence, "code": getattr(fault, "code", type(fault).__name__)}
-        err().print_json(json.dumps({"exit_code": int(code), **named, **problem}))
+        err().print_json(
+            json.dumps({"exit_code": int(code), "detail": sentence, "code": type(fault).__name__, **details})
+        )
         return
     screen = err()
     screen.print(Text.assemble(("error ", "bold red"), sentence))
-    for choice in problem.get("choices") or ():
-        screen.print(f"  possible reading: {choice}", markup=False)
+    for choice in details.get("choices", ()):
+        options = " ".join(f"-O {name}={value}" for name, value in choice.get("options", {}).items())
+        evidence = f" ({choice['evidence']})" if "evidence" in choice else ""
+        screen.print(f"  {choice.get('layout', '')}{evidence}: {options}", markup=False)
+
+
+def details_of(fault: BaseException) -> dict[str, Any]:
+    """Collect what a fault says beside its sentence: the service's problem, or the attributes of our own errors."""
+    problem = getattr(fault, "problem", None) or getattr(getattr(fault, "job", None), "error", None)
+    if problem is not None:
+        said: dict[str, Any] = problem.model_dump(exclude_none=True)
+        return said
+    names = ("code", "field", "expected", "got", "hint", "choices")
+    return {name: getattr(fault, name) for name in names if getattr(fault, name, None) is not None}
 
 
 def show_job(job: Job, *, as_json: bool) -> None:

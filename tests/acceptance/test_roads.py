@@ -88,8 +88,18 @@ def test_what_solve_is_refused_is_what_the_service_refuses(tmp_path: Path) -> No
     np.savez(tmp_path / "tracks.npz", tracks=np.ones((2, 9, 2)))
     ran = pliant("solve", "tracks.npz", "-o", "out", "--json", folder=tmp_path)
     assert ran.returncode == 3
-    assert json.loads(ran.stderr)["code"] == "too_few_frames"
+    said = json.loads(ran.stderr)
+    assert (said["code"], said["field"], said["got"], said["exit_code"]) == ("too_few_frames", "tracks", "2", 3)
     assert not (tmp_path / "out").exists()
+
+
+def test_where_two_readings_fit_the_choices_are_told_and_one_can_be_taken(tmp_path: Path) -> None:
+    np.savez(tmp_path / "noise.npz", W=np.random.default_rng(0).normal(size=(16, 9)))
+    ran = pliant("inspect", "noise.npz", folder=tmp_path)
+    assert ran.returncode == 3
+    assert "rows=interleaved" in ran.stderr
+    assert "rows=stacked" in ran.stderr
+    assert pliant("inspect", "noise.npz", "-O", "rows=stacked", folder=tmp_path).returncode == 0
 
 
 def test_inspect_says_how_a_file_is_understood(tmp_path: Path) -> None:
@@ -112,7 +122,7 @@ def test_up_stops_all_it_started_on_one_signal_and_refuses_a_second_one(tmp_path
         assert busy.returncode == 3
         assert "--port 0 takes a free port" in busy.stderr
         twice = pliant("up", "--port", "0", "--data", tmp_path / "one" / "data", folder=tmp_path)
-        assert twice.returncode != 0
+        assert twice.returncode == 6
         assert "already used" in twice.stderr
     left = [entry for entry in Path("/proc").glob("[0-9]*/cmdline") if str(tmp_path).encode() in _read(entry)]
     assert left == []
