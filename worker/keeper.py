@@ -126,7 +126,7 @@ class Keeper:
                 clean_up(settings, beat.token)
                 self._say(id, f"Lost its worker; it is {after.job.status.value} now.")
                 if after.job.status is Status.QUEUED:
-                    self.jobs.queue.push(id, fresh)
+                    self.jobs.queue.push(id, fresh, front=True)  # it has waited before
 
     def _queue_forgotten(self, gap: float) -> None:
         records, queue = self.jobs.records, self.jobs.queue
@@ -140,7 +140,7 @@ class Keeper:
             with suppress(StaleAttempt, UnknownJob):
                 records.update(id, partial(lifecycle.redeliver, token=old, fresh=fresh))
                 queue.remove(old)
-                queue.push(id, fresh)
+                queue.push(id, fresh, front=True)
                 self._say(id, "The queue had forgotten it; queued again.")
 
     def _expire(self) -> None:

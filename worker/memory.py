@@ -173,10 +173,10 @@ class MemoryQueue(Queue):
     def __init__(self) -> None:
         self._tokens: list[str] = []
 
-    def push(self, id: str, token: str) -> None:  # noqa: ARG002
+    def push(self, id: str, token: str, *, front: bool = False) -> None:  # noqa: ARG002
         """See `Queue.push`."""
         if token not in self._tokens:
-            self._tokens.append(token)
+            self._tokens.insert(0 if front else len(self._tokens), token)
 
     def remove(self, token: str) -> None:
         """See `Queue.remove`."""

@@ -9,7 +9,7 @@ import redis
 from pliant.worker.connection import reachable
 from rq import Queue as RqQueue
 from rq import worker_registration
-from rq.exceptions import NoSuchJobError
+from rq.exceptions import InvalidJobOperation, NoSuchJobError
 from rq.job import Job as RqJob
 from rq.registry import clean_registries
 from rq.serializers import JSONSerializer
@@ -30,8 +30,8 @@ class Queue(ABC):
     """Who is next."""
 
     @abstractmethod
-    def push(self, id: str, token: str) -> None:
-        """Put an attempt at the end; nothing happens if it waits already."""
+    def push(self, id: str, token: str, *, front: bool = False) -> None:
+        """Put an attempt at the end, or before all the others; nothing happens if it waits already."""
 
     @abstractmethod
     def remove(self, token: str) -> None:
@@ -62,7 +62,7 @@ class RedisQueue(Queue):
         self._name = name
         self._queue = RqQueue(name, connection=client, serializer=JSONSerializer)
 
-    def push(self, id: str, token: str) -> None:
+    def push(self, id: str, token: str, *, front: bool = False) -> None:
         """See `Queue.push`."""
         with reachable():
             if self._redis.lpos(self._queue.key, token) is not None:
@@ -75,6 +75,7 @@ class RedisQueue(Queue):
                 result_ttl=0,
                 failure_ttl=FAILURE_KEPT,
                 description=f"job {id}",
+                at_front=front,
             )
 
     def remove(self, token: str) -> None:
@@ -84,7 +85,7 @@ class RedisQueue(Queue):
                 self._redis.lrem(key, 0, token)
             try:
                 RqJob.fetch(token, connection=self._redis, serializer=JSONSerializer).delete()
-            except NoSuchJobError:
+            except (NoSuchJobError, InvalidJobOperation):  # gone already, or just now
                 return
 
     def waiting(self) -> list[str]:

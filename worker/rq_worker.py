@@ -2,8 +2,8 @@
 
 What of RQ is switched off, and why: its job timeout (an alarm that waits for a C call to return), its maintenance
 (notices a lost job after minutes, and two at once queue it twice), its scheduler (a forked one keeps a dead worker's
-connection and swallows jobs), callbacks and webhooks named by a delivery (whoever may write to Redis could name any
-function).
+connection and swallows jobs), its commands (a thread beside a fork), callbacks and webhooks named by a delivery
+(whoever may write to Redis could name any function).
 """
 
 from __future__ import annotations
@@ -44,6 +44,9 @@ ALIVE_FOR = 20
 
 RSS_UNIT = 1 if sys.platform == "darwin" else 1024
 """Bytes in one unit of `ru_maxrss`."""
+
+AWAY = (redis.ConnectionError, redis.TimeoutError)
+"""What Redis raises when it does not answer."""
 
 POLL = 0.05
 """Seconds between looks at a running horse."""
@@ -93,6 +96,12 @@ class PliantWorker(Worker):
         self._deliveries = queue
         self._stop_by: float | None = None
 
+    def subscribe(self) -> None:
+        """Listen to no commands: we cancel by the record, and a process that forks is better off without threads."""
+
+    def unsubscribe(self) -> None:
+        """Do nothing; see `subscribe`."""
+
     def run_maintenance_tasks(self) -> None:
         """Do nothing: the keeper looks after lost jobs."""
 
@@ -102,10 +111,22 @@ class PliantWorker(Worker):
         return False
 
     def heartbeat(self, timeout: int | None = None, pipeline: Any = None) -> None:
-        """Give RQ's sign of life, and our own that ends with us."""
-        super().heartbeat(timeout, pipeline)
+        """Give RQ's sign of life, and our own that ends with us; a store that is away is no reason to end."""
         target: Any = pipeline if pipeline is not None else self.connection
-        target.set(alive_key(self._settings.queue, self.name), os.getpid(), ex=ALIVE_FOR)
+        try:
+            super().heartbeat(timeout, pipeline)
+            target.set(alive_key(self._settings.queue, self.name), os.getpid(), ex=ALIVE_FOR)
+        except AWAY as error:
+            logger.warning("no sign of life: %s", error)
+
+    def execute_job(self, job: RqJob, queue: RqQueue) -> None:
+        """Run a delivery. If the store goes away before there is a horse, the keeper delivers the job again."""
+        try:
+            super().execute_job(job, queue)
+        except AWAY as error:
+            if self.horse_pid:
+                raise
+            logger.warning("delivery %s: %s", job.id, error)
 
     def request_stop(self, signum: int, frame: FrameType | None) -> None:  # noqa: ARG002
         """SIGTERM: end when idle; with a job, let it go on for the grace. A second one ends the grace."""
@@ -149,8 +170,7 @@ class PliantWorker(Worker):
                 self.kill_horse()
             if time.monotonic() > next_sign:
                 next_sign = time.monotonic() + IDLE_WAKE
-                with suppress(redis.ConnectionError, redis.TimeoutError):
-                    self.heartbeat()
+                self.heartbeat()
             time.sleep(POLL)
         self._horse_pid = 0
         self._bury(watch, job, status=status, peak=usage.ru_maxrss * RSS_UNIT)
@@ -162,10 +182,10 @@ class PliantWorker(Worker):
             if settled is not None:
                 self._records.append_log(watch.id, last_words(self._settings, watch.token))
                 if settled.job.status is Status.QUEUED:
-                    self._deliveries.push(watch.id, settled.token)
+                    self._deliveries.push(watch.id, settled.token, front=True)  # it has waited before
             if status != os.EX_OK:
-                job.delete()
-        except (StoreUnavailable, redis.ConnectionError, redis.TimeoutError) as error:
+                self._deliveries.remove(job.id)
+        except StoreUnavailable as error:
             logger.warning("job %s: %s; the keeper will look after it", watch.id, error)
         finally:
             clean_up(self._settings, watch.token)

@@ -61,11 +61,16 @@ class _Running:
     restart_at: float = 0.0
 
 
+class _ToldToStop(BaseException):
+    """A signal came while the children were being started."""
+
+
 class Supervisor:
     """Keeps children running until it is told to stop. Use it from the main thread: its children die with that thread."""
 
     def __init__(self, children: list[Child]) -> None:
         self._running = [_Running(child) for child in children]
+        self._starting = False
         self._stopping = False
         self._hurry = False
 
@@ -90,13 +95,17 @@ class Supervisor:
         """
         handlers = {number: signal.signal(number, self._told) for number in (signal.SIGTERM, signal.SIGINT)}
         try:
+            self._starting = True
             self.start()
-            if on_started is not None and not self._stopping:
+            self._starting = False
+            if on_started is not None:
                 on_started()
             while not self._stopping:
                 self.look()
                 time.sleep(POLL)
             self.stop()
+        except _ToldToStop:
+            logger.info("stopped while starting")
         finally:
             for number, handler in handlers.items():
                 signal.signal(number, handler)
@@ -136,6 +145,9 @@ class Supervisor:
     def _told(self, signum: int, frame: FrameType | None) -> None:  # noqa: ARG002
         self._hurry = self._stopping
         self._stopping = True
+        if self._starting:
+            self._starting = False
+            raise _ToldToStop
 
     def _launch(self, each: _Running) -> None:
         child, parent = each.child, os.getpid()

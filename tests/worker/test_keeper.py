@@ -120,7 +120,9 @@ def test_a_queued_job_that_the_queue_does_not_hold_is_queued_again(
     world.jobs.queue.remove(token)
     world.pass_seconds(5)
     assert world.jobs.records.get(id).token != token, "the old delivery, should it turn up, is void"
-    assert world.jobs.queue.waiting() == [world.jobs.records.get(each).token for each in (other, id)]
+    assert world.jobs.queue.waiting() == [world.jobs.records.get(each).token for each in (id, other)], (
+        "before all the others"
+    )
 
 
 def test_only_what_has_expired_is_removed(world: World, submit: Callable[[World], str]) -> None:

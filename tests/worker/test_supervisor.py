@@ -135,6 +135,20 @@ def test_a_second_signal_stops_the_waiting() -> None:
     assert gone(child)
 
 
+def test_a_signal_while_starting_stops_what_was_started() -> None:
+    waiting = SUPERVISED.replace(
+        "grace=60.0", "grace=60.0, ready=lambda c: (print(c.pid, flush=True), time.sleep(600))"
+    )
+    code = "import time\n" + waiting.format(code=SLEEP)
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    child = int(process.stdout.readline())
+    process.terminate()
+    assert process.wait(10) == 0
+    process.stdout.close()
+    assert gone(child)
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells a child of its parent's end")
 def test_children_die_with_a_killed_supervisor() -> None:
     process = subprocess.Popen([sys.executable, "-c", SUPERVISED.format(code=SLEEP)], stdout=subprocess.PIPE, text=True)
