@@ -285,7 +285,7 @@ class Jobs:
         Parameters
         ----------
         after : str, optional
-            `Event.id`; None returns all that are kept (the latest 256).
+            `Event.id`; None returns all that are kept (the latest 256; of a finished job the latest 16).
         timeout : float
             Seconds to wait, at most 20.
 

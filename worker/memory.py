@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 from pliant.client.schemas import Status
 from pliant.worker.errors import UnknownJob
 from pliant.worker.queue import Queue
-from pliant.worker.records import EVENTS_KEPT, LOG_KEPT, Beat, Event, Records, Stored, event_of
+from pliant.worker.records import LOG_KEPT, Beat, Event, Records, Stored, event_of, events_kept
 
 
 class MemoryRecords(Records):
@@ -158,7 +158,7 @@ class MemoryRecords(Records):
         name, data = event_of(before, after)
         events = self._events.setdefault(after.job.id, [])
         events.append(Event(f"{self._clock}-0", name, data))
-        del events[:-EVENTS_KEPT]
+        del events[: -events_kept(after)]
         self._changed.notify_all()
 
 

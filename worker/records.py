@@ -19,6 +19,9 @@ from pydantic import BaseModel, ConfigDict
 EVENTS_KEPT = 256
 """Events of one job that can be read again; older ones are dropped."""
 
+EVENTS_KEPT_AT_LAST = 16
+"""Events that are kept of a finished job: whoever follows it needs the last ones, and finished jobs are many."""
+
 LOG_KEPT = 2000
 """Lines of one job's log; older ones are dropped."""
 
@@ -97,6 +100,11 @@ def event_of(before: Stored | None, after: Stored) -> tuple[str, str]:
         if before.job.model_copy(update=still) == after.job.model_copy(update=still):
             return "progress", after.job.progress.model_dump_json()
     return "job", after.job.model_dump_json()
+
+
+def events_kept(after: Stored) -> int:
+    """Return how many events to keep of a job that stands like this."""
+    return EVENTS_KEPT_AT_LAST if after.job.status.final else EVENTS_KEPT
 
 
 class Records(ABC):

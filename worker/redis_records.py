@@ -20,7 +20,7 @@ import redis
 from pliant.client.schemas import Status
 from pliant.worker.connection import reachable
 from pliant.worker.errors import UnknownJob
-from pliant.worker.records import EVENTS_KEPT, LOG_KEPT, Beat, Event, Records, Stored, event_of
+from pliant.worker.records import LOG_KEPT, Beat, Event, Records, Stored, event_of, events_kept
 
 LONGEST_WAIT = 20.0
 """Seconds one blocking read waits at most: below the connection's own timeout."""
@@ -111,7 +111,7 @@ class RedisRecords(Records):
             taken = self._create(
                 args=[
                     self._at, job.id, stored.version, job.status.value, stored.token, stored.owner, stored.sort_key,
-                    stored.bytes, stored.key or "", stored.model_dump_json(), name, data, EVENTS_KEPT,
+                    stored.bytes, stored.key or "", stored.model_dump_json(), name, data, events_kept(stored),
                 ]
             )  # fmt: skip
         return stored if taken is None else self.get(str(taken))
@@ -138,7 +138,7 @@ class RedisRecords(Records):
             written = self._replace(
                 args=[
                     self._at, job.id, before.version, after.version, job.status.value, after.token, after.bytes,
-                    after.model_dump_json(), name, data, EVENTS_KEPT,
+                    after.model_dump_json(), name, data, events_kept(after),
                 ]
             )  # fmt: skip
         return bool(written)

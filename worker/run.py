@@ -64,7 +64,7 @@ def reconstruct(
     on_progress : callable, optional
         Told often; whoever cannot listen so often drops some.
     should_stop : callable, optional
-        Asked often; once it says True, the job ends with `Interrupted` and no files.
+        Asked often; once it says True, the job ends with `Interrupted`, and the files it has written are not all.
 
     Raises
     ------
@@ -91,12 +91,14 @@ def reconstruct(
     metrics = _metrics(inputs, solution)
     seconds = {"solve": solved - began, "metrics": time.perf_counter() - solved}
     report = build_report(inputs, solution, options, metrics=metrics, seconds=seconds)
-    artifacts = write_artifacts(
-        inputs, solution, options, report, directory, on_progress=lambda done: teller.part("exporting", done)
-    )
-    if should_stop is not None and should_stop():
-        raise Interrupted
-    teller.part("exporting", 1.0)
+
+    def exported(done: float) -> None:
+        teller.part("exporting", done)
+        if should_stop is not None and should_stop():
+            raise Interrupted
+
+    artifacts = write_artifacts(inputs, solution, options, report, directory, on_progress=exported)
+    exported(1.0)
     return Finished(
         metrics=metrics,
         outcome=solution.outcome.value,

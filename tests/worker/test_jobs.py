@@ -305,6 +305,11 @@ def test_events_are_capped(jobs: Jobs, submit) -> None:  # type: ignore[no-untyp
         progress = Progress(stage="reweight", fraction=number / 300, updated_at=NOW)
         jobs.records.update(id, lambda stored, p=progress: lifecycle.report(stored, token=token, progress=p))  # type: ignore[misc]
     assert len(jobs.events(id, timeout=0)) == 256
+    jobs.cancel(id)
+    jobs.records.update(id, lambda stored: lifecycle.stop(stored, token=token, now=NOW, retention=0))
+    kept = jobs.events(id, timeout=0)
+    assert len(kept) == 16
+    assert Job.model_validate_json(kept[-1].data).status is Status.CANCELLED
 
 
 def test_the_quota_refuses_what_does_not_fit(jobs: Jobs, submit, inputs_file: Path) -> None:  # type: ignore[no-untyped-def]
