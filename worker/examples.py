@@ -45,9 +45,9 @@ WRITERS: dict[str, Write] = {
 EXAMPLES = {
     example.name: example
     for example in (
-        Example("face", "talking face", lambda: corrupt(face(40, 2500, degrees=40), noise=0.002, outliers=0.02)),
-        Example("flag", "waving flag", lambda: corrupt(flag(50, 1500), noise=0.002, hidden=0.05)),
-        Example("sphere", "breathing sphere", lambda: sphere(60, 1200)),
+        Example("face", "talking face", lambda: corrupt(face(30, 1500, degrees=40), noise=0.002, outliers=0.02)),
+        Example("flag", "waving flag", lambda: corrupt(flag(30, 800), noise=0.002, hidden=0.05)),
+        Example("sphere", "breathing sphere", lambda: sphere(30, 500)),
     )
 }
 """Small enough for a result within seconds, and with something wrong in each (noise, outliers, hidden points)."""

@@ -123,8 +123,8 @@ export class Compose {
     });
     input.addEventListener("change", () => void this.put(part, input.files?.[0] ?? null));
     this.slots.set(part, { input, name, contents, remove, file: null });
-    const choose = h("label", { for: id, class: "choose" }, h("span", { class: "slot-label" }, SLOTS[part].label), name);
-    const row = h("div", { class: "slot", "data-part": part }, input, choose, remove, contents);
+    const choose = h("label", { for: id, class: "choose" }, SLOTS[part].label);
+    const row = h("div", { class: "slot", "data-part": part }, input, choose, name, remove, contents);
     if (part === "mesh") row.append(h("span", { class: "grid-size" }, h("label", { for: "grid" }, "or points on a grid"), this.grid));
     return row;
   }

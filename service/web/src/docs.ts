@@ -49,7 +49,9 @@ function manual(api: Document): HTMLElement[] {
   ];
 }
 
-const anchor = (method: string, path: string): string => `${method}-${path}`.replace(/[^A-Za-z0-9]+/g, "-");
+function anchor(method: string, path: string): string {
+  return `${method}-${path}`.replace(/[^A-Za-z0-9]+/g, "-");
+}
 
 function section(api: Document, method: string, path: string, operation: Operation): HTMLElement {
   const parameters = (operation.parameters ?? []).map((one) =>
