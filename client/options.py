@@ -73,6 +73,9 @@ class Options(BaseModel):
     precision: Literal["float64", "float32"] = Field("float64", description="Arithmetic of the large arrays.")
     seed: int = Field(0, ge=0, lt=2**32, description="Seed of every random choice.")
 
+    time_limit: Annotated[float, Field(gt=0, le=604_800, allow_inf_nan=False)] | None = Field(
+        None, description="Seconds the job may take before it ends as timed_out; null: the service's own limit alone."
+    )
     fps: float = Field(
         25.0, gt=0, le=1000, allow_inf_nan=False, description="Frames per second of the written animation."
     )

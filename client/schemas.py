@@ -7,7 +7,7 @@ from enum import StrEnum
 from typing import Any
 
 from pliant.client.options import Options
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 
 class Status(StrEnum):
@@ -116,6 +116,14 @@ class Job(Record):
     warnings: list[str] = Field(default_factory=list, description="What the user should read about this result.")
     artifacts: list[Artifact] = Field(default_factory=list)
     error: Problem | None = None
+
+    @field_validator("options", mode="before")
+    @classmethod
+    def _leave_out_unknown_options(cls, given: object) -> object:
+        """Read a job that a newer service wrote: a request with an unknown option is refused, a record with one is not."""
+        if not isinstance(given, dict):
+            return given
+        return {name: value for name, value in given.items() if name in Options.model_fields}
 
 
 class JobPage(Record):

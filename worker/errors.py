@@ -13,6 +13,7 @@
     ├── DataDirectoryInUse      another Pliant runs on the data directory
     ├── ServerFailed            the embedded Valkey does not start
     ├── Interrupted             a reconstruction was asked to stop, and did
+    ├── TimedOut                a reconstruction took longer than its options allow
     └── StaleAttempt            an attempt that no longer owns its job tried to write
 
 Every one carries a stable `code`, a whole sentence (`str(error)`) and whether the same request may succeed later.
@@ -159,6 +160,20 @@ class Interrupted(WorkerError):
 
     def __init__(self) -> None:
         super().__init__("The reconstruction was stopped on request.")
+
+
+class TimedOut(WorkerError):
+    """A reconstruction took longer than its options allow."""
+
+    code = "timed_out"
+    retryable = True
+
+    def __init__(self, limit: float) -> None:
+        super().__init__(
+            f"The job took longer than the {limit:g} s of its option time_limit. Give it more, send fewer points or frames, "
+            "or lower max_reweightings."
+        )
+        self.limit = limit
 
 
 class StaleAttempt(WorkerError):

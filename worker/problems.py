@@ -7,7 +7,7 @@ import os
 import signal
 
 from pliant.client.schemas import Problem
-from pliant.worker.errors import StoreUnavailable
+from pliant.worker.errors import StoreUnavailable, TimedOut
 
 _NO_ROOM_FOR_A_THREAD = ("can't start new thread", os.strerror(errno.EAGAIN))
 """What Python and SciPy's pool say when a thread's stack does not fit into the address space."""
@@ -34,6 +34,15 @@ def problem_of(error: BaseException, *, memory_limit: int = 0) -> Problem:
         return out_of_memory(memory_limit)
     if memory_limit and isinstance(error, RuntimeError) and str(error) in _NO_ROOM_FOR_A_THREAD:
         return out_of_memory(memory_limit)
+    if isinstance(error, TimedOut):
+        return Problem(
+            title="Timed out",
+            status=504,
+            detail=str(error),
+            code=error.code,
+            field="options.time_limit",
+            retryable=True,
+        )
     if isinstance(error, StoreUnavailable):
         return Problem(title="Storage failed", status=503, detail=str(error), code=error.code, retryable=True)
     if isinstance(error, OSError) and error.errno is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from pliant.client.options import SOLVER_FIELDS, Options
@@ -13,7 +13,7 @@ from pliant.client.schemas import Artifact, Progress
 from pliant.solver import Outcome, Settings, Solution, Step, solve
 from pliant.solver.metrics import evaluate
 from pliant.worker.artifacts import build_report, write_artifacts
-from pliant.worker.errors import Interrupted
+from pliant.worker.errors import Interrupted, TimedOut
 from pliant.worker.formats import Inputs
 from pliant.worker.progress import Teller
 
@@ -70,6 +70,8 @@ def reconstruct(
     ------
     Interrupted
         `should_stop` said so.
+    TimedOut
+        It took longer than `options.time_limit`.
     InvalidInput
         The inputs and the options do not fit together.
     """
@@ -77,16 +79,17 @@ def reconstruct(
     directory.mkdir(parents=True, exist_ok=True)
     teller.part("loading", 1.0)
     began = time.perf_counter()
+    halt = _Halt(should_stop, options.time_limit)
     solution = solve(
         inputs.tracks,
         inputs.mesh,
         cameras=inputs.cameras,
         settings=solver_settings(options),
         on_step=lambda step: _told(teller, step),
-        should_stop=should_stop,
+        should_stop=halt.asked,
     )
     if solution.outcome is Outcome.STOPPED:
-        raise Interrupted
+        halt.check()
     solved = time.perf_counter()
     metrics = _metrics(inputs, solution)
     seconds = {"solve": solved - began, "metrics": time.perf_counter() - solved}
@@ -94,8 +97,7 @@ def reconstruct(
 
     def exported(done: float) -> None:
         teller.part("exporting", done)
-        if should_stop is not None and should_stop():
-            raise Interrupted
+        halt.check()
 
     artifacts = write_artifacts(inputs, solution, options, report, directory, on_progress=exported)
     exported(1.0)
@@ -106,6 +108,27 @@ def reconstruct(
         warnings=tuple(solution.choices.warnings),
         artifacts=tuple(artifacts),
     )
+
+
+@dataclass(slots=True)
+class _Halt:
+    """Whether to stop, and why; once asked for, it stays so."""
+
+    should_stop: Callable[[], bool] | None
+    limit: float | None
+    began: float = field(default_factory=time.monotonic)
+    reason: Interrupted | TimedOut | None = None
+
+    def asked(self) -> bool:
+        if self.reason is None and self.should_stop is not None and self.should_stop():
+            self.reason = Interrupted()
+        if self.reason is None and self.limit is not None and time.monotonic() > self.began + self.limit:
+            self.reason = TimedOut(self.limit)
+        return self.reason is not None
+
+    def check(self) -> None:
+        if self.asked() and self.reason is not None:
+            raise self.reason
 
 
 def _metrics(inputs: Inputs, solution: Solution) -> dict[str, float]:

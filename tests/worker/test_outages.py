@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import secrets
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -17,6 +19,7 @@ from pliant.worker.audit import findings
 from pliant.worker.connection import connect
 from pliant.worker.errors import StoreUnavailable
 from pliant.worker.settings import Settings
+from pliant.worker.valkey import find_binary
 from worker_house import House, running, settled
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="finds processes in /proc")
@@ -59,6 +62,44 @@ def test_killing_valkey_loses_nothing(tmp_path: Path, inputs_files: tuple[Path, 
         assert rest.keys("rq:job:*") == [], "RQ keeps nothing of jobs that are done"
         rest.close()
         settled(house)
+
+
+@pytest.mark.s3
+def test_jobs_run_on_a_redis_with_a_password_and_on_s3(
+    tmp_path: Path, s3_url: str, inputs_files: tuple[Path, Path]
+) -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    password = secrets.token_hex(8)
+    command = [str(find_binary()), "--bind", "127.0.0.1", "--port", str(port), "--requirepass", password, "--save", ""]
+    server = subprocess.Popen(
+        [*command, "--dir", str(tmp_path), "--loglevel", "warning", "--logfile", str(tmp_path / "log")]
+    )
+    settings = Settings(
+        data=tmp_path, redis_url=f"redis://:{password}@127.0.0.1:{port}/3", blob_url=f"{s3_url}-{secrets.token_hex(3)}",
+        threads=1,
+    )  # fmt: skip
+    client = connect(settings.redis, decode=True)
+    client.ping()
+    client.close()
+    with House(settings, inputs=inputs_files) as house:
+        job = house.final(house.submit())
+        assert job.status is Status.SUCCEEDED, job.error
+        for artifact in job.artifacts:
+            _, blob = house.jobs.artifact(job.id, artifact.name)
+            digest = hashlib.sha256()
+            for chunk in blob.read():
+                digest.update(chunk)
+            assert (blob.size, digest.hexdigest()) == (artifact.bytes, artifact.sha256)
+        for pid in house.supervisor.pids().values():
+            assert password.encode() not in Path(f"/proc/{pid}/cmdline").read_bytes(), "anybody may read a command line"
+        assert not (tmp_path / "blobs").exists()
+        settled(house)
+        house.jobs.delete(job.id)
+        assert house.jobs.blobs.list() == []
+    server.terminate()
+    server.wait(10)
 
 
 SUPERVISOR = """

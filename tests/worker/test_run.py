@@ -10,8 +10,9 @@ import pytest
 from pliant.client.options import SOLVER_FIELDS, Options
 from pliant.client.schemas import Progress
 from pliant.solver import InvalidInput, Mesh, Settings
-from pliant.worker.errors import Interrupted
+from pliant.worker.errors import Interrupted, TimedOut
 from pliant.worker.formats import Inputs
+from pliant.worker.problems import problem_of
 from pliant.worker.run import reconstruct, solver_settings
 from worker_house import make_inputs
 
@@ -56,6 +57,14 @@ def test_it_stops_at_every_stage(inputs: Inputs, tmp_path: Path, stage: str) -> 
     assert stage == "exporting" or (told[-1].stage != "exporting" and told[-1].reweighting <= 1)
     assert not (tmp_path / "report.json").exists(), "the report is the last to be written"
     assert not list(tmp_path.glob(".*")), "no half-written file"
+
+
+def test_a_job_keeps_to_its_own_time_limit(inputs: Inputs, tmp_path: Path) -> None:
+    with pytest.raises(TimedOut, match=r"0\.001 s of its option time_limit") as caught:
+        reconstruct(inputs, Options(time_limit=0.001), tmp_path)
+    problem = problem_of(caught.value)
+    assert (problem.code, problem.field, problem.retryable) == ("timed_out", "options.time_limit", True)
+    assert reconstruct(inputs, Options(time_limit=100, max_reweightings=1), tmp_path).outcome == "max_reweightings"
 
 
 def test_every_option_of_the_solver_reaches_it() -> None:
