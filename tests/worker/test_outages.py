@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import secrets
@@ -184,3 +185,30 @@ def test_a_full_blob_store_refuses_the_job_and_keeps_nothing(
         assert house.jobs.page().jobs == []
         assert house.jobs.records.used() == 0
         assert findings(house.jobs, settle=0) == []
+
+
+def test_a_full_disk_under_valkey_refuses_and_loses_nothing(
+    small_disk: Path, tmp_path: Path, inputs_files: tuple[Path, Path]
+) -> None:
+    settings = Settings(data=small_disk, blob_url=(tmp_path / "blobs").as_uri(), threads=1)
+    with House(settings, own_valkey=True, inputs=inputs_files, children=[]) as house:
+        accepted = [house.submit()]
+
+        def answered(wanted: bool) -> bool:
+            try:
+                accepted.append(house.submit())
+            except StoreUnavailable:
+                return not wanted
+            return wanted
+
+        filler = small_disk / "filler"
+        with filler.open("wb", buffering=0) as out, contextlib.suppress(OSError):
+            while out.write(b"x" * 4096):
+                pass
+        house.until(lambda: answered(False), "it refuses")
+        filler.unlink()
+        house.until(lambda: answered(True), "it accepts again")
+        assert set(accepted) <= {job.id for job in house.jobs.page(limit=200).jobs}
+        # There is no keeper here: it would queue what is not queued, and sweep a refused submission's file hours later.
+        left = findings(house.jobs, settle=0)
+        assert all("belongs to no job" in each or "the queue does not hold it" in each for each in left)
