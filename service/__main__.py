@@ -1,0 +1,68 @@
+"""The process of the service: `python -m pliant.service`, set up by the environment alone."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from collections.abc import Callable
+from types import FrameType
+
+import uvicorn
+from fastapi import FastAPI
+from pliant.service.app import create_app
+from pliant.service.settings import InvalidServiceSetting, ServiceSettings
+from pliant.worker.errors import InvalidSetting
+from pliant.worker.jobs import Jobs
+from pliant.worker.settings import Settings
+
+STOP_WITHIN = 10
+"""Seconds that running requests get after SIGTERM."""
+
+
+class Server(uvicorn.Server):
+    """A server that tells the application when it is asked to stop, so that streams without end can end."""
+
+    def __init__(self, config: uvicorn.Config, *, on_stop: Callable[[], None]) -> None:
+        super().__init__(config)
+        self._on_stop = on_stop
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """See uvicorn; called once for each signal."""
+        self._on_stop()
+        super().handle_exit(sig, frame)
+
+
+def stop_streams(app: FastAPI) -> None:
+    """End the event streams, if the application has started at all."""
+    service = getattr(app.state, "service", None)
+    if service is not None:
+        service.followers.close()
+
+
+def main() -> int:
+    """Serve until SIGTERM or SIGINT; return the exit code."""
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    try:
+        settings = ServiceSettings.from_environment(os.environ)
+        jobs = Jobs.open(Settings.from_environment(os.environ))
+    except (InvalidServiceSetting, InvalidSetting) as error:
+        sys.stderr.write(f"{error}\n")
+        return 2
+    app = create_app(jobs, settings)
+    config = uvicorn.Config(
+        app,
+        host=settings.host,
+        port=settings.port,
+        log_config=None,
+        access_log=False,
+        server_header=False,
+        timeout_graceful_shutdown=STOP_WITHIN,
+    )
+    server = Server(config, on_stop=lambda: stop_streams(app))
+    server.run()
+    return 0 if server.started else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

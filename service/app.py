@@ -1,0 +1,106 @@
+"""The application: the parts put together, and nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from importlib.metadata import version
+
+import anyio
+from fastapi import FastAPI
+from pliant.service import describe, problems
+from pliant.service.core import Service
+from pliant.service.follow import Followers
+from pliant.service.guard import OriginGuard, SecurityHeaders
+from pliant.service.incoming import Incoming
+from pliant.service.linger import LingeringClose
+from pliant.service.routes import about, artifacts, events, jobs
+from pliant.service.settings import ServiceSettings
+from pliant.worker import errors
+from pliant.worker.formats import InvalidInput, Limits
+from pliant.worker.jobs import Jobs
+from starlette.middleware import Middleware
+from starlette.middleware.cors import CORSMiddleware
+from starlette.requests import ClientDisconnect
+
+STATUS_OF: dict[type[Exception], int] = {
+    InvalidInput: 422,
+    errors.UnknownJob: 404,
+    errors.UnknownArtifact: 404,
+    errors.NotAllowedNow: 409,
+    errors.Conflict: 409,
+    errors.InvalidRequest: 422,
+    errors.QuotaExceeded: 507,
+    errors.StoreUnavailable: 503,
+    errors.WorkerError: 500,
+    ClientDisconnect: 400,  # nobody is left to read it
+}
+"""What each error means in HTTP; a subclass takes its nearest base's."""
+
+
+def create_app(jobs_of_all: Jobs, settings: ServiceSettings, *, limits: Limits = Limits()) -> FastAPI:  # noqa: B008
+    """Make the application.
+
+    Parameters
+    ----------
+    jobs_of_all : Jobs
+        The jobs; nothing is asked of them before the first request.
+    settings : ServiceSettings
+        How the service runs.
+    limits : Limits
+        What the readers accept.
+    """
+
+    @asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        incoming = Incoming(settings.incoming)
+        incoming.open()
+        app.state.service = Service(
+            jobs=jobs_of_all,
+            settings=settings,
+            limits=limits,
+            incoming=incoming,
+            followers=Followers(),
+            parsing=anyio.CapacityLimiter(settings.parsers),
+        )
+        yield
+        incoming.close()
+
+    app = FastAPI(
+        title="Pliant",
+        summary=describe.SUMMARY,
+        description=describe.DESCRIPTION,
+        version=version("pliant"),
+        lifespan=lifespan,
+        middleware=middleware(settings),
+        docs_url=None,  # FastAPI's page loads scripts from elsewhere, which our own content-security policy forbids
+        redoc_url=None,
+    )
+    problems.install(app, STATUS_OF)
+    for each in (jobs, artifacts, events, about):
+        app.include_router(each.router)
+    app.openapi = lambda: describe.document(app)  # type: ignore[method-assign]
+    return app
+
+
+def middleware(settings: ServiceSettings) -> list[Middleware]:
+    """Return what every request passes, the outermost first."""
+    stack = [Middleware(SecurityHeaders), Middleware(LingeringClose), Middleware(OriginGuard, settings=settings)]
+    if settings.cors_origins:
+        stack.append(
+            Middleware(
+                CORSMiddleware,
+                allow_origins=settings.cors_origins,
+                allow_methods=["GET", "POST", "PUT", "DELETE"],
+                allow_headers=["Authorization", "Content-Type", "Idempotency-Key", "Last-Event-ID", "Prefer", "Range"],
+                expose_headers=[
+                    "Location",
+                    "ETag",
+                    "Content-Range",
+                    "Repr-Digest",
+                    "Retry-After",
+                    "Preference-Applied",
+                ],
+            )
+        )
+    return stack

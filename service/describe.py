@@ -1,0 +1,125 @@
+"""What the OpenAPI document says beyond what FastAPI reads from the code: errors, examples, the form."""
+
+from __future__ import annotations
+
+from http import HTTPStatus
+from typing import Any
+
+from fastapi import FastAPI
+from pliant.client.schemas import Problem
+from pliant.service.problems import MEDIA_TYPE
+
+SUMMARY = "Dense 2-D point tracks of a deforming thing in, a moving 3-D mesh out."
+DESCRIPTION = """Submit a job with `POST /v1/jobs`, follow it, download its files.
+
+Every error is `application/problem+json` with a stable `code`, a `detail` that is a whole sentence and ends with what to do,
+and, where an input is at fault, `field`, `expected`, `got` and `hint`. `retryable` says whether the same request may succeed later.
+"""
+
+_PROBLEM_EXAMPLE = {
+    "type": "about:blank",
+    "title": "Unprocessable Content",
+    "status": 422,
+    "detail": "tracks: expected at least 3 frames, got 2. Track the points over more frames.",
+    "code": "too_few_frames",
+    "field": "tracks",
+    "expected": "at least 3 frames",
+    "got": "2",
+    "hint": "Track the points over more frames.",
+    "retryable": False,
+}
+
+JOB_EXAMPLE: dict[str, Any] = {
+    "application/json": {
+        "example": {
+            "id": "4f0c6b1d2a9e8c7b5d3f",
+            "name": "face, take 3",
+            "status": "running",
+            "created_at": "2026-05-04T09:30:00Z",
+            "started_at": "2026-05-04T09:30:01Z",
+            "attempt": 1,
+            "options": {"method": "robust", "camera": "scaled_orthographic"},
+            "interpretation": {
+                "num_frames": 99,
+                "num_points": 2880,
+                "num_faces": 5600,
+                "hidden_fraction": 0.02,
+                "mesh_source": "given",
+                "has_ground_truth": False,
+                "has_rotations": False,
+                "layout": "tracks (F, P, 2)",
+                "y_axis": "down",
+                "notes": [],
+            },
+            "progress": {
+                "stage": "reweight",
+                "fraction": 0.4,
+                "reweighting": 9,
+                "max_reweightings": 30,
+                "objective": 1.7e-3,
+                "residual": 0.21,
+                "seconds_left": 6.5,
+                "updated_at": "2026-05-04T09:30:05Z",
+            },
+        }
+    }
+}
+
+_FILE = {"type": "string", "format": "binary"}
+SUBMIT_BODY: dict[str, Any] = {
+    "required": True,
+    "content": {
+        "multipart/form-data": {
+            "schema": {
+                "type": "object",
+                "required": ["tracks"],
+                "properties": {
+                    "tracks": {
+                        **_FILE,
+                        "description": "The 2-D tracks: npz with `tracks (F, P, 2)` and optionally `visibility (F, P)`, "
+                        "or another layout that docs/formats.md lists.",
+                    },
+                    "mesh": {
+                        "oneOf": [_FILE, {"type": "string", "pattern": "^[0-9]+x[0-9]+$"}],
+                        "description": "A mesh file whose vertex i is point i, or the text ROWSxCOLUMNS for a pixel grid. "
+                        "Left out: one is made, and the report says how.",
+                    },
+                    "ground_truth": {**_FILE, "description": "npz with `shapes (F, P, 3)`; used for metrics alone."},
+                    "rotations": {
+                        **_FILE,
+                        "description": "Known cameras `(F, 3, 3)` or `(F, 2, 3)`, used as they are.",
+                    },
+                    "options": {"type": "string", "description": "A JSON object; its schema is at /v1/options."},
+                    "name": {"type": "string", "maxLength": 200, "description": "A label of your own."},
+                },
+            },
+            "encoding": {
+                "tracks": {"contentType": "application/octet-stream"},
+                "options": {"contentType": "application/json"},
+            },
+            "example": {"tracks": "(the bytes of tracks.npz)", "mesh": "38x38", "options": '{"method": "robust"}'},
+        }
+    },
+}
+
+
+def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """Return the OpenAPI entries of these error statuses."""
+    schema = {"$ref": "#/components/schemas/Problem"}
+    return {
+        status: {
+            "description": HTTPStatus(status).phrase,
+            "content": {MEDIA_TYPE: {"schema": schema, **({"example": _PROBLEM_EXAMPLE} if status == 422 else {})}},
+        }
+        for status in statuses
+    }
+
+
+def document(app: FastAPI) -> dict[str, Any]:
+    """Return the OpenAPI document, made once: FastAPI's, with the schema of problems added to it."""
+    if app.openapi_schema is None:
+        made = FastAPI.openapi(app)
+        schemas = made.setdefault("components", {}).setdefault("schemas", {})
+        schemas["Problem"] = Problem.model_json_schema(ref_template="#/components/schemas/{model}")
+        app.openapi_schema = made
+    return app.openapi_schema

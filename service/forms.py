@@ -1,0 +1,302 @@
+"""Receiving a form: parts streamed to files with a limit and a SHA-256, never held in memory.
+
+FastAPI's `UploadFile` reads the whole body into a temporary file before the route is entered, and the route copies it again;
+here the body is parsed as it arrives, in batches on a thread, so a 300 MB part costs one write and a few hundred kilobytes.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import json
+import re
+from collections.abc import AsyncIterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO
+
+from anyio import to_thread
+from pliant.service.problems import Refusal
+from python_multipart.exceptions import FormParserError
+from python_multipart.multipart import MultipartParser, parse_options_header
+from starlette.requests import Request
+
+BATCH = 2**18
+"""Bytes gathered before a thread parses and writes them: a hop costs some 50 µs, so smaller batches would be mostly hops."""
+_SUFFIX = re.compile(r"\.[a-z0-9]{1,8}")
+
+
+@dataclass(frozen=True)
+class FormRules:
+    """What a form may hold.
+
+    Attributes
+    ----------
+    files : frozenset of str
+        Parts that are written to disk when they come with a file name.
+    texts : frozenset of str
+        Parts that may be text; one that is in `files` too is text when it has no file name.
+    max_body_bytes, max_text_bytes : int
+        Limits of the whole body and of one text.
+    stall_seconds : float
+        How long the client may send nothing at all.
+    """
+
+    files: frozenset[str]
+    texts: frozenset[str]
+    max_body_bytes: int
+    max_text_bytes: int
+    stall_seconds: float = 60.0
+
+
+@dataclass(frozen=True)
+class File:
+    """A part on disk."""
+
+    path: Path
+    bytes: int
+    sha256: str
+
+
+@dataclass(frozen=True)
+class Form:
+    """What arrived: files by part name, texts by part name."""
+
+    files: Mapping[str, File]
+    texts: Mapping[str, str]
+
+    @property
+    def fingerprint(self) -> str:
+        """SHA-256 over every part's name and content, the same for the same content in any order of the parts."""
+        said = {name: ["file", file.sha256] for name, file in self.files.items()}
+        said |= {name: ["text", text] for name, text in self.texts.items()}
+        return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
+
+
+async def receive_form(request: Request, room: Path, *, rules: FormRules) -> Form:
+    """Receive a multipart form.
+
+    Parameters
+    ----------
+    request : Request
+        Its body has not been read yet.
+    room : Path
+        An empty folder for the files; whoever made it removes it.
+    rules : FormRules
+        Which parts there may be, and how large.
+
+    Raises
+    ------
+    Refusal
+        415 no multipart form, 400 malformed or cut short, 413 too large, 408 stalled, 422 an unknown or repeated part.
+    """
+    kind, parameters = parse_options_header(request.headers.get("content-type"))
+    if kind != b"multipart/form-data":
+        raise Refusal(
+            415,
+            "unsupported_media_type",
+            detail="The body must be a form: send multipart/form-data with a part `tracks`. An example is at /docs.",
+            expected="multipart/form-data",
+            got=kind.decode("latin-1") or "no Content-Type",
+        )
+    if not parameters.get(b"boundary"):
+        raise _malformed("the Content-Type names no boundary")
+    try:
+        reader = _Reader(parameters[b"boundary"], room, rules)
+    except FormParserError as error:
+        raise _malformed(str(error)) from error
+    try:
+        async for batch in batches(request, max_bytes=rules.max_body_bytes, stall_seconds=rules.stall_seconds):
+            await to_thread.run_sync(reader.feed, batch)
+        return reader.finish()
+    finally:
+        reader.close()
+
+
+async def batches(request: Request, *, max_bytes: int, stall_seconds: float) -> AsyncIterator[bytes]:
+    """Yield the body in pieces of about `BATCH` bytes.
+
+    Parameters
+    ----------
+    request : Request
+        Its body has not been read yet.
+    max_bytes : int
+        Largest body.
+    stall_seconds : float
+        How long the client may send nothing at all.
+
+    Raises
+    ------
+    Refusal
+        413 if the body is declared or turns out larger than that, 408 if the client stalls.
+    """
+    declared = request.headers.get("content-length", "")
+    if declared.isdigit() and int(declared) > max_bytes:
+        raise _too_large(max_bytes, f"{declared} bytes declared")
+    stream = request.stream()
+    gathered, held, total = [], 0, 0
+    while True:
+        try:
+            async with asyncio.timeout(stall_seconds):
+                piece = await anext(stream, None)
+        except TimeoutError:
+            detail = f"Nothing arrived for {stall_seconds:g} s, so the request was given up. Send it again."
+            raise Refusal(408, "body_stalled", detail=detail, retryable=True) from None
+        if piece is None:
+            break
+        total += len(piece)
+        if total > max_bytes:
+            raise _too_large(max_bytes, "more")
+        gathered.append(piece)
+        held += len(piece)
+        if held >= BATCH:
+            yield b"".join(gathered)
+            gathered, held = [], 0
+    if gathered:
+        yield b"".join(gathered)
+
+
+@dataclass
+class _Part:
+    """The part being read: its headers so far, then either a file or a growing text."""
+
+    header_name: bytearray = field(default_factory=bytearray)
+    header_value: bytearray = field(default_factory=bytearray)
+    disposition: bytes = b""
+    name: str = ""
+    path: Path | None = None
+    sink: BinaryIO | None = None
+    text: bytearray = field(default_factory=bytearray)
+    digest: hashlib._Hash = field(default_factory=hashlib.sha256)
+    size: int = 0
+
+
+class _Reader:
+    """Parses a form piece by piece. Belongs to one request; `feed` is called from one thread at a time."""
+
+    def __init__(self, boundary: bytes, room: Path, rules: FormRules) -> None:
+        self._room, self._rules = room, rules
+        self._files: dict[str, File] = {}
+        self._texts: dict[str, str] = {}
+        self._part = _Part()
+        self._ended = False
+        self._parser = MultipartParser(
+            boundary,
+            {
+                "on_part_begin": self._begin,
+                "on_header_field": lambda data, start, end: self._part.header_name.extend(data[start:end]),
+                "on_header_value": lambda data, start, end: self._part.header_value.extend(data[start:end]),
+                "on_header_end": self._header,
+                "on_headers_finished": self._open,
+                "on_part_data": self._data,
+                "on_part_end": self._end,
+                "on_end": self._all,
+            },
+        )
+
+    def feed(self, piece: bytes) -> None:
+        """Parse and write a piece of the body."""
+        try:
+            self._parser.write(piece)
+        except FormParserError as error:
+            raise _malformed(str(error)) from error
+
+    def finish(self) -> Form:
+        """Return the form, once all of the body was fed."""
+        if not self._ended:
+            raise _malformed("it ends before its closing boundary")
+        return Form(files=self._files, texts=self._texts)
+
+    def close(self) -> None:
+        """Close the file being written, if any."""
+        if self._part.sink is not None:
+            self._part.sink.close()
+
+    def _begin(self) -> None:
+        self._part = _Part()
+
+    def _header(self) -> None:
+        part = self._part
+        if part.header_name.lower() == b"content-disposition":
+            part.disposition = bytes(part.header_value)
+        part.header_name.clear()
+        part.header_value.clear()
+
+    def _open(self) -> None:
+        part, rules = self._part, self._rules
+        kind, said = parse_options_header(part.disposition)
+        part.name = said.get(b"name", b"").decode("utf-8", "replace")
+        if kind != b"form-data" or not part.name:
+            raise _malformed("a part has no Content-Disposition: form-data with a name")
+        known = rules.files | rules.texts
+        if part.name not in known:
+            expected = "one of " + ", ".join(sorted(known))
+            raise _unfit(
+                "unknown_part", part.name[:80], expected=expected, got="a part of that name", hint="Leave it out."
+            )
+        if part.name in self._files or part.name in self._texts:
+            raise _unfit("repeated_part", part.name, expected="the part once", got="it twice", hint="Send it once.")
+        # A part that can only be text is text even if the client gave it a file name, as several HTTP libraries do.
+        if part.name in rules.files and b"filename" in said:
+            suffix = Path(said[b"filename"].decode("utf-8", "replace")).suffix.lower()
+            part.path = self._room / f"{part.name}{suffix if _SUFFIX.fullmatch(suffix) else ''}"
+            part.sink = part.path.open("xb")
+        elif part.name not in rules.texts:
+            raise _unfit(
+                "not_a_file",
+                part.name,
+                expected="a file",
+                got="text",
+                hint=f"Give the part a file name, as in curl's -F {part.name}=@FILE.",
+            )
+
+    def _data(self, data: bytes, start: int, end: int) -> None:
+        part = self._part
+        part.size += end - start
+        if part.sink is None:
+            if part.size > self._rules.max_text_bytes:
+                raise _too_large(self._rules.max_text_bytes, "more", what=part.name)
+            part.text.extend(data[start:end])
+            return
+        piece = memoryview(data)[start:end]
+        part.sink.write(piece)
+        part.digest.update(piece)
+
+    def _end(self) -> None:
+        part = self._part
+        if part.sink is None:
+            try:
+                self._texts[part.name] = part.text.decode()
+            except UnicodeDecodeError:
+                hint = "Send it in UTF-8."
+                raise _unfit("not_utf8", part.name, expected="text in UTF-8", got="other bytes", hint=hint) from None
+            return
+        part.sink.close()
+        assert part.path is not None
+        self._files[part.name] = File(part.path, part.size, part.digest.hexdigest())
+        part.sink = None
+
+    def _all(self) -> None:
+        self._ended = True
+
+
+def _unfit(code: str, name: str, *, expected: str, got: str, hint: str) -> Refusal:
+    detail = f"{name}: expected {expected}, got {got}. {hint}"
+    return Refusal(422, code, detail=detail, field=name, expected=expected, got=got, hint=hint)
+
+
+def _malformed(why: str) -> Refusal:
+    detail = f"The form is malformed: {why.rstrip('.')}. Let an HTTP library write the body, or compare it with /docs."
+    return Refusal(400, "malformed_form", detail=detail)
+
+
+def _too_large(limit: int, got: str, *, what: str = "body") -> Refusal:
+    return Refusal(
+        413,
+        "body_too_large" if what == "body" else "text_too_large",
+        detail=f"{what}: expected at most {limit} bytes, got {got}. Take fewer frames or points; see /v1/limits.",
+        field=what,
+        expected=f"at most {limit} bytes",
+        got=got,
+        hint="Take fewer frames or points, or store float32.",
+    )

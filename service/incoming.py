@@ -1,0 +1,81 @@
+"""The folder where bodies lie while they arrive, and nothing afterwards.
+
+Each process owns one sub-folder beside a locked file; each request gets a room of its own in it, removed when the request
+ends however it ends. What a killed process left behind is known by its free lock and swept by the next one that starts.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import secrets
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+class Incoming:
+    """One process's share of the incoming folder; `open` it, `close` it.
+
+    Attributes
+    ----------
+    directory : Path
+        The folder shared by all processes of the service.
+    """
+
+    def __init__(self, directory: Path) -> None:
+        self.directory = directory
+        self._own: Path | None = None
+        self._lock = -1
+
+    def open(self) -> None:
+        """Take a sub-folder and sweep those of processes that are gone."""
+        self.directory.mkdir(parents=True, exist_ok=True)
+        while self._own is None:
+            name = secrets.token_hex(8)
+            lock = self.directory / f"{name}.lock"
+            descriptor = os.open(lock, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+            # Another process may have swept the file in the moment before it was locked; then it has no name any more.
+            if os.fstat(descriptor).st_nlink == 0:
+                os.close(descriptor)
+                continue
+            self._lock, self._own = descriptor, self.directory / name
+            self._own.mkdir(mode=0o700)
+        self._sweep()
+
+    def close(self) -> None:
+        """Remove the sub-folder."""
+        if self._own is None:
+            return
+        shutil.rmtree(self._own, ignore_errors=True)
+        self._own.with_suffix(".lock").unlink(missing_ok=True)
+        os.close(self._lock)
+        self._own, self._lock = None, -1
+
+    @contextmanager
+    def room(self) -> Iterator[Path]:
+        """Give a new empty folder, and remove it with all that is in it when the block ends."""
+        assert self._own is not None, "open() comes first"
+        with tempfile.TemporaryDirectory(dir=self._own, prefix="", ignore_cleanup_errors=True) as path:
+            yield Path(path)
+
+    def _sweep(self) -> None:
+        """Remove the sub-folders whose process is gone, which is to say whose lock is free."""
+        for lock in self.directory.glob("*.lock"):
+            if self._own is not None and lock.stem == self._own.name:
+                continue
+            try:
+                descriptor = os.open(lock, os.O_RDWR | os.O_CLOEXEC)
+            except FileNotFoundError:  # its process has just ended in good order
+                continue
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                shutil.rmtree(lock.with_suffix(""), ignore_errors=True)
+                lock.unlink(missing_ok=True)
+            except BlockingIOError:
+                pass
+            finally:
+                os.close(descriptor)

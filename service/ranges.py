@@ -1,0 +1,71 @@
+"""Conditional and ranged reading of one file (RFC 9110, sections 13 and 14), as pure functions of the request's headers."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+_ONE_RANGE = re.compile(r"\s*bytes\s*=\s*(\d{0,18})\s*-\s*(\d{0,18})\s*")
+_TAG = re.compile(r'(?:W/)?"[^"]*"')
+
+
+@dataclass(frozen=True)
+class Slice:
+    """What to send of a file: `length` bytes from `start` on, with the status that says so."""
+
+    status: int
+    """200 whole, 206 a part, 304 nothing because the client has it, 412 not the file it meant, 416 no such part."""
+    start: int = 0
+    length: int = 0
+
+
+def decide(headers: Mapping[str, str], *, size: int, etag: str) -> Slice:
+    """Return what a GET with these headers is to be answered with.
+
+    Preconditions come first (If-Match, If-None-Match), then Range if If-Range agrees. Several ranges at once are answered
+    with the whole file, as RFC 9110 §14.2 allows: nobody resumes a download that way.
+
+    Parameters
+    ----------
+    headers : mapping of str to str
+        The request's headers, names in lower case or case-insensitive.
+    size : int
+        The file's bytes.
+    etag : str
+        The file's strong entity tag, with its quotes.
+    """
+    if "if-match" in headers and not _matches(headers["if-match"], etag, strong=True):
+        return Slice(412)
+    if "if-none-match" in headers and _matches(headers["if-none-match"], etag, strong=False):
+        return Slice(304)
+    wanted = headers.get("range")
+    # If-Range with a date never agrees: we give no Last-Modified, so the client cannot have one of ours.
+    if wanted is None or headers.get("if-range", etag).strip() != etag:
+        return Slice(200, 0, size)
+    return _of_range(wanted, size)
+
+
+def _of_range(wanted: str, size: int) -> Slice:
+    """Return the part that a Range header names; a header that is no single byte range is ignored."""
+    match = _ONE_RANGE.fullmatch(wanted)
+    if match is None or match.groups() == ("", ""):
+        return Slice(200, 0, size)
+    first, last = match.groups()
+    if not first:  # the last n bytes
+        start, stop = max(size - int(last), 0), size
+    else:
+        start, stop = int(first), min(int(last) + 1 if last else size, size)
+        if last and int(last) < int(first):
+            return Slice(200, 0, size)
+    if start >= size or stop <= start:
+        return Slice(416)
+    return Slice(206, start, stop - start)
+
+
+def _matches(listed: str, etag: str, *, strong: bool) -> bool:
+    """Return True if an If-Match or If-None-Match list names this entity tag."""
+    if listed.strip() == "*":
+        return True
+    tags = _TAG.findall(listed)
+    return etag in (tags if strong else [tag.removeprefix("W/") for tag in tags])

@@ -1,0 +1,53 @@
+"""What the service is and how it is: options, limits, health."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+from fastapi import APIRouter
+from fastapi.responses import JSONResponse, Response
+from pliant.client.options import Options
+from pliant.client.schemas import ServiceLimits
+from pliant.service.core import Core
+from pliant.service.describe import problems
+from pliant.service.problems import answer, problem
+from pliant.worker.jobs import LARGEST_PAGE
+
+router = APIRouter(tags=["about"])
+
+
+@router.get("/v1/options", summary="The options of a job", responses=problems(401))
+def options() -> dict[str, Any]:
+    """Return the JSON Schema of `options`: every name with its meaning, unit, bounds and default."""
+    return Options.model_json_schema()
+
+
+@router.get("/v1/limits", summary="What this service accepts", responses=problems(401))
+def limits(core: Core) -> ServiceLimits:
+    """Return the largest body, frames, points and the like."""
+    taken = {field.name for field in dataclasses.fields(core.limits)} & set(ServiceLimits.model_fields)
+    return ServiceLimits(
+        **{name: getattr(core.limits, name) for name in taken},
+        max_body_bytes=core.settings.max_body_bytes,
+        max_text_bytes=core.settings.max_text_bytes,
+        max_wait_seconds=core.settings.max_wait_seconds,
+        max_page=LARGEST_PAGE,
+    )
+
+
+@router.get("/healthz", summary="Is the process alive?")
+def healthz() -> dict[str, str]:
+    """Return 200 while the process answers at all; nothing else is looked at."""
+    return {"status": "ok"}
+
+
+@router.get("/readyz", summary="Can it take jobs?", responses=problems(503))
+def readyz(core: Core) -> Response:
+    """Return 200 if the job store, the blob store and at least one worker are there, else 503 and what is missing."""
+    parts = core.jobs.ready()
+    missing = {name: said for name, said in parts.items() if said != "ok"}
+    if not missing:
+        return JSONResponse(parts)
+    said = " ".join(f"{name}: {sentence}" for name, sentence in missing.items())
+    return answer(problem(503, "not_ready", detail=said), headers={"Retry-After": "2"})

@@ -1,0 +1,128 @@
+"""From a received form to an accepted job: read, check, store in canonical form, submit. Nothing is queued before all of it held."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from pliant.client.options import Options
+from pliant.client.schemas import Job
+from pliant.service.forms import Form
+from pliant.service.problems import Refusal, from_validation
+from pliant.worker.formats import Limits, read_inputs, save_inputs
+from pliant.worker.jobs import Jobs
+from pydantic import ValidationError
+
+FILES = frozenset({"tracks", "mesh", "ground_truth", "rotations"})
+TEXTS = frozenset({"mesh", "options", "name"})
+LONGEST_NAME = 200
+"""Characters of the user's label."""
+
+
+def accept(
+    form: Form,
+    room: Path,
+    *,
+    jobs: Jobs,
+    limits: Limits,
+    id: str | None = None,
+    idempotency_key: str | None = None,
+) -> tuple[Job, bool]:
+    """Read a form's inputs and submit the job. Blocks; call it on a thread.
+
+    Parameters
+    ----------
+    form : Form
+        What arrived.
+    room : Path
+        Where to write the canonical inputs; removed by whoever made it.
+    jobs : Jobs
+        The jobs of whoever asks.
+    limits : Limits
+        What the readers accept.
+    id, idempotency_key : str, optional
+        The client's own id, and the key of a request that may be repeated.
+
+    Returns
+    -------
+    job : Job
+        The job, new or the one that the same request made before.
+    new : bool
+        False if it was made before.
+
+    Raises
+    ------
+    Refusal, InvalidInput, WorkerError
+        Nothing is queued then.
+    """
+    options = parse_options(form.texts.get("options", ""))
+    name = _name(form.texts.get("name", ""))
+    if "tracks" not in form.files:
+        raise missing("tracks")
+    known = jobs.known(id=id, idempotency_key=idempotency_key, fingerprint=form.fingerprint)
+    if known is not None:
+        return known, False
+    files: dict[str, Path | str | None] = {part: file.path for part, file in form.files.items()}
+    if form.texts.get("mesh", "").strip():
+        files["mesh"] = form.texts["mesh"].strip()
+    inputs = read_inputs(**files, options=options, limits=limits)  # type: ignore[arg-type]
+    canonical = room / "canonical.npz"
+    save_inputs(inputs, canonical)
+    job = jobs.submit(
+        canonical,
+        options=options,
+        interpretation=inputs.interpretation,
+        name=name,
+        id=id,
+        idempotency_key=idempotency_key,
+        fingerprint=form.fingerprint,
+    )
+    return job, True
+
+
+def missing(part: str) -> Refusal:
+    """Return the refusal of a form without a part that it must have."""
+    hint = f"Add the part, as in curl's -F {part}=@{part}.npz."
+    detail = f"{part}: expected a file, got none. {hint}"
+    return Refusal(422, "missing_part", detail=detail, field=part, expected="a file", got="none", hint=hint)
+
+
+def parse_options(text: str) -> Options:
+    """Return the options of a job from their JSON; empty text means the defaults.
+
+    Raises
+    ------
+    Refusal
+        It is no JSON object, names an option that there is not, or a value is out of its range.
+    """
+    if not text.strip():
+        return Options()
+    try:
+        given: Any = json.loads(text)
+    except (ValueError, RecursionError):
+        raise _not_an_object("something else") from None
+    if not isinstance(given, dict):
+        raise _not_an_object(f"a JSON {type(given).__name__}")
+    try:
+        return Options.model_validate(given)
+    except ValidationError as error:
+        said = from_validation(error.errors(), prefix="options").model_dump(exclude_none=True)
+        refused = {key: said[key] for key in ("field", "expected", "got", "hint")}
+        raise Refusal(422, said["code"], detail=said["detail"], **refused) from None
+
+
+def _not_an_object(got: str) -> Refusal:
+    hint = 'For example {"method": "robust"}; the schema is at /v1/options.'
+    detail = f"options: expected a JSON object, got {got}. {hint}"
+    return Refusal(422, "invalid_option", detail=detail, field="options", expected="a JSON object", got=got, hint=hint)
+
+
+def _name(text: str) -> str:
+    """Return the user's label, its blanks and control characters made single spaces."""
+    name = " ".join("".join(sign if sign.isprintable() else " " for sign in text).split())
+    if len(name) > LONGEST_NAME:
+        expected, got, hint = f"at most {LONGEST_NAME} characters", str(len(name)), "Shorten it."
+        detail = f"name: expected {expected}, got {got}. {hint}"
+        raise Refusal(422, "name_too_long", detail=detail, field="name", expected=expected, got=got, hint=hint)
+    return name

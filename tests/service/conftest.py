@@ -1,0 +1,66 @@
+"""The whole service on a free port, on a real embedded Valkey and a real directory of blobs."""
+
+from __future__ import annotations
+
+import dataclasses
+import secrets
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import httpx
+import pytest
+import uvicorn
+from pliant.service.app import create_app
+from pliant.service.settings import ServiceSettings
+from pliant.worker.formats import Limits
+from pliant.worker.jobs import Jobs
+from pliant.worker.settings import Settings
+from pliant.worker.valkey import Valkey
+from serving import Running, Serve, until
+
+
+@pytest.fixture(scope="session")
+def valkey_url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    data = tmp_path_factory.mktemp("valkey")
+    valkey = Valkey.claim(data)
+    server = valkey.start()
+    yield Settings(data=data).redis
+    server.terminate()
+    server.wait(10)
+    valkey.release()
+
+
+@pytest.fixture(scope="module")
+def serve(valkey_url: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Serve]:
+    """Start a service with settings of one's own; it ends with the module."""
+    started: list[tuple[uvicorn.Server, threading.Thread]] = []
+
+    def start(*, limits: Limits = Limits(), redis_url: str = valkey_url, **given: Any) -> Running:  # noqa: B008
+        data = tmp_path_factory.mktemp("data")
+        jobs = Jobs.open(Settings(data=data, redis_url=redis_url, queue=f"test-{secrets.token_hex(4)}"))
+        settings = dataclasses.replace(ServiceSettings(port=0, incoming=data / "incoming"), **given)
+        app = create_app(jobs, settings, limits=limits)
+        server = uvicorn.Server(uvicorn.Config(app, port=0, log_config=None, timeout_graceful_shutdown=3))
+        thread = threading.Thread(target=server.run)
+        thread.start()
+        started.append((server, thread))
+        until(lambda: server.started)
+        port = server.servers[0].sockets[0].getsockname()[1]
+        return Running(f"http://127.0.0.1:{port}", jobs, settings, server)
+
+    yield start
+    for server, thread in started:
+        server.should_exit = True
+        thread.join(10)
+
+
+@pytest.fixture(scope="module")
+def running(serve: Serve) -> Running:
+    return serve()
+
+
+@pytest.fixture
+def http(running: Running) -> Iterator[httpx.Client]:
+    with httpx.Client(base_url=running.url, timeout=20) as client:
+        yield client

@@ -1,0 +1,109 @@
+"""What tests of the service work with: a running one, forms, and the steps of a worker."""
+
+from __future__ import annotations
+
+import io
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import uvicorn
+from pliant.client.schemas import Artifact, Job
+from pliant.service.settings import ServiceSettings
+from pliant.worker import lifecycle
+from pliant.worker.jobs import Jobs
+
+NOW = datetime(2026, 5, 4, 9, 30, tzinfo=UTC)
+
+
+@dataclass(frozen=True)
+class Running:
+    """A service that answers, and what stands behind it."""
+
+    url: str
+    jobs: Jobs
+    settings: ServiceSettings
+    server: uvicorn.Server
+
+    @property
+    def left_on_disk(self) -> list[Path]:
+        """Everything in the incoming folder but the process's own lock and empty folder."""
+        return [
+            path
+            for path in self.settings.incoming.rglob("*")
+            if len(path.relative_to(self.settings.incoming).parts) > 1
+        ]
+
+    @property
+    def waiting(self) -> int:
+        """How many jobs there are."""
+        return len(self.jobs.page(limit=200).jobs)
+
+
+Serve = Callable[..., Running]
+
+
+def until(holds: Callable[[], Any], *, seconds: float = 10.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not holds():
+        assert time.monotonic() < deadline, "it did not come to hold in time"
+        time.sleep(0.01)
+
+
+def npz(**arrays: Any) -> bytes:
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)
+    return buffer.getvalue()
+
+
+def tracks(num_frames: int = 6, num_points: int = 12, *, seed: int = 0) -> bytes:
+    return npz(tracks=np.random.default_rng(seed).normal(size=(num_frames, num_points, 2)) * 100)
+
+
+def form(body: bytes | None = None, **parts: Any) -> dict[str, Any]:
+    """Return httpx's `files` for a form: bytes become files, everything else text."""
+    given = {"tracks": tracks() if body is None else body, **parts}
+    return {
+        name: (f"{name}.npz", value)
+        if isinstance(value, bytes)
+        else (None, value if isinstance(value, str) else json.dumps(value))
+        for name, value in given.items()
+    }
+
+
+def submit(http: httpx.Client, **parts: Any) -> Job:
+    answer = http.post("/v1/jobs", files=form(**parts))
+    assert answer.status_code == 202, answer.text
+    return Job.model_validate_json(answer.content)
+
+
+def claim(running: Running, id: str) -> str:
+    token = running.jobs.records.get(id).token
+    running.jobs.records.update(id, lambda stored: lifecycle.claim(stored, token=token, worker="w", now=NOW))
+    return token
+
+
+def finish(running: Running, id: str, contents: bytes, *, name: str = "shapes.npz") -> None:
+    """Do as a worker would: claim the job, store a file, publish it."""
+    token = claim(running, id)
+    file = running.settings.incoming.parent / f"{id}.tmp"
+    file.write_bytes(contents)
+    prefix = f"jobs/{id}/{token}/"
+    running.jobs.blobs.put(f"{prefix}{name}", file)
+    artifact = Artifact(
+        name=name, media_type="application/octet-stream", bytes=len(contents), sha256=sha256(contents).hexdigest()
+    )
+    running.jobs.records.update(
+        id,
+        lambda stored: lifecycle.succeed(
+            stored, token=token, prefix=prefix, artifacts=[artifact], metrics={}, outcome="converged",
+            sentence="Converged.", warnings=[], now=NOW, retention=0,
+        ),
+    )  # fmt: skip
