@@ -1,4 +1,4 @@
-"""`python -m pliant.worker [work|keep]`: one worker, or one keeper, set up by the `PLIANT_…` environment."""
+"""`python -m pliant.worker [work|keep|audit]`: one worker, one keeper or one audit, set up by the `PLIANT_…` environment."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import signal
 import sys
 from types import FrameType
 
+from pliant.worker.audit import findings
 from pliant.worker.connection import connect
 from pliant.worker.errors import WorkerError
 from pliant.worker.jobs import Jobs
@@ -20,7 +21,7 @@ from pliant.worker.redis_records import RedisRecords
 from pliant.worker.rq_worker import PliantWorker
 from pliant.worker.settings import NUMERICAL_THREADS, Settings
 
-USAGE = "usage: python -m pliant.worker [work|keep]"
+USAGE = "usage: python -m pliant.worker [work|keep|audit]"
 
 PRELOADED = ("pliant.worker.formats", "pliant.worker.run")
 
@@ -28,7 +29,7 @@ WATCH_ANSWERS_WITHIN = 2.0
 """Seconds a sign of life may take: the watcher must go on watching when the store hangs."""
 
 
-def work(settings: Settings) -> None:
+def work(settings: Settings) -> int:
     """Take jobs until told to stop.
 
     What a job needs is loaded before the first fork, once for all of them. That is safe as long as this process
@@ -50,9 +51,10 @@ def work(settings: Settings) -> None:
         queue=RedisQueue(connection, name=settings.queue),
         name=secrets.token_hex(6),
     ).work(logging_level=None)
+    return 0
 
 
-def keep(settings: Settings) -> None:
+def keep(settings: Settings) -> int:
     """Look after the jobs until told to stop."""
     told = False
 
@@ -63,23 +65,30 @@ def keep(settings: Settings) -> None:
     signal.signal(signal.SIGTERM, stop)
     signal.signal(signal.SIGINT, stop)
     Keeper(jobs=Jobs.open(settings)).run(lambda: told)
+    return 0
+
+
+def audit(settings: Settings) -> int:
+    """Say what of everything stored does not fit the records; return 1 if something does not."""
+    found = findings(Jobs.open(settings))
+    sys.stdout.writelines(f"{finding}\n" for finding in found or ["Everything stored is as the records say."])
+    return 1 if found else 0
 
 
 def main(arguments: list[str]) -> int:
     """Run one process; return its exit code."""
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(processName)s %(name)s %(levelname)s %(message)s")
     logging.getLogger("rq.worker").setLevel(logging.WARNING)
-    tasks = {"work": work, "keep": keep}
+    tasks = {"work": work, "keep": keep, "audit": audit}
     task = tasks.get(arguments[0] if arguments else "work")
     if task is None or len(arguments) > 1:
         sys.stderr.write(f"{USAGE}\n")
         return 2
     try:
-        task(Settings.from_environment(os.environ))
+        return task(Settings.from_environment(os.environ))
     except WorkerError as error:
         sys.stderr.write(f"{error}\n")
         return 1
-    return 0
 
 
 if __name__ == "__main__":

@@ -152,6 +152,11 @@ class PliantWorker(Worker):
         job.settings = self._settings  # type: ignore[attr-defined]
         super().main_work_horse(job, queue)
 
+    def setup_work_horse_signals(self) -> None:
+        """Leave stopping to the worker: service managers send SIGTERM to every process of a service at once."""
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+
     def fork_work_horse(self, job: RqJob, queue: RqQueue) -> None:
         """Fork; the horse must know who its parent was even if that one is gone at once."""
         os.environ["PLIANT_WORKER_PROCESS"] = str(os.getpid())

@@ -47,6 +47,8 @@ class Watch:
     clock: Callable[[], float] = time.monotonic
     reason: Reason | None = None
     """Why it was killed, once it was."""
+    stopping: bool = False
+    """The worker is being shut down; whoever does that may kill the horse as well."""
     began: float = field(init=False)
     kills: OomKills = field(init=False)
     _next_beat: float = field(init=False)
@@ -65,6 +67,7 @@ class Watch:
             Until when the worker's own shutdown lets the job go on.
         """
         now = self.clock()
+        self.stopping = stop_by is not None
         if now >= self._next_beat:
             self._next_beat = now + BEAT
             self._look(now)
@@ -140,7 +143,7 @@ def _verdict(watch: Watch, *, status: int, peak: int) -> Callable[[Stored], Stor
             raise StaleAttempt(watch.id)
         if watch.reason is Reason.CANCELLED:
             return lifecycle.stop(stored, token=token, now=now, retention=settings.retention)
-        if watch.reason is Reason.STOPPING:
+        if watch.reason is Reason.STOPPING or (watch.reason is None and watch.stopping and _was_killed(status)):
             problem = worker_lost("The worker was shut down.")
             fresh = new_token(watch.id)
             return lifecycle.requeue(
@@ -163,8 +166,12 @@ def _verdict(watch: Watch, *, status: int, peak: int) -> Callable[[Stored], Stor
 
 def _death(watch: Watch, *, status: int, peak: int) -> Problem:
     """Tell a death for want of memory from the others: by the kernel's counters, or by a limit that was nearly full."""
-    killed = os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL
+    killed = _was_killed(status)
     limit = watch.settings.memory_limit
     if (killed and OomKills.now().since(watch.kills)) or (limit > 0 and peak > 0.9 * limit):
         return out_of_memory(limit)
     return worker_lost(how_it_ended(status))
+
+
+def _was_killed(status: int) -> bool:
+    return os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL

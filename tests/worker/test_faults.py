@@ -165,8 +165,10 @@ def test_a_worker_that_is_told_to_stop_puts_its_job_back(house: House) -> None:
     house.solving(id)
     (horse,) = house.horses()
     (worker,) = [pid for pid in house.worker_pids() if horse in children(pid)]
+    os.kill(horse, signal.SIGTERM)  # as service managers do, which tell every process
     os.kill(worker, signal.SIGTERM)
     house.until(lambda: house.jobs.get(id).attempt == 2, "it begins again", seconds=8)
+    assert "worker_lost" not in str([event.data for event in house.jobs.events(id)])
     house.until(lambda: not running(worker), "the worker ends", seconds=5)
     house.jobs.cancel(id)
     assert house.final(id).status is Status.CANCELLED
@@ -280,3 +282,14 @@ def test_wrong_arguments_and_settings_are_said() -> None:
     unset = run("keep", PLIANT_WORKERS="none")
     assert (unset.returncode, unset.stderr.count("\n")) == (1, 1)
     assert "PLIANT_WORKERS: expected a whole number" in unset.stderr
+
+
+def test_the_audit_is_a_command(house: House) -> None:
+    command = [sys.executable, "-m", "pliant.worker", "audit"]
+    env = {**os.environ, **house.settings.to_environment()}
+    clean = subprocess.run(command, capture_output=True, text=True, check=False, env=env)
+    assert (clean.returncode, clean.stdout) == (0, "Everything stored is as the records say.\n")
+    house.jobs.blobs.put("jobs/nobody/nobody-1/inputs.npz", house.short_inputs)
+    found = subprocess.run(command, capture_output=True, text=True, check=False, env=env)
+    assert (found.returncode, found.stdout) == (1, "File jobs/nobody/nobody-1/inputs.npz belongs to no job.\n")
+    house.jobs.blobs.delete("jobs/nobody/")

@@ -91,6 +91,15 @@ def test_a_worker_that_stops_puts_the_job_back_however_often(jobs: Jobs, running
     assert settle(watch, status=KILLED, peak=0, patience=0) is None
 
 
+def test_a_horse_that_is_killed_while_its_worker_stops_is_put_back(running: Callable[..., Watch]) -> None:
+    for status, expected in ((KILLED, Status.QUEUED), (int(signal.SIGSEGV), Status.FAILED)):
+        watch = running([0.0])
+        assert watch.must_end(stop_by=100.0) is None
+        after = settle(watch, status=status, peak=0, patience=0)
+        assert after is not None
+        assert after.job.status is expected
+
+
 def test_an_attempt_that_lost_its_job_is_killed_at_once(jobs: Jobs, running: Callable[..., Watch]) -> None:
     time = [0.0]
     watch = running(time)
