@@ -6,6 +6,7 @@ import io
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -109,7 +110,7 @@ def long_job(url: str) -> Iterator[Callable[[str], str]]:
     queued: list[str] = []
 
     def submit(name: str) -> str:
-        sequence = corrupt(face(60, 4000), outliers=0.05)
+        sequence = corrupt(face(40, 1500), outliers=0.05)
         answer = httpx.post(
             f"{url}/v1/jobs",
             files={"tracks": packed(tracks=sequence.tracks.points), "mesh": packed(faces=sequence.mesh.faces)},
@@ -278,6 +279,10 @@ def test_a_running_job_survives_a_reload_and_can_be_cancelled(
     expect(page.get_by_text("Next in the queue.")).to_be_visible()
     page.get_by_role("button", name="Cancel").click()
     expect(page.get_by_role("article").get_by_text("Cancelled", exact=True)).to_be_visible()
+    page.get_by_role("button", name="Try again").click()
+    expect(page.get_by_text("Next in the queue.")).to_be_visible()
+    page.get_by_role("button", name="Cancel").click()
+    expect(page.get_by_role("article").get_by_text("Cancelled", exact=True)).to_be_visible()
     page.get_by_role("link", name="a long job").click()
     page.get_by_role("button", name="Cancel").click()
     expect(page.get_by_role("article").get_by_text("Cancelled", exact=True)).to_be_visible(timeout=30_000)
@@ -288,6 +293,39 @@ def test_a_running_job_survives_a_reload_and_can_be_cancelled(
     expect(page.get_by_role("link", name="a long job")).to_have_count(0)
     assert httpx.get(f"{url}/v1/jobs/{id}").status_code == 404
     assert httpx.get(f"{url}/v1/jobs/{waiting}").json()["status"] == "cancelled"
+
+
+@pytest.mark.parametrize("language", ["Python", "Shell", "curl"])
+def test_the_code_shown_makes_the_same_job(
+    page: Page, url: str, small: dict[str, bytes], tmp_path: Path, language: str
+) -> None:
+    if language == "curl" and shutil.which("curl") is None:
+        pytest.skip("no curl here")
+    for name, content in small.items():
+        (tmp_path / name).write_bytes(content)
+    options = {"method": "spatio_temporal", "fps": 12.5, "refine_rotations": False}
+    files = {"tracks": small[TRACKS], "mesh": small["mesh.npz"], "ground_truth": small["truth.npz"]}
+    asked = httpx.post(
+        f"{url}/v1/jobs", files=files, data={"name": "it's a face", "options": json.dumps(options)}, timeout=60
+    )
+    model = asked.json()
+    page.goto(f"{url}/#job={model['id']}")
+    page.get_by_role("button", name=language, exact=True).click()
+    code = page.get_by_role("region", name="Do this from code").locator("code").inner_text()
+    assert url in code
+    before = {job["id"] for job in httpx.get(f"{url}/v1/jobs").json()["jobs"]}
+    if language == "Python":
+        command = [sys.executable, "-c", code]
+    else:
+        program = f'pliant() {{ {sys.executable} -m pliant.client.cli "$@"; }}\n' + code.split("\n\n")[0]
+        command = ["bash", "-c", program]
+    ran = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=90, check=False)
+    assert ran.returncode == 0, ran.stderr
+    (made,) = [job for job in httpx.get(f"{url}/v1/jobs").json()["jobs"] if job["id"] not in before]
+    for same in ("name", "options", "interpretation"):
+        assert made[same] == model[same]
+    if language == "Shell":
+        assert (tmp_path / "result" / "shapes.npz").is_file()
 
 
 def test_the_example_by_keyboard_alone(page: Page) -> None:
@@ -301,6 +339,7 @@ def test_the_example_by_keyboard_alone(page: Page) -> None:
     tab_to("breathing sphere")
     page.keyboard.press("Enter")
     expect(page.get_by_role("button", name="Reconstruct")).to_be_focused()
+    expect(page.locator("[data-part=tracks]")).to_contain_text("tracks 30 × 500 × 2 float32")
     page.keyboard.press("Enter")
     expect(page.get_by_role("heading", name="breathing sphere")).to_be_focused()
     canvas = page.locator("canvas")

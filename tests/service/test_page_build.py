@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import shutil
+import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -86,6 +88,18 @@ def test_skip_does_not_try(builder: ModuleType, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setenv("PLIANT_PAGE", "skip")
     builder.provide_page()
     assert builder.node_requirement() == []
+
+
+@pytest.mark.node
+def test_the_pages_types_hold(builder: ModuleType) -> None:
+    checker = ROOT / "service" / "web" / "node_modules" / "typescript" / "bin" / "tsc"
+    if not checker.is_file() and not os.environ.get("CI"):
+        pytest.skip("TypeScript is not installed; say `make page`")
+    (node, _) = builder.node_commands()
+    ran = subprocess.run(
+        [*node, str(checker), "--noEmit"], cwd=ROOT / "service" / "web", capture_output=True, text=True
+    )
+    assert ran.returncode == 0, ran.stdout
 
 
 def test_the_lock_file_names_no_host() -> None:

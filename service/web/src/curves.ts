@@ -14,6 +14,7 @@ const HEIGHT = 96;
 
 export class Curves {
   readonly element = h("div", { class: "curves" });
+  private attempt = 0;
   private readonly objective = new Curve("Objective", "the energy that is minimised");
   private readonly residual = new Curve("Residual", "median reprojection residual, the tracks' unit");
 
@@ -38,8 +39,13 @@ export class Curves {
     this.show();
   }
 
-  /** A job without any number yet, or of a method without reweightings, shows no charts. */
+  /** Take what a record says. Another attempt than before begins its own curves. */
   job(job: Job): void {
+    if (job.attempt !== this.attempt) {
+      this.objective.clear();
+      this.residual.clear();
+      this.attempt = job.attempt;
+    }
     if (job.progress) this.progress(job.progress);
   }
 
@@ -76,10 +82,15 @@ class Curve {
     return this.samples.length;
   }
 
+  /** Samples come in any order: first where the job is now, then the past that the event stream tells again. */
   add(step: number, value: number): void {
-    const last = this.samples.at(-1);
-    if (last && last.step === step) last.value = value;
-    else if (!last || step > last.step) this.samples.push({ step, value });
+    const at = this.samples.findIndex((sample) => sample.step >= step);
+    if (at < 0) this.samples.push({ step, value });
+    else this.samples.splice(at, this.samples[at]?.step === step ? 1 : 0, { step, value });
+  }
+
+  clear(): void {
+    this.samples = [];
   }
 
   set(values: number[]): void {

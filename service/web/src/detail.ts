@@ -73,7 +73,10 @@ export class Detail {
 
   private async follow(): Promise<void> {
     const follower = {
-      onJob: (job: Job) => this.isNews(job) && this.show(job),
+      onJob: (job: Job) => {
+        this.curves.job(job);
+        this.learn(job);
+      },
       onProgress: (progress: Progress) => this.progress(progress),
       onTrouble: (refusal: Refusal | null) => this.trouble.replaceChildren(...(refusal ? [refusalBox(refusal.problem)] : [])),
     };
@@ -98,7 +101,15 @@ export class Detail {
     return (job.progress?.updated_at ?? "") >= (known.progress?.updated_at ?? "");
   }
 
-  show(job: Job): void {
+  /** Take in a record that may be older than what is known. */
+  learn(job: Job): void {
+    if (!this.isNews(job)) return;
+    // Events are written once, while the place in the queue moves on with the others: only a fresh answer knows it.
+    const place = job.place_in_queue ?? (job.status === "queued" ? (this.job?.place_in_queue ?? null) : null);
+    this.show({ ...job, place_in_queue: place });
+  }
+
+  private show(job: Job): void {
     this.job = job;
     say(this.heading, title(job));
     say(this.status, STATUS_WORDS[job.status]);
@@ -108,7 +119,6 @@ export class Detail {
     this.showMeter(job);
     this.showActions(job);
     fill(this.failure, JSON.stringify(job.error), () => (job.error ? [refusalBox(job.error)] : []));
-    this.curves.job(job);
     this.understood.show(job);
     this.metrics.show(job);
     this.files.show(job);

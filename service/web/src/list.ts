@@ -34,8 +34,8 @@ export class JobList {
     return this.jobs.some((job) => !isFinal(job.status));
   }
 
-  /** Ask for the newest page and show it; jobs of older pages stay as they are. */
-  async refresh(): Promise<void> {
+  /** Ask for the newest page and show it; jobs of older pages stay as they are. Returns what was learned. */
+  async refresh(): Promise<Job[]> {
     const page = await listJobs();
     const fresh = new Set(page.jobs.map((job) => job.id));
     const oldest = page.jobs.at(-1)?.created_at;
@@ -44,6 +44,7 @@ export class JobList {
     if (kept.length === 0) this.next = page.next;
     this.jobs = [...page.jobs, ...kept];
     this.show();
+    return page.jobs;
   }
 
   private async more(): Promise<void> {

@@ -82,7 +82,8 @@ async function start(): Promise<void> {
     if (!loaded) await compose.load();
     loaded = true;
     offer();
-    await list.refresh();
+    const jobs = await list.refresh();
+    for (const job of jobs) if (job.id === detail?.id) detail.learn(job);
     trouble.replaceChildren();
   } catch (error) {
     report(error);

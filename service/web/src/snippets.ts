@@ -69,10 +69,15 @@ function given(job: Job, schema: Schema): Given {
   return Object.entries(job.options).filter(([name, value]) => differs(name, value));
 }
 
+/** The record does not say the grid's size; like the names of the files, it stands for the reader's own. */
+const GRID = "ROWSxCOLUMNS";
+
+/** The parts of the form, with names that stand for the reader's own files. */
 function parts(job: Job): [string, string][] {
   const seen = job.interpretation;
   const found: [string, string][] = [["tracks", "tracks.npz"]];
   if (seen.mesh_source === "given") found.push(["mesh", "mesh.npz"]);
+  if (seen.mesh_source === "grid") found.push(["mesh", GRID]);
   if (seen.has_ground_truth) found.push(["ground_truth", "truth.npz"]);
   if (seen.has_rotations) found.push(["rotations", "cameras.npz"]);
   return found;
@@ -108,12 +113,12 @@ function shell(job: Job, chosen: Given, url: string): string {
     .map(([part, file]) => `--${part.replace("_", "-")} ${file}`);
   const options = chosen.map(([name, value]) => `--option ${quote(`${name}=${String(value)}`)}`);
   const name = job.name ? [`--name ${quote(job.name)}`] : [];
-  return `${["pliant submit tracks.npz", ...files, ...name, `--url ${quote(url)}`, ...options].join(" \\\n  ")}\n`;
+  return `${["pliant submit tracks.npz", ...files, ...name, `--url ${quote(url)}`, ...options, "--output result"].join(" \\\n  ")}\n`;
 }
 
 function curl(job: Job, chosen: Given, url: string): string {
   const fields = [
-    ...parts(job).map(([part, file]) => `-F ${part}=@${file}`),
+    ...parts(job).map(([part, file]) => `-F ${part}=${file === GRID ? "" : "@"}${file}`),
     ...(job.name ? [`-F ${quote(`name=${job.name}`)}`] : []),
     ...(chosen.length > 0 ? [`-F ${quote(`options=${JSON.stringify(Object.fromEntries(chosen))}`)}`] : []),
   ];
