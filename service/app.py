@@ -14,7 +14,8 @@ from pliant.service.follow import Followers
 from pliant.service.guard import OriginGuard, SecurityHeaders
 from pliant.service.incoming import Incoming
 from pliant.service.linger import LingeringClose
-from pliant.service.routes import about, artifacts, events, jobs
+from pliant.service.page import mount_page
+from pliant.service.routes import about, artifacts, events, examples, jobs
 from pliant.service.settings import ServiceSettings
 from pliant.worker import errors
 from pliant.worker.formats import InvalidInput, Limits
@@ -27,6 +28,7 @@ STATUS_OF: dict[type[Exception], int] = {
     InvalidInput: 422,
     errors.UnknownJob: 404,
     errors.UnknownArtifact: 404,
+    errors.UnknownExample: 404,
     errors.NotAllowedNow: 409,
     errors.Conflict: 409,
     errors.InvalidRequest: 422,
@@ -77,8 +79,9 @@ def create_app(jobs_of_all: Jobs, settings: ServiceSettings, *, limits: Limits =
         redoc_url=None,
     )
     problems.install(app, STATUS_OF)
-    for each in (jobs, artifacts, events, about):
+    for each in (jobs, artifacts, events, about, examples):
         app.include_router(each.router)
+    mount_page(app)
     app.openapi = lambda: describe.document(app)  # type: ignore[method-assign]
     return app
 

@@ -1,0 +1,76 @@
+"""Made-up inputs to try the service with: what there is, and the files."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Path, Request
+from fastapi.responses import Response
+from pliant.client.schemas import Record
+from pliant.service.describe import problems
+from pliant.worker.examples import EXAMPLES, example_file
+
+router = APIRouter(prefix="/v1/examples", tags=["about"])
+
+Name = Annotated[str, Path(description="An example's name.", examples=["face"])]
+File = Annotated[str, Path(description="One of its files.", examples=["tracks.npz"])]
+
+
+class ExampleFile(Record):
+    """One input file of an example."""
+
+    part: str
+    """The form part that it belongs to."""
+    file: str
+    url: str
+
+
+class Example(Record):
+    """A made-up sequence with known truth."""
+
+    name: str
+    title: str
+    files: list[ExampleFile]
+
+
+class Examples(Record):
+    """What there is to try."""
+
+    examples: list[Example]
+
+
+@router.get("", summary="Inputs to try", responses=problems(401))
+def examples(request: Request) -> Examples:
+    """List made-up sequences; send their files as the parts of a new job, or look at how such files are written."""
+    return Examples(
+        examples=[
+            Example(
+                name=one.name,
+                title=one.title,
+                files=[
+                    ExampleFile(
+                        part=part,
+                        file=file,
+                        url=str(request.app.url_path_for("example", name=one.name, file=file)),
+                    )
+                    for part, file in one.files
+                ],
+            )
+            for one in EXAMPLES.values()
+        ]
+    )
+
+
+@router.get(
+    "/{name}/{file}",
+    summary="A file of an example",
+    response_class=Response,
+    responses={200: {"content": {"application/octet-stream": {}}}, **problems(401, 404)},
+)
+def example(name: Name, file: File) -> Response:
+    """Return an input file; the same bytes every time."""
+    return Response(
+        example_file(name, file),
+        media_type="application/octet-stream",
+        headers={"Content-Disposition": f'attachment; filename="{file}"', "Cache-Control": "private, max-age=3600"},
+    )
