@@ -8,13 +8,7 @@ import pytest
 
 
 @pytest.fixture(scope="session")
-def service_code() -> None:
-    """Skip where the API process is not part of the tree yet."""
-    pytest.importorskip("pliant.service.app")
-
-
-@pytest.fixture(scope="session")
-def service_url(service_code: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+def service_url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """Address of a running service; its jobs compute with one thread, so that their arrays can be compared bit for bit."""
     from pliant.client.cli.demo import running
 

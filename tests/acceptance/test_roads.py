@@ -34,7 +34,6 @@ def arrays(path: Path) -> dict[str, np.ndarray]:
         return {name: held[name] for name in held.files}
 
 
-@pytest.mark.usefixtures("service_code")
 def test_the_demonstration_ends_with_files_that_play_and_an_honest_verdict(tmp_path: Path) -> None:
     ran = pliant("demo", "--small", "--json", folder=tmp_path)
     said = json.loads(ran.stdout)
@@ -114,7 +113,6 @@ def test_inspect_says_how_a_file_is_understood(tmp_path: Path) -> None:
     assert f"12 frames × {sequence.tracks.num_points} points" in ran.stdout
 
 
-@pytest.mark.usefixtures("service_code")
 def test_up_stops_all_it_started_on_one_signal_and_refuses_a_second_one(tmp_path: Path) -> None:
     with running(tmp_path / "one") as url:
         port = url.rpartition(":")[2]

@@ -78,7 +78,7 @@ class Installation:
 
 
 @pytest.fixture
-def installation(service_code: None, tmp_path: Path):
+def installation(tmp_path: Path):
     installation = Installation(tmp_path)
     yield installation
     installation.stop()
