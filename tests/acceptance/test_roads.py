@@ -4,14 +4,21 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
+from typing import IO, Any
 
+import httpx
 import numpy as np
 import pytest
 from pliant.client.cli.demo import GOOD, judge, running
 from pliant.solver.gallery import corrupt, face
+from pliant.worker.jobs import Jobs
+from pliant.worker.settings import Settings
+from pliant.worker.valkey import Valkey
 
 ENVIRONMENT = {name: value for name, value in os.environ.items() if not name.startswith("PLIANT_")}
 
@@ -35,10 +42,21 @@ def arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 def test_the_demonstration_ends_with_files_that_play_and_an_honest_verdict(tmp_path: Path) -> None:
-    ran = pliant("demo", "--small", "--json", folder=tmp_path)
-    said = json.loads(ran.stdout)
-    assert said["job"]["status"] == "succeeded", ran.stderr
-    assert said["good"] == judge(said["metrics"]) == (ran.returncode == 0)
+    command = [sys.executable, "-m", "pliant.client.cli", "demo", "--small", "--keep", "--json"]
+    process = subprocess.Popen(command, cwd=tmp_path, env=ENVIRONMENT, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    said = document(process.stdout)
+    assert said["job"]["status"] == "succeeded"
+    assert httpx.get(f"{said['url']}/v1/jobs").json()["jobs"][0]["id"] == said["job"]["id"]
+    assert "text/html" in httpx.get(said["url"]).headers["content-type"]
+    process.send_signal(signal.SIGINT)
+    assert process.stdout.read() == ""
+    process.stdout.close()
+    assert process.wait(60) == (0 if said["good"] else 1)
+    with pytest.raises(httpx.ConnectError):
+        httpx.get(said["url"])
+
+    assert said["good"] == judge(said["metrics"])
     assert set(GOOD) <= set(said["metrics"])
     assert all(value > 0 for value in said["metrics"].values())
     files = {name: tmp_path / path for name, path in said["files"].items()}
@@ -48,6 +66,40 @@ def test_the_demonstration_ends_with_files_that_play_and_an_honest_verdict(tmp_p
     report = json.loads(files["report.json"].read_text())
     assert report["options"] == said["job"]["options"]
     assert list(tmp_path.iterdir()) == [tmp_path / "demo-output"]
+
+
+def document(stream: IO[str]) -> dict[str, Any]:
+    """Read the first JSON document of a stream that stays open."""
+    text = ""
+    for line in stream:
+        text += line
+        if line.rstrip() == "}":
+            break
+    value: dict[str, Any] = json.loads(text)
+    return value
+
+
+def test_work_serves_a_queue_until_it_is_told_to_stop(tmp_path: Path) -> None:
+    valkey = Valkey.claim(tmp_path)
+    server = valkey.start()
+    command = [sys.executable, "-m", "pliant.client.cli", "work", "--data", str(tmp_path), "--workers", "1"]
+    process = subprocess.Popen(command, env=ENVIRONMENT, stderr=subprocess.PIPE, text=True)
+    try:
+        jobs = Jobs.open(Settings(data=tmp_path))
+        deadline = time.monotonic() + 60
+        while jobs.ready()["workers"] != "ok" and time.monotonic() < deadline:
+            time.sleep(0.1)
+        assert jobs.ready()["workers"] == "ok"
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(60) == 0
+        assert process.stderr is not None
+        assert "1 worker(s) of queue pliant" in process.stderr.read()
+        process.stderr.close()
+        assert jobs.ready()["workers"] != "ok"
+    finally:
+        server.terminate()
+        server.wait(10)
+        valkey.release()
 
 
 def test_solve_and_the_service_give_the_same_bits(service_url: str, tmp_path: Path) -> None:
