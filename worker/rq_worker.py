@@ -110,6 +110,16 @@ class PliantWorker(Worker):
         """Never; see `run_maintenance_tasks`."""
         return False
 
+    def check_for_suspension(self, burst: bool) -> None:
+        """Do nothing: we have no use for suspended workers, and the question would need the store."""
+
+    def set_state(self, state: str, pipeline: Any = None) -> None:
+        """Note the state, in RQ's books too if the store is there."""
+        try:
+            super().set_state(state, pipeline)
+        except AWAY as error:
+            logger.warning("state %s not written: %s", state, error)
+
     def heartbeat(self, timeout: int | None = None, pipeline: Any = None) -> None:
         """Give RQ's sign of life, and our own that ends with us; a store that is away is no reason to end."""
         target: Any = pipeline if pipeline is not None else self.connection
@@ -188,8 +198,7 @@ class PliantWorker(Worker):
                 self._records.append_log(watch.id, last_words(self._settings, watch.token))
                 if settled.job.status is Status.QUEUED:
                     self._deliveries.push(watch.id, settled.token, front=True)  # it has waited before
-            if status != os.EX_OK:
-                self._deliveries.remove(job.id)
+            self._deliveries.remove(job.id)
         except StoreUnavailable as error:
             logger.warning("job %s: %s; the keeper will look after it", watch.id, error)
         finally:

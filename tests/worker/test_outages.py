@@ -60,7 +60,7 @@ def test_killing_valkey_loses_nothing(tmp_path: Path, inputs_files: tuple[Path, 
         assert max(job.attempt for job in jobs) <= 2
         assert len(house.jobs.page().jobs) == 20
         rest = connect(house.settings.redis, decode=True)
-        assert rest.keys("rq:job:*") == [], "RQ keeps nothing of jobs that are done"
+        house.until(lambda: rest.keys("rq:job:*") == [], "RQ keeps nothing of jobs that are done")
         rest.close()
         settled(house)
 
