@@ -12,6 +12,7 @@ from pliant.client.cli.show import err, metrics_table, out, print_json, understo
 
 if TYPE_CHECKING:
     from pliant.worker.formats import Inputs
+    from pliant.worker.run import Finished
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
 """Read by the numerical libraries when they are loaded, which is after this."""
@@ -50,21 +51,7 @@ def solve(
         show_understood(inputs)
     with progress_bar() as bar:
         done = reconstruct(inputs, options, output, on_progress=bar.on_step, should_stop=None)
-    if as_json:
-        print_json(
-            {
-                "outcome": done.outcome, "sentence": done.sentence, "metrics": done.metrics, "warnings": list(done.warnings),
-                "files": {artifact.name: str(output / artifact.name) for artifact in done.artifacts},
-            }
-        )  # fmt: skip
-        return
-    screen = out()
-    for warning in done.warnings:
-        err().print(f"[yellow]warning[/yellow] {warning}")
-    screen.print(done.sentence, markup=False)
-    screen.print(metrics_table(done.metrics))
-    for artifact in done.artifacts:
-        screen.print(f"{output / artifact.name}  {artifact.bytes / 1e6:.2f} MB", markup=False)
+    show_finished(done, output, as_json=as_json)
 
 
 def inspect(
@@ -89,6 +76,25 @@ def inspect(
         print_json(inputs.interpretation.model_dump(mode="json"))
     else:
         show_understood(inputs)
+
+
+def show_finished(done: Finished, output: Path, *, as_json: bool) -> None:
+    """Show how a reconstruction ended, and where its files are."""
+    if as_json:
+        print_json(
+            {
+                "outcome": done.outcome, "sentence": done.sentence, "metrics": done.metrics, "warnings": list(done.warnings),
+                "files": {artifact.name: str(output / artifact.name) for artifact in done.artifacts},
+            }
+        )  # fmt: skip
+        return
+    screen = out()
+    for warning in done.warnings:
+        err().print(f"[yellow]warning[/yellow] {warning}")
+    screen.print(done.sentence, markup=False)
+    screen.print(metrics_table(done.metrics))
+    for artifact in done.artifacts:
+        screen.print(f"{output / artifact.name}  {artifact.bytes / 1e6:.2f} MB", markup=False)
 
 
 def file_or_word(mesh: str | None) -> Path | str | None:
