@@ -185,6 +185,7 @@ def run(soak: Soak, seconds: float, every: float) -> int:
     soak.feeding = False
     ended = soak.wait(120.0, until=lambda: not soak.open)
     soak.wrong += [] if ended else [f"job {id} has not ended" for id in soak.open]
+    soak.wait(100.0, until=lambda: not findings(soak.jobs, settle=0.5))  # the keeper tidies up every half minute
     soak.wrong += findings(soak.jobs)
     print(f"{sum(soak.ends.values())} jobs acknowledged in {seconds / 60:g} min, {sum(faults.values())} faults")
     print(f"{soak.refused} submissions refused while Valkey was being started again (never acknowledged)\n")

@@ -43,6 +43,9 @@ FORGOTTEN_AFTER = 3.0
 ORPHAN_AGE = timedelta(hours=6)
 """A file of a job that is not known is removed when it is older: younger ones may be a submission that has no record yet."""
 
+DEAD_AGE = timedelta(minutes=1)
+"""Working files of an attempt that is over are removed when they are older: until then its worker may be reading them."""
+
 
 @dataclass(slots=True)
 class Stillness:
@@ -89,6 +92,7 @@ class Keeper:
         if self._tidied is None or now >= self._tidied + TIDY_EVERY:
             self._expire()
             self._clean_up_after_failures()
+            self._clear_work()
             self.jobs.queue.tidy()
             self._tidied = now
         if self._swept is None or now >= self._swept + SWEEP_EVERY:
@@ -174,10 +178,14 @@ class Keeper:
             if wanted is False or (wanted is None and written < oldest):
                 self.jobs.blobs.delete(key)
                 logger.info("removed %s, which belongs to no job or attempt", key)
-        work = self.jobs.settings.work
+
+    def _clear_work(self) -> None:
+        """Remove working files of attempts that are over and whose worker did not live to do it."""
+        work, oldest = self.jobs.settings.work, self.jobs.clock() - DEAD_AGE
         for directory in work.iterdir() if work.exists() else ():
-            if directory.stat().st_mtime < oldest.timestamp() and not self._running_here(directory.name):
-                shutil.rmtree(directory, ignore_errors=True)
+            with suppress(FileNotFoundError):
+                if directory.stat().st_mtime < oldest.timestamp() and not self._running_here(directory.name):
+                    shutil.rmtree(directory, ignore_errors=True)
 
     def _wanted(self, key: str) -> bool | None:
         """Tell whether a job wants a file; None: there is no such job, or not yet."""

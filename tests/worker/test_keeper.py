@@ -160,10 +160,6 @@ def test_files_of_no_job_are_removed_once_they_are_old(
     stray = {f"jobs/{id}/{id}-000000000000/artifacts/shapes.npz", "jobs/nobody/nobody-1/inputs.npz"}
     for key in (wanted | stray) - {world.jobs.records.get(id).inputs}:
         world.jobs.blobs.put(key, file)
-    directories = [working_directory(world.jobs.settings, each) for each in (token, "nobody-1")]
-    for directory in directories:
-        directory.mkdir(parents=True)
-        os.utime(directory, (0, 0))
     beat = lambda: world.jobs.records.beat(id, token)  # noqa: E731
 
     def sweep_at(moment: datetime) -> set[str]:
@@ -175,7 +171,19 @@ def test_files_of_no_job_are_removed_once_they_are_old(
     unknown = {"jobs/nobody/nobody-1/inputs.npz"}
     assert sweep_at(datetime.now(UTC) + timedelta(hours=5)) == wanted | unknown
     assert sweep_at(datetime.now(UTC) + timedelta(hours=7)) == wanted
-    assert [directory.exists() for directory in directories] == [True, False]
+
+
+def test_working_files_of_attempts_that_are_over_are_removed(world: World, submit: Callable[[World], str]) -> None:
+    id = submit(world)
+    token = world.claim(id)
+    running, over, just_over = (working_directory(world.jobs.settings, each) for each in (token, f"{id}-0", f"{id}-1"))
+    world.now = datetime.now(UTC)
+    for directory in (running, over, just_over):
+        directory.mkdir(parents=True)
+    for directory in (running, over):
+        os.utime(directory, (0, 0))
+    world.pass_seconds(31, meanwhile=lambda: world.jobs.records.beat(id, token))
+    assert [directory.exists() for directory in (running, over, just_over)] == [True, False, True]
 
 
 def test_what_a_killed_attempt_had_uploaded_is_removed(
