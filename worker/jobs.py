@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import re
 import secrets
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -14,10 +13,11 @@ from pliant.client.options import Options
 from pliant.client.schemas import Artifact, Interpretation, Job, JobPage, Status
 from pliant.worker import lifecycle
 from pliant.worker.blobs import Blob, Blobs
+from pliant.worker.checks import LARGEST_PAGE as LARGEST_PAGE
+from pliant.worker.checks import check_event_id, check_id, check_key, check_page, is_id
 from pliant.worker.connection import connect
 from pliant.worker.errors import (
     Conflict,
-    InvalidRequest,
     NotAllowedNow,
     QuotaExceeded,
     StoreUnavailable,
@@ -28,12 +28,6 @@ from pliant.worker.queue import Queue, RedisQueue
 from pliant.worker.records import Event, Records, Stored, new_token
 from pliant.worker.redis_records import RedisRecords
 from pliant.worker.settings import Settings
-
-ID_PATTERN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{2,63}")
-CURSOR_PATTERN = re.compile(r"[0-9]{14}:[A-Za-z0-9_-]{3,64}")
-EVENT_PATTERN = re.compile(r"[0-9]{1,20}-[0-9]{1,20}")
-LONGEST_KEY = 255
-LARGEST_PAGE = 200
 
 
 def utc_now() -> datetime:
@@ -131,16 +125,10 @@ class Jobs:
         fingerprint: str | None = None,
     ) -> Job | None:
         """Return the job that a repeated request has already made, None if the request is new. Raises as `submit`."""
-        if id is not None and not ID_PATTERN.fullmatch(id):
-            raise InvalidRequest(
-                "invalid_id", field="id", expected="3–64 letters, digits, underscores or dashes", got=repr(id)[:80],
-                hint="Choose another id or leave it out.",
-            )  # fmt: skip
-        if idempotency_key is not None and not 1 <= len(idempotency_key) <= LONGEST_KEY:
-            raise InvalidRequest(
-                "invalid_idempotency_key", field="Idempotency-Key", expected=f"1–{LONGEST_KEY} characters",
-                got=f"{len(idempotency_key)}", hint="A random UUID is a good key.",
-            )  # fmt: skip
+        if id is not None:
+            check_id(id)
+        if idempotency_key is not None:
+            check_key(idempotency_key)
         digest = self._digest(idempotency_key)
         found = self.records.find(digest) if digest is not None else None
         if found is None and id is not None:
@@ -171,15 +159,7 @@ class Jobs:
         InvalidRequest
             The cursor is not one, or the limit is out of range.
         """
-        if not 1 <= limit <= LARGEST_PAGE:
-            raise InvalidRequest(
-                "invalid_limit", field="limit", expected=f"1–{LARGEST_PAGE}", got=str(limit), hint="Ask for less at once."
-            )  # fmt: skip
-        if cursor is not None and not CURSOR_PATTERN.fullmatch(cursor):
-            raise InvalidRequest(
-                "invalid_cursor", field="cursor", expected="`next` of an earlier page", got=repr(cursor)[:80],
-                hint="Start again without a cursor.",
-            )  # fmt: skip
+        check_page(cursor, limit)
         wanted = tuple(Status) if statuses is None else tuple(statuses)
         found, following = self.records.page(cursor=cursor, limit=limit, statuses=wanted, owner=self.owner)
         places: dict[str, int] = {}
@@ -294,11 +274,8 @@ class Jobs:
         InvalidRequest
             `after` is not an event's id.
         """
-        if after is not None and not EVENT_PATTERN.fullmatch(after):
-            raise InvalidRequest(
-                "invalid_event_id", field="Last-Event-ID", expected="the id of an event", got=repr(after)[:80],
-                hint="Leave it out to get all events that are kept.",
-            )  # fmt: skip
+        if after is not None:
+            check_event_id(after)
         self._stored(id)
         return self.records.events(id, after=after, timeout=timeout)
 
@@ -319,7 +296,7 @@ class Jobs:
         return found
 
     def _stored(self, id: str) -> Stored:
-        if not ID_PATTERN.fullmatch(id):
+        if not is_id(id):
             raise UnknownJob(id[:80])
         stored = self.records.get(id)
         if self.owner is not None and stored.owner != self.owner:

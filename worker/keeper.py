@@ -20,9 +20,10 @@ from functools import partial
 
 from pliant.client.schemas import Status
 from pliant.worker import lifecycle
+from pliant.worker.checks import LARGEST_PAGE
 from pliant.worker.errors import StaleAttempt, StoreUnavailable, UnknownJob
 from pliant.worker.files import clean_up
-from pliant.worker.jobs import LARGEST_PAGE, Jobs
+from pliant.worker.jobs import Jobs
 from pliant.worker.problems import worker_lost
 from pliant.worker.records import Beat, new_token
 
