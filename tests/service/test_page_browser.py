@@ -402,6 +402,27 @@ def test_a_service_that_is_away_is_said_and_its_return_noticed(page: Page, url: 
     expect(page.get_by_role("alert")).to_have_count(0, timeout=15_000)
 
 
+def test_a_token_is_asked_for_and_then_sent_with_everything(page: Page, url: str, finished: str) -> None:
+    def guarded(route: Route) -> None:
+        if route.request.headers.get("authorization") == "Bearer a-token":
+            route.continue_()
+        else:
+            problem = {"title": "Unauthorised", "status": 401, "detail": "Send a token.", "code": "unauthorised"}
+            route.fulfill(status=401, content_type="application/problem+json", body=json.dumps(problem))
+
+    page.route("**/v1/**", guarded)
+    page.goto(f"{url}/#job={finished}")
+    page.reload()
+    expect(page.get_by_role("alert").first).to_contain_text("Send a token.")
+    page.get_by_label("Token").fill("a-token")
+    page.get_by_role("button", name="Use it").click()
+    page.locator("canvas").wait_for(timeout=30_000)
+    expect(page.get_by_role("alert")).to_have_count(0)
+    with page.expect_download() as download:
+        page.get_by_role("link", name="report.json").click()
+    assert "metrics" in json.loads(Path(download.value.path()).read_text())
+
+
 def test_a_dense_result_plays_within_time_and_memory(page: Page, url: str, finished: str, tmp_path: Path) -> None:
     """99 frames of 29,000 points, put in the place of a small job's preview."""
     sequence = face(99, 29_000)

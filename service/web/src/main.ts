@@ -63,6 +63,7 @@ function tokenForm(): HTMLElement {
     event.preventDefault();
     setToken(input.value.trim());
     trouble.replaceChildren();
+    show(named(), false);
     void start();
   });
   return form;
