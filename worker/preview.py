@@ -1,9 +1,10 @@
 """A compact copy of a result for the web page: `preview.bin`.
 
-The page plays a result of 99 frames and 29,000 points in a browser, on a telephone too. `shapes.glb` with a morph target a frame
-is twice the bytes and keeps every target on the graphics card, where the shader walks through them for every vertex;
-`shapes.npz` is four times the bytes and comes whole or not at all. This file holds int16 coordinates frame after frame, so that drawing starts when the first frame has arrived, and
-puts what is not always looked at (residuals, ground truth) where a byte range finds it.
+The page plays a result of 99 frames and 29,000 points in a browser, on a telephone too. `shapes.glb` with a morph target
+a frame is twice the bytes and keeps every target on the graphics card, where the shader walks through them for every vertex;
+`shapes.npz` is four times the bytes and comes whole or not at all. This file holds int16 coordinates frame after frame, so
+that drawing starts when the first frame has arrived, and puts what is not always looked at (residuals, ground truth) where
+a byte range finds it.
 
 Layout, little-endian: `b"PLIANTPV"`, uint32 version, uint32 length of the header, the header as JSON in UTF-8, then sections at
 the offsets that the header gives, each a multiple of 8.

@@ -254,6 +254,18 @@ def test_a_refusal_is_shown_as_the_services_own_sentence(page: Page, url: str) -
     expect(alert).to_contain_text("too_few_frames")
 
 
+def test_where_two_readings_fit_a_click_chooses_one(page: Page, url: str) -> None:
+    noise = np.random.default_rng(0).normal(size=(40, 50))
+    choose(page, {TRACKS: packed(W=noise)})
+    page.get_by_role("button", name="Reconstruct").click()
+    expect(page.get_by_role("alert")).to_contain_text("ambiguous_layout")
+    page.get_by_role("button", name="W (2F, P), rows stacked").click()
+    expect(page.get_by_role("article").get_by_text("20 frames of 50 points")).to_be_visible()
+    expect(page.get_by_role("article").get_by_text("W (2F, P), rows stacked")).to_be_visible()
+    id = page.url.partition("job=")[2]
+    assert httpx.get(f"{url}/v1/jobs/{id}").json()["options"]["rows"] == "stacked"
+
+
 def test_sending_nothing_says_what_is_missing(page: Page) -> None:
     page.get_by_role("button", name="Reconstruct").click()
     expect(page.get_by_text("Choose a track file first")).to_be_visible()

@@ -26,8 +26,8 @@ export function refusalBox(problem: Problem, choose?: (choice: Record<string, un
 }
 
 function choiceButton(choice: Record<string, unknown>, choose: (choice: Record<string, unknown>) => void): HTMLElement {
-  const { label, description, options, ...rest } = choice;
-  const values = (options ?? rest) as Record<string, unknown>;
-  const words = label ?? description ?? Object.entries(values).map(([name, value]) => `${name}: ${String(value)}`).join(", ");
-  return button(String(words), () => choose(values));
+  const { layout, evidence, options } = choice;
+  const values = (options ?? {}) as Record<string, unknown>;
+  const words = layout ?? Object.entries(values).map(([name, value]) => `${name}: ${String(value)}`).join(", ");
+  return button(String(words), () => choose(values), { title: evidence === undefined ? null : String(evidence) });
 }
