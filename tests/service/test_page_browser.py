@@ -254,6 +254,22 @@ def test_a_refusal_is_shown_as_the_services_own_sentence(page: Page, url: str) -
     expect(alert).to_contain_text("too_few_frames")
 
 
+def test_sending_again_after_a_lost_answer_makes_no_second_job(page: Page, url: str, small: dict[str, bytes]) -> None:
+    def lost(route: Route) -> None:
+        route.fetch()
+        route.abort()
+
+    page.route("**/v1/jobs", lost, times=1)
+    choose(page, small)
+    page.get_by_label("name (optional)").fill("sent twice")
+    page.get_by_role("button", name="Reconstruct").click()
+    expect(page.get_by_role("alert")).to_contain_text("The service does not answer.")
+    page.get_by_role("button", name="Reconstruct").click()
+    expect(page.get_by_role("heading", name="sent twice")).to_be_focused()
+    jobs = httpx.get(f"{url}/v1/jobs").json()["jobs"]
+    assert len([job for job in jobs if job["name"] == "sent twice"]) == 1
+
+
 def test_where_two_readings_fit_a_click_chooses_one(page: Page, url: str) -> None:
     noise = np.random.default_rng(0).normal(size=(40, 50))
     choose(page, {TRACKS: packed(W=noise)})

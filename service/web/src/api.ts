@@ -103,13 +103,19 @@ export async function exampleFile(name: string, file: string): Promise<File> {
   return new File([await answer.blob()], file);
 }
 
+/** A key by which the service knows a repeated submission for what it is. */
+export function newKey(): string {
+  return Array.from(crypto.getRandomValues(new Uint8Array(16)), (byte) => byte.toString(16).padStart(2, "0")).join("");
+}
+
 /** Send a new job. XMLHttpRequest, because fetch cannot say how much of a body has gone out. */
-export function submit(form: FormData, onSent: (fraction: number) => void, signal: AbortSignal): Promise<Job> {
+export function submit(form: FormData, key: string, onSent: (fraction: number) => void, signal: AbortSignal): Promise<Job> {
   return new Promise((resolve, reject) => {
     const request = new XMLHttpRequest();
     request.open("POST", "v1/jobs");
     for (const [name, value] of Object.entries(headers())) request.setRequestHeader(name, value);
     request.setRequestHeader("Accept", "application/json");
+    request.setRequestHeader("Idempotency-Key", key);
     request.upload.onprogress = (event) => {
       if (event.lengthComputable) onSent(event.loaded / event.total);
     };

@@ -1,6 +1,6 @@
 // The form for a new job: files by drop or by choice, what is in them, options, and the service's answer if it says no.
 
-import { type Example, Refusal, exampleFile, getOptions, listExamples, submit } from "./api";
+import { type Example, Refusal, exampleFile, getOptions, listExamples, newKey, submit } from "./api";
 import { button, h, uniqueId } from "./dom";
 import { OptionsForm } from "./options";
 import { type Entry, describe, peek } from "./peek";
@@ -34,6 +34,8 @@ export class Compose {
   private readonly answer = h("div", { class: "answer", "aria-live": "assertive" });
   private readonly examples = h("p", { class: "examples" });
   private sending: AbortController | null = null;
+  /** Kept while it is unknown whether the service has got the job: sending again must not make a second one. */
+  private key: string | null = null;
   private offered: Example[] = [];
 
   constructor(private readonly onJob: (job: Job) => void) {
@@ -56,6 +58,7 @@ export class Compose {
       this.answer,
     );
     const summary = h("summary", {}, h("h2", { id: "compose-title" }, "New reconstruction"));
+    form.addEventListener("change", () => (this.key = null));
     this.element = h("details", { class: "card", open: true }, summary, form);
     this.acceptDrops();
   }
@@ -132,6 +135,7 @@ export class Compose {
   private async put(part: Part, file: File | null): Promise<void> {
     const slot = this.slots.get(part) as Slot;
     slot.file = file;
+    this.key = null;
     slot.remove.hidden = file === null;
     slot.name.textContent = file === null ? SLOTS[part].hint : `${file.name}, ${bytes(file.size)}`;
     slot.name.classList.toggle("hint", file === null);
@@ -183,10 +187,13 @@ export class Compose {
       words.textContent = fraction < 1 ? `Sending, ${percent(fraction)}` : "Sent; the service is reading it…";
     };
     try {
-      const job = await submit(form, onSent, this.sending.signal);
+      this.key ??= newKey();
+      const job = await submit(form, this.key, onSent, this.sending.signal);
+      this.key = null;
       this.answer.replaceChildren();
       this.onJob(job);
     } catch (error) {
+      if (!(error instanceof Refusal && error.problem.status === 0)) this.key = null;
       this.refuse(error);
     } finally {
       this.sending = null;
