@@ -48,6 +48,12 @@ def understand(arrays: Arrays, options: Options) -> Understood:
     named = short_names(arrays)
     dialect, name = _recognised(named)
     array = _numeric(named[name], name)
+    if dialect.last == 3:
+        raise refusal(
+            "unsupported_feature", "tracks", expected="two image coordinates for each point",
+            got=f"{name} of shape {array.shape} ({dialect.name})",
+            hint="Save x and y in pixels as tracks (F, P, 2), and visibility (F, P) beside them.",
+        )  # fmt: skip
     array = drop_batch(array, 3 if array.ndim == 4 else array.ndim, field="tracks")
     reading, notes = choose(name, array, dialect=dialect, options=options, field="tracks")
     found = find_visibility(named, reading.points.shape[:2], transposed=reading.order == "points_frames")

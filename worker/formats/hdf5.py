@@ -1,0 +1,75 @@
+"""MATLAB .mat files of version 7.3, which are HDF5. Only plain data sets inside the file itself are read.
+
+HDF5 can point elsewhere: data sets in other files (external storage, virtual data sets) and links that leave the file; it can declare
+terabytes in a kilobyte. All of these are refused before a value is read. MATLAB stores columns first, so axes come out reversed and are
+turned back.
+"""
+
+from __future__ import annotations
+
+from typing import IO
+
+import h5py
+import numpy as np
+from pliant.worker.formats.errors import damaged, refusal, too_large
+from pliant.worker.formats.records import Arrays, Limits
+
+SIGNATURE = b"\x89HDF\r\n\x1a\n"
+MAX_OBJECTS = 512
+MAX_DEPTH = 4
+
+
+def read_matlab73(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
+    """Read every numeric data set; members of structs (groups) under dotted names.
+
+    Raises
+    ------
+    InvalidInput
+        Codes damaged_file, missing_array, too_large, unsupported_feature.
+    """
+    found: Arrays = {}
+    try:
+        with h5py.File(stream, "r") as file:
+            _collect(file, "", found, field=field, limits=limits, depth=0)
+    except (OSError, ValueError, KeyError, RuntimeError, TypeError, AttributeError) as error:
+        raise damaged(field, f"an HDF5 file that cannot be read ({str(error)[:120]})") from error
+    if not found:
+        raise refusal(
+            "missing_array", field, expected="a numeric matrix such as W", got="no plain array",
+            hint="Save the 2F × P matrix: save('tracks.mat', 'W', '-v7').",
+        )  # fmt: skip
+    return found
+
+
+def _collect(group: h5py.Group, prefix: str, found: Arrays, *, field: str, limits: Limits, depth: int) -> None:
+    if depth > MAX_DEPTH or len(group) > MAX_OBJECTS or len(found) > MAX_OBJECTS:
+        raise too_large(field, expected=f"at most {MAX_OBJECTS} variables, {MAX_DEPTH} levels deep", got="more")
+    for name in group:
+        if name.startswith("#"):
+            continue
+        if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+            raise _elsewhere(field, f"{prefix}{name} is a soft or external link")
+        item = group[name]
+        if isinstance(item, h5py.Group):
+            _collect(item, f"{prefix}{name}.", found, field=field, limits=limits, depth=depth + 1)
+        elif isinstance(item, h5py.Dataset) and item.dtype.kind in "fiub" and item.size:
+            found[f"{prefix}{name}"] = _values(
+                item, f"{prefix}{name}", sum(a.nbytes for a in found.values()), field, limits
+            )
+
+
+def _values(item: h5py.Dataset, name: str, so_far: int, field: str, limits: Limits) -> np.ndarray:
+    if item.is_virtual or item.external:
+        raise _elsewhere(field, f"{name} lies in another file")
+    declared = int(np.prod(item.shape, dtype=np.float64)) * item.dtype.itemsize
+    if so_far + declared > limits.max_bytes:
+        raise too_large(field, expected=f"at most {limits.max_bytes} bytes", got=f"{name} declares {declared}")
+    values = np.asarray(item[()])
+    return np.ascontiguousarray(values.T.astype(values.dtype.newbyteorder("="), copy=False))
+
+
+def _elsewhere(field: str, what: str) -> Exception:
+    return refusal(
+        "unsupported_feature", field, expected="data inside the file itself", got=what,
+        hint="Save the matrix itself: save('tracks.mat', 'W', '-v7').",
+    )  # fmt: skip

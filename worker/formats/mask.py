@@ -1,0 +1,40 @@
+"""A mask picture as a mesh: the marked pixels are the points, row by row, and neighbours in the picture are neighbours on the surface."""
+
+from __future__ import annotations
+
+import warnings
+from typing import IO
+
+import numpy as np
+from PIL import Image, PngImagePlugin
+from pliant.worker.formats.errors import damaged, too_large
+from pliant.worker.formats.records import Arrays, Limits
+
+MAX_PIXELS_A_POINT = 64
+
+
+def read_png(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
+    """Read a PNG; pixels that are not black (and not wholly transparent) are points.
+
+    Returns
+    -------
+    dict
+        `mask (rows, columns)` of bool.
+
+    Raises
+    ------
+    InvalidInput
+        Codes damaged_file, too_large.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            picture = PngImagePlugin.PngImageFile(stream)
+            if picture.width * picture.height > MAX_PIXELS_A_POINT * limits.max_points:
+                raise too_large(
+                    field, expected=f"at most {MAX_PIXELS_A_POINT * limits.max_points} pixels", got=f"{picture.size}"
+                )
+            values = np.asarray(picture.convert("LA"))
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise damaged(field, f"a PNG that cannot be read ({str(error)[:120]})") from error
+    return {"mask": (values[..., 0] > 0) & (values[..., 1] > 0)}
