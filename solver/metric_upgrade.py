@@ -60,7 +60,9 @@ def upgrade(gram: Floats, basis_size: int) -> Upgrade:
         K, with 3K ≤ 2F.
     """
     factor = leading_factor(gram, 3 * basis_size)
-    corrective = refine_factor(factor, least_trace_factor(factor))
+    if basis_size == 1:  # the answer is unique: columns of equal length, so that little rotation is not shrunk to none
+        factor = factor / np.maximum(np.sqrt((factor**2).mean(axis=(0, 1))), 1e-6)
+    corrective = refine_factor(factor, least_trace_factor(factor, 0.0 if basis_size == 1 else TRACE_WEIGHT))
     rows = continue_signs(factor @ corrective)
     lengths = np.sqrt(np.maximum((rows**2).sum(axis=(1, 2)) / 2, np.finfo(float).tiny))
     scales = np.exp(np.log(lengths) - np.log(lengths).mean())
@@ -77,7 +79,7 @@ def leading_factor(gram: Floats, rank: int) -> Floats:
     return np.asarray(factor / np.sqrt((factor**2).sum() / len(gram)))
 
 
-def least_trace_factor(factor: Floats) -> Floats:
+def least_trace_factor(factor: Floats, trace_weight: float = TRACE_WEIGHT) -> Floats:
     """Return G (n×3) of the Q ⪰ 0 of least trace that meets the orthonormality constraints, by ADMM.
 
     Minimises ½‖A(Q) − b‖²/F + μ tr Q over symmetric Q ⪰ 0: the quadratic part by a solve in the n(n+1)/2 coordinates of Q
@@ -95,11 +97,11 @@ def least_trace_factor(factor: Floats) -> Floats:
     for _ in range(ROUNDS):
         solved = inverse @ (right + penalty * (copy - dual))
         values, vectors = np.linalg.eigh(_unfold(solved + dual, upper, stretch, size))
-        values = np.maximum(values - TRACE_WEIGHT / penalty, 0.0)
+        values = np.maximum(values - trace_weight / penalty, 0.0)
         copy = ((vectors * values) @ vectors.T)[upper] * stretch
         dual += solved - copy
     values, vectors = np.linalg.eigh(_unfold(copy, upper, stretch, size))
-    return np.asarray(vectors[:, -3:] * np.sqrt(np.maximum(values[-3:], 1e-9 * max(float(values[-1]), 1e-9))))
+    return np.asarray(vectors[:, -3:] * np.sqrt(np.maximum(values[-3:], 1e-4 * max(float(values[-1]), 1e-9))))
 
 
 def _normal_equations(factor: Floats, upper: Upper, stretch: Floats) -> tuple[Floats, Floats]:

@@ -1,0 +1,129 @@
+"""Cameras from tracks: exact recovery, gradients, scales, outliers, hidden points, degenerate motion."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pliant.solver import Settings, Tracks
+from pliant.solver.cameras import estimate_cameras, estimate_scales
+from pliant.solver.likelihood import Motion, Scene, energy, start
+from pliant.solver.metric_upgrade import upgrade
+from pliant.solver.normalise import normalise
+from pliant.solver.rotation import MIRROR, angles_between, exponential, left_jacobian, nearest, start_at_identity
+
+
+def turning(frames: int, degrees: float) -> np.ndarray:
+    """A camera that pans to and fro and nods."""
+    time = np.linspace(0, 2 * np.pi, frames)
+    half = np.radians(degrees)
+    return start_at_identity(
+        exponential(np.stack([0.4 * half * np.sin(2 * time), half * np.sin(time), 0 * time], axis=1))
+    )
+
+
+def view(shapes: np.ndarray, rotations: np.ndarray) -> np.ndarray:
+    return np.einsum("fij,fpj->fpi", rotations[:, :2], np.broadcast_to(shapes, (len(rotations), *shapes.shape[-2:])))
+
+
+def error(found: np.ndarray, truth: np.ndarray) -> float:
+    """Mean angle in degrees, one world rotation and the depth mirror free."""
+    errors = []
+    for mirror in (np.eye(3), MIRROR):
+        turned = mirror @ found @ mirror
+        world = nearest(np.einsum("fji,fjk->ik", turned, truth))
+        errors.append(float(np.degrees(angles_between(turned @ world, truth).mean())))
+    return min(errors)
+
+
+RIGID = np.random.default_rng(3).normal(size=(60, 3)) * [1.0, 0.8, 0.5]
+CAMERA = turning(20, 40)
+
+
+def test_a_rigid_scene_is_exact() -> None:
+    found = estimate_cameras(normalise(Tracks.from_arrays(view(RIGID, CAMERA) * 7 + 3)), Settings())
+    assert error(found.rotations, CAMERA) < 0.1
+    np.testing.assert_allclose(found.rotations[0], np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(found.scales, 1.0, atol=1e-3)
+    np.testing.assert_allclose(found.translations, 0.0, atol=1e-12)
+    assert found.warnings == ()
+    assert set(found.reasons) == {"basis_size", "scales", "rotations"}
+
+
+def test_a_low_rank_scene_needs_its_own_k() -> None:
+    random = np.random.default_rng(0)
+    camera = turning(60, 70)
+    play = 0.3 * np.sin(np.linspace(0, 9, 60))[:, None, None]
+    tracks = view(RIGID + play * random.normal(size=RIGID.shape), camera).transpose(0, 2, 1).reshape(120, -1)
+    centred = tracks - tracks.mean(axis=1, keepdims=True)
+    own, rigid = (error(upgrade(centred @ centred.T, size).rotations, camera) for size in (2, 1))
+    assert own < 1.5
+    assert rigid > 1.5 * own
+
+
+def test_scales_are_found_where_the_camera_has_them() -> None:
+    scales = np.exp(0.1 * np.sin(np.linspace(0, 3, 20)))
+    scales /= np.exp(np.log(scales).mean())
+    normalised = normalise(Tracks.from_arrays(view(RIGID, CAMERA) * scales[:, None, None]))
+    found = estimate_cameras(normalised, Settings())
+    np.testing.assert_allclose(found.scales, scales, rtol=5e-3)
+    assert np.log(found.scales).mean() == pytest.approx(0, abs=1e-12)
+    np.testing.assert_allclose(estimate_scales(normalised, CAMERA), scales, rtol=5e-3)
+    plain = estimate_cameras(normalised, Settings(camera="orthographic"))
+    assert (plain.scales == 1).all()
+
+
+def test_outliers_and_hidden_points_hardly_matter() -> None:
+    random = np.random.default_rng(1)
+    points = view(RIGID, CAMERA)
+    points[random.random(points.shape[:2]) < 0.1] = random.uniform(-2, 2, 2)
+    visible = random.random(points.shape[:2]) > 0.3
+    found = estimate_cameras(normalise(Tracks.from_arrays(points, visible)), Settings())
+    assert np.isfinite(found.rotations).all()
+    assert error(found.rotations, CAMERA) < 3
+
+
+def test_a_still_camera_is_said() -> None:
+    still = np.broadcast_to(np.eye(3), (8, 3, 3))
+    found = estimate_cameras(normalise(Tracks.from_arrays(view(RIGID, still))), Settings())
+    assert any("hardly turns" in sentence for sentence in found.warnings)
+
+
+@pytest.mark.parametrize(("frames", "points"), [(3, 4), (3, 60), (20, 4)])
+def test_the_smallest_inputs_give_rotations(frames: int, points: int) -> None:
+    found = estimate_cameras(normalise(Tracks.from_arrays(view(RIGID[:points], turning(frames, 40)))), Settings())
+    square = found.rotations @ found.rotations.transpose(0, 2, 1)
+    np.testing.assert_allclose(square, np.broadcast_to(np.eye(3), (frames, 3, 3)), atol=1e-9)
+
+
+def test_the_same_seed_gives_the_same_bits_and_stopping_returns() -> None:
+    normalised = normalise(Tracks.from_arrays(view(RIGID, CAMERA)))
+    first, second = estimate_cameras(normalised, Settings()), estimate_cameras(normalised, Settings())
+    assert (first.rotations == second.rotations).all()
+    steps: list[float] = []
+    estimate_cameras(normalised, Settings(), on_step=lambda step: steps.append(step.fraction), should_stop=lambda: True)
+    assert steps == sorted(steps)
+    assert estimate_cameras(normalised, Settings(basis_size=2)).basis_size == 2
+
+
+@pytest.mark.parametrize("with_scales", [True, False])
+def test_the_gradient_is_that_of_the_energy(with_scales: bool) -> None:
+    random = np.random.default_rng(0)
+    tracks = random.normal(size=(14, 30))
+    scene = Scene.of(tracks @ tracks.T / 30, exponential(random.normal(0, 0.3, (7, 3))), with_scales=with_scales)
+    flat = start(scene, np.exp(random.normal(0, 0.05, 7))).flat()
+    flat = flat + random.normal(0, 0.1, flat.size)
+
+    def value(at: np.ndarray) -> float:
+        return energy(scene, Motion.unflat(at, 7))[0]
+
+    numeric = np.array([(value(flat + 1e-6 * unit) - value(flat - 1e-6 * unit)) / 2e-6 for unit in np.eye(flat.size)])
+    exact = energy(scene, Motion.unflat(flat, 7))[1].flat()
+    np.testing.assert_allclose(exact, numeric, atol=1e-6 * np.abs(numeric).max())
+
+
+def test_the_exponential_map_and_its_jacobian() -> None:
+    random = np.random.default_rng(0)
+    vector, small = random.normal(size=3), 1e-6 * random.normal(size=3)
+    np.testing.assert_allclose(exponential(vector) @ exponential(-vector), np.eye(3), atol=1e-14)
+    moved = exponential(left_jacobian(vector) @ small) @ exponential(vector)
+    np.testing.assert_allclose(exponential(vector + small), moved, atol=1e-11)
