@@ -9,10 +9,10 @@ Three kinds of surface, each for any number of frames and points, each determini
 Axes are those of an image: x right, y down, z away from the viewer; the unit is a pixel.
 """
 
-from pliant.solver.gallery.corruption import corrupt
+from pliant.solver.gallery.corruption import corrupt, corrupt_tracks
 from pliant.solver.gallery.face import face
 from pliant.solver.gallery.flag import flag
 from pliant.solver.gallery.sequence import Sequence
 from pliant.solver.gallery.sphere import sphere
 
-__all__ = ["Sequence", "corrupt", "face", "flag", "sphere"]
+__all__ = ["Sequence", "corrupt", "corrupt_tracks", "face", "flag", "sphere"]

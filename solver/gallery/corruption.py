@@ -2,20 +2,37 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
-from pliant.solver.gallery.sequence import Sequence, refusal, with_tracks
+from pliant.solver.gallery.sequence import Sequence, refusal
+from pliant.solver.records import Tracks
 
 
 def corrupt(
     sequence: Sequence, *, noise: float = 0.0, outliers: float = 0.0, hidden: float = 0.0, seed: int = 0
 ) -> Sequence:
-    """Spoil the tracks of a sequence; the truth stays.
+    """Spoil the tracks of a sequence, see `corrupt_tracks`; the truth stays, and `outliers` says where they are.
+
+    Raises
+    ------
+    InvalidInput
+        Noise below 0, or a share outside [0, 1].
+    """
+    tracks, wrong = corrupt_tracks(sequence.tracks, noise=noise, outliers=outliers, hidden=hidden, seed=seed)
+    return replace(sequence, tracks=tracks, outliers=(sequence.outliers | wrong) & (tracks.visible > 0))
+
+
+def corrupt_tracks(
+    tracks: Tracks, *, noise: float = 0.0, outliers: float = 0.0, hidden: float = 0.0, seed: int = 0
+) -> tuple[Tracks, NDArray[np.bool_]]:
+    """Spoil tracks.
 
     Parameters
     ----------
-    sequence
-        As the gallery made it, or already corrupted.
+    tracks
+        Clean, or already corrupted.
     noise : float
         r: Gaussian noise of standard deviation `σ = r · max |W|` on every coordinate, W the tracks with every frame's
         centroid removed (Dai, Deng, He 2017, section 5; their r goes to .05).
@@ -25,6 +42,11 @@ def corrupt(
         Share of the F·P observations hidden, in addition to those hidden already, each chosen at random.
     seed : int
         The same seed spoils the same observations in the same way.
+
+    Returns
+    -------
+    tracks, outliers
+        Corrupted tracks, and which observations were put at random places, `(F, P)`.
 
     Raises
     ------
@@ -37,18 +59,18 @@ def corrupt(
         if not 0 <= share <= 1:
             raise refusal(name, "a share from 0 to 1", share)
     random = np.random.default_rng(seed)
-    visible = sequence.tracks.visible.copy()
+    visible = tracks.visible.copy()
     seen = visible > 0
     counts = seen.sum(axis=1)[:, None]
-    middles = (sequence.tracks.points * seen[..., None]).sum(axis=1) / np.maximum(counts, 1)
-    centred = (sequence.tracks.points - middles[:, None]) * seen[..., None]
+    middles = (tracks.points * seen[..., None]).sum(axis=1) / np.maximum(counts, 1)
+    centred = (tracks.points - middles[:, None]) * seen[..., None]
     largest = np.abs(centred).max()
     box = np.stack([centred.min(axis=(0, 1)), centred.max(axis=(0, 1))])
     points = centred + noise * largest * random.standard_normal(centred.shape)
     wrong = _pick(seen.shape, outliers, random)
     points[wrong] = random.uniform(box[0], box[1], (int(wrong.sum()), 2))
     visible[_pick(seen.shape, hidden, random)] = 0.0
-    return with_tracks(sequence, points + middles[:, None], visible, (sequence.outliers | wrong) & (visible > 0))
+    return Tracks.from_arrays(points + middles[:, None], visible), wrong & (visible > 0)
 
 
 def _pick(shape: tuple[int, ...], share: float, random: np.random.Generator) -> NDArray[np.bool_]:

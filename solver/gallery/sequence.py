@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -120,11 +120,6 @@ def vertex_normals(points: Floats, mesh: Mesh) -> Floats:
     )
     length = np.linalg.norm(total, axis=1, keepdims=True)
     return np.asarray(np.divide(total, length, out=np.zeros_like(total), where=length > 0))
-
-
-def with_tracks(sequence: Sequence, points: Floats, visible: Floats, outliers: NDArray[np.bool_]) -> Sequence:
-    """Replace what was seen, keep the truth."""
-    return replace(sequence, tracks=Tracks.from_arrays(points, visible), outliers=outliers)
 
 
 def refusal(name: str, expected: str, got: object) -> InvalidInput:

@@ -1,0 +1,129 @@
+"""One measurement is one cell: a line of JSON, appended when it is done, so that a table can be resumed at any time."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pliant.solver import Settings, solve
+from pliant.solver.gallery import corrupt_tracks
+from pliant.solver.metrics import evaluate
+
+from benchmarks.sequences import Case
+
+METHODS: dict[str, dict[str, str]] = {
+    "pseudo_inverse": {"method": "pseudo_inverse", "prior": "smooth"},
+    "temporal": {"method": "temporal", "prior": "smooth"},
+    "spatio_temporal": {"method": "spatio_temporal", "prior": "smooth"},
+    "robust": {"method": "robust", "prior": "smooth"},
+    "robust+low_rank": {"method": "robust", "prior": "smooth+low_rank"},
+}
+
+CORRUPTIONS: dict[str, dict[str, float]] = {
+    "clean": {},
+    "noise .01": {"noise": 0.01},
+    "noise .03": {"noise": 0.03},
+    "noise .05": {"noise": 0.05},
+    "outliers 2 %": {"outliers": 0.02},
+    "outliers 6 %": {"outliers": 0.06},
+    "outliers 10 %": {"outliers": 0.10},
+    "hidden 30 %": {"hidden": 0.30},
+    "both": {"noise": 0.01, "outliers": 0.05, "hidden": 0.20},
+}
+"""`both`: 5 % outliers, 20 % hidden and noise of r = .01 together."""
+
+
+@dataclass(frozen=True, slots=True)
+class Key:
+    """What a cell measures."""
+
+    case: str
+    points: int
+    visibility: str
+    cameras: str
+    """`true` or `estimated`."""
+    method: str
+    corruption: str
+    trial: int
+    settings: str = ""
+    """Settings beyond the method's, as `name=value,…`."""
+
+
+def measure(case: Case, key: Key) -> dict[str, Any]:
+    """Corrupt, solve and compare."""
+    tracks, _ = corrupt_tracks(case.tracks, **CORRUPTIONS[key.corruption], seed=key.trial)
+    settings = replace(Settings(), **METHODS[key.method], **parse_settings(key.settings))  # type: ignore[arg-type]
+    cameras = case.cameras if key.cameras == "true" else None
+    wall, cpu = time.perf_counter(), time.process_time()
+    solution = solve(tracks, case.mesh, cameras=cameras, settings=settings)
+    wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+    rotations = None if case.cameras is None else case.cameras.rotations
+    metrics = evaluate(solution, tracks, case.shapes, rotations)
+    if rotations is None:
+        # The truth is in each frame's own axes: one transform for the sequence cannot fit, and the number says nothing.
+        metrics = {name: value for name, value in metrics.items() if name not in ("e3d_sequence", "e3d_mocap")}
+    choices = solution.choices
+    chosen = {
+        name: getattr(choices, name)
+        for name in (
+            "basis_size",
+            "temporal_weight",
+            "spatial_weight",
+            "robust_scale",
+            "temporal_order",
+            "low_rank_weight",
+        )
+    }
+    return {
+        **asdict(key),
+        "metrics": metrics,
+        "chosen": chosen,
+        "warnings": list(choices.warnings),
+        "outcome": str(solution.outcome),
+        "iterations": int(np.sum(solution.trace.iterations)),
+        "reweightings": len(solution.trace.objective) - 1,
+        "seconds": wall,
+        "cpu_seconds": cpu,
+    }
+
+
+def parse_settings(text: str) -> dict[str, Any]:
+    """Read `name=value,…`; values are Python literals where they can be, words otherwise."""
+    values: dict[str, Any] = {}
+    for part in filter(None, text.split(",")):
+        name, _, value = part.partition("=")
+        try:
+            values[name] = json.loads(value.replace("True", "true").replace("False", "false").replace("None", "null"))
+        except json.JSONDecodeError:
+            values[name] = value
+    return values
+
+
+def key_of(row: dict[str, Any]) -> Key:
+    """Rebuild the key of a stored row."""
+    return Key(**{name: row[name] for name in Key.__dataclass_fields__})
+
+
+def read_rows(path: Path) -> dict[Key, dict[str, Any]]:
+    """Read finished cells; a line cut off by an interrupted run is measured again."""
+    rows: dict[Key, dict[str, Any]] = {}
+    for line in path.read_text().splitlines() if path.exists() else []:
+        try:
+            row = json.loads(line)
+        except json.JSONDecodeError:
+            continue
+        rows[key_of(row)] = row
+    return rows
+
+
+def append_row(path: Path, row: dict[str, Any]) -> None:
+    """Add one finished cell on a line of its own, even behind a line that was cut off."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a+") as file:
+        file.seek(0)
+        text = file.read()
+        file.write(("" if not text or text.endswith("\n") else "\n") + json.dumps(row) + "\n")
