@@ -1,0 +1,141 @@
+"""The benchmarks run at tiny sizes, resume, thin meshes properly and notice a regression."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pliant.solver import KnownCamera, Mesh, Settings, solve
+from pliant.solver.gallery import corrupt, face, sphere
+
+ROOT = Path(__file__).parent.parent.parent
+
+
+@pytest.fixture
+def bench(monkeypatch):
+    """Import a module of the benchmarks as they import each other: from the root of the repository."""
+    monkeypatch.syspath_prepend(str(ROOT))
+    return lambda name: import_module(f"benchmarks.{name}")
+
+
+def run(*arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "benchmarks.accuracy", *map(str, arguments)]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
+
+
+def write_case(folder: Path) -> None:
+    made = face(5, 120)
+    folder.mkdir(parents=True)
+    np.savez(folder / "tracks.npz", tracks=made.tracks.points, visibility=made.tracks.visible > 0)
+    np.savez(folder / "mesh.npz", faces=made.mesh.faces)
+    np.savez(folder / "truth.npz", shapes=made.shapes, rotations=made.rotations[:, :2])
+    (folder / "about.json").write_text(json.dumps({"units": "pixels"}))
+
+
+def test_accuracy_measures_once_and_resumes(tmp_path):
+    write_case(tmp_path / "data" / "tiny")
+    results = tmp_path / "cells.jsonl"
+    arguments = ("--data", tmp_path / "data", "--points", 60, "--methods", "pseudo_inverse,temporal", "--corruptions",
+                 "clean,outliers 6", "--trials", 2, "--results", results)  # fmt: skip
+    first = run(*arguments)
+    assert first.returncode == 0, first.stderr
+    rows = [json.loads(line) for line in results.read_text().splitlines()]
+    assert len(rows) == 2 * 2 * (1 + 2)  # cameras × methods × (clean once, outliers twice)
+    assert {row["points"] for row in rows} == {60}
+    assert "| tiny | outliers 6 % | 2 |" in first.stdout
+    assert "### e3d_frame, estimated over true cameras, clean" in first.stdout
+    kept = results.read_text()
+    results.write_text(kept[:-40])  # the last line was cut off by an interruption
+    again = run(*arguments)
+    assert again.returncode == 0, again.stderr
+    lines = results.read_text().splitlines()
+    assert lines[:-2] == kept.splitlines()[:-1]  # nothing else was measured anew
+    remade, original = json.loads(lines[-1]), json.loads(kept.splitlines()[-1])
+    assert remade["metrics"] == pytest.approx(original["metrics"])
+
+
+def test_thinning_keeps_a_closed_surface_closed(bench):
+    ball = sphere(3, 2000)
+    points = ball.shapes[0]
+    kept = bench("subsample").thin_points(points, 150)
+    assert len(set(kept.tolist())) == 150
+    thin = bench("subsample").thin_mesh(ball.mesh, points, kept)
+    assert thin.num_points == 150
+    assert 150 - len(thin.edges) + len(thin.faces) == 2  # Euler's number of a sphere
+    corners = points[kept][thin.faces]
+    outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert (np.einsum("ti,ti->t", outward, corners.mean(axis=1) - points.mean(axis=0)) > 0).mean() > 0.98
+    assert np.ptp(np.linalg.norm(np.diff(points[kept][thin.edges], axis=1), axis=-1)) < 250
+
+
+def test_thinning_keeps_components_apart(bench):
+    two = np.concatenate([np.arange(6).reshape(2, 3), 6 + np.arange(6).reshape(2, 3)])
+    faces = np.concatenate([Mesh.from_grid(np.arange(6).reshape(2, 3)).faces + shift for shift in (0, 6)])
+    points = np.zeros((12, 3))
+    points[:, 0] = np.tile(np.arange(3), 4)
+    points[:, 1] = np.repeat([0, 1, 5, 6], 3)
+    kept = np.array([0, 2, 3, 5, 6, 8, 9, 11])
+    thin = bench("subsample").thin_mesh(Mesh.from_faces(faces, 12), points, kept)
+    assert two.shape == (4, 3)
+    side = points[kept][thin.edges][..., 1] > 3
+    assert (side[:, 0] == side[:, 1]).all()
+
+
+def test_all_visible_puts_hidden_points_where_the_camera_would_see_them(bench):
+    ball = sphere(8, 100)
+    whole = sphere(8, 100, self_occlusion=False)
+    sequences = bench("sequences")
+    case = sequences.as_given(sequences.from_gallery(ball, "sphere"), "all")
+    assert case.tracks.all_visible
+    assert case.tracks.points == pytest.approx(whole.tracks.points)
+    assert sequences.as_given(sequences.from_gallery(ball, "sphere"), "file").tracks is ball.tracks
+
+
+def test_a_regression_is_noticed_and_noise_is_not(bench):
+    gate = bench("gate")
+    baseline = {"a": 0.1, "b": 0.0, "c": 0.2}
+    assert gate.regressions({"a": 0.1055, "b": 0.0009, "c": 0.05}, baseline) == set()
+    assert gate.regressions({"a": 0.107, "b": 0.0011, "new": 9.0}, baseline) == {"a", "b"}
+
+
+@pytest.fixture(scope="module")
+def small_problem():
+    made = corrupt(face(8, 120), noise=0.01, outliers=0.1)
+    cameras = KnownCamera.from_arrays(made.rotations, made.scales)
+    settings = Settings(preset="paper", prior="smooth", tolerance=1e-6, max_reweightings=200)
+    return made, cameras, settings, solve(made.tracks, made.mesh, cameras=cameras, settings=settings)
+
+
+@pytest.mark.parametrize("name", ["gradient_descent", "conjugate_gradients", "direct"])
+def test_every_baseline_reaches_the_solver_s_energy(bench, small_problem, name):
+    made, cameras, settings, solution = small_problem
+    baselines, speed = bench("baselines"), bench("speed")
+    problem, start, translations = speed.prepare(made.tracks, made.mesh, cameras, settings, solution)
+    best = solution.trace.objective[-1]
+    finished = getattr(baselines, name)(problem, start, translations, target=1.01 * best, cap=30.0)
+    assert finished.reached
+    assert best * 0.999 < finished.objective[-1] <= 1.01 * best
+
+
+def test_growth_exponent_of_a_known_law(bench):
+    sizes = np.array([10.0, 20.0, 80.0])
+    assert bench("speed").exponent(sizes, 3 * sizes**1.25) == pytest.approx(1.25)
+
+
+def test_the_rasteriser_shows_the_nearer_surface_and_its_colour(bench):
+    raster = bench("raster")
+    square = np.array([(-1, -1, 0), (-1, 1, 0), (1, 1, 0), (1, -1, 0)], dtype=float)
+    points = np.concatenate([square, square * 0.5 - (0, 0, 1)])
+    faces = np.array([(0, 1, 2, 3), (4, 5, 6, 7)])
+    colours = np.array([(1.0, 0, 0)] * 4 + [(0, 1.0, 0)] * 4)
+    image = raster.draw_mesh(points, faces, size=(60, 60), scale=20, colours=colours)
+    assert image[30, 30, 1] > 0.5 > 0.1 > image[30, 30, 0]
+    assert image[15, 15, 0] > 0.5 > 0.1 > image[15, 15, 1]
+    assert (image[2, 2] == 1).all()
+    covered = (image != 1).any(axis=2)
+    assert covered.sum() == pytest.approx(40 * 40, rel=0.02)
