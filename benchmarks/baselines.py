@@ -11,6 +11,7 @@ whose cost is not charged to it, and runs until the energy is at most `target`, 
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -41,7 +42,9 @@ class Run:
         return self.reached
 
 
-def gradient_descent(problem: Problem, shapes: np.ndarray, translations: np.ndarray, *, target: float, cap: float) -> Run:
+def gradient_descent(
+    problem: Problem, shapes: np.ndarray, translations: np.ndarray, *, target: float, cap: float
+) -> Run:
     """Steepest descent with exact line search on the reweighted energy.
 
     Vectorised over everything. The smoothness part of the gradient is linear, so its value at the new shapes comes from its
@@ -80,7 +83,9 @@ def conjugate_gradients(
 def direct(problem: Problem, shapes: np.ndarray, translations: np.ndarray, *, target: float, cap: float) -> Run:
     """Reweight; factor the explicit normal equations with SuperLU; repeat."""
 
-    def inner(fixed: sparse.csr_array, data: sparse.csr_array, right: np.ndarray, _: np.ndarray, run: Run, __: float) -> np.ndarray:
+    def inner(
+        fixed: sparse.csr_array, data: sparse.csr_array, right: np.ndarray, _: np.ndarray, run: Run, __: float
+    ) -> np.ndarray:
         run.iterations += 1
         factor = splu((fixed + data).tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
         return factor.solve(right)
@@ -151,10 +156,8 @@ def _scipy_cg(reduction: float, cap: float) -> Inner:
             if time.perf_counter() - began > cap:
                 raise TimeoutError
 
-        try:
+        with contextlib.suppress(TimeoutError):  # the last iterate stands, and the run ends
             latest, _ = cg(matrix, right, x0=start, rtol=0.0, atol=enough, maxiter=2000, M=jacobi, callback=count)
-        except TimeoutError:
-            pass  # the last iterate stands, and the run ends
         return latest
 
     return inner

@@ -4,7 +4,7 @@
     python -m benchmarks.pictures --data DIR --only face --frames 4
     python -m benchmarks.pictures --outliers .1 --side 50
 
-Needs matplotlib (`pip install -e '.[bench]'`) for the frame around the drawings; the drawings are `benchmarks.raster`'s.
+Needs matplotlib (`pip install matplotlib`) for the frame around the drawings; the drawings are `benchmarks.raster`'s.
 """
 
 from __future__ import annotations
