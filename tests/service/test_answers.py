@@ -1,0 +1,171 @@
+"""Files in parts, events, waiting, and what is refused before a body is read."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import os
+import threading
+import time
+from pathlib import Path
+
+import httpx
+import pytest
+from pliant.client.schemas import Status
+from pliant.service.app import STATUS_OF
+from pliant.service.incoming import Incoming
+from pliant.service.settings import MB, InvalidServiceSetting, ServiceSettings
+from pliant.worker import errors
+from serving import Running, Serve, finish, submit
+
+CONTENTS = os.urandom(3_000_000)
+
+
+@pytest.fixture(scope="module")
+def address(running: Running) -> str:
+    with httpx.Client(base_url=running.url) as http:
+        job = submit(http, name="done")
+    finish(running, job.id, CONTENTS)
+    return f"/v1/jobs/{job.id}/artifacts/shapes.npz"
+
+
+def test_a_file_comes_whole_with_its_digest(http: httpx.Client, address: str) -> None:
+    answer = http.get(address)
+    digest = hashlib.sha256(CONTENTS)
+    assert answer.content == CONTENTS
+    assert answer.headers["content-length"] == str(len(CONTENTS))
+    assert answer.headers["etag"] == f'"{digest.hexdigest()}"'
+    assert answer.headers["repr-digest"] == f"sha-256=:{base64.b64encode(digest.digest()).decode()}:"
+    assert answer.headers["content-disposition"] == 'attachment; filename="shapes.npz"'
+    head = http.head(address)
+    assert (head.status_code, head.content, head.headers["etag"]) == (200, b"", answer.headers["etag"])
+    listed = http.get(address.rpartition("/")[0]).json()
+    assert [(each["name"], each["sha256"]) for each in listed] == [("shapes.npz", digest.hexdigest())]
+
+
+def test_an_interrupted_download_is_resumed(http: httpx.Client, address: str) -> None:
+    tag = http.head(address).headers["etag"]
+    rest = http.get(address, headers={"Range": "bytes=1234567-", "If-Range": tag})
+    assert (rest.status_code, rest.content) == (206, CONTENTS[1234567:])
+    assert rest.headers["content-range"] == f"bytes 1234567-{len(CONTENTS) - 1}/{len(CONTENTS)}"
+    assert http.get(address, headers={"Range": "bytes=5-", "If-Range": '"other"'}).content == CONTENTS
+    assert http.get(address, headers={"If-None-Match": tag}).status_code == 304
+    assert http.get(address, headers={"If-Match": '"other"'}).json()["code"] == "precondition_failed"
+    beyond = http.get(address, headers={"Range": f"bytes={len(CONTENTS)}-"})
+    assert (beyond.status_code, beyond.json()["code"]) == (416, "range_not_satisfiable")
+    assert beyond.headers["content-range"] == f"bytes */{len(CONTENTS)}"
+    assert http.get(address + "x").json()["code"] == "unknown_artifact"
+
+
+def test_events_end_with_the_job_and_go_on_from_the_last_one(running: Running, http: httpx.Client) -> None:
+    job = submit(http, name="followed")
+    timer = threading.Timer(0.5, finish, (running, job.id, b"x"))
+    timer.start()
+    text = http.get(f"/v1/jobs/{job.id}/events").text
+    timer.join()
+    assert '"status":"succeeded"' in text.replace(" ", "")
+    ids = [line.removeprefix("id: ") for line in text.splitlines() if line.startswith("id: ")]
+    assert len(ids) == len(set(ids)) >= 2
+    later = http.get(f"/v1/jobs/{job.id}/events", headers={"Last-Event-ID": ids[-2]}).text
+    assert [line for line in later.splitlines() if line.startswith("id: ")] == [f"id: {ids[-1]}"]
+    odd = http.get(f"/v1/jobs/{job.id}/events", headers={"Last-Event-ID": "x"})
+    assert (odd.status_code, odd.json()["code"]) == (422, "invalid_event_id")
+    assert http.get("/v1/jobs/nobody/events").status_code == 404
+
+
+def test_waiting_ends_when_the_job_does_or_patience_does(running: Running, http: httpx.Client) -> None:
+    job = submit(http, name="awaited")
+    begun = time.monotonic()
+    early = http.get(f"/v1/jobs/{job.id}", headers={"Prefer": "wait=1"})
+    assert 0.9 < time.monotonic() - begun < 5
+    assert (early.json()["status"], early.headers["preference-applied"]) == (Status.QUEUED, "wait=1")
+    timer = threading.Timer(0.5, finish, (running, job.id, b"x"))
+    timer.start()
+    begun = time.monotonic()
+    assert http.get(f"/v1/jobs/{job.id}", headers={"Prefer": "respond-async, wait=15"}).json()["status"] == "succeeded"
+    assert time.monotonic() - begun < 8
+    timer.join()
+
+
+def test_every_answer_tells_the_browser_to_be_careful(http: httpx.Client) -> None:
+    for answer in (http.get("/healthz"), http.get("/nowhere"), http.get("/v1/jobs/nobody")):
+        assert answer.headers["content-security-policy"].startswith("default-src 'self'")
+        assert answer.headers["x-content-type-options"] == "nosniff"
+        assert "access-control-allow-origin" not in answer.headers
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "status", "code"),
+    [("GET", "/nowhere", 404, "no_such_address"), ("DELETE", "/v1/options", 405, "method_not_allowed")],
+)
+def test_the_frameworks_own_refusals_are_problems(
+    http: httpx.Client, method: str, path: str, status: int, code: str
+) -> None:
+    answer = http.request(method, path)
+    assert (answer.status_code, answer.json()["code"]) == (status, code)
+    assert answer.headers["content-type"] == "application/problem+json"
+
+
+@pytest.mark.parametrize(
+    ("headers", "status"),
+    [
+        ({"Host": "evil.example"}, 421),
+        ({"Origin": "https://evil.example"}, 403),
+        ({"Sec-Fetch-Site": "cross-site"}, 403),
+        ({"Origin": "null"}, 403),
+    ],
+)
+def test_a_page_of_another_site_cannot_write(running: Running, headers: dict[str, str], status: int) -> None:
+    before = running.waiting
+    answer = httpx.post(f"{running.url}/v1/jobs", content=b"", headers=headers)
+    assert answer.status_code == status
+    assert running.waiting == before
+
+
+def test_an_origin_that_was_allowed_may(serve: Serve) -> None:
+    running = serve(cors_origins=("https://good.example",))
+    headers = {"Origin": "https://good.example"}
+    answer = httpx.post(f"{running.url}/v1/jobs", content=b"x", headers=headers)
+    assert (answer.status_code, answer.headers["access-control-allow-origin"]) == (415, "https://good.example")
+
+
+def test_without_its_store_the_service_says_so_and_keeps_nothing(serve: Serve, tmp_path: Path) -> None:
+    running = serve(redis_url=f"unix://{tmp_path}/nobody.sock")
+    assert httpx.get(f"{running.url}/healthz").status_code == 200
+    assert httpx.get(f"{running.url}/readyz").json()["code"] == "not_ready"
+    answer = httpx.get(f"{running.url}/v1/jobs", timeout=30)
+    assert (answer.status_code, answer.json()["code"]) == (503, "store_unavailable")
+    assert answer.json()["retryable"]
+    assert answer.headers["retry-after"] == "2"
+
+
+def test_every_error_of_the_worker_has_a_status() -> None:
+    kinds = [each for each in vars(errors).values() if isinstance(each, type) and issubclass(each, Exception)]
+    assert len(kinds) > 8
+    assert all(any(base in STATUS_OF for base in kind.__mro__) for kind in kinds)
+
+
+def test_a_killed_process_folder_is_swept_and_a_living_ones_is_not(tmp_path: Path) -> None:
+    living = Incoming(tmp_path)
+    living.open()
+    (tmp_path / "dead").mkdir()
+    (tmp_path / "dead" / "part").write_bytes(b"x")
+    (tmp_path / "dead.lock").touch()
+    with living.room() as room:
+        (room / "part").write_bytes(b"x")
+        second = Incoming(tmp_path)
+        second.open()
+        assert not (tmp_path / "dead").exists()
+        assert (room / "part").read_bytes() == b"x"
+        second.close()
+    living.close()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_settings_come_from_the_environment() -> None:
+    settings = ServiceSettings.from_environment({"PLIANT_MAX_BODY_MB": "5", "PLIANT_ALLOWED_HOSTS": "a, b"})
+    assert (settings.max_body_bytes, settings.allowed_hosts, settings.loopback) == (5 * MB, ("a", "b"), True)
+    assert not ServiceSettings.from_environment({"PLIANT_HOST": "0.0.0.0"}).loopback
+    for name, value in (("PLIANT_PORT", "70000"), ("PLIANT_PARSERS", "0"), ("PLIANT_PORT", "x")):
+        with pytest.raises(InvalidServiceSetting, match=name):
+            ServiceSettings.from_environment({name: value})
