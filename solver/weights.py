@@ -1,34 +1,85 @@
-"""λ1, λ2, λ3 and the robust scale: the paper's values, or chosen from the data."""
+"""λ1, λ2, λ3 and the robust scale: the paper's values, or chosen from the data.
+
+Near zero a robust loss is a parabola with curvature 1/ε, far steeper than a least-squares data term; away from zero its slope is
+1, so that a point follows an outlier wherever bending its path costs less than the residual does. With the paper's λ1 = 1e-3
+bending costs next to nothing and gross outliers win. A point is held back once λ1 ‖H S‖² of the jump outweighs the jump itself,
+which for jumps of one RMS radius means λ1 well above 1; what fits exactly stays fitted exactly, because the loss has slope 1 from
+the first residual on. λ2 must stay far below λ1: where the camera leaves depth open, the two alone decide it, and a strong λ2
+flattens the surface. Measured in `benchmarks/README.md`.
+"""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
 from pliant.solver.cameras import CameraEstimate
 from pliant.solver.laplacian import Laplacian
 from pliant.solver.normalise import Normalised
 from pliant.solver.settings import Settings
 from pliant.solver.state import Weights
 
-PAPER = Weights(temporal=1e-3, spatial=1.0, low_rank=0.0, robust_scale=1e-3, order=1)
+PAPER = Weights(temporal=1e-3, spatial=1.0, low_rank=0.0, robust_scale=1e-3, order=1, rank_floor=1e-4)
 """Dai, Deng, He (2017), section 5: λ1 = 1e-3, λ2 = 1, first order; in units of the tracks' RMS radius."""
+
+ROBUST_TEMPORAL = 30.0
+"""λ1 of `auto` with a robust loss: large enough that no path bends to an outlier."""
+
+SPATIAL_SHARE = 3e-4
+"""λ2/λ1 of `auto`: neighbours help against outliers without flattening the depth."""
+
+SCALES = (1e-3, 1e-2)
+"""Range of the robust scale that follows the noise."""
 
 
 def choose_weights(
-    normalised: Normalised,  # noqa: ARG001
+    normalised: Normalised,
     estimate: CameraEstimate,  # noqa: ARG001
     laplacian: Laplacian | None,
     settings: Settings,
 ) -> tuple[Weights, float, dict[str, str]]:
     """Return the weights, the estimated noise (normalised units) and one sentence for each choice."""
-    chosen = PAPER
-    reasons = {"weights": "The paper's values."}
-    given = Weights(
+    noise = noise_of(normalised)
+    chosen, reason = (PAPER, "The paper's values.") if settings.preset == "paper" else _from_data(noise, settings)
+    given = replace(
+        chosen,
         temporal=chosen.temporal if settings.temporal_weight is None else settings.temporal_weight,
         spatial=chosen.spatial if settings.spatial_weight is None else settings.spatial_weight,
         low_rank=chosen.low_rank if settings.low_rank_weight is None else settings.low_rank_weight,
         robust_scale=chosen.robust_scale if settings.robust_scale is None else settings.robust_scale,
         order=chosen.order if settings.temporal_order is None else settings.temporal_order,
-        rank_floor=1e-4,
     )
     if laplacian is None:
-        given = Weights(given.temporal, 0.0, given.low_rank, given.robust_scale, given.order, given.rank_floor)
-    return given, 0.0, reasons
+        given = replace(given, spatial=0.0)
+    if settings.prior == "smooth":
+        given = replace(given, low_rank=0.0)
+    return given, noise, {"weights": reason}
+
+
+def noise_of(normalised: Normalised) -> float:
+    """Return an upper estimate of the tracks' noise, normalised units.
+
+    The median absolute third difference of each coordinate over frames, as the standard deviation of white noise that would
+    leave it; smooth motion leaves little of it, and outliers do not move a median. Short sequences use lower differences.
+    """
+    order = min(3, len(normalised.points) - 1)
+    differences = np.diff(normalised.points, n=order, axis=0)
+    whole = np.ones(differences.shape[:2], dtype=bool)
+    for start in range(order + 1):
+        whole &= normalised.visible[start : start + len(differences)] > 0
+    if not whole.any():
+        return 0.0
+    norm = {1: 2.0, 2: 6.0, 3: 20.0}[order] ** 0.5
+    return float(1.4826 * np.median(np.abs(differences[whole])) / norm)
+
+
+def _from_data(noise: float, settings: Settings) -> tuple[Weights, str]:
+    if settings.method != "robust" or settings.loss == "l2":
+        chosen = replace(PAPER, spatial=PAPER.temporal * SPATIAL_SHARE)
+        return chosen, f"Least squares: λ1 = {chosen.temporal:g} as published, λ2 = {SPATIAL_SHARE:g} λ1."
+    scale = float(np.clip(noise, *SCALES))
+    chosen = replace(PAPER, temporal=ROBUST_TEMPORAL, spatial=ROBUST_TEMPORAL * SPATIAL_SHARE, robust_scale=scale)
+    return chosen, (
+        f"λ1 = {chosen.temporal:g} holds paths against outliers, λ2 = {SPATIAL_SHARE:g} λ1 keeps depth from flattening, "
+        f"and the loss turns linear at the noise of at most {noise:.2g} RMS radii (between {SCALES[0]:g} and {SCALES[1]:g})."
+    )
