@@ -10,7 +10,7 @@ flattens the surface. Measured in `benchmarks/README.md`.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pliant.solver.cameras import CameraEstimate
@@ -19,14 +19,28 @@ from pliant.solver.normalise import Normalised
 from pliant.solver.settings import Settings
 from pliant.solver.state import Weights
 
-PAPER = Weights(temporal=1e-3, spatial=1.0, low_rank=0.0, robust_scale=1e-3, order=1, rank_floor=1e-4)
-"""Dai, Deng, He (2017), section 5: λ1 = 1e-3, λ2 = 1, first order; in units of the tracks' RMS radius."""
+PAPER = Weights(temporal=1e-3, spatial=1.0, low_rank=3e-7, robust_scale=1e-3, order=1, rank_floor=1e-4)
+"""Dai, Deng, He (2017), section 5: λ1 = 1e-3, λ2 = 1, first order; in units of the tracks' RMS radius. The paper has no low-rank
+prior; λ3 counts only where it is asked for."""
 
-ROBUST_TEMPORAL = 30.0
-"""λ1 of `auto` with a robust loss: large enough that no path bends to an outlier."""
+STIFFEST = 30.0
+"""Largest λ1 of `auto` with a robust loss: no path bends to an outlier."""
+
+SOFTEST = 1.0
+"""Smallest λ1 of `auto` with a robust loss: few frames, far apart."""
+
+STIFFNESS = 0.1
+"""λ1 times the roughness: a point that moves by its own deformation must not look like an outlier."""
+
+FAR, FAR_AT_LEAST, JUMPS = 12.0, 0.05, 0.02
+"""A third difference above `FAR` times the typical one (and this many RMS radii) is a jump; above this share of them, the tracks
+have gross outliers."""
 
 SPATIAL_SHARE = 3e-4
 """λ2/λ1 of `auto`: neighbours help against outliers without flattening the depth."""
+
+LOW_RANK_SHARE = 3e-4
+"""λ3/λ1 of `auto` with the low-rank prior."""
 
 SCALES = (1e-3, 1e-2)
 """Range of the robust scale that follows the noise."""
@@ -39,8 +53,8 @@ def choose_weights(
     settings: Settings,
 ) -> tuple[Weights, float, dict[str, str]]:
     """Return the weights, the estimated noise (normalised units) and one sentence for each choice."""
-    noise = noise_of(normalised)
-    chosen, reason = (PAPER, "The paper's values.") if settings.preset == "paper" else _from_data(noise, settings)
+    rough = roughness_of(normalised)
+    chosen, reason = (PAPER, "The paper's values.") if settings.preset == "paper" else _from_data(rough, settings)
     given = replace(
         chosen,
         temporal=chosen.temporal if settings.temporal_weight is None else settings.temporal_weight,
@@ -53,33 +67,54 @@ def choose_weights(
         given = replace(given, spatial=0.0)
     if settings.prior == "smooth":
         given = replace(given, low_rank=0.0)
-    return given, noise, {"weights": reason}
+    return given, rough.noise, {"weights": reason}
 
 
-def noise_of(normalised: Normalised) -> float:
-    """Return an upper estimate of the tracks' noise, normalised units.
+@dataclass(frozen=True, slots=True)
+class Roughness:
+    """What third differences over frames say about the tracks."""
 
-    The median absolute third difference of each coordinate over frames, as the standard deviation of white noise that would
-    leave it; smooth motion leaves little of it, and outliers do not move a median. Short sequences use lower differences.
+    noise: float
+    """Upper estimate of the noise's standard deviation, normalised units."""
+
+    jumps: float
+    """Share of the third differences that are far larger than the typical one: what gross outliers leave."""
+
+
+def roughness_of(normalised: Normalised) -> Roughness:
+    """Return noise and jumps of the tracks.
+
+    The noise is the median absolute third difference of each coordinate over frames, as the standard deviation of white noise
+    that would leave it; smooth motion leaves little of it, and outliers do not move a median. Short sequences use lower
+    differences.
     """
     order = min(3, len(normalised.points) - 1)
-    differences = np.diff(normalised.points, n=order, axis=0)
+    differences = np.abs(np.diff(normalised.points, n=order, axis=0))
     whole = np.ones(differences.shape[:2], dtype=bool)
     for start in range(order + 1):
         whole &= normalised.visible[start : start + len(differences)] > 0
     if not whole.any():
-        return 0.0
+        return Roughness(0.0, 0.0)
+    seen = differences[whole]
+    typical = 1.4826 * float(np.median(seen))
     norm = {1: 2.0, 2: 6.0, 3: 20.0}[order] ** 0.5
-    return float(1.4826 * np.median(np.abs(differences[whole])) / norm)
+    return Roughness(typical / norm, float((seen.max(axis=1) > max(FAR * typical, FAR_AT_LEAST)).mean()))
 
 
-def _from_data(noise: float, settings: Settings) -> tuple[Weights, str]:
+def _from_data(rough: Roughness, settings: Settings) -> tuple[Weights, str]:
     if settings.method != "robust" or settings.loss == "l2":
-        chosen = replace(PAPER, spatial=PAPER.temporal * SPATIAL_SHARE)
+        chosen = replace(PAPER, spatial=PAPER.temporal * SPATIAL_SHARE, low_rank=PAPER.temporal * LOW_RANK_SHARE)
         return chosen, f"Least squares: λ1 = {chosen.temporal:g} as published, λ2 = {SPATIAL_SHARE:g} λ1."
-    scale = float(np.clip(noise, *SCALES))
-    chosen = replace(PAPER, temporal=ROBUST_TEMPORAL, spatial=ROBUST_TEMPORAL * SPATIAL_SHARE, robust_scale=scale)
+    scale = float(np.clip(rough.noise, *SCALES))
+    spoiled = rough.jumps > JUMPS
+    stiff = STIFFEST if spoiled else float(np.clip(STIFFNESS / max(rough.noise, 1e-9), SOFTEST, STIFFEST))
+    chosen = replace(
+        PAPER, temporal=stiff, spatial=stiff * SPATIAL_SHARE, low_rank=stiff * LOW_RANK_SHARE, robust_scale=scale
+    )
+    why = (
+        "gross outliers have to be held back" if spoiled else f"frame-to-frame roughness is {rough.noise:.2g} RMS radii"
+    )
     return chosen, (
-        f"λ1 = {chosen.temporal:g} holds paths against outliers, λ2 = {SPATIAL_SHARE:g} λ1 keeps depth from flattening, "
-        f"and the loss turns linear at the noise of at most {noise:.2g} RMS radii (between {SCALES[0]:g} and {SCALES[1]:g})."
+        f"λ1 = {stiff:.3g} because {why} ({rough.jumps:.1%} of the third differences are jumps); λ2 = {SPATIAL_SHARE:g} λ1 keeps "
+        f"depth from flattening; the loss turns linear at {scale:.2g} RMS radii."
     )
