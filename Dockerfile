@@ -2,6 +2,7 @@
 FROM python:3.12-slim AS build
 WORKDIR /source
 COPY . .
+ENV PLIANT_PAGE=required
 RUN python -m pip wheel --no-cache-dir --constraint constraints.txt --wheel-dir /wheels .
 
 FROM python:3.12-slim

@@ -60,13 +60,14 @@ class Options(BaseModel):
         description="Spatial smoothness: 8-direction stencil on a pixel grid, or mesh Laplacian; auto: by the mesh given.",
     )
     prior: Literal["smooth", "smooth+low_rank"] = Field(
-        "smooth",
-        description="smooth: the published method; smooth+low_rank also favours shapes that few basis shapes explain.",
+        "smooth+low_rank",
+        description="smooth: the published method; smooth+low_rank also favours shapes that few basis shapes explain (with preset "
+        "paper only if low_rank_weight is given).",
     )
     low_rank_weight: Weight | None = Field(
         None, description="λ3, strength of the low-rank prior, dimensionless; null: from the data."
     )
-    max_reweightings: int = Field(30, ge=1, le=1000, description="Upper bound on the reweightings of the robust loss.")
+    max_reweightings: int = Field(60, ge=1, le=1000, description="Upper bound on the reweightings of the robust loss.")
     tolerance: float = Field(
         1e-4, gt=0, lt=1, description="Converged when the objective's relative change in one reweighting is below this."
     )

@@ -95,7 +95,8 @@ def _centred(problem: Problem, shapes: Array, translations: Floats) -> tuple[Arr
 def _evaluated(problem: Problem, shapes: Array, translations: Floats, *, reweighting: int, iterations: int) -> State:
     left = residuals(problem, shapes, translations)
     weights = problem.weights
-    value = objective(problem, shapes, left)
+    whole = bool(np.isfinite(np.vdot(shapes, shapes)))
+    value = objective(problem, shapes, left) if whole else np.inf
     if not np.isfinite(value):
         raise NotFinite(f"the energy became {value} after {reweighting} reweightings")
     seen = problem.confidence > 0

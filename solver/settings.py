@@ -61,13 +61,14 @@ class Settings:
     """`grid8`: the paper's 8-direction stencil (needs a grid); `uniform` or `cotangent` on a mesh; `auto`: grid8 on a grid,
     else uniform."""
 
-    prior: Prior = "smooth"
-    """`smooth`: the paper's method exactly; `smooth+low_rank` adds a reweighted nuclear norm on the F×3P shape matrix."""
+    prior: Prior = "smooth+low_rank"
+    """`smooth`: the paper's method exactly; `smooth+low_rank` adds a reweighted nuclear norm on the F×3P shape matrix
+    (under preset `paper` only if `low_rank_weight` is given)."""
 
     low_rank_weight: float | None = None
     """λ3, dimensionless, strength of the low-rank prior; None takes it from the data."""
 
-    max_reweightings: int = 30
+    max_reweightings: int = 60
     """Upper bound on the outer IRLS steps."""
 
     tolerance: float = 1e-4

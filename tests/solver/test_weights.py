@@ -38,7 +38,7 @@ def test_without_a_mesh_there_is_no_spatial_weight(face: gallery.Sequence) -> No
 
 
 def test_the_low_rank_prior_counts_only_where_it_is_asked_for(face: gallery.Sequence) -> None:
-    smooth = solve(face.tracks, settings=Settings(low_rank_weight=1.0, max_reweightings=1)).choices
+    smooth = solve(face.tracks, settings=Settings(prior="smooth", low_rank_weight=1.0, max_reweightings=1)).choices
     asked = solve(face.tracks, settings=Settings(prior="smooth+low_rank", max_reweightings=1)).choices
     assert smooth.low_rank_weight == 0
     assert asked.low_rank_weight > 0
@@ -56,7 +56,9 @@ def test_gross_outliers_ruin_least_squares_and_hardly_touch_the_default(face: ga
 
 def test_the_low_rank_prior_brings_a_face_nearer_to_the_truth(face: gallery.Sequence) -> None:
     spoiled = gallery.corrupt(face, outliers=0.1, seed=3).tracks
-    assert error(face, spoiled, Settings(prior="smooth+low_rank")) < 0.9 * error(face, spoiled, Settings())
+    assert error(face, spoiled, Settings(prior="smooth+low_rank")) < 0.9 * error(
+        face, spoiled, Settings(prior="smooth")
+    )
 
 
 @pytest.mark.parametrize("frames", [3, 4, 40])
