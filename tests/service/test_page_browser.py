@@ -186,10 +186,12 @@ def test_from_an_upload_to_a_playing_mesh(page: Page, url: str, small: dict[str,
 
     seek(page, 0)
     first, again = canvas.screenshot(), canvas.screenshot()
-    seek(page, 5)
-    later = canvas.screenshot()
     assert differing_pixels(page, first, again) == 0
-    assert differing_pixels(page, first, later) > 0.01
+    later = []
+    for frame in range(1, 10, 2):
+        seek(page, frame)
+        later.append(differing_pixels(page, first, canvas.screenshot()))
+    assert max(later) > 0.003  # a changing expression is a small part of the picture; the same frame differs by nothing
 
     page.get_by_role("button", name="Play").click()
     shown = page.get_by_role("slider", name="Frame").input_value()

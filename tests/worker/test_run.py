@@ -10,6 +10,7 @@ import pytest
 from pliant.client.options import SOLVER_FIELDS, Options
 from pliant.client.schemas import Progress
 from pliant.solver import InvalidInput, Mesh, Settings
+from pliant.solver.metrics import e3d_frame
 from pliant.worker.errors import Interrupted, TimedOut
 from pliant.worker.formats import Inputs
 from pliant.worker.problems import problem_of
@@ -29,11 +30,12 @@ def test_the_files_hold_what_the_call_returns(inputs: Inputs, tmp_path: Path) ->
     assert (report["outcome"], report["sentence"]) == (finished.outcome, finished.sentence)
     assert report["metrics"] == pytest.approx(finished.metrics)
     assert {"e3d_sequence", "reprojection_median"} <= set(finished.metrics)
-    assert 0 < finished.metrics["e3d_sequence"] < 1
     for artifact in finished.artifacts:
         assert (tmp_path / "new" / artifact.name).stat().st_size == artifact.bytes
     with np.load(tmp_path / "new" / "shapes.npz") as arrays:
         assert arrays["shapes"].shape == (8, 60, 3)
+        assert inputs.ground_truth is not None
+        assert finished.metrics["e3d_frame"] == pytest.approx(e3d_frame(arrays["shapes"], inputs.ground_truth.shapes))
     stages = [each.stage for each in told]
     assert stages[0] == "loading"
     assert stages[-1] == "exporting"
