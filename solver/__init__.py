@@ -7,6 +7,7 @@ if __name__ != "pliant.solver":
     raise ImportError(f"import this folder as pliant.solver, not as {__name__!r}: install it with pip install -e .")
 
 from pliant.solver.errors import InvalidInput, InvalidSettings, NotFinite, SolverError
+from pliant.solver.parallel import threads_limited
 from pliant.solver.reconstruct import solve
 from pliant.solver.records import Camera, Choices, KnownCamera, Mesh, Outcome, Solution, Step, Trace, Tracks
 from pliant.solver.settings import Settings
@@ -27,4 +28,5 @@ __all__ = [
     "Trace",
     "Tracks",
     "solve",
+    "threads_limited",
 ]

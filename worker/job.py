@@ -159,15 +159,21 @@ class Attempt:
 def _work(attempt: Attempt, stored: Stored, directory: Path) -> Finished | Problem | None:
     """Run the job; every exception becomes the problem it is, its traceback goes into the log."""
     try:
+        from pliant.solver import threads_limited
         from pliant.worker.formats import load_inputs
         from pliant.worker.run import reconstruct
 
         file = directory / "inputs.npz"
         attempt.jobs.blobs.fetch(stored.inputs, file)
         results = directory / "artifacts"
-        finished = reconstruct(
-            load_inputs(file), stored.job.options, results, on_progress=attempt.tell, should_stop=attempt.should_stop
-        )
+        with threads_limited(attempt.jobs.settings.threads_per_job):
+            finished = reconstruct(
+                load_inputs(file),
+                stored.job.options,
+                results,
+                on_progress=attempt.tell,
+                should_stop=attempt.should_stop,
+            )
         for artifact in finished.artifacts:
             attempt.jobs.blobs.put(f"{attempt.prefix}{artifact.name}", results / artifact.name)
     except Interrupted:

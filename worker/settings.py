@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -16,11 +17,18 @@ NUMERICAL_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS
 """What the numerical libraries read when they are loaded."""
 
 
-def usable_cores() -> int:
-    """Cores this process may run on (the affinity mask, where the system has one)."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+CPU_QUOTA = Path("/sys/fs/cgroup/cpu.max")
+"""Where a container's share of the processors stands: `quota period` in microseconds, or `max period` (cgroup v2)."""
+
+
+def usable_cores(quota: Path = CPU_QUOTA) -> int:
+    """Cores this process may use: the affinity mask, where the system has one, and no more than its container's share."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    try:
+        share, period = map(float, quota.read_text().split())
+    except (OSError, ValueError):  # no such file, or "max": no limit
+        return cores
+    return max(1, min(cores, math.ceil(share / period)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

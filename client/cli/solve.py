@@ -19,7 +19,7 @@ THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
 
 Threads = Annotated[
     int | None,
-    typer.Option("--threads", help="Threads of the numerical libraries; all cores if not given.", min=1),
+    typer.Option("--threads", help="Threads to use; all cores if not given.", min=1),
 ]
 
 
@@ -40,6 +40,7 @@ def solve(
         os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(threads)))
     from pliant.client.parts import checked_options
     from pliant.client.progress import progress_bar
+    from pliant.solver import threads_limited
     from pliant.worker.formats import read_inputs
     from pliant.worker.run import reconstruct
 
@@ -49,7 +50,7 @@ def solve(
     )
     if not as_json:
         show_understood(inputs)
-    with progress_bar() as bar:
+    with progress_bar() as bar, threads_limited(threads):
         done = reconstruct(inputs, options, output, on_progress=bar.on_step, should_stop=None)
     show_finished(done, output, as_json=as_json)
 

@@ -1,11 +1,12 @@
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
 from pliant.worker.errors import InvalidSetting
 from pliant.worker.paths import LONGEST_SOCKET_PATH, socket_path
-from pliant.worker.settings import VARIABLES, Settings
+from pliant.worker.settings import VARIABLES, Settings, usable_cores
 
 
 def test_an_empty_environment_gives_the_defaults() -> None:
@@ -50,3 +51,16 @@ def test_a_deep_data_directory_gets_a_short_socket() -> None:
 def test_cores_are_shared_among_the_workers() -> None:
     assert Settings(workers=1000).threads_per_job == 1
     assert Settings(threads=3, workers=2).threads_per_job == 3
+
+
+@pytest.mark.parametrize(
+    ("text", "cores"), [("150000 100000\n", 2), ("20000 100000\n", 1), ("max 100000\n", 99), (None, 99)]
+)
+def test_a_container_s_share_bounds_the_cores(
+    text: str | None, cores: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(99)))
+    file = tmp_path / "cpu.max"
+    if text is not None:
+        file.write_text(text)
+    assert usable_cores(file) == cores
