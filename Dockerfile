@@ -14,5 +14,7 @@ WORKDIR /data
 ENV PLIANT_DATA=/data PYTHONUNBUFFERED=1
 VOLUME /data
 EXPOSE 8000
-# Alone, the image is the whole service: API, workers and embedded Valkey in one container.
+# Alone, the image is the whole service: API, workers and embedded Valkey in one container. It asks for tokens, so make one first:
+#   docker run --rm -v pliant:/data pliant pliant token create me
+#   docker run -v pliant:/data -p 127.0.0.1:8000:8000 pliant
 CMD ["pliant", "up", "--host", "0.0.0.0", "--port", "8000"]

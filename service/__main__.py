@@ -12,9 +12,12 @@ import uvicorn
 from fastapi import FastAPI
 from pliant.service.app import create_app
 from pliant.service.settings import InvalidServiceSetting, ServiceSettings
-from pliant.worker.errors import InvalidSetting
+from pliant.worker.errors import InvalidSetting, StoreUnavailable
 from pliant.worker.jobs import Jobs
 from pliant.worker.settings import Settings
+from pliant.worker.tokens import Tokens
+
+_log = logging.getLogger("pliant.service")
 
 STOP_WITHIN = 10
 """Seconds that running requests get after SIGTERM."""
@@ -40,16 +43,46 @@ def stop_streams(app: FastAPI) -> None:
         service.followers.close()
 
 
+def check_door(settings: ServiceSettings, tokens: Tokens) -> None:
+    """Refuse to start where tokens are asked for and there are none: nobody could use the service, and why would be a riddle.
+
+    Raises
+    ------
+    InvalidServiceSetting
+        With the two ways out.
+    """
+    if not settings.asks_for_tokens:
+        if not settings.loopback:
+            _log.warning(
+                "PLIANT_AUTH=off on %s: whoever reaches this address may read and delete every job", settings.host
+            )
+        return
+    try:
+        usable = tokens.usable()
+    except StoreUnavailable:
+        return  # then every request is answered 503 until it is there
+    if not usable:
+        raise InvalidServiceSetting(
+            f"Requests to {settings.host} need a token, and there is none that is valid. Make one with `pliant token create NAME`, "
+            "with the same PLIANT_DATA or PLIANT_REDIS_URL, then start again; or say PLIANT_AUTH=off if something else keeps "
+            "strangers away."
+        )
+
+
 def main() -> int:
     """Serve until SIGTERM or SIGINT; return the exit code."""
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    for name in ("uvicorn", "uvicorn.error"):  # its start and stop are said by whoever started us
+        logging.getLogger(name).setLevel(logging.WARNING)
     try:
         settings = ServiceSettings.from_environment(os.environ)
-        jobs = Jobs.open(Settings.from_environment(os.environ))
+        of_worker = Settings.from_environment(os.environ)
+        tokens = Tokens.open(of_worker)
+        check_door(settings, tokens)
     except (InvalidServiceSetting, InvalidSetting) as error:
         sys.stderr.write(f"{error}\n")
         return 2
-    app = create_app(jobs, settings)
+    app = create_app(Jobs.open(of_worker), settings, tokens=tokens)
     config = uvicorn.Config(
         app,
         host=settings.host,

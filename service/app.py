@@ -9,6 +9,7 @@ from importlib.metadata import version
 import anyio
 from fastapi import FastAPI
 from pliant.service import describe, problems
+from pliant.service.auth import Authentication
 from pliant.service.core import Service
 from pliant.service.follow import Followers
 from pliant.service.guard import OriginGuard, SecurityHeaders
@@ -20,6 +21,7 @@ from pliant.service.settings import ServiceSettings
 from pliant.worker import errors
 from pliant.worker.formats import InvalidInput, Limits
 from pliant.worker.jobs import Jobs
+from pliant.worker.tokens import Tokens
 from starlette.middleware import Middleware
 from starlette.middleware.cors import CORSMiddleware
 from starlette.requests import ClientDisconnect
@@ -29,6 +31,7 @@ STATUS_OF: dict[type[Exception], int] = {
     errors.UnknownJob: 404,
     errors.UnknownArtifact: 404,
     errors.UnknownExample: 404,
+    errors.UnknownToken: 404,
     errors.NotAllowedNow: 409,
     errors.Conflict: 409,
     errors.InvalidRequest: 422,
@@ -40,7 +43,13 @@ STATUS_OF: dict[type[Exception], int] = {
 """What each error means in HTTP; a subclass takes its nearest base's."""
 
 
-def create_app(jobs_of_all: Jobs, settings: ServiceSettings, *, limits: Limits = Limits()) -> FastAPI:  # noqa: B008
+def create_app(
+    jobs_of_all: Jobs,
+    settings: ServiceSettings,
+    *,
+    tokens: Tokens,
+    limits: Limits = Limits(),  # noqa: B008
+) -> FastAPI:
     """Make the application.
 
     Parameters
@@ -49,6 +58,8 @@ def create_app(jobs_of_all: Jobs, settings: ServiceSettings, *, limits: Limits =
         The jobs; nothing is asked of them before the first request.
     settings : ServiceSettings
         How the service runs.
+    tokens : Tokens
+        Who may ask, where the settings say that tokens are asked for.
     limits : Limits
         What the readers accept.
     """
@@ -74,7 +85,7 @@ def create_app(jobs_of_all: Jobs, settings: ServiceSettings, *, limits: Limits =
         description=describe.DESCRIPTION,
         version=version("pliant"),
         lifespan=lifespan,
-        middleware=middleware(settings),
+        middleware=middleware(settings, tokens),
         docs_url=None,  # FastAPI's page loads scripts from elsewhere, which our own content-security policy forbids
         redoc_url=None,
     )
@@ -86,7 +97,7 @@ def create_app(jobs_of_all: Jobs, settings: ServiceSettings, *, limits: Limits =
     return app
 
 
-def middleware(settings: ServiceSettings) -> list[Middleware]:
+def middleware(settings: ServiceSettings, tokens: Tokens) -> list[Middleware]:
     """Return what every request passes, the outermost first."""
     stack = [Middleware(SecurityHeaders), Middleware(LingeringClose), Middleware(OriginGuard, settings=settings)]
     if settings.cors_origins:
@@ -106,4 +117,6 @@ def middleware(settings: ServiceSettings) -> list[Middleware]:
                 ],
             )
         )
+    # Inside CORS: a browser's preflight carries no token, and a page of an allowed origin may read why it was refused.
+    stack.append(Middleware(Authentication, settings=settings, tokens=tokens))
     return stack

@@ -7,6 +7,7 @@ from typing import Any
 
 from fastapi import FastAPI
 from pliant.client.schemas import Problem
+from pliant.service.auth import is_public
 from pliant.service.problems import MEDIA_TYPE
 
 SUMMARY = "Dense 2-D point tracks of a deforming thing in, a moving 3-D mesh out."
@@ -120,6 +121,16 @@ def document(app: FastAPI) -> dict[str, Any]:
     if app.openapi_schema is None:
         made = FastAPI.openapi(app)
         schemas = made.setdefault("components", {}).setdefault("schemas", {})
+        made["components"]["securitySchemes"] = {
+            "token": {
+                "type": "http",
+                "scheme": "bearer",
+                "description": "Where the service asks for tokens; `pliant token create`.",
+            }
+        }
+        for path, operations in made["paths"].items():
+            for operation in operations.values():
+                operation["security"] = [] if is_public(path) else [{"token": []}]
         schemas["Problem"] = Problem.model_json_schema(ref_template="#/components/schemas/{model}")
         app.openapi_schema = made
     return app.openapi_schema

@@ -6,8 +6,11 @@ import ipaddress
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal, get_args
 
 MB = 2**20
+
+Auth = Literal["auto", "required", "off"]
 
 
 class InvalidServiceSetting(ValueError):
@@ -39,6 +42,9 @@ class ServiceSettings:
     allowed_hosts: tuple[str, ...] = ()
     """Values of the Host header that are answered, commas between them (PLIANT_ALLOWED_HOSTS). Empty: on the
     loopback address its usual names, on another address any."""
+    auth: Auth = "auto"
+    """Whether a request needs a token: `required`, `off`, or `auto`, which is off on the loopback address and required on
+    any other (PLIANT_AUTH)."""
     cors_origins: tuple[str, ...] = ()
     """Origins whose pages may call the service, commas between them; empty: none (PLIANT_CORS_ORIGINS)."""
 
@@ -54,7 +60,7 @@ class ServiceSettings:
         Raises
         ------
         InvalidServiceSetting
-            A number is not a number, or out of its range.
+            A number is not a number, or out of its range, or a word is none of those expected.
         """
         return cls(
             host=env.get("PLIANT_HOST", cls.host),
@@ -63,9 +69,15 @@ class ServiceSettings:
             max_body_bytes=_whole(env, "PLIANT_MAX_BODY_MB", default=cls.max_body_bytes // MB, least=1, most=2**20)
             * MB,
             parsers=_whole(env, "PLIANT_PARSERS", default=cls.parsers, least=1, most=64),
+            auth=_auth(env),
             allowed_hosts=_listed(env, "PLIANT_ALLOWED_HOSTS"),
             cors_origins=_listed(env, "PLIANT_CORS_ORIGINS"),
         )
+
+    @property
+    def asks_for_tokens(self) -> bool:
+        """True if a request needs a token."""
+        return self.auth == "required" or (self.auth == "auto" and not self.loopback)
 
     @property
     def loopback(self) -> bool:
@@ -88,6 +100,15 @@ def _whole(env: Mapping[str, str], name: str, *, default: int, least: int, most:
             f"{name}: expected a whole number from {least} to {most}, got {text!r}. Correct it."
         )
     return int(text)
+
+
+def _auth(env: Mapping[str, str]) -> Auth:
+    """Return PLIANT_AUTH."""
+    text = env.get("PLIANT_AUTH", "") or "auto"
+    for word in get_args(Auth):
+        if text == word:
+            return word  # type: ignore[no-any-return]
+    raise InvalidServiceSetting(f"PLIANT_AUTH: expected one of {', '.join(get_args(Auth))}, got {text!r}. Correct it.")
 
 
 def _listed(env: Mapping[str, str], name: str) -> tuple[str, ...]:

@@ -4,6 +4,7 @@
     ├── UnknownJob              no job of that id (or not yours)
     ├── UnknownArtifact         the job has no such file
     ├── UnknownExample          there is no such made-up sequence, or it has no such file
+    ├── UnknownToken            there is no token of that id
     ├── NotAllowedNow           the job's status does not allow it
     ├── Conflict                an id or idempotency key is already used for something else
     ├── InvalidRequest          an id or cursor that cannot be one
@@ -68,6 +69,16 @@ class UnknownExample(WorkerError):
     def __init__(self, name: str, file: str, *, known: list[str]) -> None:
         super().__init__(f"There is no example file {name}/{file}. There are: {', '.join(known)}.")
         self.name, self.file = name, file
+
+
+class UnknownToken(WorkerError):
+    """There is no token of that id."""
+
+    code = "unknown_token"
+
+    def __init__(self, id: str) -> None:
+        super().__init__(f"There is no token {id!r}. `pliant token list` shows which there are.")
+        self.id = id
 
 
 class NotAllowedNow(WorkerError):

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Annotated
 
 import typer
-from pliant.client.cli import jobs
+from pliant.client.cli import jobs, tokens
 from pliant.client.cli.demo import demo
 from pliant.client.cli.doctor import doctor
 from pliant.client.cli.exits import Guarded
@@ -54,6 +54,7 @@ _COMMANDS: dict[str, dict[str, Callable[..., None]]] = {
 for panel, commands in _COMMANDS.items():
     for name, command in commands.items():
         app.command(name, rich_help_panel=panel)(command)
+app.add_typer(tokens.app, rich_help_panel="Run a service")
 
 
 def main() -> None:

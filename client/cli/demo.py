@@ -133,9 +133,8 @@ def running(folder: Path, *, threads: int | None = None) -> Iterator[str]:
 
     log = folder / "service.log"
     command = [sys.executable, "-m", "pliant.client.cli", "up", "--port", "0", "--data", str(folder / "data"), "--json"]
-    environment = {
-        name: value for name, value in os.environ.items() if name not in ("PLIANT_REDIS_URL", "PLIANT_BLOB_URL")
-    }
+    elsewhere = ("PLIANT_REDIS_URL", "PLIANT_BLOB_URL", "PLIANT_HOST", "PLIANT_AUTH", "PLIANT_TOKEN")
+    environment = {name: value for name, value in os.environ.items() if name not in elsewhere}
     if threads is not None:
         environment["PLIANT_THREADS"] = str(threads)
     folder.mkdir(parents=True, exist_ok=True)

@@ -24,7 +24,7 @@ class Exit(IntEnum):
     UNREACHABLE = 4
     """No service answered, or it is at fault."""
     NOT_FOUND = 5
-    """There is no such job or file."""
+    """There is no such job, file or token."""
     NOT_NOW = 6
     """The job's status, the token, or another Pliant on the same data does not allow it."""
     TIME_IS_UP = 7
@@ -47,6 +47,8 @@ _CODES: tuple[tuple[str, str, Exit], ...] = (
     ("pliant.solver.errors", "InvalidInput", Exit.REFUSED),
     ("pliant.solver.errors", "SolverError", Exit.FAILED),
     ("pliant.worker.errors", "InvalidSetting", Exit.REFUSED),
+    ("pliant.worker.errors", "InvalidRequest", Exit.REFUSED),
+    ("pliant.worker.errors", "UnknownToken", Exit.NOT_FOUND),
     ("pliant.worker.errors", "DataDirectoryInUse", Exit.NOT_NOW),
     ("pliant.worker.errors", "WorkerError", Exit.UNREACHABLE),
 )

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 from pliant.client.cli.session import Json
@@ -44,6 +44,10 @@ def up(
     ] = 8000,
     data: Data = None,
     workers: Workers = None,
+    auth: Annotated[
+        Literal["auto", "required", "off"],
+        typer.Option("--auth", envvar="PLIANT_AUTH", help="Ask for tokens; auto: not on the loopback address."),
+    ] = "auto",
     as_json: Json = False,
 ) -> None:
     """Run everything: service, page, queue and workers. One Ctrl-C stops it all.
@@ -63,7 +67,7 @@ def up(
             valkey = Valkey.claim(settings.data)
             held.callback(valkey.release)
             children.append(valkey_child(valkey))
-        children += [*worker_children(settings), service_child(settings, host, port, url)]
+        children += [*worker_children(settings), service_child(settings, host, port, url, auth=auth)]
 
         def announce() -> None:
             if as_json:
@@ -132,11 +136,11 @@ def address(host: str, port: int) -> str:
     return f"http://[{name}]:{port}" if ":" in name else f"http://{name}:{port}"
 
 
-def service_child(settings: Settings, host: str, port: int, url: str) -> Child:
+def service_child(settings: Settings, host: str, port: int, url: str, *, auth: str) -> Child:
     """Return the API process as a child that counts as started once all parts answer."""
     from pliant.worker.supervisor import Child
 
-    env = {**settings.to_environment(), "PLIANT_HOST": host, "PLIANT_PORT": str(port)}
+    env = {**settings.to_environment(), "PLIANT_HOST": host, "PLIANT_PORT": str(port), "PLIANT_AUTH": auth}
     command = [sys.executable, "-m", "pliant.service"]
     return Child(name="service", argv=command, env=env, ready=until_ready(url), grace=15.0)
 

@@ -16,6 +16,7 @@ from pliant.service.settings import ServiceSettings
 from pliant.worker.formats import Limits
 from pliant.worker.jobs import Jobs
 from pliant.worker.settings import Settings
+from pliant.worker.tokens import Tokens
 from pliant.worker.valkey import Valkey
 from serving import Running, Serve, until
 
@@ -40,14 +41,15 @@ def serve(valkey_url: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator
         data = tmp_path_factory.mktemp("data")
         jobs = Jobs.open(Settings(data=data, redis_url=redis_url, queue=f"test-{secrets.token_hex(4)}"))
         settings = dataclasses.replace(ServiceSettings(port=0, incoming=data / "incoming"), **given)
-        app = create_app(jobs, settings, limits=limits)
+        tokens = Tokens.open(jobs.settings)
+        app = create_app(jobs, settings, tokens=tokens, limits=limits)
         server = uvicorn.Server(uvicorn.Config(app, port=0, log_config=None, timeout_graceful_shutdown=3))
         thread = threading.Thread(target=server.run)
         thread.start()
         started.append((server, thread))
         until(lambda: server.started)
         port = server.servers[0].sockets[0].getsockname()[1]
-        return Running(f"http://127.0.0.1:{port}", jobs, settings, server)
+        return Running(f"http://127.0.0.1:{port}", jobs, settings, server, tokens)
 
     yield start
     for server, thread in started:

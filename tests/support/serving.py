@@ -19,6 +19,7 @@ from pliant.client.schemas import Artifact, Job
 from pliant.service.settings import ServiceSettings
 from pliant.worker import lifecycle
 from pliant.worker.jobs import Jobs
+from pliant.worker.tokens import Scope, Tokens
 
 NOW = datetime(2026, 5, 4, 9, 30, tzinfo=UTC)
 
@@ -31,6 +32,7 @@ class Running:
     jobs: Jobs
     settings: ServiceSettings
     server: uvicorn.Server
+    tokens: Tokens
 
     @property
     def left_on_disk(self) -> list[Path]:
@@ -40,6 +42,11 @@ class Running:
             for path in self.settings.incoming.rglob("*")
             if len(path.relative_to(self.settings.incoming).parts) > 1
         ]
+
+    def client(self, *scopes: Scope, name: str = "somebody", **more: Any) -> httpx.Client:
+        """Return a client with a new token of its own."""
+        _, text = self.tokens.create(name, scopes=scopes or (Scope.READ, Scope.SUBMIT), **more)
+        return httpx.Client(base_url=self.url, timeout=20, headers={"Authorization": f"Bearer {text}"})
 
     @property
     def waiting(self) -> int:

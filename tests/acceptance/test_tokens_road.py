@@ -1,0 +1,145 @@
+"""The road with tokens, as those who run a service and those who use it walk it: `pliant token`, `pliant up`, command line, page."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from browsing import Browsing, why_not
+from pliant.client.cli.demo import announced
+from pliant.client.cli.exits import Exit
+
+PLIANT = [sys.executable, "-m", "pliant.client.cli"]
+CLEAN = {name: value for name, value in os.environ.items() if not name.startswith("PLIANT_")}
+
+
+def pliant(*arguments: object, token: str = "", **env: str) -> subprocess.CompletedProcess[str]:
+    given = {"PLIANT_TOKEN": token} if token else {}
+    return subprocess.run(
+        [*PLIANT, *map(str, arguments)],
+        env=CLEAN | given | env,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+def made(data: Path, *arguments: str) -> dict[str, Any]:
+    ran = pliant("token", "create", *arguments, "--data", data, "--json")
+    assert ran.returncode == 0, ran.stderr
+    token: dict[str, Any] = json.loads(ran.stdout)
+    return token
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("house") / "data"
+
+
+@pytest.fixture(scope="module")
+def first(data: Path) -> dict[str, Any]:
+    """The first token, made before the service ever ran."""
+    return made(data, "first")
+
+
+@pytest.fixture(scope="module")
+def url(data: Path, first: dict[str, Any], tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    log = tmp_path_factory.mktemp("log") / "up.log"
+    command = [*PLIANT, "up", "--port", "0", "--auth", "required", "--data", str(data), "--json"]
+    with log.open("wb") as errors:
+        up = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, env=CLEAN, text=True)
+    assert up.stdout is not None
+    address = announced(up.stdout)
+    assert address is not None, log.read_text()
+    yield address
+    up.send_signal(signal.SIGTERM)
+    assert up.wait(60) == 0
+    up.stdout.close()
+    assert "INFO" not in log.read_text()
+    assert first["token"] not in log.read_text()
+
+
+@pytest.fixture
+def tracks(tmp_path: Path) -> Path:
+    path = tmp_path / "tracks.npz"
+    np.savez(path, tracks=np.random.default_rng(0).normal(size=(5, 12, 2)))
+    return path
+
+
+def test_without_a_token_a_service_that_asks_for_one_does_not_start(tmp_path: Path) -> None:
+    ran = pliant("up", "--port", 0, "--auth", "required", "--data", tmp_path / "empty")
+    assert ran.returncode == Exit.UNREACHABLE
+    assert "pliant token create NAME" in ran.stderr
+    assert "PLIANT_AUTH=off" in ran.stderr
+
+
+def test_the_command_line_works_with_a_token_and_not_without(url: str, first: dict[str, Any], tracks: Path) -> None:
+    sent = pliant("submit", tracks, "--id", "mine", "--url", url, token=first["token"])
+    assert sent.returncode == 0, sent.stderr
+    seen = pliant("watch", "mine", "--url", url, "--json", token=first["token"])
+    assert json.loads(seen.stdout)["status"] == "succeeded", seen.stderr
+    for wrong in ("", "nonsense"):
+        refused = pliant("status", "mine", "--url", url, token=wrong)
+        assert refused.returncode == Exit.NOT_NOW
+        assert "token" in refused.stderr
+
+
+def test_tokens_are_made_and_revoked_while_the_service_runs(url: str, data: Path) -> None:
+    second = made(data, "second", "--scope", "read", "--expires", "1h")
+    listed = pliant("token", "list", "--data", data)
+    assert "second" in listed.stdout
+    assert second["token"] not in listed.stdout
+    assert second["token"].rpartition("_")[2] not in pliant("token", "list", "--data", data, "--json").stdout
+    assert pliant("status", "mine", "--url", url, token=second["token"]).returncode == Exit.NOT_FOUND
+    assert pliant("cancel", "mine", "--url", url, token=second["token"]).returncode == Exit.NOT_NOW
+    assert pliant("token", "revoke", second["id"], "--data", data).returncode == 0
+    assert pliant("list", "--url", url, token=second["token"]).returncode == Exit.NOT_NOW
+    assert pliant("token", "revoke", second["id"], "--data", data).returncode == Exit.NOT_FOUND
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["x", "--scope", "everything"], "read, submit, admin"),
+        (["x", "--expires", "soon"], "12h, 90d"),
+        (["  "], "printable characters"),
+    ],
+)
+def test_what_cannot_be_a_token_is_refused_in_a_sentence(url: str, data: Path, arguments: list[str], said: str) -> None:
+    del url
+    ran = pliant("token", "create", *arguments, "--data", data)
+    assert ran.returncode == Exit.REFUSED
+    assert said in ran.stderr
+
+
+@pytest.mark.chromium
+@pytest.mark.skipif(why_not() is not None and not os.environ.get("CI"), reason=str(why_not()))
+def test_the_page_asks_for_the_token_and_shows_its_jobs(url: str, first: dict[str, Any], tracks: Path) -> None:
+    from playwright.sync_api import expect
+
+    sent = pliant("submit", tracks, "--id", "paged", "--name", "seen in the page", "--url", url, token=first["token"])
+    assert sent.returncode == 0, sent.stderr
+    assert pliant("watch", "paged", "--url", url, token=first["token"]).returncode == 0
+    with Browsing() as browser:
+        page = browser.new_page()
+        page.goto(f"{url}/#job=paged")
+        expect(page.get_by_role("alert").first).to_contain_text("asks for a token", timeout=20_000)
+        page.get_by_label("Token").fill("nonsense")
+        page.get_by_role("button", name="Use it").click()
+        expect(page.get_by_role("alert").first).to_contain_text("not known here")
+        page.get_by_label("Token").fill(first["token"])
+        page.get_by_role("button", name="Use it").click()
+        expect(page.get_by_role("alert")).to_have_count(0, timeout=20_000)
+        expect(page.get_by_text("seen in the page").first).to_be_visible(timeout=20_000)
+        with page.expect_download() as download:
+            page.get_by_role("link", name="report.json").click()
+        assert "metrics" in json.loads(Path(download.value.path()).read_text())

@@ -1,0 +1,229 @@
+"""Bearer tokens: made, kept as digests, recognised, revoked.
+
+A token reads ``pliant_<id>_<secret>``. The id finds the record; of the secret, 256 random bits, only the SHA-256 of the whole
+token is kept, so whoever reads the store cannot use what he finds. A slow hash would add nothing: there is no password to guess.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import re
+import secrets
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime, timedelta
+from enum import StrEnum
+from typing import Any
+
+import redis
+from pliant.worker.connection import connect, reachable
+from pliant.worker.errors import InvalidRequest, UnknownToken
+from pliant.worker.settings import Settings
+from pydantic import BaseModel, ConfigDict
+
+PREFIX = "pliant_"
+"""What every token begins with, so that scanners for leaked secrets can know one."""
+
+LONGEST_NAME = 100
+
+_FORM = re.compile(PREFIX + r"([0-9a-f]{12})_([A-Za-z0-9_-]{43})", re.ASCII)
+_DURATION = re.compile(r"([1-9][0-9]{0,5})([smhdw])", re.ASCII)
+_UNITS = {"s": "seconds", "m": "minutes", "h": "hours", "d": "days", "w": "weeks"}
+
+
+class Scope(StrEnum):
+    """What a token may do. They do not contain each other, except that `admin` may do everything."""
+
+    READ = "read"
+    """Look at its own jobs and download their files."""
+    SUBMIT = "submit"
+    """Submit jobs; cancel, retry and delete its own."""
+    ADMIN = "admin"
+    """Both, with everybody's jobs; read the metrics."""
+
+
+class Token(BaseModel):
+    """What is kept of a token."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    id: str
+    name: str
+    scopes: tuple[Scope, ...]
+    owner: str
+    """Whose jobs it works with: its own id, or that of the token whose jobs it shares."""
+    sha256: str
+    """Digest of the whole token, in hex."""
+    created_at: datetime
+    expires_at: datetime | None = None
+    """None: never."""
+    max_body_bytes: int | None = None
+    """Largest body of one request; None, here and below: what the service allows everybody."""
+    max_queued: int | None = None
+    """Jobs that may wait at once."""
+    requests_per_minute: int | None = None
+
+    def may(self, scope: Scope) -> bool:
+        """Tell whether the token has a scope."""
+        return scope in self.scopes or Scope.ADMIN in self.scopes
+
+    @property
+    def sees_all(self) -> bool:
+        """True if everybody's jobs are its own."""
+        return Scope.ADMIN in self.scopes
+
+    def expired(self, now: datetime) -> bool:
+        """Tell whether its time is over."""
+        return self.expires_at is not None and self.expires_at <= now
+
+
+def utc_now() -> datetime:
+    """Return the time."""
+    return datetime.now(UTC)
+
+
+class Tokens:
+    """The tokens of one installation, in one hash of the store: id → record. All methods may raise `StoreUnavailable`."""
+
+    def __init__(self, client: redis.Redis, *, prefix: str, clock: Callable[[], datetime] = utc_now) -> None:
+        self._redis: Any = client
+        self._key = f"{prefix}:tokens"
+        self._clock = clock
+
+    @classmethod
+    def open(cls, settings: Settings) -> Tokens:
+        """Connect to the store that the settings name; nothing is sent before it is needed."""
+        return cls(connect(settings.redis, decode=True), prefix=settings.queue)
+
+    def create(
+        self,
+        name: str,
+        *,
+        scopes: Sequence[Scope] = (Scope.READ, Scope.SUBMIT),
+        expires: timedelta | None = None,
+        sharing: str | None = None,
+        max_body_bytes: int | None = None,
+        max_queued: int | None = None,
+        requests_per_minute: int | None = None,
+    ) -> tuple[Token, str]:
+        """Make a token.
+
+        Parameters
+        ----------
+        name : str
+            For people: who has it, or what for.
+        scopes : sequence of Scope
+            What it may do.
+        expires : timedelta, optional
+            From now; None: never.
+        sharing : str, optional
+            Id of a token whose jobs the new one shares, e.g. to replace it.
+        max_body_bytes, max_queued, requests_per_minute : int, optional
+            Limits of its own.
+
+        Returns
+        -------
+        token : Token
+            What is kept.
+        text : str
+            The token itself. It is kept nowhere and cannot be shown again.
+
+        Raises
+        ------
+        InvalidRequest
+            The name is empty or too long, or there is no scope.
+        UnknownToken
+            There is no token to share jobs with.
+        """
+        label = " ".join(name.split())
+        if not 1 <= len(label) <= LONGEST_NAME or not label.isprintable():
+            raise InvalidRequest(
+                "invalid_token_name", field="name", expected=f"1–{LONGEST_NAME} printable characters", got=repr(name)[:80],
+                hint="Say who will use the token.",
+            )  # fmt: skip
+        if not scopes:
+            expected = "at least one of " + ", ".join(Scope)
+            raise InvalidRequest("no_scope", field="scope", expected=expected, got="none", hint="Give --scope read.")
+        owner = None if sharing is None else self.get(sharing).owner
+        id = secrets.token_hex(6)
+        text = f"{PREFIX}{id}_{secrets.token_urlsafe(32)}"
+        now = self._clock()
+        token = Token(
+            id=id, name=label, scopes=tuple(dict.fromkeys(scopes)), owner=owner or id, sha256=_digest(text),
+            created_at=now, expires_at=None if expires is None else now + expires, max_body_bytes=max_body_bytes,
+            max_queued=max_queued, requests_per_minute=requests_per_minute,
+        )  # fmt: skip
+        with reachable():
+            self._redis.hset(self._key, id, token.model_dump_json())
+        return token, text
+
+    def recognise(self, text: str) -> Token | None:
+        """Return what is kept of a token, its time over or not; None if it is none of ours, or was revoked."""
+        form = _FORM.fullmatch(text)
+        if form is None:
+            return None
+        with reachable():
+            body = self._redis.hget(self._key, form[1])
+        if body is None:
+            return None
+        token = Token.model_validate_json(body)
+        return token if hmac.compare_digest(token.sha256, _digest(text)) else None
+
+    def get(self, id: str) -> Token:
+        """Return a token's record.
+
+        Raises
+        ------
+        UnknownToken
+            There is none of that id.
+        """
+        with reachable():
+            body = self._redis.hget(self._key, id)
+        if body is None:
+            raise UnknownToken(id)
+        return Token.model_validate_json(body)
+
+    def all(self) -> list[Token]:
+        """Return every token's record, oldest first."""
+        with reachable():
+            bodies = self._redis.hvals(self._key)
+        return sorted(map(Token.model_validate_json, bodies), key=lambda token: (token.created_at, token.id))
+
+    def usable(self) -> bool:
+        """Tell whether there is a token whose time is not over."""
+        now = self._clock()
+        return any(not token.expired(now) for token in self.all())
+
+    def revoke(self, id: str) -> Token:
+        """Remove a token; from the next request on nobody knows it. Its jobs stay.
+
+        Raises
+        ------
+        UnknownToken
+            There is none of that id.
+        """
+        token = self.get(id)
+        with reachable():
+            self._redis.hdel(self._key, id)
+        return token
+
+
+def parse_duration(text: str) -> timedelta:
+    """Read a duration such as ``90d``: a whole number and one of s, m, h, d, w.
+
+    Raises
+    ------
+    InvalidRequest
+        It is none.
+    """
+    form = _DURATION.fullmatch(text.strip())
+    if form is None:
+        raise InvalidRequest(
+            "invalid_duration", field="expires", expected="a duration such as 12h, 90d or 52w", got=repr(text)[:80],
+            hint="Leave it out for a token that never expires.",
+        )  # fmt: skip
+    return timedelta(**{_UNITS[form[2]]: int(form[1])})
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
