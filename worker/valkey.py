@@ -16,7 +16,8 @@ import shutil
 import stat
 import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,6 +25,7 @@ import redis
 from pliant.worker.connection import connect
 from pliant.worker.errors import DataDirectoryInUse, ServerFailed
 from pliant.worker.paths import socket_path, valkey_directory
+from pliant.worker.settings import Settings
 
 STARTS_WITHIN = 60.0
 """Seconds until the server must answer: it first reads its whole append-only file."""
@@ -137,6 +139,41 @@ class Valkey:
         """Let go of the directory; the server must have ended."""
         os.close(self.lock)
         os.close(self.guard)
+
+
+@contextmanager
+def attended(settings: Settings) -> Iterator[None]:
+    """See to it that the settings' store answers while the block runs, by running the embedded one if it does not run.
+
+    Raises
+    ------
+    DataDirectoryInUse, ServerFailed
+        See `Valkey`.
+    """
+    if settings.redis_url is not None or _answers(settings.redis):
+        yield
+        return
+    valkey = Valkey.claim(settings.data)
+    try:
+        process = valkey.start()
+        try:
+            yield
+        finally:
+            process.terminate()
+            process.wait(STOPS_WITHIN)
+    finally:
+        valkey.release()
+
+
+def _answers(url: str) -> bool:
+    client = connect(url, decode=True, retries=0)
+    try:
+        client.ping()
+    except (redis.ConnectionError, redis.TimeoutError):
+        return False
+    finally:
+        client.close()
+    return True
 
 
 def _command(binary: Path, home: Path, socket: Path) -> list[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -139,32 +140,11 @@ def scopes_of(words: list[str]) -> list[Any]:
 
 
 @contextmanager
-def store(data: Any) -> Iterator[Tokens]:
-    """Give the tokens of an installation: through its running store, or by running the embedded one for this moment."""
-    import redis
-    from pliant.worker.connection import connect
+def store(data: Path | None) -> Iterator[Tokens]:
+    """Give the tokens of an installation, whether its service runs or not."""
     from pliant.worker.tokens import Tokens
-    from pliant.worker.valkey import Valkey
+    from pliant.worker.valkey import attended
 
     settings = chosen(data, None)
-    if settings.redis_url is not None:
+    with attended(settings):
         yield Tokens.open(settings)
-        return
-    client = connect(settings.redis, decode=True, retries=0)
-    try:
-        client.ping()
-    except (redis.ConnectionError, redis.TimeoutError):
-        valkey = Valkey.claim(settings.data)
-        try:
-            process = valkey.start()
-            try:
-                yield Tokens.open(settings)
-            finally:
-                process.terminate()
-                process.wait(15)
-        finally:
-            valkey.release()
-    else:
-        yield Tokens.open(settings)
-    finally:
-        client.close()
