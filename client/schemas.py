@@ -126,6 +126,17 @@ class Job(Record):
         return {name: value for name, value in given.items() if name in Options.model_fields}
 
 
+class Upload(Record):
+    """A large input on its way, or waiting for jobs to name it."""
+
+    id: str
+    offset: int = Field(description="Bytes that have arrived.")
+    length: int | None = Field(None, description="Bytes of the whole; null while nobody has said.")
+    complete: bool = Field(description="True once all of it is there; only then may a job name it.")
+    sha256: str | None = Field(None, description="Of the whole; null until it is complete.")
+    expires_at: datetime | None = Field(None, description="When it is removed unless used before; null: never.")
+
+
 class JobPage(Record):
     """One page of jobs, newest first."""
 
@@ -138,6 +149,7 @@ class ServiceLimits(Record):
 
     max_body_bytes: int = Field(description="Largest body of one request.")
     max_text_bytes: int = Field(description="Largest text field of a form.")
+    max_upload_bytes: int = Field(0, description="Largest upload, over all its requests; 0: there are no uploads.")
     max_bytes: int = Field(description="Largest file, and all arrays read from it, inflated.")
     max_frames: int
     max_points: int

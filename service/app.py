@@ -16,12 +16,14 @@ from pliant.service.guard import OriginGuard, SecurityHeaders
 from pliant.service.incoming import Incoming
 from pliant.service.linger import LingeringClose
 from pliant.service.page import mount_page
-from pliant.service.routes import about, artifacts, events, examples, jobs
+from pliant.service.routes import about, artifacts, events, examples, jobs, uploads
 from pliant.service.settings import ServiceSettings
+from pliant.service.turns import Turns
 from pliant.worker import errors
 from pliant.worker.formats import InvalidInput, Limits
 from pliant.worker.jobs import Jobs
 from pliant.worker.tokens import Tokens
+from pliant.worker.uploads import Uploads
 from starlette.middleware import Middleware
 from starlette.middleware.cors import CORSMiddleware
 from starlette.requests import ClientDisconnect
@@ -32,9 +34,12 @@ STATUS_OF: dict[type[Exception], int] = {
     errors.UnknownArtifact: 404,
     errors.UnknownExample: 404,
     errors.UnknownToken: 404,
+    errors.UnknownUpload: 404,
     errors.NotAllowedNow: 409,
     errors.Conflict: 409,
     errors.InvalidRequest: 422,
+    errors.UploadTooLarge: 413,
+    errors.TooManyUploads: 429,
     errors.QuotaExceeded: 507,
     errors.StoreUnavailable: 503,
     errors.WorkerError: 500,
@@ -74,6 +79,8 @@ def create_app(
             limits=limits,
             incoming=incoming,
             followers=Followers(),
+            uploads=Uploads.open(jobs_of_all.settings),
+            turns=Turns(),
             parsing=anyio.CapacityLimiter(settings.parsers),
         )
         yield
@@ -90,7 +97,7 @@ def create_app(
         redoc_url=None,
     )
     problems.install(app, STATUS_OF)
-    for each in (jobs, artifacts, events, about, examples):
+    for each in (jobs, uploads, artifacts, events, about, examples):
         app.include_router(each.router)
     mount_page(app)
     app.openapi = lambda: describe.document(app)  # type: ignore[method-assign]
@@ -105,8 +112,11 @@ def middleware(settings: ServiceSettings, tokens: Tokens) -> list[Middleware]:
             Middleware(
                 CORSMiddleware,
                 allow_origins=settings.cors_origins,
-                allow_methods=["GET", "POST", "PUT", "DELETE"],
-                allow_headers=["Authorization", "Content-Type", "Idempotency-Key", "Last-Event-ID", "Prefer", "Range"],
+                allow_methods=["GET", "POST", "PUT", "PATCH", "DELETE"],
+                allow_headers=[
+                    *("Authorization", "Content-Type", "Idempotency-Key", "Last-Event-ID", "Prefer", "Range"),
+                    *("Repr-Digest", "Upload-Complete", "Upload-Length", "Upload-Offset"),
+                ],
                 expose_headers=[
                     "Location",
                     "ETag",
@@ -114,6 +124,7 @@ def middleware(settings: ServiceSettings, tokens: Tokens) -> list[Middleware]:
                     "Repr-Digest",
                     "Retry-After",
                     "Preference-Applied",
+                    *("Upload-Complete", "Upload-Length", "Upload-Limit", "Upload-Offset"),
                 ],
             )
         )

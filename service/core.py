@@ -10,8 +10,10 @@ from fastapi import Depends, Request
 from pliant.service.follow import Followers
 from pliant.service.incoming import Incoming
 from pliant.service.settings import ServiceSettings
+from pliant.service.turns import Turns
 from pliant.worker.formats import Limits
 from pliant.worker.jobs import Jobs
+from pliant.worker.uploads import Uploads
 
 
 @dataclass(frozen=True)
@@ -25,6 +27,9 @@ class Service:
     """What the readers accept."""
     incoming: Incoming
     followers: Followers
+    uploads: Uploads
+    """Everybody's uploads; a route takes `MyUploads` instead."""
+    turns: Turns
     parsing: anyio.CapacityLimiter
     """Holds the number of inputs that are in memory at once."""
 
@@ -43,5 +48,11 @@ def mine(request: Request) -> Jobs:
     return jobs if owner is None else jobs.of(owner)
 
 
+def my_uploads(request: Request) -> Uploads:
+    """Return the uploads of the request's token, or everybody's where tokens are off."""
+    return service_of(request).uploads.of(request.scope.get("pliant.owner") or "")
+
+
 Core = Annotated[Service, Depends(service_of)]
 Mine = Annotated[Jobs, Depends(mine)]
+MyUploads = Annotated[Uploads, Depends(my_uploads)]

@@ -73,7 +73,7 @@ SUBMIT_BODY: dict[str, Any] = {
         "multipart/form-data": {
             "schema": {
                 "type": "object",
-                "required": ["tracks"],
+                "anyOf": [{"required": ["tracks"]}, {"required": ["tracks_upload"]}],
                 "properties": {
                     "tracks": {
                         **_FILE,
@@ -92,6 +92,13 @@ SUBMIT_BODY: dict[str, Any] = {
                     },
                     "options": {"type": "string", "description": "A JSON object; its schema is at /v1/options."},
                     "name": {"type": "string", "maxLength": 200, "description": "A label of your own."},
+                    **{
+                        f"{part}_upload": {
+                            "type": "string",
+                            "description": f"Id of an upload (`PUT /v1/uploads/ID`) that stands for the part `{part}`.",
+                        }
+                        for part in ("tracks", "mesh", "ground_truth", "rotations")
+                    },
                 },
             },
             "encoding": {

@@ -19,7 +19,7 @@ from anyio import to_thread
 from pliant.service.problems import Refusal
 from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 
 BATCH = 2**18
 """Bytes gathered before a thread parses and writes them: a hop costs some 50 µs, so smaller batches would be mostly hops."""
@@ -129,12 +129,15 @@ async def batches(request: Request, *, max_bytes: int, stall_seconds: float) -> 
     ------
     Refusal
         413 if the body is declared or turns out larger than that, 408 if the client stalls.
+    ClientDisconnect
+        The body breaks off, after what has arrived of it.
     """
     declared = request.headers.get("content-length", "")
     if declared.isdigit() and int(declared) > max_bytes:
         raise _too_large(max_bytes, f"{declared} bytes declared")
     stream = request.stream()
-    gathered, held, total = [], 0, 0
+    gathered: list[bytes] = []
+    held = total = 0
     while True:
         try:
             async with asyncio.timeout(stall_seconds):
@@ -142,6 +145,10 @@ async def batches(request: Request, *, max_bytes: int, stall_seconds: float) -> 
         except TimeoutError:
             detail = f"Nothing arrived for {stall_seconds:g} s, so the request was given up. Send it again."
             raise Refusal(408, "body_stalled", detail=detail, retryable=True) from None
+        except ClientDisconnect:
+            if gathered:  # an upload keeps what has arrived
+                yield b"".join(gathered)
+            raise
         if piece is None:
             break
         total += len(piece)

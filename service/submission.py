@@ -8,14 +8,18 @@ from typing import Any
 
 from pliant.client.options import Options
 from pliant.client.schemas import Job
-from pliant.service.forms import Form
+from pliant.service.forms import File, Form
 from pliant.service.problems import Refusal, from_validation
+from pliant.worker.errors import Conflict, UnknownUpload
 from pliant.worker.formats import Limits, read_inputs, save_inputs
 from pliant.worker.jobs import Jobs
+from pliant.worker.uploads import Uploads
 from pydantic import ValidationError
 
 FILES = frozenset({"tracks", "mesh", "ground_truth", "rotations"})
-TEXTS = frozenset({"mesh", "options", "name"})
+UPLOADS = {f"{part}_upload": part for part in sorted(FILES)}
+"""Texts that name an upload, and the part that it stands for."""
+TEXTS = frozenset({"mesh", "options", "name", *UPLOADS})
 LONGEST_NAME = 200
 """Characters of the user's label."""
 
@@ -25,6 +29,7 @@ def accept(
     room: Path,
     *,
     jobs: Jobs,
+    uploads: Uploads,
     limits: Limits,
     id: str | None = None,
     idempotency_key: str | None = None,
@@ -39,6 +44,8 @@ def accept(
         Where to write the canonical inputs; removed by whoever made it.
     jobs : Jobs
         The jobs of whoever asks.
+    uploads : Uploads
+        The uploads of whoever asks; the form may name them.
     limits : Limits
         What the readers accept.
     id, idempotency_key : str, optional
@@ -56,6 +63,7 @@ def accept(
     Refusal, InvalidInput, WorkerError
         Nothing is queued then.
     """
+    form = with_uploads(form, room, uploads)
     options = parse_options(form.texts.get("options", ""))
     name = _name(form.texts.get("name", ""))
     if "tracks" not in form.files:
@@ -79,6 +87,40 @@ def accept(
         fingerprint=form.fingerprint,
     )
     return job, True
+
+
+def with_uploads(form: Form, room: Path, uploads: Uploads) -> Form:
+    """Return the form with the uploads that it names as files; the same content is the same form by either road.
+
+    Raises
+    ------
+    Refusal
+        There is no such upload, it is not whole, or the form carries the part as well.
+    """
+    files, texts = dict(form.files), dict(form.texts)
+    for name, part in UPLOADS.items():
+        if name not in form.texts:
+            continue
+        id, path = texts.pop(name).strip(), room / name
+        if part in files or part in texts:
+            raise _unfit(
+                "repeated_part", name, expected=f"either {part} or {name}", got="both", hint="Leave one of them out."
+            )
+        try:
+            digest = uploads.take(id, path)
+        except UnknownUpload as error:
+            hint = f"PUT it to /v1/uploads/{id[:64]} first; uploads that are not used expire."
+            raise _unfit(error.code, name, expected="the id of an upload", got=repr(id[:80]), hint=hint) from error
+        except Conflict as error:
+            hint = "Send the rest of it first, from the offset that HEAD tells."
+            raise _unfit(error.code, name, expected="an upload that is whole", got="a part of it", hint=hint) from error
+        files[part] = File(path, path.stat().st_size, digest)
+    return Form(files=files, texts=texts)
+
+
+def _unfit(code: str, field: str, *, expected: str, got: str, hint: str) -> Refusal:
+    detail = f"{field}: expected {expected}, got {got}. {hint}"
+    return Refusal(422, code, detail=detail, field=field, expected=expected, got=got, hint=hint)
 
 
 def missing(part: str) -> Refusal:

@@ -15,6 +15,7 @@ from pliant.worker.errors import UnknownJob
 from pliant.worker.jobs import Jobs
 from pliant.worker.lifecycle import ACTIVE
 from pliant.worker.records import Stored
+from pliant.worker.uploads import Uploads
 
 
 def findings(jobs: Jobs, *, settle: float = 5.0) -> list[str]:
@@ -39,6 +40,7 @@ def _look(jobs: Jobs) -> Iterator[str]:
         yield from _of_record(stored, sizes)
     yield from _of_files(jobs, records, sizes)
     yield from _of_queue(jobs, records)
+    yield from Uploads.open(jobs.settings).findings(jobs.clock())
     used, counted = jobs.records.used(), sum(stored.bytes for stored in records)
     if used != counted:
         yield f"The jobs hold {counted:,} bytes, but {used:,} are on the books."

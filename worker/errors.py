@@ -5,9 +5,13 @@
     ├── UnknownArtifact         the job has no such file
     ├── UnknownExample          there is no such made-up sequence, or it has no such file
     ├── UnknownToken            there is no token of that id
+    ├── UnknownUpload           no upload of that id (or not yours)
     ├── NotAllowedNow           the job's status does not allow it
     ├── Conflict                an id or idempotency key is already used for something else
+    │   └── OffsetMismatch      bytes that do not belong where the upload stands
     ├── InvalidRequest          an id or cursor that cannot be one
+    │   └── UploadTooLarge      more bytes than one upload may have
+    ├── TooManyUploads          more uploads than one owner may have
     ├── InvalidSetting          a setting does not parse or is out of its range
     ├── QuotaExceeded           the jobs together hold as many bytes as they may
     ├── StoreUnavailable        Redis or the blob store does not answer, or is full
@@ -81,6 +85,16 @@ class UnknownToken(WorkerError):
         self.id = id
 
 
+class UnknownUpload(WorkerError):
+    """There is no upload of that id, or it belongs to somebody else."""
+
+    code = "unknown_upload"
+
+    def __init__(self, id: str) -> None:
+        super().__init__(f"There is no upload {id!r}; uploads are removed when they expire. Send it again.")
+        self.id = id
+
+
 class NotAllowedNow(WorkerError):
     """The job's status does not allow what was asked."""
 
@@ -100,12 +114,42 @@ class Conflict(WorkerError):
         self.id = id
 
 
+class OffsetMismatch(Conflict):
+    """Bytes were sent that do not belong where the upload stands."""
+
+    def __init__(self, id: str, *, expected: int, got: int) -> None:
+        sentence = f"Upload {id!r} holds {expected} bytes, and what was sent begins at {got}. Go on at {expected}."
+        super().__init__("upload_offset_mismatch", id=id, sentence=sentence)
+        self.field, self.offset = "Upload-Offset", expected
+        self.expected, self.got = str(expected), str(got)
+
+
 class InvalidRequest(WorkerError):
     """An id, cursor or key that cannot be one."""
 
     def __init__(self, code: str, *, field: str, expected: str, got: str, hint: str) -> None:
         super().__init__(f"{field}: expected {expected}, got {got}. {hint}")
         self.code, self.field, self.expected, self.got, self.hint = code, field, expected, got, hint
+
+
+class UploadTooLarge(InvalidRequest):
+    """An upload has more bytes than it may have."""
+
+    def __init__(self, most: int, got: int) -> None:
+        super().__init__(
+            "upload_too_large", field="body", expected=f"at most {most} bytes", got=f"{got} or more",
+            hint="Take fewer frames or points, or store float32; see /v1/limits.",
+        )  # fmt: skip
+
+
+class TooManyUploads(WorkerError):
+    """An owner has as many uploads as he may have."""
+
+    code = "too_many_uploads"
+    retryable = True
+
+    def __init__(self, most: int) -> None:
+        super().__init__(f"There are {most} uploads already. Delete some, or wait until they expire.")
 
 
 class InvalidSetting(WorkerError):

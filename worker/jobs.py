@@ -279,6 +279,10 @@ class Jobs:
         self._stored(id)
         return self.records.events(id, after=after, timeout=timeout)
 
+    def used(self) -> int:
+        """Return the bytes that everybody's jobs hold together."""
+        return self.records.used()
+
     def ready(self) -> dict[str, str]:
         """Return for `redis`, `blobs` and `workers` the word `ok`, or a sentence that says what is wrong."""
         found: dict[str, str] = {}

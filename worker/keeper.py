@@ -26,6 +26,7 @@ from pliant.worker.files import clean_up
 from pliant.worker.jobs import Jobs
 from pliant.worker.problems import worker_lost
 from pliant.worker.records import Beat, new_token
+from pliant.worker.uploads import Uploads
 
 logger = logging.getLogger(__name__)
 
@@ -94,6 +95,7 @@ class Keeper:
             self._expire()
             self._clean_up_after_failures()
             self._clear_work()
+            self._expire_uploads()
             self.jobs.queue.tidy()
             self._tidied = now
         if self._swept is None or now >= self._swept + SWEEP_EVERY:
@@ -161,6 +163,11 @@ class Keeper:
             cursor = page.next
             if cursor is None:
                 return
+
+    def _expire_uploads(self) -> None:
+        """Remove uploads that nobody went on with, or that no job took, for longer than they are kept."""
+        for id in Uploads.open(self.jobs.settings).expire(self.jobs.clock()):
+            logger.info("upload %s: expired and removed", id)
 
     def _clean_up_after_failures(self) -> None:
         """Remove what attempts had uploaded when they were killed, once for each job that ended badly of late."""

@@ -77,6 +77,9 @@ class Settings:
     disk_quota: int = 0
     """Bytes all jobs together may hold before new ones are refused; 0: no quota."""
 
+    upload_expiry: float = 86400.0
+    """How long an upload is kept after its last byte, or after the last job that used it; 0: for ever."""
+
     @classmethod
     def from_environment(cls, environment: Mapping[str, str]) -> Settings:
         """Read the `PLIANT_…` variables; one that is absent or empty leaves the default.
@@ -118,6 +121,11 @@ class Settings:
         return self.data.absolute() / "work"
 
     @property
+    def uploads(self) -> Path:
+        """Directory of large inputs that no job has taken yet."""
+        return self.data.absolute() / "uploads"
+
+    @property
     def threads_per_job(self) -> int:
         """Threads the numerical libraries may use in one job."""
         return self.threads or max(1, usable_cores() // self.workers)
@@ -152,5 +160,6 @@ VARIABLES: dict[str, tuple[str, str, Callable[[str], Any]]] = {
     "max_attempts": ("PLIANT_MAX_ATTEMPTS", *_ONE),
     "retention": ("PLIANT_RETENTION", *_SECONDS),
     "disk_quota": ("PLIANT_DISK_QUOTA", *_BYTES),
+    "upload_expiry": ("PLIANT_UPLOAD_EXPIRY", *_SECONDS),
 }
 """Field, its environment variable, what is expected, how it is read."""

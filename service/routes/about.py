@@ -30,6 +30,7 @@ def limits(core: Core) -> ServiceLimits:
     return ServiceLimits(
         **{name: getattr(core.limits, name) for name in taken},
         max_body_bytes=core.settings.max_body_bytes,
+        max_upload_bytes=core.limits.max_bytes,
         max_text_bytes=core.settings.max_text_bytes,
         max_wait_seconds=core.settings.max_wait_seconds,
         max_page=LARGEST_PAGE,

@@ -8,7 +8,7 @@ from typing import Annotated
 from anyio import to_thread
 from fastapi import APIRouter, Header, Path, Query, Request, Response
 from pliant.client.schemas import Job, JobPage, Status
-from pliant.service.core import Core, Mine, Service
+from pliant.service.core import Core, Mine, Service, my_uploads
 from pliant.service.describe import JOB_EXAMPLE, SUBMIT_BODY, problems
 from pliant.service.forms import FormRules, receive_form
 from pliant.service.submission import FILES, TEXTS, accept
@@ -134,7 +134,15 @@ async def _receive(
     with core.incoming.room() as room:
         form = await receive_form(request, room, rules=rules)
         return await to_thread.run_sync(
-            lambda: accept(form, room, jobs=jobs, limits=core.limits, id=id, idempotency_key=idempotency_key),
+            lambda: accept(
+                form,
+                room,
+                jobs=jobs,
+                uploads=my_uploads(request),
+                limits=core.limits,
+                id=id,
+                idempotency_key=idempotency_key,
+            ),
             limiter=core.parsing,
         )
 

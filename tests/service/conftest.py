@@ -37,9 +37,10 @@ def serve(valkey_url: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator
     """Start a service with settings of one's own; it ends with the module."""
     started: list[tuple[uvicorn.Server, threading.Thread]] = []
 
-    def start(*, limits: Limits = Limits(), redis_url: str = valkey_url, **given: Any) -> Running:  # noqa: B008
+    def start(*, limits: Limits = Limits(), redis_url: str = valkey_url, quota: int = 0, **given: Any) -> Running:  # noqa: B008
         data = tmp_path_factory.mktemp("data")
-        jobs = Jobs.open(Settings(data=data, redis_url=redis_url, queue=f"test-{secrets.token_hex(4)}"))
+        queue = f"test-{secrets.token_hex(4)}"
+        jobs = Jobs.open(Settings(data=data, redis_url=redis_url, queue=queue, disk_quota=quota))
         settings = dataclasses.replace(ServiceSettings(port=0, incoming=data / "incoming"), **given)
         tokens = Tokens.open(jobs.settings)
         app = create_app(jobs, settings, tokens=tokens, limits=limits)

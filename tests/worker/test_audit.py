@@ -114,6 +114,11 @@ def test_every_kind_of_misfit_is_found(jobs: Jobs, submit: Callable[[], Stored],
     assert any("its results lie under p/" in found for found in findings(jobs, settle=0))
     jobs.records.update(stored.job.id, lambda held: held.model_copy(update={"prefix": None}))
 
+    upload = jobs.settings.uploads / "somebody" / "half"
+    upload.mkdir(parents=True)
+    only("Upload half holds nothing")
+    upload.rmdir()
+
     jobs.blobs.delete(stored.inputs)
     only("has lost its inputs")
 

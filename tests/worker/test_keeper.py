@@ -21,6 +21,7 @@ from pliant.worker.jobs import Jobs
 from pliant.worker.keeper import Keeper, Stillness
 from pliant.worker.memory import MemoryQueue, MemoryRecords
 from pliant.worker.settings import Settings
+from pliant.worker.uploads import Room, Uploads
 
 
 class World:
@@ -238,3 +239,16 @@ def test_last_words_are_the_end_of_what_was_written(tmp_path: Path) -> None:
     clean_up(settings, "t-1")
     clean_up(settings, "t-1")
     assert not directory.exists()
+
+
+def test_it_removes_uploads_that_have_expired(world: World) -> None:
+    uploads = Uploads.open(world.jobs.settings)
+    for id in ("old", "young"):
+        with uploads.write(id, offset=0, length=None, room=Room(max_bytes=9)) as writer:
+            writer.write(b"x")
+        (file,) = uploads.directory.glob(f"*/{id}/part")
+        moment = world.now.timestamp() - (uploads.expiry if id == "old" else uploads.expiry - 3600)
+        os.utime(file, (moment, moment))
+    world.pass_seconds(31)
+    assert uploads.find("old") is None
+    assert uploads.find("young") is not None

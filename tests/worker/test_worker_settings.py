@@ -17,6 +17,7 @@ def test_the_environment_round_trips() -> None:
     settings = Settings(
         data=Path("/some/where"), redis_url="redis://h/1", blob_url="s3://b/p", queue="q", workers=3, threads=2,
         time_limit=1.5, memory_limit=10, cancel_grace=2, stop_grace=3, lost_after=4, max_attempts=5, retention=0, disk_quota=7,
+        upload_expiry=8,
     )  # fmt: skip
     assert Settings.from_environment(settings.to_environment()) == settings
     assert len(settings.to_environment()) == len(VARIABLES) == len(Settings.__dataclass_fields__)

@@ -1,0 +1,240 @@
+"""Large inputs in raw bytes, resumable: sent before the job, which then names them instead of carrying them.
+
+The headers are those of the IETF's draft "Resumable Uploads for HTTP" (draft-ietf-httpbis-resumable-upload): `Upload-Offset`,
+`Upload-Complete`, `Upload-Length`, `Upload-Limit`, HEAD to ask for the offset, PATCH to append, DELETE to give up, 409 with the
+right offset where they differ. It was chosen over tus 1.0, which it is to replace, because a whole upload is one plain `PUT` that
+any HTTP client can send (`curl -T`), and over parts with numbers, as S3 has, because the offset is the only thing to remember.
+Different from the draft: the client chooses the id, as it may for jobs, so there is no interim response 104 to wait for, and a
+`PUT` with `Upload-Offset` goes on like PATCH, because it is idempotent: repeated after a lost answer it does no harm.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import re
+from dataclasses import dataclass
+from functools import partial
+from typing import Annotated
+
+import anyio
+from anyio import to_thread
+from fastapi import APIRouter, Header, Path, Request, Response
+from pliant.client.schemas import Upload
+from pliant.service.core import Core, MyUploads, Service
+from pliant.service.describe import problems
+from pliant.service.forms import batches
+from pliant.service.problems import Refusal
+from pliant.worker.errors import OffsetMismatch
+from pliant.worker.uploads import Room, Uploads, Writer
+
+router = APIRouter(prefix="/v1/uploads", tags=["uploads"])
+
+ANY = 2**62
+MISMATCH = "https://iana.org/assignments/http-problem-types#mismatching-upload-offset"
+Id = Annotated[
+    str, Path(description="Any id of your own: 3 to 64 letters, digits, underscores or dashes.", examples=["take-3"])
+]
+Offset = Annotated[
+    int | None,
+    Header(alias="Upload-Offset", ge=0, le=ANY, description="Where the body belongs; 0, the default, begins anew."),
+]
+Complete = Annotated[
+    str,
+    Header(alias="Upload-Complete", pattern=r"^\?[01]$", description="`?0` if more will follow; `?1` is the default."),
+]
+Length = Annotated[
+    int | None,
+    Header(alias="Upload-Length", ge=0, le=ANY, description="Bytes of the whole upload, where they are known."),
+]
+Digest = Annotated[
+    str | None,
+    Header(
+        alias="Repr-Digest", max_length=500, description="`sha-256=:BASE64:` of the whole; checked when it is there."
+    ),
+]
+_STATE = {
+    "Upload-Offset": {"description": "Bytes that have arrived.", "schema": {"type": "integer"}},
+    "Upload-Complete": {"description": "`?1` once all of it is there.", "schema": {"type": "string"}},
+    "Upload-Limit": {"description": "The largest upload, and its seconds to live.", "schema": {"type": "string"}},
+}
+_BODY = {
+    "requestBody": {
+        "required": True,
+        "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
+    }
+}
+_ERRORS = problems(400, 401, 403, 404, 408, 409, 413, 422, 429, 503, 507)
+
+
+@router.put(
+    "/{id}",
+    status_code=201,
+    summary="Send a large input, or go on with one",
+    responses={
+        201: {"headers": _STATE},
+        200: {"model": Upload, "description": "Went on, or was there already."},
+        **_ERRORS,
+    },
+    openapi_extra=_BODY,
+)
+async def put(
+    id: Id,
+    request: Request,
+    response: Response,
+    core: Core,
+    uploads: MyUploads,
+    offset: Offset = None,
+    complete: Complete = "?1",
+    length: Length = None,
+    digest: Digest = None,
+) -> Upload:
+    """Stream raw bytes to the service's disk. A job then names the upload: `tracks_upload=ID` in place of the part `tracks`.
+
+    After an interruption ask with HEAD how far it came, and send the rest with `Upload-Offset`. Only a whole upload can be used.
+    It is removed a day after its last byte or last use, unless whoever runs the service chose another time.
+    """
+    sending = Sending.of(request, offset=offset or 0, complete=complete, length=length, digest=digest)
+    there = await _already(uploads, id, sending)
+    response.status_code = 200 if there is not None or sending.offset > 0 else 201
+    if there is None:
+        async with core.turns.take((uploads.owner, id)):
+            await _receive(request, core, uploads=uploads, id=id, sending=sending)
+        there = await to_thread.run_sync(uploads.get, id)
+    _describe(response, there, core, uploads)
+    response.headers["Location"] = f"/v1/uploads/{id}"
+    return there
+
+
+@router.patch(
+    "/{id}", summary="Go on with a large input", responses={200: {"headers": _STATE}, **_ERRORS}, openapi_extra=_BODY
+)
+async def patch(
+    id: Id,
+    request: Request,
+    response: Response,
+    core: Core,
+    uploads: MyUploads,
+    offset: Annotated[int, Header(alias="Upload-Offset", ge=0, le=ANY)],
+    complete: Complete = "?1",
+    length: Length = None,
+    digest: Digest = None,
+) -> Upload:
+    """Append at `Upload-Offset`: the verb that the IETF's draft has for it. `PUT` with that header does the same."""
+    there = await put(id, request, response, core, uploads, offset, complete, length, digest)
+    response.status_code = 200
+    return there
+
+
+@router.head(
+    "/{id}", status_code=204, summary="How far is it?", responses={204: {"headers": _STATE}, **problems(401, 404)}
+)
+def head(id: Id, response: Response, core: Core, uploads: MyUploads) -> None:
+    """Answer with `Upload-Offset`: where to go on; and with `Upload-Complete`."""
+    _describe(response, uploads.get(id), core, uploads)
+
+
+@router.get("/{id}", summary="Look at a large input", responses={200: {"headers": _STATE}, **problems(401, 404)})
+def get(id: Id, response: Response, core: Core, uploads: MyUploads) -> Upload:
+    """Return how much of it has arrived, when it expires, and its SHA-256 once it is whole."""
+    there = uploads.get(id)
+    _describe(response, there, core, uploads)
+    return there
+
+
+@router.delete("/{id}", status_code=204, summary="Remove a large input", responses=problems(401, 403, 404, 409))
+async def delete(id: Id, core: Core, uploads: MyUploads) -> None:
+    """Remove it, whole or not. Jobs that have been submitted with it are not touched: they have their own copy."""
+    async with core.turns.take((uploads.owner, id)):
+        await to_thread.run_sync(uploads.delete, id)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sending:
+    """What one request's headers say of its body."""
+
+    offset: int
+    last: bool
+    """Nothing follows this body."""
+    length: int | None
+    """Bytes of the whole, where they are known."""
+    sha256: str | None
+    """Of the whole, where the client says it."""
+
+    @classmethod
+    def of(cls, request: Request, *, offset: int, complete: str, length: int | None, digest: str | None) -> Sending:
+        """Read them; the length of a body that is the last one tells the length of the whole."""
+        last, body = complete == "?1", request.headers.get("content-length", "")
+        if length is None and last and body.isdigit():
+            length = offset + int(body)
+        return cls(offset=offset, last=last, length=length, sha256=_sha256(digest))
+
+
+async def _receive(request: Request, core: Service, *, uploads: Uploads, id: str, sending: Sending) -> None:
+    """Write the body as it arrives. If it breaks off, what has arrived stays: that is where the client goes on."""
+    room = await to_thread.run_sync(partial(_room, core, uploads, id))
+    held = uploads.write(id, offset=sending.offset, length=sending.length, room=room)
+    try:
+        writer: Writer = await to_thread.run_sync(held.__enter__)
+    except OffsetMismatch as error:
+        headers = {"Upload-Offset": error.expected, "Upload-Complete": "?0"}
+        said = {"type": MISMATCH, "field": error.field, "expected": error.expected, "got": error.got}
+        raise Refusal(409, error.code, detail=str(error), headers=headers, **said) from error
+    try:
+        # The writer holds the limit, over all requests together.
+        async for batch in batches(request, max_bytes=ANY, stall_seconds=core.settings.stall_seconds):
+            await to_thread.run_sync(writer.write, batch)
+        if sending.last:
+            await to_thread.run_sync(partial(writer.finish, sha256=sending.sha256))
+    finally:
+        with anyio.CancelScope(shield=True):  # a request that another one stops still has to let go of the lock
+            await to_thread.run_sync(held.__exit__, None, None, None)
+
+
+def _room(core: Service, uploads: Uploads, id: str) -> Room:
+    quota = core.jobs.settings.disk_quota
+    used = core.jobs.used() + uploads.used() - uploads.size(id) if quota > 0 else 0
+    return Room(max_bytes=core.limits.max_bytes, quota=quota, used=used)
+
+
+async def _already(uploads: Uploads, id: str, sending: Sending) -> Upload | None:
+    """Return the upload if it is whole and what the client is about to send: its first answer was lost."""
+    if sending.sha256 is None or sending.offset > 0:
+        return None
+    there = await to_thread.run_sync(uploads.find, id)
+    return there if there is not None and there.sha256 == sending.sha256 else None
+
+
+def _sha256(digest: str | None) -> str | None:
+    """Return the SHA-256 of a Repr-Digest (RFC 9530) in hexadecimal; other algorithms are passed over.
+
+    Raises
+    ------
+    Refusal
+        It cannot be read.
+    """
+    found = re.search(r"(?:^|,)\s*sha-256=:([^:]*):", digest or "")
+    if found is None:
+        return None
+    try:
+        value = base64.b64decode(found[1], validate=True)
+    except binascii.Error:
+        value = b""
+    if len(value) != 32:
+        expected, got, hint = "sha-256=:BASE64 of 32 bytes:", found[0][:80], "Encode the raw digest, or leave it out."
+        detail = f"Repr-Digest: expected {expected}, got {got}. {hint}"
+        raise Refusal(422, "invalid_digest", detail=detail, field="Repr-Digest", expected=expected, got=got, hint=hint)
+    return value.hex()
+
+
+def _describe(response: Response, upload: Upload, core: Service, uploads: Uploads) -> None:
+    """Say in headers how far the upload is."""
+    headers = response.headers
+    headers["Upload-Offset"] = str(upload.offset)
+    headers["Upload-Complete"] = "?1" if upload.complete else "?0"
+    if upload.length is not None:
+        headers["Upload-Length"] = str(upload.length)
+    age = f", max-age={int(uploads.expiry)}" if uploads.expiry > 0 else ""
+    headers["Upload-Limit"] = f"max-size={core.limits.max_bytes}{age}"
+    if upload.sha256 is not None:
+        headers["Repr-Digest"] = f"sha-256=:{base64.b64encode(bytes.fromhex(upload.sha256)).decode()}:"

@@ -1,0 +1,229 @@
+"""Large inputs over real HTTP: sent whole, in parts, over broken connections; named by jobs; refused with both sides."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import io
+import socket
+import threading
+import time
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from pliant.client.schemas import Job, Problem, Upload
+from pliant.service.core import my_uploads
+from pliant.worker.formats import Limits
+from serving import Running, Serve, form, npz, tracks, until
+
+DATA = np.random.default_rng(0).bytes(3_000_000)
+
+
+def repr_digest(data: bytes) -> str:
+    return f"sha-256=:{base64.b64encode(hashlib.sha256(data).digest()).decode()}:"
+
+
+def begun(url: str, path: str, *, declared: int, sent: bytes, headers: str = "") -> socket.socket:
+    """Begin a PUT and leave it open."""
+    host, port = url.removeprefix("http://").split(":")
+    connection = socket.create_connection((host, int(port)), timeout=10)
+    head = f"PUT {path} HTTP/1.1\r\nHost: {host}\r\nContent-Length: {declared}\r\n{headers}\r\n"
+    connection.sendall(head.encode() + sent)
+    return connection
+
+
+def offset(http: httpx.Client, path: str) -> int:
+    answer = http.head(path)
+    return int(answer.headers["upload-offset"]) if answer.status_code == 204 else -1
+
+
+def test_one_plain_put_is_a_whole_upload(http: httpx.Client) -> None:
+    answer = http.put("/v1/uploads/plain", content=DATA)
+    assert answer.status_code == 201
+    upload = Upload.model_validate_json(answer.content)
+    assert (upload.complete, upload.offset, upload.length) == (True, len(DATA), len(DATA))
+    assert upload.sha256 == hashlib.sha256(DATA).hexdigest()
+    assert answer.headers["location"] == "/v1/uploads/plain"
+    assert answer.headers["repr-digest"] == repr_digest(DATA)
+    head = http.head("/v1/uploads/plain")
+    assert (head.status_code, head.headers["upload-offset"]) == (204, str(len(DATA)))
+    assert (head.headers["upload-complete"], head.headers["cache-control"]) == ("?1", "no-store")
+    assert head.headers["upload-limit"] == f"max-size={Limits().max_bytes}, max-age=86400"
+    assert Upload.model_validate_json(http.get("/v1/uploads/plain").content) == upload
+    assert http.delete("/v1/uploads/plain").status_code == 204
+    assert http.get("/v1/uploads/plain").json()["code"] == "unknown_upload"
+
+
+@pytest.mark.parametrize("verb", ["PATCH", "PUT"])
+def test_parts_one_after_the_other(http: httpx.Client, verb: str) -> None:
+    path = f"/v1/uploads/parts-{verb}"
+    first = http.put(path, content=DATA[:1_000_000], headers={"Upload-Complete": "?0", "Upload-Length": str(len(DATA))})
+    assert (first.status_code, first.json()["complete"], first.headers["upload-complete"]) == (201, False, "?0")
+    assert http.head(path).headers["upload-length"] == str(len(DATA))
+    more = {"Upload-Offset": "1000000", "Upload-Complete": "?0"}
+    assert http.request(verb, path, content=DATA[1_000_000:2_000_000], headers=more).status_code == 200
+    last = {"Upload-Offset": "2000000", "Repr-Digest": repr_digest(DATA)}
+    whole = http.request(verb, path, content=DATA[2_000_000:], headers=last).json()
+    assert (whole["complete"], whole["sha256"]) == (True, hashlib.sha256(DATA).hexdigest())
+
+
+def test_a_broken_connection_keeps_what_arrived_and_the_rest_follows(running: Running, http: httpx.Client) -> None:
+    path = "/v1/uploads/broken"
+    connection = begun(running.url, path, declared=len(DATA), sent=DATA[:2_000_000])
+    until(lambda: offset(http, path) >= 1_000_000)
+    connection.close()
+    until(lambda: offset(http, path) == 2_000_000)
+    assert http.get(path).json()["length"] == len(DATA), "known from the first request's Content-Length"
+    named = http.post("/v1/jobs", files={"tracks_upload": (None, "broken")}).json()
+    assert (named["code"], named["field"]) == ("upload_incomplete", "tracks_upload")
+    wrong = http.patch(path, content=DATA[1_500_000:], headers={"Upload-Offset": "1500000"})
+    assert (wrong.status_code, wrong.headers["upload-offset"]) == (409, "2000000")
+    problem = Problem.model_validate_json(wrong.content)
+    assert (problem.code, problem.expected, problem.got) == ("upload_offset_mismatch", "2000000", "1500000")
+    assert problem.type.endswith("#mismatching-upload-offset")
+    rest = http.patch(path, content=DATA[2_000_000:], headers={"Upload-Offset": "2000000"})
+    assert rest.json()["sha256"] == hashlib.sha256(DATA).hexdigest()
+
+
+def test_a_client_that_comes_back_need_not_wait_for_its_dead_connection(running: Running, http: httpx.Client) -> None:
+    path = "/v1/uploads/half-open"
+    with begun(running.url, path, declared=len(DATA), sent=DATA[:2_000_000]) as dead:
+        until(lambda: offset(http, path) >= 1_500_000)  # whole batches; the service still waits for more
+        time.sleep(0.2)
+        began = time.monotonic()
+        at = offset(http, path)
+        answer = http.patch(path, content=DATA[at:], headers={"Upload-Offset": str(at)})
+        assert time.monotonic() - began < 5
+        assert answer.json()["sha256"] == hashlib.sha256(DATA).hexdigest()
+        assert b'"upload_taken_over"' in dead.recv(65536)
+
+
+def test_repeating_a_put_after_a_lost_answer_is_safe(running: Running, http: httpx.Client) -> None:
+    said = {"Repr-Digest": repr_digest(DATA)}
+    assert http.put("/v1/uploads/again", content=DATA, headers=said).status_code == 201
+    assert http.put("/v1/uploads/again", content=DATA, headers=said).status_code == 200
+    other = http.put("/v1/uploads/again", content=DATA)
+    assert (other.status_code, other.json()["code"]) == (409, "upload_complete")
+    assert http.get("/v1/uploads/again").json()["complete"]
+
+
+def test_ten_at_once_end_in_one_whole(running: Running, http: httpx.Client) -> None:
+    said = {"Repr-Digest": repr_digest(DATA)}
+
+    def send() -> None:
+        httpx.put(f"{running.url}/v1/uploads/at-once", content=DATA, headers=said, timeout=30)
+
+    threads = [threading.Thread(target=send) for _ in range(10)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert http.get("/v1/uploads/at-once").json()["sha256"] == hashlib.sha256(DATA).hexdigest()
+
+
+@pytest.fixture(scope="module")
+def small(serve: Serve) -> Running:
+    return serve(stall_seconds=0.5, limits=Limits(max_bytes=100_000))
+
+
+REFUSED: dict[str, tuple[dict[str, str], bytes, int, str]] = {
+    "too large": ({}, b"x" * 200_000, 413, "upload_too_large"),
+    "length too large": ({"Upload-Complete": "?0", "Upload-Length": "200000"}, b"x", 413, "upload_too_large"),
+    "other bytes": ({"Repr-Digest": repr_digest(b"y")}, b"x", 422, "digest_mismatch"),
+    "odd digest": ({"Repr-Digest": "sha-256=:AAA:"}, b"x", 422, "invalid_digest"),
+    "short digest": ({"Repr-Digest": "sha-256=:AAAA:"}, b"x", 422, "invalid_digest"),
+    "negative": ({"Upload-Offset": "-1"}, b"x", 422, "invalid_request"),
+    "not a number": ({"Upload-Length": "many"}, b"x", 422, "invalid_request"),
+    "not a boolean": ({"Upload-Complete": "yes"}, b"x", 422, "invalid_request"),
+    "not begun": ({"Upload-Offset": "7"}, b"x", 404, "unknown_upload"),
+    "longer than said": ({"Upload-Length": "3"}, b"xxxx", 422, "inconsistent_upload_length"),
+    "shorter than said": ({"Upload-Length": "3"}, b"xx", 422, "inconsistent_upload_length"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_a_refusal_says_why(small: Running, case: str) -> None:
+    headers, body, status, code = REFUSED[case]
+    path = f"{small.url}/v1/uploads/{case.replace(' ', '-')}"
+    answer = httpx.put(path, content=body, headers=headers)
+    assert (answer.status_code, answer.json()["code"]) == (status, code), answer.text
+    assert answer.headers["content-type"] == "application/problem+json"
+    there = httpx.get(path)
+    assert there.status_code == 404 or there.json()["complete"] is False
+
+
+def test_a_body_without_a_length_is_held_to_the_limit_too(small: Running) -> None:
+    answer = httpx.put(f"{small.url}/v1/uploads/endless", content=iter([b"x" * 50_000] * 10))
+    assert (answer.status_code, answer.json()["code"]) == (413, "upload_too_large")
+    assert httpx.put(f"{small.url}/v1/uploads/x", content=b"").json()["code"] == "invalid_id"
+
+
+def test_a_stalled_upload_is_given_up_and_kept(small: Running) -> None:
+    with begun(small.url, "/v1/uploads/stalled", declared=90_000, sent=b"x" * 1000) as connection:
+        assert b'"body_stalled"' in connection.recv(65536)
+    there = httpx.get(f"{small.url}/v1/uploads/stalled").json()
+    assert (there["complete"], there["length"]) == (False, 90_000)
+
+
+def test_a_job_names_uploads_instead_of_carrying_parts(running: Running, http: httpx.Client) -> None:
+    sent = tracks(6, 12)
+    truth = npz(shapes=np.random.default_rng(1).normal(size=(6, 12, 3)))
+    http.put("/v1/uploads/tracks-1", content=sent)
+    http.put("/v1/uploads/truth-1", content=truth)
+    parts: dict[str, Any] = form(sent, mesh="3x4") | {"ground_truth_upload": (None, "truth-1")}
+    del parts["tracks"]
+    parts["tracks_upload"] = (None, "tracks-1")
+    key = {"Idempotency-Key": "by either road"}
+    answer = http.post("/v1/jobs", files=parts, headers=key)
+    assert answer.status_code == 202, answer.text
+    job = Job.model_validate_json(answer.content)
+    assert (job.interpretation.num_points, job.interpretation.has_ground_truth) == (12, True)
+    # The same content is the same request, whether it came as parts or as uploads; nor does the job need them any more.
+    for id in ("tracks-1", "truth-1"):
+        assert http.delete(f"/v1/uploads/{id}").status_code == 204
+    carried = http.post("/v1/jobs", files=form(sent, mesh="3x4", ground_truth=truth), headers=key)
+    assert carried.json()["id"] == job.id
+    assert running.jobs.blobs.get(running.jobs.records.get(job.id).inputs).size > 0
+    assert running.left_on_disk == []
+
+
+def test_a_job_that_names_no_upload_or_both_is_refused(running: Running, http: httpx.Client) -> None:
+    before = running.waiting
+    unknown = http.post("/v1/jobs", files={"tracks_upload": (None, "nowhere")})
+    assert (unknown.status_code, unknown.json()["code"]) == (422, "unknown_upload")
+    assert unknown.json()["field"] == "tracks_upload"
+    both = http.post("/v1/jobs", files=form(tracks_upload="nowhere"))
+    assert (both.status_code, both.json()["code"]) == (422, "repeated_part")
+    two = http.post("/v1/jobs", files=form(mesh="3x4", mesh_upload="nowhere"))
+    assert (two.status_code, two.json()["code"]) == (422, "repeated_part")
+    assert running.waiting == before
+
+
+def test_a_quota_counts_uploads(serve: Serve) -> None:
+    full = serve(quota=150_000)
+    with httpx.Client(base_url=full.url) as http:
+        assert http.put("/v1/uploads/first", content=b"x" * 100_000).status_code == 201
+        answer = http.put("/v1/uploads/second", content=b"x" * 100_000)
+        assert (answer.status_code, answer.json()["code"], answer.json()["retryable"]) == (507, "quota_exceeded", True)
+        http.delete("/v1/uploads/first")
+        assert http.put("/v1/uploads/second", content=b"x" * 100_000).status_code == 201
+        assert http.put("/v1/uploads/second", content=b"x" * 100_000).status_code == 409
+
+
+def test_too_many_uploads_are_refused(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pliant.worker.uploads.MOST", 2)
+    url = serve().url
+    answers = [httpx.put(f"{url}/v1/uploads/number-{number}", content=io.BytesIO(b"x")) for number in range(3)]
+    assert [answer.status_code for answer in answers] == [201, 201, 429]
+    assert answers[-1].json()["code"] == "too_many_uploads"
+
+
+def test_a_token_sees_its_own_uploads_alone(running: Running) -> None:
+    from starlette.requests import Request
+
+    app = running.server.config.app
+    for owner, expected in ((None, ""), ("token-7", "token-7")):
+        scope = {"type": "http", "app": app, "headers": [], **({} if owner is None else {"pliant.owner": owner})}
+        assert my_uploads(Request(scope)).owner == expected
