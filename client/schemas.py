@@ -157,3 +157,8 @@ class ServiceLimits(Record):
     max_faces: int
     max_wait_seconds: int = Field(description="Longest `Prefer: wait=n` that is honoured.")
     max_page: int = Field(description="Most jobs on one page.")
+    max_queued: int = Field(0, description="Jobs of yours that may wait at once; 0: any number. Beyond: 429.")
+    max_running: int = Field(
+        0, description="Jobs of yours that are worked on at once, the others wait; 0: as many as there are workers."
+    )
+    requests_per_minute: int = Field(0, description="Requests in a minute; 0: any number. Beyond: 429.")

@@ -16,6 +16,7 @@ from pliant.service.guard import OriginGuard, SecurityHeaders
 from pliant.service.incoming import Incoming
 from pliant.service.linger import LingeringClose
 from pliant.service.page import mount_page
+from pliant.service.rates import RateLimit
 from pliant.service.routes import about, artifacts, events, examples, jobs, uploads
 from pliant.service.settings import ServiceSettings
 from pliant.service.turns import Turns
@@ -40,6 +41,7 @@ STATUS_OF: dict[type[Exception], int] = {
     errors.InvalidRequest: 422,
     errors.UploadTooLarge: 413,
     errors.TooManyUploads: 429,
+    errors.TooManyQueued: 429,
     errors.QuotaExceeded: 507,
     errors.StoreUnavailable: 503,
     errors.WorkerError: 500,
@@ -130,4 +132,5 @@ def middleware(settings: ServiceSettings, tokens: Tokens) -> list[Middleware]:
         )
     # Inside CORS: a browser's preflight carries no token, and a page of an allowed origin may read why it was refused.
     stack.append(Middleware(Authentication, settings=settings, tokens=tokens))
+    stack.append(Middleware(RateLimit, settings=settings))
     return stack

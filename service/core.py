@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import anyio
@@ -13,6 +13,7 @@ from pliant.service.settings import ServiceSettings
 from pliant.service.turns import Turns
 from pliant.worker.formats import Limits
 from pliant.worker.jobs import Jobs
+from pliant.worker.tokens import Token
 from pliant.worker.uploads import Uploads
 
 
@@ -41,11 +42,37 @@ def service_of(request: Request) -> Service:
     return service
 
 
+@dataclass(frozen=True)
+class Bounds:
+    """What the one who asks may use: the limits of his token, the service's where it has none. 0 means any number."""
+
+    max_body_bytes: int
+    max_upload_bytes: int
+    max_queued: int
+    max_running: int
+    requests_per_minute: int
+
+
+def bounds_of(request: Request) -> Bounds:
+    """Return the limits of the request's token."""
+    service, token = service_of(request), request.scope.get("pliant.token")
+    settings = service.settings
+    assert token is None or isinstance(token, Token)
+    own = (None, None, None) if token is None else (token.max_body_bytes, token.max_queued, token.requests_per_minute)
+    most = float("inf") if own[0] is None else own[0]
+    return Bounds(
+        max_body_bytes=int(min(most, settings.max_body_bytes)),
+        max_upload_bytes=int(min(most, service.limits.max_bytes)),
+        max_queued=settings.max_queued if own[1] is None else own[1],
+        max_running=service.jobs.settings.max_running,
+        requests_per_minute=settings.rate_of(own[2]),
+    )
+
+
 def mine(request: Request) -> Jobs:
     """Return the jobs that the request's token may see: its own, or everybody's where tokens are off."""
     owner = request.scope.get("pliant.owner")
-    jobs = service_of(request).jobs
-    return jobs if owner is None else jobs.of(owner)
+    return replace(service_of(request).jobs, owner=owner, max_queued=bounds_of(request).max_queued)
 
 
 def my_uploads(request: Request) -> Uploads:
@@ -56,3 +83,4 @@ def my_uploads(request: Request) -> Uploads:
 Core = Annotated[Service, Depends(service_of)]
 Mine = Annotated[Jobs, Depends(mine)]
 MyUploads = Annotated[Uploads, Depends(my_uploads)]
+Bound = Annotated[Bounds, Depends(bounds_of)]

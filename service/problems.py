@@ -157,7 +157,8 @@ def install(app: FastAPI, table: Mapping[type[Exception], int]) -> None:
 
     async def of_ours(_: Request, error: Exception) -> Response:
         status = next(table[base] for base in type(error).__mro__ if base in table)
-        return answer(from_error(error, status), headers={"Retry-After": "2"} if status == 503 else None)
+        after = getattr(error, "retry_after", None)
+        return answer(from_error(error, status), headers=None if after is None else {"Retry-After": str(after)})
 
     async def of_http(_: Request, error: Exception) -> Response:
         assert isinstance(error, HTTPException)

@@ -10,6 +10,9 @@ from typing import Literal, get_args
 
 MB = 2**20
 
+USUAL_RATE = 1200
+"""Requests in a minute: twenty a second, with a minute's worth at once."""
+
 Auth = Literal["auto", "required", "off"]
 
 
@@ -31,6 +34,12 @@ class ServiceSettings:
     """Largest body of one request, in bytes (PLIANT_MAX_BODY_MB)."""
     max_text_bytes: int = 1 * MB
     """Largest text field of a form, or whole JSON body, in bytes."""
+    max_queued: int = 1000
+    """Jobs of one token that may wait at once, unless the token has a limit of its own; 0: any number. Where tokens are off,
+    all jobs count as one token's (PLIANT_MAX_QUEUED)."""
+    requests_per_minute: int | None = None
+    """Requests in a minute of one token, or of one address where tokens are off; 0: any number; None: `USUAL_RATE` where the
+    service is not on the loopback address or asks for tokens, any number elsewhere (PLIANT_REQUESTS_PER_MINUTE)."""
     parsers: int = 2
     """How many bodies are parsed at once; each may hold a whole input in memory (PLIANT_PARSERS)."""
     stall_seconds: float = 60.0
@@ -68,6 +77,12 @@ class ServiceSettings:
             incoming=Path(env.get("PLIANT_DATA", "pliant-data")) / "incoming",
             max_body_bytes=_whole(env, "PLIANT_MAX_BODY_MB", default=cls.max_body_bytes // MB, least=1, most=2**20)
             * MB,
+            max_queued=_whole(env, "PLIANT_MAX_QUEUED", default=cls.max_queued, least=0, most=10**7),
+            requests_per_minute=(
+                _whole(env, "PLIANT_REQUESTS_PER_MINUTE", default=0, least=0, most=10**7)
+                if env.get("PLIANT_REQUESTS_PER_MINUTE")
+                else None
+            ),
             parsers=_whole(env, "PLIANT_PARSERS", default=cls.parsers, least=1, most=64),
             auth=_auth(env),
             allowed_hosts=_listed(env, "PLIANT_ALLOWED_HOSTS"),
@@ -78,6 +93,20 @@ class ServiceSettings:
     def asks_for_tokens(self) -> bool:
         """True if a request needs a token."""
         return self.auth == "required" or (self.auth == "auto" and not self.loopback)
+
+    def rate_of(self, own: int | None) -> int:
+        """Return the requests in a minute that are allowed, 0 for any number.
+
+        Parameters
+        ----------
+        own : int or None
+            What the token says.
+        """
+        if own is not None:
+            return own
+        if self.requests_per_minute is not None:
+            return self.requests_per_minute
+        return USUAL_RATE if self.asks_for_tokens or not self.loopback else 0
 
     @property
     def loopback(self) -> bool:

@@ -93,6 +93,13 @@ def _counts(held: Stored, key: str) -> bool:
     return held.job.status in ACTIVE and key.startswith(f"jobs/{held.job.id}/{held.token}/")
 
 
+def _held_back(jobs: Jobs, records: list[Stored], waiting: set[str]) -> set[str]:
+    """Return the queued jobs whose owner has as many running or about to run as may."""
+    taken = Counter(stored.owner for stored in records if stored.job.status in ACTIVE or stored.token in waiting)
+    most = jobs.settings.max_running
+    return {stored.job.id for stored in records if 0 < most <= taken[stored.owner]}
+
+
 def _of_queue(jobs: Jobs, records: list[Stored]) -> Iterator[str]:
     waiting = Counter(jobs.queue.waiting())
     queued = {stored.token: stored.job.id for stored in records if stored.job.status is Status.QUEUED}
@@ -101,6 +108,7 @@ def _of_queue(jobs: Jobs, records: list[Stored]) -> Iterator[str]:
             yield f"The queue holds {token}, which no queued job owns."
         elif times > 1:
             yield f"The queue holds {token} {times} times."
+    held = _held_back(jobs, records, set(waiting))
     for token, id in queued.items():
-        if token not in waiting:
+        if token not in waiting and id not in held:
             yield f"Job {id} is queued, but the queue does not hold it."

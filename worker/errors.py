@@ -13,6 +13,7 @@
     │   └── UploadTooLarge      more bytes than one upload may have
     ├── TooManyUploads          more uploads than one owner may have
     ├── InvalidSetting          a setting does not parse or is out of its range
+    ├── TooManyQueued           as many jobs of yours wait as may
     ├── QuotaExceeded           the jobs together hold as many bytes as they may
     ├── StoreUnavailable        Redis or the blob store does not answer, or is full
     ├── DataDirectoryInUse      another Pliant runs on the data directory
@@ -38,10 +39,13 @@ class WorkerError(Exception):
         Stable machine-readable name.
     retryable : bool
         True if the same request may succeed later.
+    retry_after : int or None
+        Seconds after which it may.
     """
 
     code = "worker_error"
     retryable = False
+    retry_after: int | None = None
 
 
 class UnknownJob(WorkerError):
@@ -162,6 +166,20 @@ class InvalidSetting(WorkerError):
         self.name, self.expected, self.got = name, expected, got
 
 
+class TooManyQueued(WorkerError):
+    """As many jobs of one owner wait as may."""
+
+    code = "too_many_queued"
+    retryable = True
+    retry_after = 10
+
+    def __init__(self, limit: int) -> None:
+        super().__init__(
+            f"{limit} of your jobs wait already, and no more may. Send the next one when one of them has begun, or cancel one."
+        )
+        self.limit = limit
+
+
 class QuotaExceeded(WorkerError):
     """The jobs together hold as many bytes as they may."""
 
@@ -180,6 +198,7 @@ class StoreUnavailable(WorkerError):
 
     code = "store_unavailable"
     retryable = True
+    retry_after = 2
 
     def __init__(self, what: str, *, reason: str) -> None:
         super().__init__(f"{what} cannot be used now ({reason}). Nothing was lost; try again in a few seconds.")

@@ -21,6 +21,7 @@ from pliant.worker.errors import (
     NotAllowedNow,
     QuotaExceeded,
     StoreUnavailable,
+    TooManyQueued,
     UnknownArtifact,
     UnknownJob,
 )
@@ -48,6 +49,8 @@ class Jobs:
     settings: Settings
     owner: str | None = None
     """None: everybody's jobs; otherwise those of this owner, and to him there are no others."""
+    max_queued: int = 0
+    """Jobs of one owner that may wait at once; 0: any number."""
     clock: Callable[[], datetime] = utc_now
 
     @classmethod
@@ -96,6 +99,8 @@ class Jobs:
             The id or the key cannot be one.
         QuotaExceeded
             The jobs together hold as many bytes as they may.
+        TooManyQueued
+            As many jobs of this owner wait as may.
         """
         known = self.known(id=id, idempotency_key=idempotency_key, fingerprint=fingerprint)
         if known is not None:
@@ -137,6 +142,27 @@ class Jobs:
             except UnknownJob:
                 return None
         return None if found is None else self._same(found, fingerprint, wanted=id)
+
+    def check_room(self, *, id: str | None = None, idempotency_key: str | None = None) -> None:
+        """Return if a submission would find room, before its inputs are even received.
+
+        A repeated request is let through: it makes no new job. What is decided here is decided again, without a gap, when
+        the record is written.
+
+        Raises
+        ------
+        TooManyQueued
+            As many jobs of this owner wait as may.
+        """
+        if not 0 < self.max_queued <= self.records.count([Status.QUEUED], owner=self.owner or ""):
+            return
+        digest = self._digest(idempotency_key)
+        if digest is not None and self.records.find(digest) is not None:
+            return
+        try:
+            self.records.get(id or "")
+        except UnknownJob:
+            raise TooManyQueued(self.max_queued) from None
 
     def get(self, id: str) -> Job:
         """Return a job."""
@@ -329,15 +355,29 @@ class Jobs:
             key=key,
             fingerprint=fingerprint,
         )
-        kept = self.records.create(mine)
+        try:
+            kept = self.records.create(mine, max_queued=self.max_queued)
+        except TooManyQueued:
+            self.blobs.delete(inputs)
+            raise
         if kept.inputs != inputs:
             self.blobs.delete(inputs)
             return self._same(kept, fingerprint, wanted=job.id)
         try:
-            self.queue.push(job.id, token)
+            if not self._held_back(mine.owner):
+                self.queue.push(job.id, token)
         except StoreUnavailable:
             return job  # the record is safe, and the keeper queues what the queue does not know
         return self._placed(mine)
+
+    def _held_back(self, owner: str) -> bool:
+        """Tell whether a job just made has to wait until fewer of its owner's run; the keeper queues it then.
+
+        Counted after the record was written, so two submissions at once cannot both miss each other.
+        """
+        most = self.settings.max_running
+        unfinished = (Status.QUEUED, Status.RUNNING, Status.CANCELLING)
+        return most > 0 and self.records.count(unfinished, owner=owner) > most
 
     def _same(self, found: Stored, fingerprint: str | None, *, wanted: str | None) -> Job:
         """Return the job of a repeated request, or refuse a different one."""

@@ -12,7 +12,8 @@ from __future__ import annotations
 import logging
 import shutil
 import time
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import timedelta
@@ -77,6 +78,7 @@ class Keeper:
     _tidied: float | None = None
     _swept: float | None = None
     _cleaned: set[str] = field(default_factory=set)
+    _held: set[str] = field(default_factory=set)
 
     def tick(self) -> None:
         """Do what is due.
@@ -136,19 +138,49 @@ class Keeper:
                     self.jobs.queue.push(id, fresh, front=True)  # it has waited before
 
     def _queue_forgotten(self, gap: float) -> None:
+        """Queue what the queue has lost, and what was held back until fewer of its owner's jobs run."""
         records, queue = self.jobs.records, self.jobs.queue
-        ids = records.ids(Status.QUEUED)
+        queued = records.beats(records.ids(Status.QUEUED))
         waiting = set(queue.waiting())
-        absent = {id: beat.token for id, beat in records.beats(ids).items() if beat.token not in waiting}
-        for id, still in self._queued.look(dict(absent), gap).items():
-            if still < FORGOTTEN_AFTER:
-                continue
-            old, fresh = absent[id], new_token(id)
-            with suppress(StaleAttempt, UnknownJob):
-                records.update(id, partial(lifecycle.redeliver, token=old, fresh=fresh))
-                queue.remove(old)
-                queue.push(id, fresh, front=True)
+        absent = {id: beat for id, beat in queued.items() if beat.token not in waiting}
+        held = self._over_the_limit(queued, absent)
+        for id in [id for id in absent if id in self._held - held]:
+            self._queue_again(id, absent.pop(id).token, front=False)
+        self._held = held
+        lost = {id: beat.token for id, beat in absent.items() if id not in held}
+        for id, still in self._queued.look(dict(lost), gap).items():
+            if still >= FORGOTTEN_AFTER and self._queue_again(id, lost[id], front=True):
                 self._say(id, "The queue had forgotten it; queued again.")
+
+    def _over_the_limit(self, queued: Mapping[str, Beat], absent: Mapping[str, Beat]) -> set[str]:
+        """Return the queued jobs that must wait because their owner has no more running.
+
+        What is in the queue, or on its way from there to a worker, counts as running; the places that are left go to the oldest.
+        """
+        most = self.jobs.settings.max_running
+        if most == 0:
+            return set()
+        records = self.jobs.records
+        active = records.beats([*records.ids(Status.RUNNING), *records.ids(Status.CANCELLING)])
+        taken = Counter(beat.owner for beat in active.values())
+        taken.update(beat.owner for id, beat in queued.items() if id not in absent)
+        held: set[str] = set()
+        for id, beat in absent.items():  # oldest first, as `ids` gives them
+            taken[beat.owner] += 1
+            if taken[beat.owner] > most:
+                held.add(id)
+        return held
+
+    def _queue_again(self, id: str, old: str, *, front: bool) -> bool:
+        """Put a queued job into the queue under a new token; False if somebody else was quicker."""
+        fresh = new_token(id)
+        try:
+            self.jobs.records.update(id, partial(lifecycle.redeliver, token=old, fresh=fresh))
+        except (StaleAttempt, UnknownJob):
+            return False
+        self.jobs.queue.remove(old)
+        self.jobs.queue.push(id, fresh, front=front)
+        return True
 
     def _expire(self) -> None:
         """Remove the jobs whose time is over. Nothing that is not finished, or has no `expires_at`, is ever touched."""

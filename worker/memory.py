@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterable, Sequence
 
 from pliant.client.schemas import Status
-from pliant.worker.errors import UnknownJob
+from pliant.worker.errors import TooManyQueued, UnknownJob
 from pliant.worker.queue import Queue
 from pliant.worker.records import LOG_KEPT, Beat, Event, Records, Stored, event_of, events_kept
 
@@ -24,7 +24,7 @@ class MemoryRecords(Records):
         self._logs: dict[str, list[str]] = {}
         self._clock = 0
 
-    def create(self, stored: Stored) -> Stored:
+    def create(self, stored: Stored, *, max_queued: int = 0) -> Stored:
         """See `Records.create`."""
         id = stored.job.id
         with self._changed:
@@ -33,6 +33,8 @@ class MemoryRecords(Records):
                 return self._records[taken]
             if id in self._records:
                 return self._records[id]
+            if 0 < max_queued <= self.count([Status.QUEUED], owner=stored.owner):
+                raise TooManyQueued(max_queued)
             if stored.key is not None:
                 self._keys[stored.key] = id
             self._records[id] = stored
@@ -126,7 +128,11 @@ class MemoryRecords(Records):
     def beats(self, ids: Iterable[str]) -> dict[str, Beat]:
         """See `Records.beats`."""
         with self._changed:
-            return {id: Beat(self._records[id].token, self._beats[id]) for id in ids if id in self._records}
+            return {
+                id: Beat(self._records[id].token, self._beats[id], self._records[id].owner)
+                for id in ids
+                if id in self._records
+            }
 
     def events(self, id: str, *, after: str | None, timeout: float) -> list[Event]:
         """See `Records.events`."""

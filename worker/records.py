@@ -83,6 +83,7 @@ class Beat(NamedTuple):
 
     token: str
     beats: int
+    owner: str
 
 
 Change = Callable[[Stored], Stored]
@@ -117,8 +118,19 @@ class Records(ABC):
     """
 
     @abstractmethod
-    def create(self, stored: Stored) -> Stored:
-        """Write a new record, unless its idempotency key or its id is taken: then return the record that has it."""
+    def create(self, stored: Stored, *, max_queued: int = 0) -> Stored:
+        """Write a new record, unless its idempotency key or its id is taken: then return the record that has it.
+
+        Parameters
+        ----------
+        max_queued : int
+            Jobs of this owner that may be queued at once, the new one among them; 0: any number.
+
+        Raises
+        ------
+        TooManyQueued
+            There are as many.
+        """
 
     @abstractmethod
     def get(self, id: str) -> Stored:

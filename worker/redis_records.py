@@ -19,13 +19,14 @@ from typing import Any
 import redis
 from pliant.client.schemas import Status
 from pliant.worker.connection import reachable
-from pliant.worker.errors import UnknownJob
+from pliant.worker.errors import TooManyQueued, UnknownJob
 from pliant.worker.records import LOG_KEPT, Beat, Event, Records, Stored, event_of, events_kept
 
 LONGEST_WAIT = 20.0
 """Seconds one blocking read waits at most: below the connection's own timeout."""
 
-# ARGV: 1 prefix, 2 id, 3 version, 4 status, 5 token, 6 owner, 7 sort key, 8 bytes, 9 key digest, 10 body, 11 event, 12 data, 13 cap
+# ARGV: 1 prefix, 2 id, 3 version, 4 status, 5 token, 6 owner, 7 sort key, 8 bytes, 9 key digest, 10 body, 11 event, 12 data, 13 cap,
+# 14 most queued jobs of the owner (0: any)
 _CREATE = """
 local at = ARGV[1]
 if ARGV[9] ~= '' then
@@ -33,6 +34,8 @@ if ARGV[9] ~= '' then
   if taken then return taken end
 end
 if redis.call('EXISTS', at .. 'job:' .. ARGV[2]) == 1 then return ARGV[2] end
+local most = tonumber(ARGV[14])
+if most > 0 and redis.call('ZCARD', at .. 'index:@' .. ARGV[6] .. ':queued') >= most then return '!full' end
 if ARGV[9] ~= '' then redis.call('SET', at .. 'key:' .. ARGV[9], ARGV[2]) end
 redis.call('HSET', at .. 'job:' .. ARGV[2], 'version', ARGV[3], 'status', ARGV[4], 'token', ARGV[5], 'owner', ARGV[6],
   'sort', ARGV[7], 'bytes', ARGV[8], 'key', ARGV[9], 'body', ARGV[10], 'beat', 0)
@@ -42,6 +45,9 @@ redis.call('INCRBY', at .. 'used', ARGV[8])
 redis.call('XADD', at .. 'events:' .. ARGV[2], 'MAXLEN', ARGV[13], '*', 'name', ARGV[11], 'data', ARGV[12])
 return false
 """
+
+_FULL = "!full"
+"""What `_CREATE` answers instead of an id when the owner's queue is full; no id begins with this sign."""
 
 # ARGV: 1 prefix, 2 id, 3 version before, 4 version, 5 status, 6 token, 7 bytes, 8 body, 9 event, 10 data, 11 cap
 _REPLACE = """
@@ -103,7 +109,7 @@ class RedisRecords(Records):
         self._beat = client.register_script(_BEAT)
         self._log = client.register_script(_LOG)
 
-    def create(self, stored: Stored) -> Stored:
+    def create(self, stored: Stored, *, max_queued: int = 0) -> Stored:
         """See `Records.create`."""
         name, data = event_of(None, stored)
         job = stored.job
@@ -112,8 +118,11 @@ class RedisRecords(Records):
                 args=[
                     self._at, job.id, stored.version, job.status.value, stored.token, stored.owner, stored.sort_key,
                     stored.bytes, stored.key or "", stored.model_dump_json(), name, data, events_kept(stored),
+                    max_queued,
                 ]
             )  # fmt: skip
+        if taken == _FULL:
+            raise TooManyQueued(max_queued)
         return stored if taken is None else self.get(str(taken))
 
     def get(self, id: str) -> Stored:
@@ -199,10 +208,12 @@ class RedisRecords(Records):
         with reachable():
             pipe = self._redis.pipeline(transaction=False)
             for id in wanted:
-                pipe.hmget(f"{self._at}job:{id}", "token", "beat")
+                pipe.hmget(f"{self._at}job:{id}", "token", "beat", "owner")
             answers = pipe.execute()
         return {
-            id: Beat(token, int(beat)) for id, (token, beat) in zip(wanted, answers, strict=True) if token is not None
+            id: Beat(token, int(beat), owner)
+            for id, (token, beat, owner) in zip(wanted, answers, strict=True)
+            if token is not None
         }
 
     def events(self, id: str, *, after: str | None, timeout: float) -> list[Event]:

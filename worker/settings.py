@@ -71,6 +71,10 @@ class Settings:
     max_attempts: int = 3
     """How often a job is begun anew when workers vanish under it."""
 
+    max_running: int = 0
+    """Jobs of one owner that are worked on at once, the others wait; 0: as many as there are workers. Where tokens are off,
+    all jobs have one owner."""
+
     retention: float = 30 * 86400.0
     """How long a finished job and its files are kept; 0: for ever."""
 
@@ -158,6 +162,7 @@ VARIABLES: dict[str, tuple[str, str, Callable[[str], Any]]] = {
     "stop_grace": ("PLIANT_STOP_GRACE", *_SECONDS),
     "lost_after": ("PLIANT_LOST_AFTER", "a number of seconds, at least 1", _at_least(1, float)),
     "max_attempts": ("PLIANT_MAX_ATTEMPTS", *_ONE),
+    "max_running": ("PLIANT_MAX_RUNNING", "a whole number, at least 0", _at_least(0, int)),
     "retention": ("PLIANT_RETENTION", *_SECONDS),
     "disk_quota": ("PLIANT_DISK_QUOTA", *_BYTES),
     "upload_expiry": ("PLIANT_UPLOAD_EXPIRY", *_SECONDS),

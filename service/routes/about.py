@@ -9,7 +9,7 @@ from fastapi import APIRouter
 from fastapi.responses import JSONResponse, Response
 from pliant.client.options import Options
 from pliant.client.schemas import ServiceLimits
-from pliant.service.core import Core
+from pliant.service.core import Bound, Core
 from pliant.service.describe import problems
 from pliant.service.problems import answer, problem
 from pliant.worker.jobs import LARGEST_PAGE
@@ -24,13 +24,12 @@ def options() -> dict[str, Any]:
 
 
 @router.get("/v1/limits", summary="What this service accepts", responses=problems(401))
-def limits(core: Core) -> ServiceLimits:
-    """Return the largest body, frames, points and the like."""
+def limits(core: Core, bounds: Bound) -> ServiceLimits:
+    """Return the largest body, frames, points and the like, for the token that asks."""
     taken = {field.name for field in dataclasses.fields(core.limits)} & set(ServiceLimits.model_fields)
     return ServiceLimits(
         **{name: getattr(core.limits, name) for name in taken},
-        max_body_bytes=core.settings.max_body_bytes,
-        max_upload_bytes=core.limits.max_bytes,
+        **dataclasses.asdict(bounds),
         max_text_bytes=core.settings.max_text_bytes,
         max_wait_seconds=core.settings.max_wait_seconds,
         max_page=LARGEST_PAGE,

@@ -8,7 +8,7 @@ from typing import Annotated
 from anyio import to_thread
 from fastapi import APIRouter, Header, Path, Query, Request, Response
 from pliant.client.schemas import Job, JobPage, Status
-from pliant.service.core import Core, Mine, Service, my_uploads
+from pliant.service.core import Bound, Bounds, Core, Mine, Service, my_uploads
 from pliant.service.describe import JOB_EXAMPLE, SUBMIT_BODY, problems
 from pliant.service.forms import FormRules, receive_form
 from pliant.service.submission import FILES, TEXTS, accept
@@ -42,14 +42,14 @@ _LOCATION = {"Location": {"description": "The job's address.", "schema": {"type"
     openapi_extra={"requestBody": SUBMIT_BODY},
 )
 async def submit(
-    request: Request, response: Response, core: Core, jobs: Mine, key: Key = None, prefer: Prefer = None
+    request: Request, response: Response, core: Core, jobs: Mine, bounds: Bound, key: Key = None, prefer: Prefer = None
 ) -> Job:
     """Read the tracks and whatever comes with them, check them, and queue the job.
 
     An answer of 202 is a promise: the job is stored and will end with a result or a reason, whatever is killed meanwhile.
     Any other answer means that nothing was queued and nothing kept.
     """
-    job, _ = await _receive(request, core, jobs, idempotency_key=key)
+    job, _ = await _receive(request, core, jobs, bounds, idempotency_key=key)
     response.headers["Location"] = f"/v1/jobs/{job.id}"
     return await _waited(job, core, jobs, prefer, response)
 
@@ -65,12 +65,14 @@ async def submit(
     },
     openapi_extra={"requestBody": SUBMIT_BODY},
 )
-async def put(id: Id, request: Request, response: Response, core: Core, jobs: Mine, prefer: Prefer = None) -> Job:
+async def put(
+    id: Id, request: Request, response: Response, core: Core, jobs: Mine, bounds: Bound, prefer: Prefer = None
+) -> Job:
     """Do as `POST` does, under an id that you choose: 3 to 64 letters, digits, underscores or dashes.
 
     Repeating the request is safe: the same content returns the same job with 200, other content is refused with 409.
     """
-    job, new = await _receive(request, core, jobs, id=id)
+    job, new = await _receive(request, core, jobs, bounds, id=id)
     response.status_code = 202 if new else 200
     response.headers["Location"] = f"/v1/jobs/{job.id}"
     return await _waited(job, core, jobs, prefer, response)
@@ -120,17 +122,24 @@ def delete(id: Id, jobs: Mine) -> None:
 
 
 async def _receive(
-    request: Request, core: Service, jobs: Jobs, *, id: str | None = None, idempotency_key: str | None = None
+    request: Request,
+    core: Service,
+    jobs: Jobs,
+    bounds: Bounds,
+    *,
+    id: str | None = None,
+    idempotency_key: str | None = None,
 ) -> tuple[Job, bool]:
     """Receive a form into a room of its own and submit what it holds; the room is gone afterwards, whatever happened."""
     settings = core.settings
     rules = FormRules(
         files=FILES,
         texts=TEXTS,
-        max_body_bytes=settings.max_body_bytes,
+        max_body_bytes=bounds.max_body_bytes,
         max_text_bytes=settings.max_text_bytes,
         stall_seconds=settings.stall_seconds,
     )
+    await to_thread.run_sync(lambda: jobs.check_room(id=id, idempotency_key=idempotency_key))
     with core.incoming.room() as room:
         form = await receive_form(request, room, rules=rules)
         return await to_thread.run_sync(

@@ -21,7 +21,7 @@ import anyio
 from anyio import to_thread
 from fastapi import APIRouter, Header, Path, Request, Response
 from pliant.client.schemas import Upload
-from pliant.service.core import Core, MyUploads, Service
+from pliant.service.core import Bounds, Core, MyUploads, Service, bounds_of
 from pliant.service.describe import problems
 from pliant.service.forms import batches
 from pliant.service.problems import Refusal
@@ -172,7 +172,7 @@ class Sending:
 
 async def _receive(request: Request, core: Service, *, uploads: Uploads, id: str, sending: Sending) -> None:
     """Write the body as it arrives. If it breaks off, what has arrived stays: that is where the client goes on."""
-    room = await to_thread.run_sync(partial(_room, core, uploads, id))
+    room = await to_thread.run_sync(partial(_room, core, uploads, id, bounds_of(request)))
     held = uploads.write(id, offset=sending.offset, length=sending.length, room=room)
     try:
         writer: Writer = await to_thread.run_sync(held.__enter__)
@@ -191,10 +191,10 @@ async def _receive(request: Request, core: Service, *, uploads: Uploads, id: str
             await to_thread.run_sync(held.__exit__, None, None, None)
 
 
-def _room(core: Service, uploads: Uploads, id: str) -> Room:
+def _room(core: Service, uploads: Uploads, id: str, bounds: Bounds) -> Room:
     quota = core.jobs.settings.disk_quota
     used = core.jobs.used() + uploads.used() - uploads.size(id) if quota > 0 else 0
-    return Room(max_bytes=core.limits.max_bytes, quota=quota, used=used)
+    return Room(max_bytes=bounds.max_upload_bytes, quota=quota, used=used)
 
 
 async def _already(uploads: Uploads, id: str, sending: Sending) -> Upload | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import threading
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -16,6 +17,7 @@ from pliant.worker.errors import (
     NotAllowedNow,
     QuotaExceeded,
     StaleAttempt,
+    TooManyQueued,
     UnknownArtifact,
     UnknownJob,
 )
@@ -326,3 +328,50 @@ def test_readiness_names_each_part(jobs: Jobs) -> None:
     found = jobs.ready()
     assert (found["redis"], found["blobs"]) == ("ok", "ok")
     assert found["workers"] == "ok" or "pliant work" in found["workers"]
+
+
+def test_no_more_of_an_owners_jobs_wait_than_may(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
+    ada, bob = (dataclasses.replace(jobs.of(owner), max_queued=2) for owner in ("ada", "bob"))
+    first, _ = submit(ada), submit(ada, id="second", fingerprint="f")
+    before = blob_names(jobs)
+    ada.check_room(id="second")
+    for refused in (
+        lambda: submit(ada),
+        lambda: ada.check_room(id="third"),
+        lambda: ada.check_room(idempotency_key="k"),
+    ):
+        with pytest.raises(TooManyQueued, match="2 of your jobs wait"):
+            refused()
+    assert blob_names(jobs) == before, "what was refused leaves no file"
+    assert submit(ada, id="second", fingerprint="f").id == "second"
+    submit(bob)
+    submit(jobs)
+    claim(jobs, first.id)
+    submit(ada)
+    with pytest.raises(TooManyQueued):
+        submit(ada)
+
+
+def test_submissions_at_the_same_moment_do_not_slip_past_the_limit(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
+    ada = dataclasses.replace(jobs.of("ada"), max_queued=3)
+    refused: list[Exception] = []
+
+    def one() -> None:
+        try:
+            submit(ada)
+        except TooManyQueued as error:
+            refused.append(error)
+
+    threads = [threading.Thread(target=one) for _ in range(12)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert (ada.count([Status.QUEUED]), len(refused)) == (3, 9)
+
+
+def test_a_repeated_key_finds_its_job_though_the_queue_is_full(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
+    ada = dataclasses.replace(jobs.of("ada"), max_queued=1)
+    job = submit(ada, idempotency_key="k", fingerprint="f")
+    ada.check_room(idempotency_key="k")
+    assert submit(ada, idempotency_key="k", fingerprint="f").id == job.id

@@ -252,3 +252,63 @@ def test_it_removes_uploads_that_have_expired(world: World) -> None:
     world.pass_seconds(31)
     assert uploads.find("old") is None
     assert uploads.find("young") is not None
+
+
+def test_no_more_of_an_owners_jobs_run_than_may_and_the_next_begins_when_one_ends(
+    tmp_path: Path, inputs_file: Path, interpretation: Interpretation
+) -> None:
+    world = World(tmp_path, max_running=2)
+
+    def made(owner: str) -> str:
+        jobs = world.jobs.of(owner)
+        world.now += timedelta(milliseconds=10)
+        return jobs.submit(inputs_file, options=Options(), interpretation=interpretation).id
+
+    def waiting() -> list[str]:
+        return [token.rpartition("-")[0] for token in world.jobs.queue.waiting()]
+
+    adas = [made("ada") for _ in range(5)]
+    bobs = [made("bob")]
+    assert waiting() == [*adas[:2], *bobs]
+    world.pass_seconds(30)
+    assert waiting() == [*adas[:2], *bobs], "what is held back is not taken for forgotten"
+    assert findings(world.jobs, settle=0) == []
+    tokens = [world.claim(adas[0]), world.claim(adas[1])]
+
+    def alive() -> None:
+        for id, token in zip(adas, tokens, strict=False):
+            world.jobs.records.beat(id, token)
+
+    world.pass_seconds(10, meanwhile=alive)
+    assert waiting() == bobs
+    world.jobs.cancel(adas[0])
+    stopped = lambda held: lifecycle.stop(held, token=tokens[0], now=world.now, retention=0)  # noqa: E731
+    world.pass_seconds(10, meanwhile=alive)
+    assert waiting() == bobs, "a job being cancelled still runs"
+    world.jobs.records.update(adas[0], stopped)
+    world.pass_seconds(1, meanwhile=alive)
+    assert waiting() == [*bobs, adas[2]], "at the next look, the oldest first"
+    world.pass_seconds(10, meanwhile=alive)
+    assert waiting() == [*bobs, adas[2]]
+    world.jobs.cancel(adas[3])
+    world.jobs.cancel(adas[2])
+    world.pass_seconds(1, meanwhile=alive)
+    assert waiting() == [*bobs, adas[4]]
+    assert "forgotten" not in world.jobs.log(adas[4])
+
+
+def test_a_job_on_its_way_to_a_worker_counts_as_running(
+    tmp_path: Path, inputs_file: Path, interpretation: Interpretation
+) -> None:
+    world = World(tmp_path, max_running=1)
+    first, second = (
+        world.jobs.submit(inputs_file, options=Options(), interpretation=interpretation, id=f"job-{n}").id for n in "12"
+    )
+    world.pass_seconds(1)
+    token = world.jobs.records.get(first).token
+    world.jobs.queue.remove(token)  # taken by a worker that has not claimed it yet
+    world.pass_seconds(2)
+    assert world.jobs.queue.waiting() == []
+    world.pass_seconds(2)
+    assert [each.rpartition("-")[0] for each in world.jobs.queue.waiting()] == [first], "lost on its way: queued again"
+    assert world.jobs.get(second).status is Status.QUEUED
