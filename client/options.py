@@ -5,9 +5,9 @@ The solver's part mirrors `pliant.solver.Settings` field for field; a test holds
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
 SOLVER_FIELDS = (
     "method", "camera", "basis_size", "refine_rotations", "preset", "temporal_weight", "spatial_weight", "robust_scale",
@@ -16,6 +16,22 @@ SOLVER_FIELDS = (
 """The fields that go to the solver; the others say how to read the input or write the result."""
 
 Weight = Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
+
+Output = Literal["glb", "ply", "obj", "usd", "mat", "csv"]
+"""A result file that is written if asked for; `shapes.npz`, `report.json` and `preview.bin` always are."""
+
+
+def _listed(given: object) -> object:
+    """Take `"glb,mat"` for `["glb", "mat"]`, as command lines and forms send it."""
+    return [word.strip() for word in given.split(",") if word.strip()] if isinstance(given, str) else given
+
+
+def _in_order(given: tuple[Output, ...]) -> tuple[Output, ...]:
+    """Each once and in one order, so that equal wishes are equal records."""
+    return tuple(name for name in get_args(Output) if name in given)
+
+
+Outputs = Annotated[tuple[Output, ...], Field(max_length=64), BeforeValidator(_listed), AfterValidator(_in_order)]
 
 
 class Options(BaseModel):
@@ -79,6 +95,26 @@ class Options(BaseModel):
     )
     fps: float = Field(
         25.0, gt=0, le=1000, allow_inf_nan=False, description="Frames per second of the written animation."
+    )
+    outputs: Outputs = Field(
+        ("glb", "ply", "csv"),
+        description="Files to write besides shapes.npz, report.json and preview.bin. glb: animated glTF. ply, obj: one mesh a frame, in a "
+        "zip. usd: USD with time samples. mat: MATLAB. csv: metrics of every frame and of every point.",
+    )
+    normals: Literal["static", "animated", "none"] = Field(
+        "static",
+        description="static: shapes.glb has normals of its first shape. animated: they move with the shape, and are in every frame of PLY, "
+        "OBJ and USD, too. none: viewers make their own.",
+    )
+    colours: Literal["none", "error"] = Field(
+        "none",
+        description="none: no colours. error: points are coloured by their distance from the ground truth, or by their reprojection "
+        "residual where there is none: in every frame in PLY, OBJ and USD, by the mean over frames in shapes.glb.",
+    )
+    glb_quantized: bool = Field(
+        False,
+        description="Write shapes.glb with 16-bit positions (KHR_mesh_quantization): two thirds of the size or less, and coarser by "
+        "a 65,534th of the largest extent.",
     )
 
     layout: Literal["auto", "frames_points", "points_frames"] = Field(

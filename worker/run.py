@@ -12,7 +12,7 @@ from pliant.client.options import SOLVER_FIELDS, Options
 from pliant.client.schemas import Artifact, Progress
 from pliant.solver import Outcome, Settings, Solution, Step, solve
 from pliant.solver.metrics import evaluate
-from pliant.worker.artifacts import build_report, write_artifacts
+from pliant.worker.artifacts import build_report, kinds_for, write_artifacts
 from pliant.worker.errors import Interrupted, TimedOut
 from pliant.worker.formats import Inputs
 from pliant.worker.progress import Teller
@@ -73,8 +73,9 @@ def reconstruct(
     TimedOut
         It took longer than `options.time_limit`.
     InvalidInput
-        The inputs and the options do not fit together.
+        The inputs and the options do not fit together, or a file is asked for that cannot be written here.
     """
+    kinds_for(options)  # what cannot be written is refused before anything is computed
     teller = Teller(on_progress if on_progress is not None else _silent)
     directory.mkdir(parents=True, exist_ok=True)
     teller.part("loading", 1.0)

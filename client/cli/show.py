@@ -161,6 +161,8 @@ def allowed(entry: Mapping[str, Any]) -> str:
     for variant in entry.get("anyOf", [entry]):
         if "enum" in variant:
             said.append(" | ".join(map(str, variant["enum"])))
+        elif "enum" in variant.get("items", {}):
+            said.append("any of " + ", ".join(map(str, variant["items"]["enum"])))
         elif "$ref" not in variant and variant.get("type") != "null":
             signs = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
             bounds = [f"{sign} {variant[key]:g}" for key, sign in signs.items() if key in variant]

@@ -3,15 +3,19 @@
 Viewers are right up to about 256 targets and slow beyond. Up to 200 frames each frame is its own target and the weights are one-hot, so
 every frame is exact in single precision. Above, the frames minus their mean are expanded in principal components (SVD); the weights are the
 coefficients, shifted and scaled into [0, 1] because viewers clamp weights to the slider's range (others come out wrong in Blender).
+
+Targets are made when they are asked for, and everything over all frames goes through a block of points at a time: what is held
+beside the shapes is a frame, or the modes, never another copy of the sequence.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from pliant.worker.artifacts.geometry import Floats, Singles
+from pliant.worker.artifacts.geometry import Floats, Singles, upright
 
 MAX_FRAME_TARGETS = 200
 MAX_MODES = 200
@@ -22,13 +26,13 @@ ERROR_BOUND = 1e-3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Animation:
-    """Points of frame f = base + Σ_k weights[f, k] · targets[k]."""
+    """Points of frame f = base + Σ_k weights[f, k] · target(k)."""
 
     base: Singles
     """Shape `(P, 3)`, what a viewer shows that does not animate."""
 
-    targets: Singles
-    """Shape `(K, P, 3)`, displacements."""
+    target: Callable[[int], Singles]
+    """Displacements `(P, 3)` of target k."""
 
     weights: Singles
     """Shape `(F, K)`, in [0, 1]."""
@@ -39,74 +43,94 @@ class Animation:
     extras: dict[str, Any]
     """What the file says of itself: encoding and error bound, in the tracks' unit."""
 
-    def frame(self, index: int) -> Floats:
-        """Points `(P, 3)` as a viewer computes them."""
-        return self.base.astype(np.float64) + np.tensordot(self.weights[index].astype(np.float64), self.targets, axes=1)
+
+def animate(shapes: Floats, *, y_axis: str = "up") -> Animation:
+    """Encode shapes `(F, P, 3)`, turned to y up, exactly, or within the bound where there are more than 200 frames."""
+    return (_per_frame if len(shapes) <= MAX_FRAME_TARGETS else _modes)(shapes, y_axis)
 
 
-def animate(shapes: Floats) -> Animation:
-    """Encode shapes `(F, P, 3)` exactly, or within the bound where there are more than 200 frames."""
-    return _per_frame(shapes) if len(shapes) <= MAX_FRAME_TARGETS else _modes(shapes)
-
-
-def _per_frame(shapes: Floats) -> Animation:
+def _per_frame(shapes: Floats, y_axis: str) -> Animation:
     frames = len(shapes)
-    base = shapes[0].astype(np.float32)
-    targets = (shapes - base).astype(np.float32)
-    worst = max(float(np.abs(base + target - shape).max()) for target, shape in zip(targets, shapes, strict=True))
+    base = upright(shapes[0], y_axis).astype(np.float32)
+
+    def target(index: int) -> Singles:
+        return (upright(shapes[index], y_axis) - base).astype(np.float32)
+
+    worst = max(float(np.abs(base + target(index) - upright(shapes[index], y_axis)).max()) for index in range(frames))
     return Animation(
         base=base,
-        targets=targets,
+        target=target,
         weights=np.eye(frames, dtype=np.float32),
         names=[f"frame {index}" for index in range(frames)],
         extras={"encoding": "one target per frame", "targets": frames, "max_error": worst},
     )
 
 
-def _modes(shapes: Floats) -> Animation:
+def _modes(shapes: Floats, y_axis: str) -> Animation:
     frames, count, _ = shapes.shape
-    mean = shapes.mean(axis=0)
-    moved = (shapes - mean).reshape(frames, -1)
+    mean = upright(shapes.mean(axis=0), y_axis)
     # The eigenvectors of the F × F Gram matrix are the left singular vectors; F is small beside 3P.
-    values, vectors = np.linalg.eigh(moved @ moved.T)
+    gram = np.zeros((frames, frames))
+    for _, moved in _blocks(shapes, y_axis, mean):
+        gram += moved @ moved.T
+    values, vectors = np.linalg.eigh(gram)
     left = vectors[:, np.argsort(values)[::-1]]
-    diagonal = float(np.linalg.norm(shapes.max(axis=(0, 1)) - shapes.min(axis=(0, 1))))
-    allowed = ERROR_BOUND * diagonal
-    kept = _smallest(moved, left, allowed)
+    allowed = ERROR_BOUND * float(np.linalg.norm(shapes.max(axis=(0, 1)) - shapes.min(axis=(0, 1))))
+    kept = _smallest(shapes, y_axis, mean, left, allowed)
     coefficients = left[:, :kept] * np.sqrt(frames)
-    modes = (coefficients.T @ moved / frames).reshape(kept, count, 3)
     low, high = coefficients.min(axis=0), coefficients.max(axis=0)
     width = np.where(high > low, high - low, 1.0)
-    made = Animation(
-        base=(mean + np.tensordot(low, modes, axes=1)).astype(np.float32),
-        targets=(modes * width[:, None, None]).astype(np.float32),
-        weights=np.clip((coefficients - low) / width, 0, 1).astype(np.float32),
+    base, targets = np.zeros((count, 3), np.float32), np.zeros((kept, count, 3), np.float32)
+    for some, moved in _blocks(shapes, y_axis, mean):
+        modes = (coefficients.T @ moved / frames).reshape(kept, -1, 3)
+        base[some] = mean[some] + np.tensordot(low, modes, axes=1)
+        targets[:, some] = modes * width[:, None, None]
+    weights = np.clip((coefficients - low) / width, 0, 1).astype(np.float32)
+    worst, rms = _rounded_errors(shapes, y_axis, base, targets, weights)
+    return Animation(
+        base=base,
+        target=lambda index: targets[index],
+        weights=weights,
         names=[f"mode {index}" for index in range(kept)],
-        extras={"encoding": "modes", "targets": kept, "error_bound": allowed},
+        extras={"encoding": "modes", "targets": kept, "error_bound": allowed, "max_error": worst, "rms_error": rms},
     )
-    errors = [np.linalg.norm(made.frame(index) - shapes[index], axis=1) for index in range(frames)]
-    made.extras["max_error"] = float(max(error.max() for error in errors))
-    made.extras["rms_error"] = float(np.sqrt(np.mean([np.mean(error**2) for error in errors])))
-    return made
 
 
-def _smallest(moved: Floats, left: Floats, allowed: float) -> int:
+def _blocks(shapes: Floats, y_axis: str, origin: Floats | Singles) -> Iterator[tuple[slice, Floats]]:
+    """Displacements from one shape `(P, 3)`, y up, as `(F, 3 · points)`, a block of points at a time."""
+    for start in range(0, shapes.shape[1], BLOCK):
+        some = slice(start, start + BLOCK)
+        yield some, (upright(shapes[:, some], y_axis) - origin[some]).reshape(len(shapes), -1)
+
+
+def _smallest(shapes: Floats, y_axis: str, mean: Floats, left: Floats, allowed: float) -> int:
     """Few modes whose worst point is within 90 % of what is allowed (the rest is for rounding), by bisection; at most 200."""
     low, high = 1, min(MAX_MODES, int(left.shape[1]))
     while low < high:
         middle = (low + high) // 2
-        if _worst(moved, left[:, :middle]) <= 0.9 * allowed:
+        if _worst(_blocks(shapes, y_axis, mean), left[:, :middle]) <= 0.9 * allowed:
             high = middle
         else:
             low = middle + 1
     return high
 
 
-def _worst(moved: Floats, left: Floats) -> float:
-    """Largest distance of a point from its projection on the modes; in blocks of points, to spare memory."""
+def _worst(blocks: Iterator[tuple[slice, Floats]], left: Floats) -> float:
+    """Largest distance of a point from its projection on the modes."""
     worst = 0.0
-    for start in range(0, moved.shape[1], 3 * BLOCK):
-        block = moved[:, start : start + 3 * BLOCK]
-        rest = block - left @ (left.T @ block)
+    for _, moved in blocks:
+        rest = moved - left @ (left.T @ moved)
         worst = max(worst, float((rest.reshape(len(rest), -1, 3) ** 2).sum(axis=2).max()))
     return float(np.sqrt(worst))
+
+
+def _rounded_errors(
+    shapes: Floats, y_axis: str, base: Singles, targets: Singles, weights: Singles
+) -> tuple[float, float]:
+    """Worst and root mean square distance of a point from where a viewer puts it, which computes with the rounded numbers."""
+    worst, total = 0.0, 0.0
+    for some, moved in _blocks(shapes, y_axis, base):
+        modes = targets[:, some].reshape(len(targets), -1).astype(np.float64)
+        squared = np.square(moved - weights.astype(np.float64) @ modes).reshape(len(shapes), -1, 3).sum(axis=2)
+        worst, total = max(worst, float(squared.max())), total + float(squared.sum())
+    return float(np.sqrt(worst)), float(np.sqrt(total / shapes[..., 0].size))

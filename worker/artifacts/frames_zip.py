@@ -1,43 +1,98 @@
-"""One mesh file a frame in a zip, as programs for captured motion read them."""
+"""One mesh file a frame in a zip, as programs for captured motion read them: PLY or OBJ."""
 
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import IO
 
 import numpy as np
-from pliant.worker.artifacts.geometry import Floats, Ints
+from pliant.worker.artifacts.geometry import Floats, triangles_of, vertex_normals
+from pliant.worker.artifacts.result import Result
 
 FIRST_DAY = (1980, 1, 1, 0, 0, 0)
 
+OnProgress = Callable[[float], None]
 
-def write_ply_zip(
-    file: IO[bytes], shapes: Floats, faces: Ints, *, y_axis: str, on_progress: Callable[[float], None] | None = None
-) -> None:
+
+def write_ply_zip(result: Result, file: IO[bytes], on_progress: OnProgress) -> None:
     """Binary little-endian PLY of every frame, `frame_00000.ply` …; single precision, axes and unit of the tracks."""
+    faces = result.faces
     rows = np.zeros(len(faces), dtype=[("count", "u1"), ("index", "<i4", (faces.shape[1],))])
     rows["count"], rows["index"] = faces.shape[1], faces
-    depth = "away from" if y_axis == "down" else "towards"
-    head = (
-        "ply\nformat binary_little_endian 1.0\n"
-        f"comment x right, y {y_axis}, z {depth} the first camera; unit of the tracks\n"
-        f"element vertex {shapes.shape[1]}\nproperty float x\nproperty float y\nproperty float z\n"
-        f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
-    ).encode()
     tail = rows.tobytes()
-    frames = (head + shape.astype("<f4").tobytes() + tail for shape in shapes)
-    _write_members(file, frames, len(shapes), "ply", on_progress)
+
+    def content(frame: int) -> bytes:
+        points, normals, colours = _frame(result, frame)
+        fields = [("float", name, column) for name, column in zip("xyz", points.T, strict=True)]
+        if normals is not None:
+            fields += [("float", name, column) for name, column in zip(("nx", "ny", "nz"), normals.T, strict=True)]
+        if colours is not None:
+            bright = np.rint(colours * 255)
+            fields += [("uchar", name, column) for name, column in zip(("red", "green", "blue"), bright.T, strict=True)]
+        types = {"float": "<f4", "uchar": "u1"}
+        table = np.zeros(len(points), dtype=[(name, types[kind]) for kind, name, _ in fields])
+        for _, name, column in fields:
+            table[name] = column
+        head = [
+            "ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in _said(result)),
+            f"element vertex {len(points)}", *(f"property {kind} {name}" for kind, name, _ in fields),
+            f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header\n",
+        ]  # fmt: skip
+        return "\n".join(head).encode() + table.tobytes() + tail
+
+    _write_members(file, content, len(result.solution.shapes), "ply", on_progress)
+
+
+def write_obj_zip(result: Result, file: IO[bytes], on_progress: OnProgress) -> None:
+    """Wavefront OBJ of every frame, `frame_00000.obj` …; nine digits, which is single precision, axes and unit of the tracks.
+
+    Colours, if there are any, stand behind the coordinates, as MeshLab, Blender and Open3D read them.
+    """
+    head = "".join(f"# {line}\n" for line in _said(result))
+    moving = result.options.normals == "animated" and len(result.faces) > 0
+    corner = "{0}//{0}" if moving else "{0}"
+    tail = "".join("f " + " ".join(corner.format(index + 1) for index in face) + "\n" for face in result.faces.tolist())
+    if len(result.faces) == 0:
+        tail = "".join(f"p {index + 1}\n" for index in range(result.solution.shapes.shape[1]))
+
+    def content(frame: int) -> bytes:
+        points, normals, colours = _frame(result, frame)
+        vertices = _lines("v", points, "%.9g") if colours is None else _lines("v", np.hstack([points, colours]), "%.9g")
+        return (head + vertices + ("" if normals is None else _lines("vn", normals, "%.6g")) + tail).encode()
+
+    _write_members(file, content, len(result.solution.shapes), "obj", on_progress)
+
+
+def _frame(result: Result, frame: int) -> tuple[Floats, Floats | None, Floats | None]:
+    """Points, normals and sRGB colours `(P, 3)` of one frame; None for what is not wanted."""
+    points = result.solution.shapes[frame].astype(np.float32).astype(np.float64)
+    moving = result.options.normals == "animated" and len(result.faces) > 0
+    normals = vertex_normals(points, triangles_of(result.faces)).astype(np.float64) if moving else None
+    return points, normals, None if result.painting is None else result.painting.frame(frame)
+
+
+def _said(result: Result) -> list[str]:
+    depth = "away from" if result.y_axis == "down" else "towards"
+    said = [f"x right, y {result.y_axis}, z {depth} the first camera; unit of the tracks"]
+    if result.painting is not None:
+        said.append(f"colour: {result.painting.quantity}, dark at 0, bright at {result.painting.top:.6g} and above")
+    return said
+
+
+def _lines(word: str, rows: Floats, number: str) -> str:
+    """Rows `(N, width)` as lines that begin with a word."""
+    line = " ".join([word] + [number] * rows.shape[1]) + "\n"
+    return (line * len(rows)) % tuple(rows.ravel().tolist())
 
 
 def _write_members(
-    file: IO[bytes], frames: Iterable[bytes], count: int, suffix: str, on_progress: Callable[[float], None] | None
+    file: IO[bytes], content: Callable[[int], bytes], count: int, suffix: str, on_progress: OnProgress
 ) -> None:
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-        for index, content in enumerate(frames):
+        for index in range(count):
             # A fixed date, so that equal results are equal files.
             archive.writestr(
-                zipfile.ZipInfo(f"frame_{index:05d}.{suffix}", FIRST_DAY), content, zipfile.ZIP_DEFLATED, 1
+                zipfile.ZipInfo(f"frame_{index:05d}.{suffix}", FIRST_DAY), content(index), zipfile.ZIP_DEFLATED, 1
             )
-            if on_progress is not None:
-                on_progress((index + 1) / count)
+            on_progress((index + 1) / count)

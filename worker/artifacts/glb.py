@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
 from importlib.metadata import version
 from typing import IO, Any
 
@@ -23,37 +24,44 @@ POINTS, TRIANGLES = 0, 4
 CLAY = [0.74, 0.62, 0.55, 1.0]
 
 
+Array = NDArray[np.generic]
+Make = Callable[[], Array]
+
+
 class Buffer:
-    """Arrays in the order they will be written, and the glTF objects that point at them."""
+    """Arrays in the order they will be written, and the glTF objects that point at them.
+
+    An array given as a function is made twice, once to be described and once to be written, and not held in between.
+    """
 
     def __init__(self) -> None:
-        self.parts: list[NDArray[np.generic]] = []
+        self.parts: list[tuple[Make, int]] = []
         self.views: list[dict[str, Any]] = []
         self.accessors: list[dict[str, Any]] = []
         self.bytes = 0
 
     def add(
-        self, array: NDArray[np.generic], *, target: int | None = None, bounds: bool = False, normalised: bool = False
+        self, given: Array | Make, *, target: int | None = None, bounds: bool = False, normalised: bool = False
     ) -> int:
         """Append an array `(N,)` or `(N, width)` as a view of its own; returns the accessor's index.
 
         Rows of vertex data start at multiples of four bytes, so rows of other lengths are padded with zeros.
         """
+        make: Make = given if callable(given) else lambda: given
+        array = make()
         rows = array.reshape(len(array), -1)
-        width = rows.shape[1]
+        count, width = rows.shape
         size = rows.dtype.itemsize
-        padded = rows
+        stride = width * size
         view: dict[str, Any] = {"buffer": 0, "byteOffset": self.bytes}
-        if target == VERTICES and (width * size) % 4:
-            stride = -(-width * size // 4) * 4
-            padded = np.zeros((len(rows), stride // size), dtype=rows.dtype)
-            padded[:, :width] = rows
+        if target == VERTICES and stride % 4:
+            stride = -(-stride // 4) * 4
             view["byteStride"] = stride
         if target is not None:
             view["target"] = target
-        view["byteLength"] = padded.nbytes
+        view["byteLength"] = count * stride
         accessor: dict[str, Any] = {
-            "bufferView": len(self.views), "componentType": COMPONENTS[rows.dtype.name], "count": len(rows), "type": TYPES[width],
+            "bufferView": len(self.views), "componentType": COMPONENTS[rows.dtype.name], "count": count, "type": TYPES[width],
         }  # fmt: skip
         if normalised:
             accessor["normalized"] = True
@@ -61,14 +69,23 @@ class Buffer:
             accessor["min"], accessor["max"] = rows.min(axis=0).tolist(), rows.max(axis=0).tolist()
         self.views.append(view)
         self.accessors.append(accessor)
-        self.parts.append(padded)
-        self.bytes += -(-padded.nbytes // 4) * 4
+        self.parts.append((make, stride))
+        self.bytes += -(-count * stride // 4) * 4
         return len(self.accessors) - 1
+
+    def chunks(self) -> Iterator[bytes]:
+        """Yield the bytes of one array after the other, little-endian, each padded to a multiple of four."""
+        for make, stride in self.parts:
+            array = make()
+            rows = array.reshape(len(array), -1).astype(array.dtype.newbyteorder("<"), copy=False)
+            padded = np.zeros((len(rows), stride // rows.dtype.itemsize), dtype=rows.dtype)
+            padded[:, : rows.shape[1]] = rows
+            yield padded.tobytes() + b"\0" * (-padded.nbytes % 4)
 
 
 def write_glb(
     file: IO[bytes], animation: Animation, triangles: Ints, *, fps: float, node: dict[str, Any], normals: str = "static",
-    quantized: bool = False, colours: NDArray[np.uint8] | None = None, on_progress: Callable[[float], None] | None = None,
+    quantized: bool = False, colours: NDArray[np.uint16] | None = None, on_progress: Callable[[float], None] | None = None,
 ) -> None:  # fmt: skip
     """Write the animation.
 
@@ -88,16 +105,17 @@ def write_glb(
         `static`: of the base shape; `animated`: displaced with every target; `none`.
     quantized : bool
         16-bit positions by KHR_mesh_quantization.
-    colours : array of uint8, shape (P, 4), optional
-        RGBA of every point.
+    colours : array of uint16, shape (P, 4), optional
+        RGBA of every point, linear light, 65535 for 1.
     on_progress : callable, optional
         Told the share of bytes written.
     """
     buffer = Buffer()
     placed = dict(node)
-    positions, targets = animation.base, animation.targets
+    positions: Array = animation.base
+    target: Callable[[int], Array] = animation.target
     if quantized:
-        positions, targets, placed = _quantize(animation, node)  # type: ignore[assignment]
+        positions, target, placed = _quantize(animation, node)
     smooth = normals if len(triangles) else "none"
     attributes = {"POSITION": buffer.add(positions, target=VERTICES, bounds=True, normalised=quantized)}
     base_normals = vertex_normals(animation.base, triangles) if smooth != "none" else None
@@ -115,9 +133,8 @@ def write_glb(
         primitive["indices"] = buffer.add(
             triangles.reshape(-1).astype(np.uint16 if short else np.uint32), target=INDICES
         )
-    primitive["targets"] = _targets(
-        buffer, animation, targets, quantized, triangles, base_normals if smooth == "animated" else None
-    )
+    moving = base_normals if smooth == "animated" else None
+    primitive["targets"] = _targets(buffer, animation, target, quantized=quantized, triangles=triangles, base=moving)
     times = (np.arange(len(animation.weights)) / fps).astype(np.float32)
     sampler = {
         "input": buffer.add(times, bounds=True),
@@ -151,34 +168,40 @@ def write_glb(
 def _targets(
     buffer: Buffer,
     animation: Animation,
-    targets: NDArray[np.generic],
+    target: Callable[[int], Array],
+    *,
     quantized: bool,
     triangles: Ints,
     base: Singles | None,
 ) -> list[dict[str, int]]:
+    def turned(index: int) -> Singles:
+        # A mode's normals are those of the base moved by the whole mode: first order in the motion, as viewers blend them.
+        assert base is not None
+        return vertex_normals(animation.base + animation.target(index), triangles) - base
+
     found = []
-    for index, target in enumerate(targets):
-        entry = {"POSITION": buffer.add(target, target=VERTICES, bounds=True, normalised=quantized)}
+    for index in range(len(animation.names)):
+        entry = {"POSITION": buffer.add(partial(target, index), target=VERTICES, bounds=True, normalised=quantized)}
         if base is not None:
-            # A mode's normals are those of the base moved by the whole mode: first order in the motion, as viewers blend them.
-            turned = vertex_normals(animation.base + animation.targets[index], triangles)
-            entry["NORMAL"] = buffer.add(turned - base, target=VERTICES)
+            entry["NORMAL"] = buffer.add(partial(turned, index), target=VERTICES)
         found.append(entry)
     return found
 
 
-def _quantize(
-    animation: Animation, node: dict[str, Any]
-) -> tuple[NDArray[np.int16], NDArray[np.int16], dict[str, Any]]:
+def _quantize(animation: Animation, node: dict[str, Any]) -> tuple[Array, Callable[[int], Array], dict[str, Any]]:
     """Positions and displacements as 16-bit fractions of one common size, which the node's scale undoes."""
     low, high = animation.base.min(axis=0), animation.base.max(axis=0)
     centre = ((low + high) / 2).astype(np.float64)
-    size = max(float(np.abs(animation.base - centre).max()), float(np.abs(animation.targets).max(initial=0.0)), 1e-30)
+    moved = max(float(np.abs(animation.target(index)).max()) for index in range(len(animation.names)))
+    size = max(float(np.abs(animation.base - centre).max()), moved, 1e-30)
+
+    def target(index: int) -> Array:
+        return np.asarray(np.rint(animation.target(index) / size * 32767).astype(np.int16))
+
     positions = np.rint((animation.base - centre) / size * 32767).astype(np.int16)
-    targets = np.rint(animation.targets / size * 32767).astype(np.int16)
     scale = float(node.get("scale", [1.0])[0])
     placed = {**node, "scale": [scale * size] * 3, "translation": (scale * centre).tolist()}
-    return positions, targets, placed
+    return positions, target, placed
 
 
 def _material(coloured: bool) -> dict[str, Any]:
@@ -197,8 +220,7 @@ def _write(
     file.write(struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + buffer.bytes))
     file.write(struct.pack("<I4s", len(text), b"JSON") + text)
     file.write(struct.pack("<I4s", buffer.bytes, b"BIN\0"))
-    for index, part in enumerate(buffer.parts):
-        file.write(np.ascontiguousarray(part, dtype=part.dtype.newbyteorder("<")).data)
-        file.write(b"\0" * (-part.nbytes % 4))
+    for index, chunk in enumerate(buffer.chunks()):
+        file.write(chunk)
         if on_progress is not None:
             on_progress((index + 1) / len(buffer.parts))

@@ -48,7 +48,7 @@ export class OptionsForm {
     const given: Options = {};
     for (const field of this.fields) {
       const value = field.read();
-      if (value !== undefined && value !== (field.schema.default ?? null)) given[field.name] = value;
+      if (value !== undefined && JSON.stringify(value) !== JSON.stringify(field.schema.default ?? null)) given[field.name] = value;
     }
     return given;
   }
@@ -71,7 +71,10 @@ export class OptionsForm {
     control.element.addEventListener("change", () => {
       hint.textContent = describe(schema, String(control.read() ?? ""));
     });
-    const label = h("label", { for: id }, name.replaceAll("_", " "));
+    const title = name.replaceAll("_", " ");
+    const group = control.element.getAttribute("role") === "group";
+    if (group) control.element.setAttribute("aria-label", title);
+    const label = group ? h("span", {}, title) : h("label", { for: id }, title);
     return h("div", { class: "option" }, label, control.element, hint);
   }
 }
@@ -88,6 +91,7 @@ function controlFor(schema: Schema, id: string): Control {
   const values = main.enum ?? (main.const === undefined ? undefined : [main.const]);
   if (values) return choice(id, values, nullable, initial);
   if (main.type === "boolean") return tick(id, initial === true);
+  if (main.type === "array" && main.items?.enum) return several(id, main.items.enum, initial);
   return entry(id, main, nullable, initial);
 }
 
@@ -109,6 +113,21 @@ function tick(id: string, initial: boolean): Control {
   const element = h("input", { id, type: "checkbox" });
   element.checked = initial;
   return { element, read: () => element.checked, write: (value) => void (element.checked = value === true) };
+}
+
+/** Any of some values: a tick for each. */
+function several(id: string, values: unknown[], initial: unknown): Control {
+  const boxes = values.map((_, index) => h("input", { id: `${id}-${index}`, type: "checkbox" }));
+  const write = (value: unknown): void => {
+    boxes.forEach((box, index) => (box.checked = Array.isArray(value) && value.includes(values[index])));
+  };
+  write(initial);
+  const element = h(
+    "div",
+    { id, class: "row", role: "group" },
+    ...boxes.map((box, index) => h("label", { for: box.id }, box, ` ${label(values[index])}`)),
+  );
+  return { element, read: () => values.filter((_, index) => boxes[index]?.checked), write };
 }
 
 function entry(id: string, schema: Schema, nullable: boolean, initial: unknown): Control {

@@ -81,6 +81,7 @@ export interface Schema {
   enum?: unknown[];
   const?: unknown;
   anyOf?: Schema[];
+  items?: Schema;
   default?: unknown;
   description?: string;
   title?: string;

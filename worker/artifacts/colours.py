@@ -1,0 +1,74 @@
+"""Errors as colours: one scale for the whole sequence, the web page's."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pliant.worker.artifacts.geometry import Floats
+
+SCALE = ("2b2f77", "28608f", "1f8f8a", "58b96d", "b5d44a", "fbe94b")
+"""Six colours (sRGB), evenly spaced, rising in lightness all the way, so that they also read in grey and without red or green."""
+
+STOPS = np.array([[int(text[i : i + 2], 16) / 255 for i in (0, 2, 4)] for text in SCALE])
+TOP_SHARE = 0.99
+UNKNOWN = 0.5
+"""Grey of what was not seen, where the colour is the reprojection residual."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Painting:
+    """Values to be shown as colours."""
+
+    quantity: str
+    """What they are, in words."""
+
+    values: Floats
+    """Shape `(F, P)`, not negative, the tracks' unit."""
+
+    known: NDArray[np.bool_] | None
+    """Shape `(F, P)`: where there is a value; None if everywhere."""
+
+    top: float
+    """The value that gets the brightest colour: the 99th percentile, so that a few outliers do not make all else dark."""
+
+    @classmethod
+    def of(cls, quantity: str, values: Floats, known: NDArray[np.bool_] | None = None) -> Painting:
+        """Choose the scale for values `(F, P)`."""
+        counted = values.ravel() if known is None else values[known]
+        top = float(np.quantile(counted, TOP_SHARE)) if counted.size else 0.0
+        return cls(quantity, values, known, top if top > 0 else 1.0)
+
+    def frame(self, index: int) -> Floats:
+        """Colours `(P, 3)` of one frame, sRGB in [0, 1]."""
+        colours = shade(self.values[index] / self.top)
+        if self.known is not None:
+            colours[~self.known[index]] = UNKNOWN
+        return colours
+
+    def mean(self) -> Floats:
+        """Colours `(P, 3)` of the mean over the frames that have a value, sRGB in [0, 1]."""
+        if self.known is None:
+            return shade(self.values.mean(axis=0) / self.top)
+        count = self.known.sum(axis=0)
+        total = np.einsum("fp,fp->p", self.values, self.known)
+        colours = shade(total / np.maximum(count, 1) / self.top)
+        colours[count == 0] = UNKNOWN
+        return colours
+
+    def said(self) -> dict[str, Any]:
+        """Say for the report and the files what the colours mean."""
+        return {"colours": {"quantity": self.quantity, "top": self.top, "scale": ["#" + text for text in SCALE]}}
+
+
+def shade(share: Floats) -> Floats:
+    """Colours `(N, 3)`, sRGB, of shares `(N,)` of the scale; beyond 1 the brightest."""
+    place = np.clip(share, 0, 1) * (len(STOPS) - 1)
+    return np.stack([np.interp(place, np.arange(len(STOPS)), STOPS[:, i]) for i in range(3)], axis=1)
+
+
+def linear(colours: Floats) -> Floats:
+    """Decode sRGB to linear light (IEC 61966-2-1), which glTF and USD want."""
+    return np.asarray(np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4))

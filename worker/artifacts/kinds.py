@@ -1,0 +1,135 @@
+"""The result files there are: their names, what they are, which option asks for them, and who writes them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import IO, Any
+
+import numpy as np
+from pliant.client.options import Options, Output
+from pliant.solver import InvalidInput
+from pliant.worker import preview
+from pliant.worker.artifacts import usd
+from pliant.worker.artifacts.animation import animate
+from pliant.worker.artifacts.colours import linear
+from pliant.worker.artifacts.frames_zip import OnProgress, write_obj_zip, write_ply_zip
+from pliant.worker.artifacts.geometry import triangles_of, viewer_scale
+from pliant.worker.artifacts.glb import write_glb
+from pliant.worker.artifacts.matlab import write_mat
+from pliant.worker.artifacts.result import Result
+from pliant.worker.artifacts.tables import write_frames_csv, write_points_csv
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """One result file."""
+
+    name: str
+    output: Output | None
+    """The word of the option `outputs` that asks for it; None if it is always written."""
+
+    media_type: str
+    description: str
+    share: float
+    """Time it takes, in an arbitrary unit."""
+
+    write: Callable[[Result, IO[bytes], OnProgress], dict[str, Any]]
+    """Writes the file; returns what the report should say of it."""
+
+
+def kinds_for(options: Options) -> list[Kind]:
+    """Return what a job's options ask for, in the order of writing.
+
+    Raises
+    ------
+    InvalidInput
+        A file is asked for that cannot be written in this installation.
+    """
+    if "usd" in options.outputs and not usd.available():
+        raise InvalidInput(
+            "output_unavailable", field="options.outputs", expected="outputs that this installation can write",
+            got="usd, which needs the package usd-core", hint="Install it beside the worker and the service "
+            "(pip install 'pliant[usd]'), or leave usd out.",
+        )  # fmt: skip
+    return [kind for kind in KINDS if kind.output is None or kind.output in options.outputs]
+
+
+def _npz(result: Result, file: IO[bytes], on_progress: OnProgress) -> dict[str, Any]:
+    solution, camera = result.solution, result.solution.camera
+    np.savez(
+        file,
+        allow_pickle=False,
+        shapes=solution.shapes,
+        rotations=camera.rotations,
+        scales=camera.scales,
+        translations=camera.translations,
+        faces=result.faces,
+        residuals=solution.residuals.astype(np.float32),
+        weights=solution.weights.astype(np.float32),
+        trace_objective=solution.trace.objective,
+        trace_residual=solution.trace.residual,
+        trace_iterations=solution.trace.iterations,
+    )
+    on_progress(1.0)
+    return {}
+
+
+def _glb(result: Result, file: IO[bytes], on_progress: OnProgress) -> dict[str, Any]:
+    options, shapes, painted = result.options, result.solution.shapes, result.painting
+    animation = animate(shapes, y_axis=result.y_axis)
+    colours = None
+    if painted is not None:
+        animation.extras.update(painted.said())
+        shares = np.hstack([linear(painted.mean()), np.ones((shapes.shape[1], 1))])
+        colours = np.rint(shares * 65535).astype(np.uint16)
+    on_progress(0.4)
+    write_glb(
+        file, animation, triangles_of(result.faces), fps=options.fps, node={"scale": [viewer_scale(shapes)] * 3},
+        normals=options.normals, quantized=options.glb_quantized, colours=colours,
+        on_progress=lambda part: on_progress(0.4 + 0.6 * part),
+    )  # fmt: skip
+    return animation.extras
+
+
+def _painted(write: Callable[[Result, IO[bytes], OnProgress], None]) -> Callable[..., dict[str, Any]]:
+    def written(result: Result, file: IO[bytes], on_progress: OnProgress) -> dict[str, Any]:
+        write(result, file, on_progress)
+        return {} if result.painting is None else result.painting.said()
+
+    return written
+
+
+def _at_once(write: Callable[[Result, IO[bytes]], None]) -> Callable[..., dict[str, Any]]:
+    def written(result: Result, file: IO[bytes], on_progress: OnProgress) -> dict[str, Any]:
+        write(result, file)
+        on_progress(1.0)
+        return {}
+
+    return written
+
+
+def _preview(result: Result, file: IO[bytes]) -> None:
+    inputs = result.inputs
+    preview.write_preview(
+        file,
+        tracks=inputs.tracks,
+        mesh=inputs.mesh,
+        solution=result.solution,
+        truth=None if inputs.ground_truth is None else inputs.ground_truth.shapes,
+        y_axis=inputs.interpretation.y_axis,
+        fps=result.options.fps,
+    )
+
+
+KINDS = (
+    Kind("shapes.npz", None, "application/zip", "All arrays: shapes (F, P, 3), cameras, faces, residuals, weights, trace.", 2, _npz),
+    Kind("shapes.glb", "glb", "model/gltf-binary", "The moving mesh as animated glTF, y up.", 2, _glb),
+    Kind("shapes_ply.zip", "ply", "application/zip", "One binary PLY for each frame.", 6, _painted(write_ply_zip)),
+    Kind("shapes_obj.zip", "obj", "application/zip", "One OBJ for each frame.", 30, _painted(write_obj_zip)),
+    Kind("shapes.usdc", "usd", "application/octet-stream", "The moving mesh as USD, y up.", 3, _painted(usd.write_usd)),
+    Kind("shapes.mat", "mat", "application/x-matlab-data", "The same arrays for MATLAB; faces count from 1.", 2, _at_once(write_mat)),
+    Kind("metrics_frames.csv", "csv", "text/csv", "Metrics of every frame.", 2, _at_once(write_frames_csv)),
+    Kind("metrics_points.csv", "csv", "text/csv", "Metrics of every point.", 2, _at_once(write_points_csv)),
+    Kind(preview.NAME, None, preview.MEDIA_TYPE, preview.DESCRIPTION, 1, _at_once(_preview)),
+)  # fmt: skip

@@ -1,0 +1,42 @@
+"""The arrays of a solution as a MATLAB 5 file, which MATLAB, Octave and SciPy read."""
+
+from __future__ import annotations
+
+from typing import IO
+
+import numpy as np
+import scipy.io
+from pliant.worker.artifacts.result import Result
+
+HEADER = b"MATLAB 5.0 MAT-file, written by Pliant"
+TEXT_BYTES = 116
+"""Length of the text that a file begins with; what follows it are the version and the byte order."""
+
+MOST_BYTES = 2**31
+"""Above this MATLAB does not read a variable of the format."""
+
+
+def write_mat(result: Result, file: IO[bytes]) -> None:
+    """Write the arrays of `shapes.npz` under the same names; indices in `faces` count from 1."""
+    solution, camera = result.solution, result.solution.camera
+    scipy.io.savemat(
+        file,  # type: ignore[arg-type]  # documented: "str or file-like object"
+        {
+            "shapes": solution.shapes,
+            "rotations": camera.rotations,
+            "scales": camera.scales,
+            "translations": camera.translations,
+            "faces": result.faces + 1,
+            "residuals": solution.residuals.astype(np.float32),
+            "weights": solution.weights.astype(np.float32),
+            "trace_objective": solution.trace.objective,
+            "trace_residual": solution.trace.residual,
+            "trace_iterations": solution.trace.iterations,
+        },
+        oned_as="column",
+    )
+    # SciPy writes the time of day there; equal results are equal files.
+    end = file.tell()
+    file.seek(0)
+    file.write(HEADER.ljust(TEXT_BYTES))
+    file.seek(end)

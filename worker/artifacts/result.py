@@ -1,0 +1,53 @@
+"""What the writers work from: a job's inputs and solution, and what several of them need computed once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from pliant.client.options import Options
+from pliant.solver import Solution
+from pliant.solver.metrics import point_errors
+from pliant.worker.artifacts.colours import Painting
+from pliant.worker.artifacts.geometry import Floats, Ints, upright
+from pliant.worker.formats import Inputs
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """Inputs, solution and options of a job."""
+
+    inputs: Inputs
+    solution: Solution
+    options: Options
+
+    @property
+    def y_axis(self) -> str:
+        """Where y of the tracks points: `down` or `up`."""
+        return self.inputs.interpretation.y_axis
+
+    @cached_property
+    def faces(self) -> Ints:
+        """Faces of the mesh, `(0, 3)` without one."""
+        return np.zeros((0, 3), dtype=np.int32) if self.inputs.mesh is None else self.inputs.mesh.faces
+
+    @cached_property
+    def distances(self) -> Floats | None:
+        """Distance of every point from the truth, `(F, P)`, as `e3d_frame` aligns the two; None without truth."""
+        truth = self.inputs.ground_truth
+        return None if truth is None else point_errors(self.solution.shapes, truth.shapes)
+
+    @cached_property
+    def painting(self) -> Painting | None:
+        """Colours by error, if they are wanted: of the distance from the truth where there is one, else of the residual."""
+        if self.options.colours == "none":
+            return None
+        if self.distances is not None:
+            return Painting.of("distance from the truth", self.distances)
+        seen = self.inputs.tracks.visible > 0
+        return Painting.of("reprojection residual", self.solution.residuals, seen)
+
+    def standing(self, frame: int) -> Floats:
+        """Points `(P, 3)` of a frame, y up, right-handed."""
+        return upright(self.solution.shapes[frame], self.y_axis)

@@ -1,0 +1,77 @@
+"""Metrics of every frame and of every point as CSV."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterable, Mapping
+from typing import IO
+
+import numpy as np
+from numpy.typing import NDArray
+from pliant.solver.metrics import frame_errors
+from pliant.worker.artifacts.geometry import Floats
+from pliant.worker.artifacts.result import Result
+
+Column = NDArray[np.floating] | NDArray[np.integer] | Iterable[float]
+
+
+def write_frames_csv(result: Result, file: IO[bytes]) -> None:
+    """One row a frame; columns with truth only where there is truth, empty cells where nothing was visible."""
+    residuals, seen = result.solution.residuals, result.inputs.tracks.visible
+    columns: dict[str, Column] = {
+        "frame": np.arange(len(residuals)),
+        "seconds": np.arange(len(residuals)) / result.options.fps,
+        "visible": (seen > 0).sum(axis=1),
+        **_residuals(residuals, seen),
+        "weight_mean": _mean(result.solution.weights, seen > 0),
+    }
+    truth = result.inputs.ground_truth
+    if truth is not None and result.distances is not None:
+        shapes = result.solution.shapes
+        columns["e3d_sequence"] = frame_errors(shapes, truth.shapes, kind="sequence")
+        columns["e3d_frame"] = frame_errors(shapes, truth.shapes, kind="frame")
+        columns["e3d_frame_similarity"] = frame_errors(shapes, truth.shapes, kind="frame_similarity")
+        columns["distance_mean"] = result.distances.mean(axis=1)
+        columns["distance_max"] = result.distances.max(axis=1)
+    _write(file, columns)
+
+
+def write_points_csv(result: Result, file: IO[bytes]) -> None:
+    """One row a point; as `write_frames_csv`."""
+    residuals, seen = result.solution.residuals.T, result.inputs.tracks.visible.T
+    columns: dict[str, Column] = {
+        "point": np.arange(len(residuals)),
+        "visible": (seen > 0).sum(axis=1),
+        **_residuals(residuals, seen),
+        "weight_mean": _mean(result.solution.weights.T, seen > 0),
+    }
+    if result.distances is not None:
+        columns["distance_mean"] = result.distances.mean(axis=0)
+        columns["distance_max"] = result.distances.max(axis=0)
+    _write(file, columns)
+
+
+def _residuals(residuals: Floats, seen: Floats) -> dict[str, Column]:
+    """Median of the visible residuals of each row, and their root mean square, weighted with the confidence."""
+    median = [
+        float(np.median(row[some])) if some.any() else np.nan for row, some in zip(residuals, seen > 0, strict=True)
+    ]
+    return {"reprojection_median": median, "reprojection_rms": np.sqrt(_mean(np.square(residuals), seen))}
+
+
+def _mean(values: Floats, weights: Floats | NDArray[np.bool_]) -> Floats:
+    """Weighted mean of each row; NaN where no weight is."""
+    total = np.einsum("nk,nk->n", values, weights)
+    count = weights.sum(axis=1, dtype=np.float64)
+    return np.asarray(np.divide(total, count, out=np.full(len(total), np.nan), where=count > 0))
+
+
+def _write(file: IO[bytes], columns: Mapping[str, Column]) -> None:
+    """Numbers in the fewest digits that give them back exactly."""
+    text = io.TextIOWrapper(file, encoding="ascii", newline="")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    plain = (np.asarray(column).tolist() for column in columns.values())
+    writer.writerows(["" if value != value else value for value in row] for row in zip(*plain, strict=True))
+    text.detach()
