@@ -10,6 +10,7 @@ from pliant.client.options import Options
 from pliant.client.schemas import Job
 from pliant.service.forms import File, Form
 from pliant.service.problems import Refusal, from_validation
+from pliant.worker.artifacts import kinds_for
 from pliant.worker.errors import Conflict, UnknownUpload
 from pliant.worker.formats import Limits, read_inputs, save_inputs
 from pliant.worker.jobs import Jobs
@@ -71,6 +72,7 @@ def accept(
     known = jobs.known(id=id, idempotency_key=idempotency_key, fingerprint=form.fingerprint)
     if known is not None:
         return known, False
+    kinds_for(options)  # refuses what this installation cannot write
     files: dict[str, Path | str | None] = {part: file.path for part, file in form.files.items()}
     if form.texts.get("mesh", "").strip():
         files["mesh"] = form.texts["mesh"].strip()

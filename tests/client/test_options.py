@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import pytest
 from pliant.client.options import SOLVER_FIELDS, Options
 from pliant.solver import Settings
 
@@ -16,3 +17,15 @@ def test_options_mirror_the_settings_name_for_name_and_default_for_default() -> 
 
 def test_every_option_says_what_it_means() -> None:
     assert all(field.description for field in Options.model_fields.values())
+
+
+@pytest.mark.parametrize("given", ["usd, glb,usd", ["usd", "glb"], ("glb", "usd")])
+def test_outputs_are_a_list_or_words_between_commas(given: object) -> None:
+    assert Options(outputs=given).outputs == ("glb", "usd")
+    assert Options.model_validate_json(Options(outputs=given).model_dump_json()).outputs == ("glb", "usd")
+
+
+def test_an_unknown_output_is_refused_by_the_names_there_are() -> None:
+    with pytest.raises(ValueError, match="'glb', 'ply', 'obj', 'usd', 'mat' or 'csv'"):
+        Options(outputs="glb,fbx")
+    assert Options(outputs="").outputs == ()

@@ -88,6 +88,19 @@ def test_a_refusal_says_both_sides_and_leaves_nothing(running: Running, http: ht
     assert running.left_on_disk == []
 
 
+def test_a_file_that_cannot_be_written_here_is_refused_before_the_job_is_queued(
+    running: Running, http: httpx.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wish = form(options={"outputs": ["usd"]})
+    monkeypatch.setattr("pliant.worker.artifacts.usd.available", lambda: False)
+    before = running.waiting
+    problem = Problem.model_validate_json(http.post("/v1/jobs", files=wish).content)
+    assert (problem.status, problem.code, problem.field) == (422, "output_unavailable", "options.outputs")
+    assert running.waiting == before
+    monkeypatch.setattr("pliant.worker.artifacts.usd.available", lambda: True)
+    assert http.post("/v1/jobs", files=wish).status_code == 202
+
+
 @pytest.mark.parametrize(
     ("content_type", "body", "status", "code"),
     [

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from pliant.client.options import Options
 from pliant.client.schemas import Interpretation
 from pliant.solver import Camera, Choices, Mesh, Outcome, Solution, Trace, Tracks
-from pliant.worker.formats import Inputs
+from pliant.worker.formats import GroundTruth, Inputs
 
 
 def moving_sheet(frames: int, rows: int, columns: int) -> np.ndarray:
@@ -19,9 +21,21 @@ def moving_sheet(frames: int, rows: int, columns: int) -> np.ndarray:
 
 
 def make_result(
-    frames: int = 7, rows: int = 5, columns: int = 6, *, mesh: str = "grid", y_axis: str = "down"
+    frames: int = 7,
+    rows: int = 5,
+    columns: int = 6,
+    *,
+    mesh: str = "grid",
+    y_axis: str = "down",
+    truth: bool = False,
+    hidden: bool = False,
+    **options: Any,
 ) -> tuple[Inputs, Solution, Options]:
-    """Inputs and the solution that belongs to them; `mesh` is grid, triangles or none."""
+    """Inputs and the solution that belongs to them.
+
+    `mesh` is grid, triangles or none; with `truth` the result is off by a smooth error; with `hidden` a third of the observations and
+    the whole of point 3 and frame 2 are hidden.
+    """
     shapes = moving_sheet(frames, rows, columns)
     points = rows * columns
     grid = Mesh.from_grid(np.arange(points).reshape(rows, columns))
@@ -31,12 +45,17 @@ def make_result(
         num_frames=frames, num_points=points, num_faces=0 if surface is None else len(surface.faces), hidden_fraction=0.0,
         mesh_source=mesh, has_ground_truth=False, has_rotations=False, layout="tracks (F, P, 2)", y_axis=y_axis,
     )  # fmt: skip
-    inputs = Inputs(Tracks.from_arrays(shapes[..., :2] + 100), surface, None, None, interpretation)
+    visible = np.ones((frames, points))
+    if hidden:
+        visible = np.random.default_rng(0).choice([0.0, 0.5, 1.0], (frames, points))
+        visible[:, 3], visible[2] = 0, 0
+    known = GroundTruth.from_arrays(shapes + _off(frames, points), None, like=(frames, points)) if truth else None
+    inputs = Inputs(Tracks.from_arrays(shapes[..., :2] + 100, visible), surface, known, None, interpretation)
     solution = Solution(
         shapes=shapes,
         camera=Camera(np.tile(np.eye(3), (frames, 1, 1)), np.ones(frames), np.full((frames, 2), 100.0)),
-        residuals=np.linspace(0, 1, frames * points).reshape(frames, points),
-        weights=np.ones((frames, points)),
+        residuals=np.linspace(0, 1, frames * points).reshape(frames, points) * (visible > 0),
+        weights=1.0 * (visible > 0),
         trace=Trace(np.array([3.0, 2.0]), np.array([1.0, 0.5]), np.array([0, 9], dtype=np.int32)),
         outcome=Outcome.CONVERGED,
         choices=Choices(
@@ -45,4 +64,9 @@ def make_result(
         ),
         seconds={"cameras": 0.5},
     )  # fmt: skip
-    return inputs, solution, Options()
+    return inputs, solution, Options(**options)
+
+
+def _off(frames: int, points: int) -> np.ndarray:
+    """What the truth has more than the result: ever more depth from the first point to the last, and from frame to frame."""
+    return np.linspace(0, 1, frames)[:, None, None] * np.linspace(0, 3, points)[:, None] * np.array([0.0, 0.0, 1.0])

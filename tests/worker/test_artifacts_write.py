@@ -15,8 +15,10 @@ import pytest
 from khronos import assert_valid
 from pliant.client.options import Options
 from pliant.solver import Solution
+from pliant.solver.metrics import point_errors
 from pliant.worker.artifacts import build_report, write_artifacts
 from pliant.worker.artifacts.animation import animate
+from pliant.worker.artifacts.colours import linear, shade
 from pliant.worker.artifacts.geometry import triangles_of, upright, vertex_normals, viewer_scale
 from pliant.worker.artifacts.glb import write_glb
 from pliant.worker.formats import Inputs
@@ -150,7 +152,7 @@ def test_glb_passes_the_khronos_validator(tmp_path: Path, frames: int, mesh: str
 def test_every_variant_passes_and_plays(tmp_path: Path, quantized: bool, normals: str) -> None:
     shapes = moving_sheet(9, 5, 7)
     triangles = triangles_of(make_result(9, 5, 7)[0].mesh.faces)  # type: ignore[union-attr]
-    colours = np.full((35, 4), 200, dtype=np.uint8)
+    colours = np.full((35, 4), 50_000, dtype=np.uint16)
     with (tmp_path / "x.glb").open("wb") as file:
         write_glb(
             file, animate(shapes), triangles, fps=30, node={}, normals=normals, quantized=quantized, colours=colours
@@ -167,11 +169,37 @@ def test_every_variant_passes_and_plays(tmp_path: Path, quantized: bool, normals
     assert not quantized or error > 1e-8
     attributes = gltf.meshes[0].primitives[0].attributes
     assert (attributes.NORMAL is not None) == (normals == "animated")
-    np.testing.assert_allclose(accessor(gltf, attributes.COLOR_0), 200 / 255)
+    np.testing.assert_allclose(accessor(gltf, attributes.COLOR_0), 50_000 / 65_535)
     if normals == "animated":
         base = accessor(gltf, attributes.NORMAL)
         moved = accessor(gltf, gltf.meshes[0].primitives[0].targets[4]["NORMAL"])
         np.testing.assert_allclose(base + moved, vertex_normals(shapes[4], triangles), atol=1e-6)
+
+
+@pytest.mark.node
+@pytest.mark.parametrize("frames", [7, 230])
+def test_options_reach_the_glb(tmp_path: Path, frames: int) -> None:
+    made = make_result(frames, truth=True, fps=12.5, normals="animated", colours="error", glb_quantized=True)
+    inputs, solution, _ = made
+    files = write(tmp_path, made)
+    assert_valid(files["shapes.glb"])
+    shown, times, _ = played(files["shapes.glb"])
+    shapes = upright(solution.shapes, "down")
+    scale = viewer_scale(shapes)
+    bound = 1e-4 if frames <= 200 else 1.2e-3
+    assert np.abs(shown - scale * shapes).max() < bound * np.ptp(scale * shapes)
+    np.testing.assert_allclose(times, np.arange(frames) / 12.5, rtol=1e-6)
+    gltf = pygltflib.GLTF2.load_binary(files["shapes.glb"])
+    assert gltf.extensionsRequired == ["KHR_mesh_quantization"]
+    primitive = gltf.meshes[0].primitives[0]
+    assert primitive.targets[0]["NORMAL"] is not None
+    told = gltf.meshes[0].extras["pliant"]["colours"]
+    assert inputs.ground_truth is not None
+    mean = point_errors(solution.shapes, inputs.ground_truth.shapes).mean(axis=0)
+    assert told["quantity"] == "distance from the truth"
+    colours = accessor(gltf, primitive.attributes.COLOR_0)
+    np.testing.assert_allclose(colours[:, :3], linear(shade(mean / told["top"])), atol=1e-4)
+    np.testing.assert_array_equal(colours[:, 3], 1)
 
 
 def test_ply_zip_holds_every_frame(tmp_path: Path) -> None:
