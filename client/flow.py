@@ -27,11 +27,14 @@ class Call:
     headers: Mapping[str, str] = field(default_factory=dict)
     form: Form | None = None
     """Multipart body; its files are opened anew for every sending."""
+    changes_nothing: bool = False
+    """A POST that only asks a question."""
 
     @property
     def repeatable(self) -> bool:
         """True if sending it twice has the effect of sending it once."""
-        return self.method in ("GET", "HEAD", "PUT", "DELETE") or "Idempotency-Key" in self.headers
+        safe = self.changes_nothing or self.method in ("GET", "HEAD", "PUT", "DELETE")
+        return safe or "Idempotency-Key" in self.headers
 
 
 @dataclass(frozen=True)

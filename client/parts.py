@@ -75,6 +75,39 @@ class CountedFile:
         return self._file.fileno()
 
 
+@dataclass(frozen=True, kw_only=True)
+class Inputs:
+    """What a user hands over to be reconstructed, as it is."""
+
+    tracks: Source
+    visible: ArrayLike | None = None
+    mesh: Source | tuple[int, int] | None = None
+    ground_truth: Source | None = None
+    rotations: Source | None = None
+
+    def form(self, folder: Path, fields: Mapping[str, str], on_upload: OnBytes | None) -> Form:
+        """Return the form that carries it; what is not a file yet is written into `folder`.
+
+        Raises
+        ------
+        BadArgument
+            Something cannot be sent.
+        """
+        texts = dict(fields)
+        files = {"tracks": tracks_file(self.tracks, self.visible, folder)}
+        if self.mesh is not None:
+            part = mesh_part(self.mesh, folder)
+            if isinstance(part, str):
+                texts["mesh"] = part
+            else:
+                files["mesh"] = part
+        if self.ground_truth is not None:
+            files["ground_truth"] = array_part(self.ground_truth, "ground_truth", "shapes", folder)
+        if self.rotations is not None:
+            files["rotations"] = array_part(self.rotations, "rotations", "rotations", folder)
+        return Form(fields=texts, files=files, on_upload=on_upload)
+
+
 def tracks_file(tracks: Source, visible: ArrayLike | None, folder: Path) -> Path:
     """Write the tracks into a file the service reads; a path is used as it is.
 

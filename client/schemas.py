@@ -81,6 +81,9 @@ class Interpretation(Record):
     num_faces: int
     hidden_fraction: float = Field(description="Share of the F·P observations that carry no weight.")
     mesh_source: str = Field(description="`given`, `grid`, `delaunay` or `none`.")
+    mesh_grid: tuple[int, int] | None = Field(
+        None, description="Rows and columns, where the points are a whole grid, row after row."
+    )
     has_ground_truth: bool
     has_rotations: bool
     layout: str = Field(

@@ -13,11 +13,11 @@ from numpy.typing import ArrayLike
 from pliant.client import verbs
 from pliant.client.drive import iterate, run
 from pliant.client.options import Options
-from pliant.client.parts import OnBytes, Source
+from pliant.client.parts import Inputs, OnBytes, Source
 from pliant.client.policy import Attempts, Contact, Policy
 from pliant.client.request import base_of, headers_of
 from pliant.client.result import ANIMATION, LOADED, Reconstruction, copied
-from pliant.client.schemas import Job, ServiceLimits, Status
+from pliant.client.schemas import Interpretation, Job, ServiceLimits, Status
 from pliant.client.verbs import OnJob
 
 DEFAULT_URL = "http://127.0.0.1:8000"
@@ -119,15 +119,12 @@ class Client:
         BadArgument, Refused, Unreachable, TimeIsUp
             See `pliant.client.errors`.
         """
+        inputs = Inputs(tracks=tracks, visible=visible, mesh=mesh, ground_truth=ground_truth, rotations=rotations)
         with tempfile.TemporaryDirectory(prefix="pliant-submit-") as folder:
             flow = verbs.submit(
                 self._attempts(timeout, "the submission"),
-                tracks,
+                inputs,
                 folder=Path(folder),
-                visible=visible,
-                mesh=mesh,
-                ground_truth=ground_truth,
-                rotations=rotations,
                 options=options,
                 name=name,
                 job_id=job_id,
@@ -135,6 +132,46 @@ class Client:
                 on_upload=on_upload,
             )
             return RemoteJob(self, run(self._http, flow))
+
+    def inspect(
+        self,
+        tracks: Source,
+        *,
+        visible: ArrayLike | None = None,
+        mesh: Source | tuple[int, int] | None = None,
+        ground_truth: Source | None = None,
+        rotations: Source | None = None,
+        options: Options | Mapping[str, Any] | None = None,
+        on_upload: OnBytes | None = None,
+        timeout: float | None = None,
+    ) -> Interpretation:
+        """Ask how inputs would be understood, without making a job of them.
+
+        Parameters
+        ----------
+        tracks, visible, mesh, ground_truth, rotations, options, on_upload, timeout
+            As for `submit`.
+
+        Returns
+        -------
+        Interpretation
+            Frames, points, layout, what is hidden, where the mesh comes from, and the evidence in sentences.
+
+        Raises
+        ------
+        InvalidRequest
+            What `submit` would be refused with; `problem.choices` lists the readings where several fit.
+        """
+        inputs = Inputs(tracks=tracks, visible=visible, mesh=mesh, ground_truth=ground_truth, rotations=rotations)
+        with tempfile.TemporaryDirectory(prefix="pliant-inspect-") as folder:
+            flow = verbs.inspect(
+                self._attempts(timeout, "the inspection"),
+                inputs,
+                folder=Path(folder),
+                options=options,
+                on_upload=on_upload,
+            )
+            return run(self._http, flow)
 
     def get(self, job: str, *, timeout: float | None = None) -> RemoteJob:
         """Return a job as it stands now."""

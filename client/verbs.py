@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from numpy.typing import ArrayLike
 from pliant.client.download import download
 from pliant.client.errors import BadArgument, JobCancelled, JobFailed, NotAllowedNow, NotFound
 from pliant.client.events import events as follow
@@ -18,9 +17,9 @@ from pliant.client.events import told
 from pliant.client.exchange import answered, parse, record
 from pliant.client.flow import Call, Do, Emit, Flow, Pause
 from pliant.client.options import Options
-from pliant.client.parts import Form, OnBytes, Source, array_part, checked_options, mesh_part, tracks_file
+from pliant.client.parts import Inputs, OnBytes, checked_options
 from pliant.client.policy import Attempts
-from pliant.client.schemas import Job, JobPage, Problem, ServiceLimits, Status
+from pliant.client.schemas import Interpretation, Job, JobPage, Problem, ServiceLimits, Status
 
 OnJob = Callable[[Job], None]
 """Told the job each time something about it is new."""
@@ -30,13 +29,9 @@ JSON = "application/json"
 
 def submit(
     attempts: Attempts,
-    tracks: Source,
+    inputs: Inputs,
     *,
     folder: Path,
-    visible: ArrayLike | None,
-    mesh: Source | tuple[int, int] | None,
-    ground_truth: Source | None,
-    rotations: Source | None,
     options: Options | Mapping[str, Any] | None,
     name: str,
     job_id: str | None,
@@ -44,25 +39,8 @@ def submit(
     on_upload: OnBytes | None,
 ) -> Flow[Job]:
     """Send inputs; the answer is the new job. Temporary files go into `folder`, which the caller removes."""
-    fields = {"options": checked_options(options).model_dump_json(exclude_unset=True)}
-    if name != "":
-        fields["name"] = name
-
-    def gather() -> Form:
-        files = {"tracks": tracks_file(tracks, visible, folder)}
-        if mesh is not None:
-            part = mesh_part(mesh, folder)
-            if isinstance(part, str):
-                fields["mesh"] = part
-            else:
-                files["mesh"] = part
-        if ground_truth is not None:
-            files["ground_truth"] = array_part(ground_truth, "ground_truth", "shapes", folder)
-        if rotations is not None:
-            files["rotations"] = array_part(rotations, "rotations", "rotations", folder)
-        return Form(fields=fields, files=files, on_upload=on_upload)
-
-    form = yield Do(gather)
+    fields = _fields(options) | ({"name": name} if name != "" else {})
+    form = yield Do(lambda: inputs.form(folder, fields, on_upload))
     key = idempotency_key if idempotency_key is not None else secrets.token_urlsafe(16)
     call = Call(
         method="POST" if job_id is None else "PUT",
@@ -71,6 +49,21 @@ def submit(
         form=form,
     )
     return (yield from record(attempts, call, Job))
+
+
+def inspect(
+    attempts: Attempts,
+    inputs: Inputs,
+    *,
+    folder: Path,
+    options: Options | Mapping[str, Any] | None,
+    on_upload: OnBytes | None,
+) -> Flow[Interpretation]:
+    """Send inputs to be read and checked; the answer is how they were understood, and no job is made."""
+    fields = _fields(options)
+    form = yield Do(lambda: inputs.form(folder, fields, on_upload))
+    call = Call(method="POST", path="/v1/inspect", form=form, changes_nothing=True)
+    return (yield from record(attempts, call, Interpretation))
 
 
 def get(attempts: Attempts, job: str) -> Flow[Job]:
@@ -221,6 +214,10 @@ def fetch(
         url = f"{_path(job.id)}/artifacts/{quote(name)}"
         paths[name] = yield from download(attempts, url, held[name], folder, on_download=on_download)
     return paths
+
+
+def _fields(options: Options | Mapping[str, Any] | None) -> dict[str, str]:
+    return {"options": checked_options(options).model_dump_json(exclude_unset=True)}
 
 
 def _path(job: str) -> str:

@@ -17,7 +17,7 @@ from pliant.service.incoming import Incoming
 from pliant.service.linger import LingeringClose
 from pliant.service.page import mount_page
 from pliant.service.rates import RateLimit
-from pliant.service.routes import about, artifacts, events, examples, jobs, uploads
+from pliant.service.routes import about, artifacts, events, examples, inspection, jobs, uploads
 from pliant.service.settings import ServiceSettings
 from pliant.service.turns import Turns
 from pliant.worker import errors
@@ -99,7 +99,7 @@ def create_app(
         redoc_url=None,
     )
     problems.install(app, STATUS_OF)
-    for each in (jobs, uploads, artifacts, events, about, examples):
+    for each in (jobs, inspection, uploads, artifacts, events, about, examples):
         app.include_router(each.router)
     mount_page(app)
     app.openapi = lambda: describe.document(app)  # type: ignore[method-assign]

@@ -12,7 +12,7 @@ from pliant.service.forms import File, Form
 from pliant.service.problems import Refusal, from_validation
 from pliant.worker.artifacts import kinds_for
 from pliant.worker.errors import Conflict, UnknownUpload
-from pliant.worker.formats import Limits, read_inputs, save_inputs
+from pliant.worker.formats import Inputs, Limits, read_inputs, save_inputs
 from pliant.worker.jobs import Jobs
 from pliant.worker.uploads import Uploads
 from pydantic import ValidationError
@@ -67,16 +67,10 @@ def accept(
     form = with_uploads(form, room, uploads)
     options = parse_options(form.texts.get("options", ""))
     name = _name(form.texts.get("name", ""))
-    if "tracks" not in form.files:
-        raise missing("tracks")
     known = jobs.known(id=id, idempotency_key=idempotency_key, fingerprint=form.fingerprint)
     if known is not None:
         return known, False
-    kinds_for(options)  # refuses what this installation cannot write
-    files: dict[str, Path | str | None] = {part: file.path for part, file in form.files.items()}
-    if form.texts.get("mesh", "").strip():
-        files["mesh"] = form.texts["mesh"].strip()
-    inputs = read_inputs(**files, options=options, limits=limits)  # type: ignore[arg-type]
+    inputs = read_form(form, options, limits)
     canonical = room / "canonical.npz"
     save_inputs(inputs, canonical)
     job = jobs.submit(
@@ -123,6 +117,23 @@ def with_uploads(form: Form, room: Path, uploads: Uploads) -> Form:
 def _unfit(code: str, field: str, *, expected: str, got: str, hint: str) -> Refusal:
     detail = f"{field}: expected {expected}, got {got}. {hint}"
     return Refusal(422, code, detail=detail, field=field, expected=expected, got=got, hint=hint)
+
+
+def read_form(form: Form, options: Options, limits: Limits) -> Inputs:
+    """Read, check and interpret the files of a form. Blocks; call it on a thread.
+
+    Raises
+    ------
+    Refusal, InvalidInput
+        A part is missing, or cannot be read.
+    """
+    if "tracks" not in form.files:
+        raise missing("tracks")
+    kinds_for(options)  # refuses what this installation cannot write
+    files: dict[str, Path | str | None] = {part: file.path for part, file in form.files.items()}
+    if form.texts.get("mesh", "").strip():
+        files["mesh"] = form.texts["mesh"].strip()
+    return read_inputs(**files, options=options, limits=limits)  # type: ignore[arg-type]
 
 
 def missing(part: str) -> Refusal:

@@ -11,7 +11,7 @@ from pliant.client.cli.session import GroundTruth, Json, Mesh, OptionPairs, Rota
 from pliant.client.cli.show import err, metrics_table, out, print_json, understood
 
 if TYPE_CHECKING:
-    from pliant.worker.formats import Inputs
+    from pliant.client.schemas import Interpretation
     from pliant.worker.run import Finished
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
@@ -49,7 +49,7 @@ def solve(
         tracks=tracks, mesh=file_or_word(mesh), ground_truth=ground_truth, rotations=rotations, options=options
     )
     if not as_json:
-        show_understood(inputs)
+        show_understood(inputs.interpretation)
     with progress_bar() as bar, threads_limited(threads):
         done = reconstruct(inputs, options, output, on_progress=bar.on_step, should_stop=None)
     show_finished(done, output, as_json=as_json)
@@ -62,21 +62,32 @@ def inspect(
     ground_truth: GroundTruth = None,
     rotations: Rotations = None,
     option: OptionPairs = None,
+    url: Annotated[
+        str, typer.Option("--url", help="Ask this service instead of this installation.", metavar="URL")
+    ] = "",
     as_json: Json = False,
 ) -> None:
     """Say how a track file is understood, without solving anything."""
     ctx.obj.json = as_json
-    from pliant.client.parts import checked_options
-    from pliant.worker.formats import read_inputs
+    options = parse_options(option)
+    if url == "":
+        from pliant.client.parts import checked_options
+        from pliant.worker.formats import read_inputs
 
-    options = checked_options(parse_options(option))
-    inputs = read_inputs(
-        tracks=file, mesh=file_or_word(mesh), ground_truth=ground_truth, rotations=rotations, options=options
-    )
-    if as_json:
-        print_json(inputs.interpretation.model_dump(mode="json"))
+        said = read_inputs(
+            tracks=file,
+            mesh=file_or_word(mesh),
+            ground_truth=ground_truth,
+            rotations=rotations,
+            options=checked_options(options),
+        ).interpretation
     else:
-        show_understood(inputs)
+        with ctx.obj.client(url, as_json=as_json) as client:
+            said = client.inspect(file, mesh=mesh, ground_truth=ground_truth, rotations=rotations, options=options)
+    if as_json:
+        print_json(said.model_dump(mode="json"))
+    else:
+        show_understood(said)
 
 
 def show_finished(done: Finished, output: Path, *, as_json: bool) -> None:
@@ -103,12 +114,12 @@ def file_or_word(mesh: str | None) -> Path | str | None:
     return Path(mesh) if mesh is not None and Path(mesh).is_file() else mesh
 
 
-def show_understood(inputs: Inputs) -> None:
+def show_understood(interpretation: Interpretation) -> None:
     """Show how inputs were read."""
     from rich.table import Table
     from rich.text import Text
 
     table = Table.grid(padding=(0, 2))
-    for name, words in understood(inputs.interpretation):
+    for name, words in understood(interpretation):
         table.add_row(Text(name, "dim"), Text(words))
     out().print(table)

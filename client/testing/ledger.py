@@ -78,8 +78,6 @@ class Ledger:
             if entry.content != content:
                 raise Refusal(409, "idempotency_conflict", "The same key came with other content. Use a new key.")
             return entry, False
-        frames, count, _ = points.shape
-        hidden = float((~np.isfinite(points).all(axis=2)).mean())
         job = Job(
             id=job_id if job_id is not None else secrets.token_hex(8),
             name=name,
@@ -87,16 +85,7 @@ class Ledger:
             created_at=datetime.now(UTC),
             place_in_queue=0,
             options=options,
-            interpretation=Interpretation(
-                num_frames=frames,
-                num_points=count,
-                num_faces=0,
-                hidden_fraction=hidden,
-                mesh_source="none",
-                has_ground_truth=ground_truth,
-                has_rotations=rotations,
-                layout="tracks (F, P, 2)",
-            ),
+            interpretation=understood(points, ground_truth=ground_truth, rotations=rotations),
         )
         entry = self._entries[job.id] = Entry(job=job, points=points, content=content)
         if key is not None:
@@ -186,6 +175,21 @@ class Ledger:
             metrics={"reprojection_median": 0.0},
             progress=Progress(stage="exporting", fraction=1.0, updated_at=now),
         )
+
+
+def understood(points: NDArray[np.float64], *, ground_truth: bool, rotations: bool) -> Interpretation:
+    """Say how canonical tracks were read."""
+    frames, count, _ = points.shape
+    return Interpretation(
+        num_frames=frames,
+        num_points=count,
+        num_faces=0,
+        hidden_fraction=float((~np.isfinite(points).all(axis=2)).mean()),
+        mesh_source="none",
+        has_ground_truth=ground_truth,
+        has_rotations=rotations,
+        layout="tracks (F, P, 2)",
+    )
 
 
 def _npz(shapes: NDArray[np.float64]) -> bytes:

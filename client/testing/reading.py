@@ -44,6 +44,14 @@ def multipart(request: httpx.Request) -> tuple[dict[str, str], dict[str, bytes]]
     return fields, files
 
 
+def inputs_of(request: httpx.Request) -> tuple[dict[str, str], dict[str, bytes]]:
+    """Return the text fields and the files of a submission; there are tracks among them."""
+    fields, files = multipart(request)
+    if "tracks" not in files:
+        raise Refusal(422, "missing_part", "tracks: expected a file, got none. Send one.", field="tracks")
+    return fields, files
+
+
 def options_of(text: str) -> Options:
     """Read the options part."""
     try:

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from pliant.client.errors import PROBLEM_TYPE
 from pliant.client.options import Options
 from pliant.client.schemas import JobPage, Problem, ServiceLimits, Status
-from pliant.client.testing.ledger import Entry, Ledger
-from pliant.client.testing.reading import Refusal, multipart, options_of, tracks_of
+from pliant.client.testing.ledger import Entry, Ledger, understood
+from pliant.client.testing.reading import Refusal, inputs_of, options_of, tracks_of
 
 Reconstruct = Callable[[NDArray[np.float64], Options], NDArray[np.float64]]
 """From points (F, P, 2) and options to shapes (F, P, 3)."""
@@ -95,9 +95,7 @@ class FakeService(httpx.MockTransport):
         raise Refusal(404, "not_found", f"There is nothing at {request.method} {request.url.path}.")
 
     def _submit(self, request: httpx.Request, job_id: str | None = None) -> httpx.Response:
-        fields, files = multipart(request)
-        if "tracks" not in files:
-            raise Refusal(422, "missing_part", "tracks: expected a file, got none. Send one.", field="tracks")
+        fields, files = inputs_of(request)
         key = request.headers.get("idempotency-key") if job_id is None else f"id:{job_id}"
         entry, new = self._ledger.submit(
             points=tracks_of(files["tracks"]),
@@ -110,6 +108,13 @@ class FakeService(httpx.MockTransport):
             content=json.dumps(sorted(fields.items())).encode() + b"".join(files[name] for name in sorted(files)),
         )
         return self._job(entry, status=202 if new else 200, headers={"Location": f"/v1/jobs/{entry.job.id}"})
+
+    def _inspect(self, request: httpx.Request) -> httpx.Response:
+        fields, files = inputs_of(request)
+        options_of(fields.get("options", "{}"))
+        points = tracks_of(files["tracks"])
+        said = understood(points, ground_truth="ground_truth" in files, rotations="rotations" in files)
+        return _json(200, said.model_dump_json())
 
     def _get(self, request: httpx.Request, job_id: str) -> httpx.Response:
         entry = self._ledger.find(job_id)
@@ -186,6 +191,7 @@ class FakeService(httpx.MockTransport):
 _JOB = r"/v1/jobs/([A-Za-z0-9_-]+)"
 _ROUTES: tuple[tuple[str, str, Callable[..., httpx.Response]], ...] = (
     ("POST", r"/v1/jobs", FakeService._submit),
+    ("POST", r"/v1/inspect", FakeService._inspect),
     ("GET", r"/v1/jobs", FakeService._list),
     ("PUT", _JOB, FakeService._submit),
     ("GET", _JOB, FakeService._get),

@@ -52,6 +52,16 @@ def submitted(run: Run, tracks: Path, *more: object) -> dict[str, Any]:
     return json.loads(ran.stdout)
 
 
+def test_inspect_may_ask_a_service(run: Run, service: FakeService, tracks: Path) -> None:
+    ran = run("inspect", tracks, "--mesh", "3x4", "-O", "loss=huber", "--url", "http://pliant.test", "--json")
+    assert ran.exit_code == 0, ran.output
+    assert json.loads(ran.stdout)["num_points"] == 12
+    assert [request.url.path for request in service.requests] == ["/v1/inspect"]
+    assert "5 frames × 12 points" in run("inspect", tracks, "--url", "http://pliant.test").stdout
+    np.savez(tracks, tracks=np.ones((2, 9, 2)))
+    assert run("inspect", tracks, "--url", "http://pliant.test").exit_code == Exit.REFUSED
+
+
 def test_submit_wait_and_fetch_in_one_command(run: Run, tracks: Path, tmp_path: Path) -> None:
     ran = run(
         "submit", tracks, "--mesh", "3x4", "-O", "loss=huber", "-O", "fps=30", "-n", "take", "-o", tmp_path / "out"

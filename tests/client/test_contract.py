@@ -107,6 +107,21 @@ def test_what_the_service_refuses_is_a_typed_error_with_its_sentence(client: Cli
     assert "too-short" not in [job.record.name for job in client.list()]
 
 
+def test_inspecting_says_what_the_job_would_and_makes_none(client: Client) -> None:
+    points = moving_points()
+    points[2, 3] = np.nan
+    before = [job.id for job in client.list()]
+    said = client.inspect(points, mesh="none", rotations=np.tile(np.eye(3), (6, 1, 1)))
+    assert [job.id for job in client.list()] == before
+    assert (said.num_frames, said.num_points, said.has_rotations) == (6, 16, True)
+    assert said.hidden_fraction == pytest.approx(1 / (6 * 16))
+    job = client.submit(points, mesh="none", rotations=np.tile(np.eye(3), (6, 1, 1)))
+    assert job.record.interpretation == said
+    with pytest.raises(InvalidRequest) as caught:
+        client.inspect(np.ones((2, 9, 2)))
+    assert caught.value.code == "too_few_frames"
+
+
 def test_the_same_idempotency_key_makes_one_job(client: Client) -> None:
     points, key = moving_points(), secrets.token_hex()
     first = client.submit(points, idempotency_key=key)

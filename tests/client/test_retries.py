@@ -107,6 +107,12 @@ def test_a_call_that_may_have_been_carried_out_is_not_repeated(clock: Clock) -> 
     assert clock.pauses == []
 
 
+def test_a_question_is_asked_again_though_it_is_a_post(clock: Clock) -> None:
+    service = Flaky(cut_off, cut_off)
+    assert client_of(service, clock).inspect(POINTS).num_points == 9
+    assert [request.url.path for request in service.requests] == ["/v1/inspect"] * 3
+
+
 @pytest.mark.parametrize("fault", [no_connection, answer(429, **{"retry-after": "2"})], ids=["refused", "429"])
 def test_a_call_that_cannot_have_been_carried_out_is_repeated(clock: Clock, fault: Callable) -> None:
     service = Flaky()

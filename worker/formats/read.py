@@ -70,6 +70,7 @@ def read_inputs(
         num_faces=0 if surface is None else len(surface.faces),
         hidden_fraction=float((checked.visible == 0).mean()),
         mesh_source=source,
+        mesh_grid=_whole_grid(surface),
         has_ground_truth=truth is not None,
         has_rotations=cameras is not None,
         layout=understood.layout,
@@ -134,6 +135,14 @@ def _mesh_of(arrays: Arrays, num_points: int) -> Mesh:
         "missing_array", "mesh", expected="faces, or grid", got=", ".join(sorted(arrays)) or "nothing known",
         hint="Save the faces as numpy.savez('mesh.npz', faces=faces).",
     )  # fmt: skip
+
+
+def _whole_grid(surface: Mesh | None) -> tuple[int, int] | None:
+    """Return rows and columns if the points fill a grid row by row, so that `"ROWSxCOLUMNS"` says the same mesh."""
+    if surface is None or surface.grid is None:
+        return None
+    rows, columns = surface.grid.shape
+    return (rows, columns) if np.array_equal(surface.grid.ravel(), np.arange(rows * columns)) else None
 
 
 def number_cells(mask: NDArray[np.generic]) -> NDArray[np.int64]:

@@ -1,0 +1,47 @@
+"""Inspect: how files would be understood, before a job is made of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from anyio import to_thread
+from fastapi import APIRouter, Request
+from pliant.client.schemas import Interpretation
+from pliant.service.core import Bound, Core, MyUploads
+from pliant.service.describe import SUBMIT_BODY, problems
+from pliant.service.forms import Form, FormRules, receive_form
+from pliant.service.submission import FILES, TEXTS, parse_options, read_form, with_uploads
+from pliant.worker.formats import Limits
+from pliant.worker.uploads import Uploads
+
+router = APIRouter(prefix="/v1/inspect", tags=["jobs"])
+
+
+@router.post(
+    "",
+    summary="Say how files would be understood",
+    responses=problems(400, 401, 403, 408, 413, 415, 422, 429, 503, 507),
+    openapi_extra={"requestBody": SUBMIT_BODY},
+)
+async def inspect(request: Request, core: Core, bounds: Bound, uploads: MyUploads) -> Interpretation:
+    """Read the parts of a job as `POST /v1/jobs` would, and return the interpretation without making a job.
+
+    What submitting refuses is refused here in the same words, with the readings to choose from where several fit. Nothing is kept.
+    """
+    settings = core.settings
+    rules = FormRules(
+        files=FILES,
+        texts=TEXTS,
+        max_body_bytes=bounds.max_body_bytes,
+        max_text_bytes=settings.max_text_bytes,
+        stall_seconds=settings.stall_seconds,
+    )
+    with core.incoming.room() as room:
+        form = await receive_form(request, room, rules=rules)
+        return await to_thread.run_sync(lambda: understood(form, room, uploads, core.limits), limiter=core.parsing)
+
+
+def understood(form: Form, room: Path, uploads: Uploads, limits: Limits) -> Interpretation:
+    """Read a form as for a job, and forget all but how it was understood. Blocks; call it on a thread."""
+    whole = with_uploads(form, room, uploads)
+    return read_form(whole, parse_options(whole.texts.get("options", "")), limits).interpretation

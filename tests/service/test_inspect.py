@@ -1,0 +1,51 @@
+"""`POST /v1/inspect` says what a job would say, in the same words, and leaves nothing behind."""
+
+from __future__ import annotations
+
+import httpx
+import numpy as np
+import pytest
+from pliant.client.schemas import Interpretation
+from serving import Running, form, npz, tracks
+
+POINTS = np.random.default_rng(1).normal(size=(6, 12, 2)) * 100
+GOOD = {
+    "a grid": form(npz(tracks=POINTS), mesh="3x4"),
+    "hidden points": form(npz(tracks=POINTS, visibility=np.arange(12) % 4 > np.zeros((6, 1)))),
+    "a reading asked for": form(npz(W=np.random.default_rng(0).normal(size=(16, 9))), options={"rows": "stacked"}),
+    "truth and cameras": form(
+        npz(tracks=POINTS),
+        ground_truth=npz(shapes=np.random.default_rng(2).normal(size=(6, 12, 3))),
+        rotations=npz(rotations=np.tile(np.eye(3), (6, 1, 1))),
+    ),
+}
+BAD = {
+    "no file": ({"name": (None, "x")}, 422, "missing_part"),
+    "no tracks": (form(b"hello"), 422, "unknown_format"),
+    "two frames": (form(tracks(2)), 422, "too_few_frames"),
+    "two readings": (form(npz(W=np.random.default_rng(0).normal(size=(16, 9)))), 422, "ambiguous_layout"),
+    "unknown option": (form(options={"metod": "robust"}), 422, "unknown_option"),
+    "unknown part": (form() | {"pickles": ("x", b"x")}, 422, "unknown_part"),
+}
+
+
+@pytest.mark.parametrize("case", GOOD)
+def test_it_is_the_interpretation_of_the_job_and_makes_none(running: Running, http: httpx.Client, case: str) -> None:
+    before = running.waiting
+    answer = http.post("/v1/inspect", files=GOOD[case])
+    assert answer.status_code == 200, answer.text
+    assert running.waiting == before
+    assert running.left_on_disk == []
+    said = Interpretation.model_validate_json(answer.content)
+    job = http.post("/v1/jobs", files=GOOD[case]).json()
+    assert said == Interpretation.model_validate(job["interpretation"])
+    assert said.mesh_grid == ((3, 4) if case == "a grid" else None)
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_what_a_job_is_refused_for_is_said_in_the_same_words(running: Running, http: httpx.Client, case: str) -> None:
+    parts, status, code = BAD[case]
+    answer, submitted = (http.post(f"/v1/{path}", files=parts) for path in ("inspect", "jobs"))
+    assert (answer.status_code, answer.json()["code"]) == (status, code)
+    assert answer.json() == submitted.json()
+    assert running.left_on_disk == []
