@@ -1,0 +1,149 @@
+"""The least there can be, and the most that can be missing: every answer is finite, and sensible where anything is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pliant.solver import InvalidInput, KnownCamera, Mesh, Settings, Solution, Tracks, gallery, metrics, solve
+
+METHODS = ("pseudo_inverse", "temporal", "spatio_temporal", "robust")
+MADE = gallery.face(12, 120, degrees=45, mesh="triangles")
+CAMERAS = KnownCamera.from_arrays(MADE.rotations, MADE.scales)
+BOTH = pytest.mark.parametrize("cameras", [CAMERAS, None], ids=["known", "estimated"])
+EVERY = pytest.mark.parametrize("method", METHODS)
+
+
+def relative(found: np.ndarray, truth: np.ndarray) -> float:
+    return float(np.linalg.norm(found - truth) / np.linalg.norm(truth))
+
+
+def assert_finite(solution: Solution) -> None:
+    for array in (solution.shapes, solution.residuals, solution.weights, *vars_of(solution)):
+        assert np.isfinite(array).all()
+    assert (solution.weights >= 0).all()
+    assert (solution.weights <= 1).all()
+    assert (np.diff(solution.trace.objective) <= 0).all()
+
+
+def vars_of(solution: Solution) -> tuple[np.ndarray, ...]:
+    camera = solution.camera
+    return camera.rotations, camera.scales, camera.translations, solution.trace.objective, solution.trace.residual
+
+
+def hidden(frames: object = slice(None), points: object = slice(None)) -> np.ndarray:
+    visible = np.ones(MADE.tracks.points.shape[:2])
+    visible[frames, points] = 0  # type: ignore[index]
+    return visible
+
+
+@EVERY
+@BOTH
+@pytest.mark.parametrize("meshed", [True, False])
+def test_three_frames_of_four_points(cameras: KnownCamera | None, method: str, meshed: bool) -> None:
+    tracks = Tracks.from_arrays(MADE.tracks.points[:3, [0, 20, 50, 110]])
+    given = None if cameras is None else KnownCamera.from_arrays(MADE.rotations[:3], MADE.scales[:3])
+    mesh = Mesh.from_faces([[0, 1, 2], [0, 2, 3]], 4) if meshed else None
+    found = solve(tracks, mesh, cameras=given, settings=Settings(method=method))  # type: ignore[arg-type]
+    assert_finite(found)
+    assert np.median(found.residuals) < 0.2 * found.choices.unit
+
+
+@pytest.mark.parametrize(("frames", "points"), [(2, 5), (3, 3)])
+def test_fewer_are_refused(frames: int, points: int) -> None:
+    with pytest.raises(InvalidInput, match="at least"):
+        Tracks.from_arrays(np.random.default_rng(0).standard_normal((frames, points, 2)))
+
+
+@BOTH
+@pytest.mark.parametrize("nothing", [np.nan, np.inf, -np.inf])
+def test_what_is_not_a_number_is_hidden_and_nothing_else(cameras: KnownCamera | None, nothing: float) -> None:
+    gaps = np.random.default_rng(3).random(MADE.tracks.points.shape[:2]) < 0.2
+    points = MADE.tracks.points.copy()
+    points[gaps, 1] = nothing
+    by_value = solve(Tracks.from_arrays(points), MADE.mesh, cameras=cameras)
+    by_mask = solve(Tracks.from_arrays(MADE.tracks.points, ~gaps), MADE.mesh, cameras=cameras)
+    np.testing.assert_array_equal(by_value.shapes, by_mask.shapes)
+    assert (by_value.weights[gaps] == 0).all()
+    assert (by_value.residuals[gaps] == 0).all()
+
+
+@EVERY
+@BOTH
+@pytest.mark.parametrize("frames", [[5], [0], [11], [0, 1, 6, 7]], ids=str)
+def test_frames_that_show_nothing_lie_between_their_neighbours(
+    frames: list[int], cameras: KnownCamera | None, method: str
+) -> None:
+    tracks = Tracks.from_arrays(MADE.tracks.points, hidden(frames))
+    found = solve(tracks, MADE.mesh, cameras=cameras, settings=Settings(method=method))  # type: ignore[arg-type]
+    assert_finite(found)
+    error = metrics.e3d_frame(found.shapes[frames], MADE.shapes[frames])
+    if method == "pseudo_inverse":
+        assert not found.shapes[frames].any()  # every frame for itself: nothing is known, so nothing is said
+    else:
+        assert 0.005 < error < 0.2
+
+
+@BOTH
+@pytest.mark.parametrize("meshed", [True, False])
+def test_points_never_seen_are_drawn_from_their_neighbours(cameras: KnownCamera | None, meshed: bool) -> None:
+    """A point in the midst of the mesh is where its neighbours let it be; without a mesh it stays at the middle."""
+    inside = [40, 77]
+    tracks = Tracks.from_arrays(MADE.tracks.points, hidden(points=inside))
+    found = solve(tracks, MADE.mesh if meshed else None, cameras=cameras)
+    assert_finite(found)
+    assert (found.weights[:, inside] == 0).all()
+    rest = np.delete(np.arange(120), inside)
+    assert metrics.e3d_frame(found.shapes[:, rest], MADE.shapes[:, rest]) < 0.1
+    if meshed:
+        whole = solve(MADE.tracks, MADE.mesh, cameras=CAMERAS)
+        known = solve(tracks, MADE.mesh, cameras=CAMERAS)
+        size = np.linalg.norm(MADE.shapes, axis=2).mean()
+        assert np.linalg.norm(known.shapes[:, inside] - whole.shapes[:, inside], axis=2).max() < 0.25 * size
+
+
+@BOTH
+@pytest.mark.parametrize("kind", ["uniform", "cotangent", "auto"])
+def test_a_component_of_one_point_is_a_point_like_any_other(cameras: KnownCamera | None, kind: str) -> None:
+    """One vertex belongs to no face, and two patches are apart: smoothing knows nothing of them, time does."""
+    alone = 33
+    faces = MADE.mesh.faces[~(MADE.mesh.faces == alone).any(axis=1)]
+    x = MADE.shapes[0][:, 0]
+    faces = faces[((x[faces] > 0).all(axis=1)) | ((x[faces] <= 0).all(axis=1))]
+    mesh = Mesh.from_faces(faces, 120)
+    found = solve(MADE.tracks, mesh, cameras=cameras, settings=Settings(laplacian=kind))  # type: ignore[arg-type]
+    assert_finite(found)
+    assert 0.005 < metrics.e3d_frame(found.shapes, MADE.shapes) < 0.08
+    if cameras is not None:
+        truth = MADE.shapes[:, alone] - MADE.shapes.mean(axis=1)
+        assert relative(found.shapes[:, alone], truth) < 0.15
+
+
+def test_a_mesh_without_faces_is_no_mesh() -> None:
+    without = solve(MADE.tracks, cameras=CAMERAS)
+    empty = solve(MADE.tracks, Mesh.from_faces(np.zeros((0, 3), dtype=int), 120), cameras=CAMERAS)
+    np.testing.assert_array_equal(empty.shapes, without.shapes)
+
+
+@BOTH
+def test_a_grid_with_holes_and_islands(cameras: KnownCamera | None) -> None:
+    made = gallery.face(12, 120, degrees=45)
+    assert made.mesh.grid is not None
+    cells = made.mesh.grid.copy()
+    cells[:, cells.shape[1] // 2] = -1  # cut in two
+    cells[2:4, 2:4] = -1
+    kept = np.sort(cells[cells >= 0])
+    renumbered = np.full(cells.shape, -1)
+    renumbered[cells >= 0] = np.searchsorted(kept, cells[cells >= 0])
+    found = solve(Tracks.from_arrays(made.tracks.points[:, kept]), Mesh.from_grid(renumbered), cameras=cameras)
+    assert_finite(found)
+    assert 0.005 < metrics.e3d_frame(found.shapes, made.shapes[:, kept]) < 0.08
+
+
+@BOTH
+def test_a_rigid_object_comes_out_rigid(cameras: KnownCamera | None) -> None:
+    still = np.repeat(MADE.shapes[:1], 12, axis=0)
+    points = MADE.scales[:, None, None] * (still @ MADE.rotations[:, :2].transpose(0, 2, 1))
+    found = solve(Tracks.from_arrays(points), MADE.mesh, cameras=cameras)
+    assert metrics.e3d_frame(found.shapes, still) < 0.02
+    spread = np.linalg.norm(found.shapes - found.shapes.mean(axis=0)) / np.linalg.norm(found.shapes)
+    assert spread < 0.02
