@@ -129,3 +129,42 @@ class Options(BaseModel):
         "auto",
         description="Which way y grows. auto: down (pixels), or up where coordinates are centred on zero. Turns written meshes upright.",
     )
+    coordinates: Literal["auto", "pixels", "unit", "signed"] = Field(
+        "auto",
+        description="What x and y mean. pixels: taken as they are, whatever their unit. unit: from 0 to 1, divided by (width − 1, "
+        "height − 1). signed: from −1 to 1 over the same. auto: by the values; values within 0 … 1 without image_size are refused.",
+    )
+    image_size: Annotated[str, Field(pattern=r"^[1-9]\d{0,5}x[1-9]\d{0,5}$")] | None = Field(
+        None,
+        description="WIDTHxHEIGHT of the picture in pixels, e.g. 640x480; needed where coordinates are fractions of it.",
+    )
+    coordinate_order: Literal["auto", "xy", "yx"] = Field(
+        "auto", description="Order of a point's two coordinates. auto: x, y, unless only y, x lies inside image_size."
+    )
+    visibility: Literal["auto", "bool", "probability", "logits"] = Field(
+        "auto",
+        description="What the numbers beside the tracks mean. bool: not 0 is yes. probability: from 0 to 1. logits: of any size, 0 is "
+        "undecided. auto: by their values. Whether they say seen or hidden comes from the array's name.",
+    )
+    frames: Annotated[str, Field(pattern=r"^(-?\d{1,7})?:(-?\d{1,7})?(:([1-9]\d{0,6})?)?$")] | None = Field(
+        None, description="Frames to use, start:stop:step as in Python, e.g. 10:200:2; null: all."
+    )
+    stride: int = Field(
+        1,
+        ge=1,
+        le=1000,
+        description="Use every n-th point: every n-th row and column of a pixel grid, else every n-th of the list; of a given mesh, "
+        "one in n, spread evenly.",
+    )
+    max_points: Annotated[int, Field(ge=4, le=10_000_000)] | None = Field(
+        None,
+        description="Use at most this many points, spread evenly, the mesh thinned along with them; null: all there are. A pixel grid "
+        "stays one: the smallest stride that fits.",
+    )
+    min_seen: int = Field(
+        2,
+        ge=1,
+        le=1000,
+        description="A point seen in fewer frames than this is left out of the solve. It keeps its place in the result, where it "
+        "follows its neighbours on the mesh.",
+    )

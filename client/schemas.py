@@ -89,7 +89,24 @@ class Interpretation(Record):
     layout: str = Field(
         description="How the track array was read, e.g. `tracks (F, P, 2)` or `W (2F, P), rows interleaved`."
     )
+    format: str = Field(
+        "",
+        description="Whose output the tracks were recognised as, e.g. `CoTracker`; else `canonical`, `matrix` or `unnamed`.",
+    )
+    coordinates: str = Field(
+        "pixels",
+        description="How x and y came: `pixels` (or a unit of their own), `unit` or `signed` fractions of the picture, or `projected`.",
+    )
     y_axis: str = Field("down", description="`down` (pixels) or `up`.")
+    given_frames: int | None = Field(None, description="Frames in the file, of which `num_frames` are worked on.")
+    given_points: int | None = Field(None, description="Points in the file, of which `num_points` are worked on.")
+    num_left_out: int = Field(
+        0,
+        description="Points seen in too few frames to be solved for; they keep their place and follow their neighbours on the mesh.",
+    )
+    left_out_points: list[int] = Field(
+        default_factory=list, description="Their indices in the result, the first thousand."
+    )
     notes: list[str] = Field(
         default_factory=list, description="Sentences: the evidence, what was dropped, what was assumed."
     )

@@ -62,7 +62,7 @@ class Tracks:
             )
         if count < MIN_POINTS:
             raise _wrong("tracks", "too_few_points", f"at least {MIN_POINTS} points", f"{count}", "Track more points.")
-        positions = np.array(given, dtype=np.float64)
+        positions = np.array(given, dtype=np.float64, order="C")  # the same bits however they lay in memory
         confidence = _confidence(visible, (frames, count))
         confidence[~np.isfinite(positions).all(axis=2)] = 0.0
         if not confidence.any():
@@ -362,7 +362,7 @@ def _confidence(visible: ArrayLike | None, shape: tuple[int, int]) -> Floats:
         raise _wrong(
             "visibility", "wrong_shape", str(shape), _shape(given), "Visibility is (frames, points), as the tracks."
         )
-    confidence = np.array(given, dtype=np.float64)
+    confidence = np.array(given, dtype=np.float64, order="C")
     if not np.isfinite(confidence).all() or confidence.min() < 0 or confidence.max() > 1:
         raise _wrong(
             "visibility", "out_of_range", "values from 0 to 1", f"values from {confidence.min():.3g} to {confidence.max():.3g}",

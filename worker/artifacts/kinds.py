@@ -57,9 +57,12 @@ def kinds_for(options: Options) -> list[Kind]:
 
 def _npz(result: Result, file: IO[bytes], on_progress: OnProgress) -> dict[str, Any]:
     solution, camera = result.solution, result.solution.camera
+    chosen = result.inputs.selection
+    sources = {} if chosen is None else {"source_frames": chosen.frames, "source_points": chosen.points}
     np.savez(
         file,
         allow_pickle=False,
+        **sources,
         shapes=solution.shapes,
         rotations=camera.rotations,
         scales=camera.scales,

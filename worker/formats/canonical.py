@@ -11,7 +11,7 @@ from pliant.client.schemas import Interpretation
 from pliant.solver import KnownCamera, Mesh, Tracks
 from pliant.worker.formats.arrays import read_file
 from pliant.worker.formats.errors import damaged
-from pliant.worker.formats.records import Arrays, GroundTruth, Inputs, Limits
+from pliant.worker.formats.records import Arrays, GroundTruth, Inputs, Limits, Selection
 
 VERSION = 1
 _OURS = Limits(max_bytes=1 << 36)
@@ -37,6 +37,9 @@ def save_inputs(inputs: Inputs, path: Path) -> None:
         arrays["true_shapes"] = _narrow(inputs.ground_truth.shapes)
         if inputs.ground_truth.rotations is not None:
             arrays["true_rotations"] = inputs.ground_truth.rotations
+    if inputs.selection is not None:
+        arrays["source_frames"], arrays["source_points"] = inputs.selection.frames, inputs.selection.points
+        arrays["source_whole"] = np.array(inputs.selection.whole)
     with path.open("wb") as file:
         np.savez(file, allow_pickle=False, **arrays)
 
@@ -67,8 +70,12 @@ def load_inputs(path: Path) -> Inputs:
     if "true_shapes" in arrays:
         turned = _wide(arrays["true_rotations"]) if "true_rotations" in arrays else None
         truth = GroundTruth(_wide(arrays["true_shapes"]), turned)
+    selection = None
+    if "source_frames" in arrays:
+        frames, kept = (arrays[name].astype(np.intp) for name in ("source_frames", "source_points"))
+        selection = Selection(frames, kept, (int(arrays["source_whole"][0]), int(arrays["source_whole"][1])))
     told = Interpretation.model_validate(json.loads(arrays["interpretation"].tobytes()))
-    return Inputs(Tracks(points, _wide(arrays["visible"])), mesh, truth, cameras, told)
+    return Inputs(Tracks(points, _wide(arrays["visible"])), mesh, truth, cameras, told, selection)
 
 
 def _narrow(values: NDArray[np.float64]) -> NDArray[np.generic]:

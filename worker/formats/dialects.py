@@ -1,18 +1,23 @@
 """Who writes tracks how: one row for each program or data set whose files are known.
 
-Sources: each project's documented output at the time of writing — CoTracker `pred_tracks (B, T, N, 2)`; TAPIR, BootsTAPIR and
-LocoTrack `tracks (B, N, T, 2)` with logits; TAPNext `(B, T, N, 2)`; AllTracker and PIPs++ `trajs_e`; DOT with a third coordinate that
-is visibility; TAPVid-3D `tracks_XYZ`; MATLAB data sets of non-rigid structure from motion `W`, `S`, `Rs`.
+Sources: each project's documented output at the time of writing. CoTracker `pred_tracks (B, T, N, 2)` and `pred_visibility`; TAPIR,
+BootsTAPIR and LocoTrack `tracks (B, N, T, 2)` with `occlusion` and `expected_dist` logits; TAPNext `(B, T, N, 2)` with
+`visible_logits` (its model returns y before x, its demonstrations turn that round); TAP-Vid `points (N, T, 2)` with `occluded`;
+AllTracker `trajs_e` and `visconfs_e`, or whole pictures `(B, T, 2, H, W)`; PIPs++ `trajs_e`; DOT `(B, T, H, W, 3)` or `(B, T, N, 3)`
+with visibility as the third number; TAPVid-3D `tracks_xyz` in metres before the camera; MATLAB data sets of non-rigid structure from
+motion `W`, `S`, `Rs`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
+from pliant.worker.formats.errors import AmbiguousInput
 from pliant.worker.formats.records import Arrays
 
 Order = Literal["frames_points", "points_frames"]
+Third = Literal["visibility", "depth"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,53 +34,72 @@ class Dialect:
     order: Order | None = "frames_points"
     """Axis order by documentation; None: from the data."""
 
-    last: int = 2
-    """Length of the last axis: 2 = x, y; 3 = x, y, visibility or X, Y, Z."""
+    third: Third | None = None
+    """What a third number for each point means; None: there are two numbers. `depth`: metres before the camera, X, Y, Z."""
 
-    spatial: bool = False
-    """The track array holds 3-D points in the camera's frame, projected with `intrinsics`."""
-
-    unit_square: bool = False
-    """Coordinates are divided by (width − 1, height − 1)."""
+    note: str = ""
+    """A sentence that whoever uses this format should read."""
 
 
 DIALECTS = (
     Dialect(name="CoTracker", tracks=("pred_tracks",)),
-    Dialect(name="AllTracker", tracks=("trajs_e",), needs=("visconfs_e",)),
+    Dialect(
+        name="AllTracker", tracks=("trajs_e", "traj_maps_e"), needs=("visconfs_e", "visconf_maps_e"),
+    ),
     Dialect(name="PIPs++", tracks=("trajs_e",)),
-    Dialect(name="TAPVid-3D", tracks=("tracks_XYZ", "tracks_xyz"), last=3, spatial=True),
-    Dialect(name="TAPNext", tracks=("tracks",), needs=("visible_logits",)),
+    Dialect(name="TAPVid-3D", tracks=("tracks_xyz", "tracks_XYZ"), third="depth"),
+    Dialect(
+        name="TAPNext", tracks=("tracks", "pred_tracks"), needs=("visible_logits",),
+        note="TAPNext's model itself returns y before x. The coordinates are taken as x, y; if they are the model's own, "
+        "set coordinate_order to yx.",
+    ),
     Dialect(
         name="TAPIR, BootsTAPIR or LocoTrack", tracks=("tracks",), order="points_frames",
         needs=("occlusion", "occlusions", "occluded", "visibles", "expected_dist"),
     ),
-    Dialect(name="DOT", tracks=("tracks",), last=3, unit_square=True),
+    Dialect(name="TAP-Vid", tracks=("points", "target_points"), needs=("occluded",), order="points_frames"),
+    Dialect(name="DOT", tracks=("tracks",), third="visibility"),
     Dialect(name="canonical", tracks=("tracks", "points")),
     Dialect(name="matrix", tracks=("W", "w", "W_obs", "data", "measurements")),
     Dialect(name="unnamed", tracks=("array", "arr_0")),
 )  # fmt: skip
+PLAIN = ("canonical", "matrix", "unnamed")
+"""Dialects that are nobody's in particular."""
+
+HIDING = ("occlusion", "occlusions", "occluded", "MD")
+"""Names that say hidden where others say seen."""
 
 VISIBILITY = (
-    "visibility", "visible", "visibles", "pred_visibility", "vis", "mask", "vis_e", "visconfs_e", "visible_logits",
-    "occlusion", "occlusions", "occluded", "expected_dist",
+    "visibility", "visible", "visibles", "pred_visibility", "vis", "mask", "vis_e", "visconfs_e", "visconf_maps_e", "visible_logits",
+    *HIDING, "expected_dist",
 )  # fmt: skip
 INTRINSICS = ("intrinsics", "fx_fy_cx_cy")
 TRUE_SHAPES = ("shapes", "S", "S_gt", "Shat_gt", "S_GT", "P3_gt", "GT", "gt")
 TRUE_ROTATIONS = ("rotations", "Rs", "R_gt", "Rs_gt", "R", "RO")
 
-KNOWN = frozenset(
-    [name for dialect in DIALECTS for name in dialect.tracks]
-    + [*VISIBILITY, *INTRINSICS, *TRUE_SHAPES, *TRUE_ROTATIONS]
-)
+TRACKS = frozenset(name for dialect in DIALECTS for name in dialect.tracks)
+KNOWN = TRACKS | {*VISIBILITY, *INTRINSICS, *TRUE_SHAPES, *TRUE_ROTATIONS}
 """Every name that a reader of tracks looks at; other members of an npz are never inflated."""
 
 
 def short_names(arrays: Arrays) -> Arrays:
-    """Drop the names of enclosing structs, where what is left is unique: `data.W` becomes `W`."""
+    """Drop the names of enclosing structs: `data.W` becomes `W`.
+
+    Raises
+    ------
+    AmbiguousInput
+        Two structs hold tracks of one name.
+    """
     shortened: Arrays = {}
+    whole: dict[str, str] = {}
     for name, array in arrays.items():
         short = name.rsplit(".", 1)[-1]
-        shortened.setdefault(short if short in KNOWN else name, array)
+        if short not in KNOWN:
+            short = name
+        if short in TRACKS and short in shortened and "." in name and "." in whole[short]:
+            raise _two_of_one_name(whole[short], name)
+        if short not in shortened or "." not in name:
+            shortened[short], whole[short] = array, name
     return shortened
 
 
@@ -86,7 +110,15 @@ def recognise(arrays: Arrays) -> tuple[Dialect, str] | None:
             if name not in arrays or (dialect.needs and not any(need in arrays for need in dialect.needs)):
                 continue
             shape = arrays[name].shape
-            if dialect.last == 3 and (len(shape) < 3 or shape[-1] != 3):
+            if dialect.third is not None and (len(shape) < 3 or shape[-1] != 3):
                 continue
             return dialect, name
     return None
+
+
+def _two_of_one_name(one: str, other: str) -> AmbiguousInput:
+    choices: list[dict[str, Any]] = [{"layout": name, "options": {}} for name in (one, other)]
+    return AmbiguousInput(
+        field="tracks", expected="one track array", got=f"{one} and {other}",
+        hint="Save the one that is meant in a file of its own.", choices=choices,
+    )  # fmt: skip

@@ -3,8 +3,9 @@
     pliant.solver.InvalidInput      base: every refusal has code, field, expected, got and hint
     └── AmbiguousInput              two readings fit; lists the choices
 
-Codes of this package: ambiguous_layout, damaged_file, duplicate_member, empty_file, member_name, missing_array,
-object_array, pickle_refused, too_large, unknown_format, unsupported_feature, vertex_count_mismatch, wrong_shape, wrong_type.
+Codes of this package: ambiguous_coordinates, ambiguous_layout, damaged_file, duplicate_member, duplicate_observation, empty_file,
+member_name, missing_array, missing_image_size, no_frames_left, object_array, out_of_range, pickle_refused, too_large, too_slow,
+unknown_format, unsupported_feature, vertex_count_mismatch, wrong_shape, wrong_type.
 """
 
 from __future__ import annotations
@@ -23,8 +24,10 @@ class AmbiguousInput(InvalidInput):
         One for each reading: `layout` in words, `options` that select it, `evidence` for it.
     """
 
-    def __init__(self, *, field: str, expected: str, got: str, hint: str, choices: list[dict[str, Any]]) -> None:
-        super().__init__("ambiguous_layout", field=field, expected=expected, got=got, hint=hint)
+    def __init__(
+        self, *, field: str, expected: str, got: str, hint: str, choices: list[dict[str, Any]], code: str = "ambiguous_layout"
+    ) -> None:  # fmt: skip
+        super().__init__(code, field=field, expected=expected, got=got, hint=hint)
         self.choices = choices
 
 

@@ -2,7 +2,7 @@
 
 HDF5 can point elsewhere: data sets in other files (external storage, virtual data sets) and links that leave the file; it can declare
 terabytes in a kilobyte. All of these are refused before a value is read. MATLAB stores columns first, so axes come out reversed and are
-turned back.
+turned back. Cells, and the fields of struct arrays, are references to data sets of the same file; those are followed one step.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from pliant.worker.formats.records import Arrays, Limits
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 MAX_OBJECTS = 512
 MAX_DEPTH = 4
+MAX_CELLS = 20_000
 
 
 def read_matlab73(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
@@ -52,15 +53,47 @@ def _collect(group: h5py.Group, prefix: str, found: Arrays, *, field: str, limit
         item = group[name]
         if isinstance(item, h5py.Group):
             _collect(item, f"{prefix}{name}.", found, field=field, limits=limits, depth=depth + 1)
-        elif isinstance(item, h5py.Dataset) and item.dtype.kind in "fiub" and item.size:
-            found[f"{prefix}{name}"] = _values(
-                item, f"{prefix}{name}", sum(a.nbytes for a in found.values()), field, limits
-            )
+        elif isinstance(item, h5py.Dataset) and _is_numeric(item):
+            found[f"{prefix}{name}"] = _values(item, f"{prefix}{name}", _bytes(found), field, limits)
+        elif isinstance(item, h5py.Dataset) and h5py.check_ref_dtype(item.dtype) is h5py.Reference and item.size:
+            stacked = _cells(item, f"{prefix}{name}", _bytes(found), field, limits)
+            if stacked is not None:
+                found[f"{prefix}{name}"] = stacked
+
+
+def _is_numeric(item: h5py.Dataset) -> bool:
+    """Whether MATLAB would call it a numeric or logical array with content."""
+    kind = item.attrs.get("MATLAB_class", b"double")
+    return item.dtype.kind in "fiub" and bool(item.size) and kind != b"char" and "MATLAB_empty" not in item.attrs
+
+
+def _bytes(found: Arrays) -> int:
+    return sum(array.nbytes for array in found.values())
+
+
+def _cells(item: h5py.Dataset, name: str, so_far: int, field: str, limits: Limits) -> np.ndarray | None:
+    """Follow references to matrices of one shape, e.g. one for each frame, and put them along a new first axis."""
+    _check_within(item, name, field)
+    if item.size > MAX_CELLS:
+        raise too_large(field, expected=f"at most {MAX_CELLS} cells", got=f"{name} of {item.size}")
+    parts: list[np.ndarray] = []
+    for reference in item[()].T.reshape(-1, order="F"):
+        target = item.file[reference] if reference else None
+        if not isinstance(target, h5py.Dataset) or not _is_numeric(target):
+            return None
+        parts.append(_values(target, name, so_far + sum(part.nbytes for part in parts[:1]) * len(parts), field, limits))
+        if parts[-1].shape != parts[0].shape:
+            return None
+    return parts[0] if len(parts) == 1 else np.stack(parts)
+
+
+def _check_within(item: h5py.Dataset, name: str, field: str) -> None:
+    if item.is_virtual or item.external:
+        raise _elsewhere(field, f"{name} lies in another file")
 
 
 def _values(item: h5py.Dataset, name: str, so_far: int, field: str, limits: Limits) -> np.ndarray:
-    if item.is_virtual or item.external:
-        raise _elsewhere(field, f"{name} lies in another file")
+    _check_within(item, name, field)
     declared = int(np.prod(item.shape, dtype=np.float64)) * item.dtype.itemsize
     if so_far + declared > limits.max_bytes:
         raise too_large(field, expected=f"at most {limits.max_bytes} bytes", got=f"{name} declares {declared}")

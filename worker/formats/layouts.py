@@ -28,6 +28,12 @@ ALIKE = 0.98
 
 SAMPLE = 96
 
+MANY_FRAMES = 10_000
+"""No video has more; a list of all pixels has, and its neighbours are closer to each other than one frame to the next."""
+
+OF_ANY_ORDER = ("matrix", "unnamed")
+"""Dialects whose arrays of three axes have no documented order."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reading:
@@ -49,18 +55,6 @@ class Reading:
     def options(self) -> dict[str, str]:
         """The options that select this reading."""
         return {"layout": self.order} | ({} if self.rows is None else {"rows": self.rows})
-
-
-def drop_batch(array: NDArray[np.generic], dimensions: int, *, field: str) -> NDArray[np.generic]:
-    """Remove a leading batch axis of length 1."""
-    if array.ndim == dimensions + 1:
-        if array.shape[0] == 1:
-            return array.reshape(array.shape[1:])
-        raise refusal(
-            "wrong_shape", field, expected="one video", got=f"a batch of {array.shape[0]}",
-            hint="Submit each element of the batch as its own job.",
-        )  # fmt: skip
-    return array
 
 
 def readings(name: str, array: NDArray[np.generic]) -> list[Reading]:
@@ -86,9 +80,8 @@ def readings(name: str, array: NDArray[np.generic]) -> list[Reading]:
             word = "rows" if order == "frames_points" else "columns"
             found.append(Reading(f"{name} {spelled_matrix}, {word} interleaved", order, "interleaved", pairs))
             found.append(Reading(f"{name} {spelled_matrix}, {word} stacked", order, "stacked", halves))
-    return [one for one in found if one.points.shape[0] >= MIN_FRAMES and one.points.shape[1] >= MIN_POINTS] or found[
-        :1
-    ]
+    fit = [one for one in found if one.points.shape[0] >= MIN_FRAMES and one.points.shape[1] >= MIN_POINTS]
+    return [one for one in fit if one.points.shape[0] <= MANY_FRAMES] or fit or found[:1]
 
 
 def roughness(points: NDArray[np.generic]) -> float:
@@ -152,7 +145,8 @@ def choose(
         return allowed[0], []
     costs = {one.layout: roughness(one.points) for one in allowed}
     ranked = sorted(allowed, key=lambda one: costs[one.layout])
-    documented = [one for one in ranked if dialect.order in (None, one.order) or options.layout != "auto"] or ranked
+    order = None if array.ndim == 3 and dialect.name in OF_ANY_ORDER else dialect.order
+    documented = [one for one in ranked if order in (None, one.order) or options.layout != "auto"] or ranked
     best, rivals = documented[0], documented[1:]
     clear = all(costs[rival.layout] >= DECISIVE * costs[best.layout] for rival in rivals)
     if clear and costs[best.layout] <= CONTRADICTED * costs[ranked[0].layout]:

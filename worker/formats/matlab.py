@@ -88,7 +88,16 @@ def _collect(name: str, value: object, found: Arrays, depth: int) -> None:
 
 
 def _stack_cells(name: str, cells: NDArray[np.object_], found: Arrays) -> None:
-    """Put cells that all hold a matrix of one shape, e.g. one per frame, along a new first axis."""
-    parts = [part for part in cells.reshape(-1, order="F") if isinstance(part, np.ndarray)]
-    if len(parts) == cells.size and len({part.shape for part in parts}) == 1 and parts[0].dtype.kind in "fiub":
-        found[name] = np.stack(parts)
+    """Put cells that all hold a matrix of one shape, e.g. one per frame, along a new first axis; so each field of a struct array."""
+    parts = list(cells.reshape(-1, order="F"))
+    if all(isinstance(part, scipy.io.matlab.mat_struct) for part in parts):
+        for member in parts[0]._fieldnames[:MAX_ARRAYS]:
+            _stack(f"{name}.{member}", [getattr(part, member, None) for part in parts], found)
+    else:
+        _stack(name, parts, found)
+
+
+def _stack(name: str, parts: list[object], found: Arrays) -> None:
+    arrays = [part for part in parts if isinstance(part, np.ndarray) and part.dtype.kind in "fiub" and part.size > 0]
+    if len(arrays) == len(parts) and len({part.shape for part in arrays}) == 1 and len(found) < MAX_ARRAYS:
+        found[name] = np.stack(arrays)

@@ -2,27 +2,27 @@
 
 from __future__ import annotations
 
-import re
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from pliant.client.options import Options
 from pliant.client.schemas import Interpretation
-from pliant.solver import Mesh, Tracks
+from pliant.solver import InvalidInput, Mesh, Tracks
 from pliant.worker.formats.contain import read_arrays
 from pliant.worker.formats.dialects import KNOWN
-from pliant.worker.formats.errors import refusal, too_large
-from pliant.worker.formats.interpret import understand
-from pliant.worker.formats.meshes import given_vertices, mismatch
-from pliant.worker.formats.records import Arrays, GroundTruth, Inputs, Limits
+from pliant.worker.formats.errors import too_large
+from pliant.worker.formats.interpret import Understood, understand
+from pliant.worker.formats.records import GroundTruth, Inputs, Limits, Selection
+from pliant.worker.formats.selection import chosen_frames, hide_seldom_seen
+from pliant.worker.formats.surface import read_surface, whole_grid
+from pliant.worker.formats.thinning import thin
 from pliant.worker.formats.triangulate import triangulate
 from pliant.worker.formats.truth import read_rotations, read_truth
 
-GRID_SIZE = re.compile(r"(\d{1,6})\s*[x×X]\s*(\d{1,6})")
-MESH_NAMES = ("faces", "grid", "mask", "vertices")
-SELDOM = 2
-"""A point seen in fewer frames than this has no motion of its own to show."""
+LISTED = 1000
+"""Most left-out points that the interpretation lists by number."""
 
 
 def read_inputs(
@@ -43,9 +43,10 @@ def read_inputs(
     mesh : Path or str, optional
         A mesh file whose vertex i is point i, a grid size `"ROWSxCOLUMNS"`, or `"none"`; left out: one is made.
     ground_truth, rotations : Path, optional
-        True shapes, used for metrics alone; known cameras, used instead of estimated ones.
+        True shapes, used for metrics alone; known cameras, used instead of estimated ones. Both for all frames and points of the
+        tracks; what the options `frames`, `stride` and `max_points` choose is chosen from them too.
     options : Options
-        `layout`, `rows`, `y_axis` … overrule what the data suggest.
+        `layout`, `rows`, `coordinates` … overrule what the data suggest.
     limits : Limits
         How much may come in.
 
@@ -57,27 +58,64 @@ def read_inputs(
         Two readings fit; the error lists them.
     """
     understood = understand(read_arrays(tracks, field="tracks", limits=limits, wanted=KNOWN), options)
-    _check_size(understood.points, limits)
-    checked = Tracks.from_arrays(understood.points, understood.visible)
-    like = (checked.num_frames, checked.num_points)
-    notes = [*understood.notes, *_hidden_notes(checked)]
-    surface, source, mesh_notes = _read_mesh(mesh, checked, understood.y_axis, limits)
-    truth = read_truth(ground_truth, understood, like=like, limits=limits)
-    cameras = None if rotations is None else read_rotations(rotations, num_frames=like[0], limits=limits)
-    interpretation = Interpretation(
-        num_frames=like[0],
-        num_points=like[1],
-        num_faces=0 if surface is None else len(surface.faces),
+    chosen = _choose(understood, mesh, options, limits)
+    truth, truth_notes = _read_truth(ground_truth, understood, chosen.selection, limits)
+    cameras = None
+    if rotations is not None:
+        frames = chosen.selection.frames
+        cameras = read_rotations(rotations, num_frames=len(understood.points), frames=frames, limits=limits)
+    checked = chosen.tracks
+    told = Interpretation(
+        num_frames=checked.num_frames, num_points=checked.num_points,
+        num_faces=0 if chosen.mesh is None else len(chosen.mesh.faces),
         hidden_fraction=float((checked.visible == 0).mean()),
-        mesh_source=source,
-        mesh_grid=_whole_grid(surface),
-        has_ground_truth=truth is not None,
-        has_rotations=cameras is not None,
-        layout=understood.layout,
-        y_axis=understood.y_axis,
-        notes=[*notes, *mesh_notes, *_truth_notes(ground_truth, truth)],
-    )
-    return Inputs(checked, surface, truth, cameras, interpretation)
+        mesh_source=chosen.source, mesh_grid=chosen.grid, has_ground_truth=truth is not None, has_rotations=cameras is not None,
+        layout=understood.layout, format=understood.format, coordinates=understood.coordinates, y_axis=understood.y_axis,
+        given_frames=understood.points.shape[0], given_points=understood.points.shape[1],
+        num_left_out=len(chosen.left_out), left_out_points=chosen.left_out[:LISTED].tolist(),
+        notes=[*understood.notes, *chosen.notes, *truth_notes],
+    )  # fmt: skip
+    return Inputs(checked, chosen.mesh, truth, cameras, told, chosen.selection if chosen.selection.narrows else None)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Chosen:
+    """The frames and points that are worked on, checked."""
+
+    tracks: Tracks
+    mesh: Mesh | None
+    source: str
+    grid: tuple[int, int] | None
+    """Rows and columns of the grid that all points of the files fill row by row."""
+    selection: Selection
+    left_out: NDArray[np.intp]
+    notes: list[str]
+
+
+def _choose(understood: Understood, mesh: Path | str | None, options: Options, limits: Limits) -> _Chosen:
+    whole = understood.points.shape[:2]
+    frames, notes = chosen_frames(options.frames, whole[0])
+    surface = read_surface(mesh, num_points=whole[1], picture=understood.grid, limits=limits)
+    points, visible = understood.points, understood.visible
+    picked = np.arange(whole[1]) if surface.points is None else surface.points
+    if len(frames) < whole[0]:
+        points, visible = points[frames], None if visible is None else visible[frames]
+    if len(picked) < whole[1]:
+        points, visible = points[:, picked], None if visible is None else visible[:, picked]
+    kept, made, how = thin(points, visible, surface.mesh, options)
+    if len(kept) < len(picked):
+        points, visible = points[:, kept], None if visible is None else visible[:, kept]
+    _check_size(points, limits)
+    source = surface.source
+    more: list[str] = []
+    if source == "delaunay":
+        made, more = triangulate(Tracks.from_arrays(points, visible), y_axis=understood.y_axis)
+        source = "none" if made is None else source
+    confidence, left_out, seldom = hide_seldom_seen(points, visible, made, options)
+    checked = Tracks.from_arrays(points, confidence)
+    selection = Selection(frames, picked[kept], whole)
+    notes += [*surface.notes, *how, *_hidden_notes(checked), *seldom, *more]
+    return _Chosen(checked, made, source, whole_grid(surface), selection, left_out, notes)
 
 
 def _check_size(points: NDArray[np.generic], limits: Limits) -> None:
@@ -90,85 +128,42 @@ def _check_size(points: NDArray[np.generic], limits: Limits) -> None:
         )
 
 
-def _read_mesh(
-    mesh: Path | str | None, tracks: Tracks, y_axis: str, limits: Limits
-) -> tuple[Mesh | None, str, list[str]]:
-    if mesh is None:
-        made, notes = triangulate(tracks, y_axis=y_axis)
-        return made, "none" if made is None else "delaunay", notes
-    if isinstance(mesh, str):
-        return _mesh_by_word(mesh, tracks.num_points)
-    arrays = read_arrays(mesh, field="mesh", limits=limits, wanted=frozenset(MESH_NAMES))
-    given_vertices(arrays, num_points=tracks.num_points, field="mesh")
-    surface = _mesh_of(arrays, tracks.num_points)
-    if len(surface.faces) > limits.max_faces:
-        raise too_large("mesh.faces", expected=f"at most {limits.max_faces} faces", got=f"{len(surface.faces)}")
-    notes = [] if len(surface.faces) else ["The given mesh has no faces, so there is no smoothness in space."]
-    return surface, "grid" if surface.grid is not None else "given", notes
-
-
-def _mesh_by_word(word: str, num_points: int) -> tuple[Mesh | None, str, list[str]]:
-    if word.strip().lower() == "none":
-        return None, "none", ["No mesh, as asked: no smoothness in space."]
-    found = GRID_SIZE.fullmatch(word.strip())
-    if found is None:
-        raise refusal(
-            "unknown_format", "mesh", expected="a mesh file, ROWSxCOLUMNS or none", got=repr(word[:60]),
-            hint="Give a file, or a grid size such as 48x64.",
-        )  # fmt: skip
-    rows, columns = int(found[1]), int(found[2])
-    if rows * columns != num_points:
-        raise mismatch("mesh", num_points, rows * columns)
-    return Mesh.from_grid(np.arange(num_points).reshape(rows, columns)), "grid", []
-
-
-def _mesh_of(arrays: Arrays, num_points: int) -> Mesh:
-    if "faces" in arrays or "array" in arrays:
-        return Mesh.from_faces(arrays.get("faces", arrays.get("array")), num_points)  # type: ignore[arg-type]
-    if "mask" in arrays or "grid" in arrays:
-        grid = arrays["grid"] if "grid" in arrays else number_cells(arrays["mask"])
-        surface = Mesh.from_grid(grid)
-        if surface.num_points != num_points:
-            raise mismatch("mesh", num_points, surface.num_points)
-        return surface
-    raise refusal(
-        "missing_array", "mesh", expected="faces, or grid", got=", ".join(sorted(arrays)) or "nothing known",
-        hint="Save the faces as numpy.savez('mesh.npz', faces=faces).",
-    )  # fmt: skip
-
-
-def _whole_grid(surface: Mesh | None) -> tuple[int, int] | None:
-    """Return rows and columns if the points fill a grid row by row, so that `"ROWSxCOLUMNS"` says the same mesh."""
-    if surface is None or surface.grid is None:
-        return None
-    rows, columns = surface.grid.shape
-    return (rows, columns) if np.array_equal(surface.grid.ravel(), np.arange(rows * columns)) else None
-
-
-def number_cells(mask: NDArray[np.generic]) -> NDArray[np.int64]:
-    """Give the marked cells of a picture their numbers, row by row, −1 elsewhere."""
-    marked = np.asarray(mask) != 0
-    return np.where(marked, np.cumsum(marked).reshape(marked.shape) - 1, -1)
+def _read_truth(
+    given: Path | None, understood: Understood, selection: Selection, limits: Limits
+) -> tuple[GroundTruth | None, list[str]]:
+    """Truth of the chosen frames and points; what came along with the tracks and does not fit is passed over, and said."""
+    raw = read_truth(given, understood, limits=limits)
+    if raw is None:
+        return None, []
+    like = (len(selection.frames), len(selection.points))
+    shapes = raw.shapes
+    if shapes.shape == (*selection.whole, 3):
+        shapes = shapes[np.ix_(selection.frames, selection.points)] if selection.narrows else shapes
+    else:
+        like = selection.whole
+    turned = raw.rotations
+    if turned is not None and turned.ndim == 3 and len(turned) == selection.whole[0]:
+        turned = turned[selection.frames]
+    try:
+        truth = GroundTruth.from_arrays(shapes, turned, like=like)
+    except InvalidInput as error:
+        if given is not None:
+            raise
+        return None, [
+            f"The tracks file holds true shapes that cannot be used: expected {error.expected}, got {error.got}."
+        ]
+    if given is not None:
+        return truth, raw.notes
+    return truth, [
+        "The tracks file holds true shapes too: they are used for metrics, and for nothing else.",
+        *raw.notes,
+    ]
 
 
 def _hidden_notes(tracks: Tracks) -> list[str]:
-    seen = (tracks.visible > 0).sum(axis=0)
     hidden = float((tracks.visible == 0).mean())
     notes = [f"{hidden:.1%} of the observations are hidden and carry no weight."] if hidden else []
-    seldom = np.flatnonzero(seen < SELDOM)
-    if len(seldom):
-        shown = ", ".join(str(index) for index in seldom[:10]) + (" …" if len(seldom) > 10 else "")
-        notes.append(
-            f"{len(seldom)} points are seen in fewer than {SELDOM} frames (points {shown}): they keep their place in the "
-            "order, and what is written for them follows from their neighbours alone."
-        )
     unseen = np.flatnonzero((tracks.visible > 0).sum(axis=1) == 0)
     if len(unseen):
         notes.append(f"{len(unseen)} frames show no point at all (first: frame {unseen[0]}).")
     return notes
-
-
-def _truth_notes(given: Path | None, truth: GroundTruth | None) -> list[str]:
-    if truth is None or given is not None:
-        return []
-    return ["The tracks file holds true shapes too: they are used for metrics, and for nothing else."]

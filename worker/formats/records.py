@@ -83,7 +83,7 @@ class GroundTruth:
                 "wrong_shape", "ground_truth.shapes", expected=expected, got=str(given.shape),
                 hint="Truth is (frames, points, 3), with the tracks' frames and points in the tracks' order.",
             )  # fmt: skip
-        points = np.array(given, dtype=np.float64)
+        points = np.array(given, dtype=np.float64, order="C")
         if not np.isfinite(points).all():
             raise refusal(
                 "not_finite", "ground_truth.shapes", expected="finite coordinates", got=f"{int((~np.isfinite(points)).sum())} that are not",
@@ -107,6 +107,25 @@ class GroundTruth:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Selection:
+    """Which frames and points of the files are worked on, in the files' order."""
+
+    frames: NDArray[np.intp]
+    """Rising indices, shape `(F,)`."""
+
+    points: NDArray[np.intp]
+    """Rising indices, shape `(P,)`: vertex i of the result is point `points[i]` of the files."""
+
+    whole: tuple[int, int]
+    """Frames and points of the files."""
+
+    @property
+    def narrows(self) -> bool:
+        """Whether anything was left away."""
+        return (len(self.frames), len(self.points)) != self.whole
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Inputs:
     """Everything a job works on, checked; vertex i of the mesh and of the truth is point i of the tracks."""
 
@@ -115,3 +134,6 @@ class Inputs:
     ground_truth: GroundTruth | None
     cameras: KnownCamera | None
     interpretation: Interpretation
+
+    selection: Selection | None = None
+    """Which frames and points of the files these are; None: all of them."""
