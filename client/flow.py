@@ -11,7 +11,7 @@ from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
-from pliant.client.parts import Form
+from pliant.client.parts import Form, Rest
 
 T = TypeVar("T")
 
@@ -27,6 +27,8 @@ class Call:
     headers: Mapping[str, str] = field(default_factory=dict)
     form: Form | None = None
     """Multipart body; its files are opened anew for every sending."""
+    body: Rest | None = None
+    """Raw body; likewise."""
     changes_nothing: bool = False
     """A POST that only asks a question."""
 

@@ -29,17 +29,47 @@ class Form:
     fields: Mapping[str, str]
     files: Mapping[str, Path]
     on_upload: OnBytes | None = None
+    before: int = 0
+    """Bytes of the submission that went before, as uploads."""
+
+    @property
+    def size(self) -> int:
+        """Bytes of the files."""
+        return sum(path.stat().st_size for path in self.files.values())
 
     @contextmanager
     def open(self) -> Iterator[dict[str, tuple[str, IO[bytes], str]]]:
         """Open the files in the form that httpx takes, counting what is read."""
-        count = Count(sum(path.stat().st_size for path in self.files.values()), self.on_upload)
+        count = Count(self.before + self.size, self.on_upload)
+        count.add(self.before)
         with ExitStack() as stack:
             opened = {}
             for name, path in self.files.items():
                 file = CountedFile(stack.enter_context(path.open("rb")), count)
                 opened[name] = (path.name, cast(IO[bytes], file), "application/octet-stream")
             yield opened
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rest:
+    """The bytes of a file from some offset on, as a body that can be sent again."""
+
+    path: Path
+    offset: int
+    tell: Callable[[int], None]
+    """Told the bytes of the file that are on their way so far."""
+
+    def pieces(self) -> Iterator[bytes]:
+        """Read them."""
+        with self.path.open("rb") as file:
+            file.seek(self.offset)
+            while piece := file.read(PIECE):
+                yield piece
+                self.tell(file.tell())
+
+
+PIECE = 1 << 18
+"""Bytes of a raw body that are read at a time."""
 
 
 class Count:

@@ -11,7 +11,7 @@ from typing import Any
 from urllib.parse import quote
 
 from pliant.client.download import download
-from pliant.client.errors import BadArgument, JobCancelled, JobFailed, NotAllowedNow, NotFound
+from pliant.client.errors import BadArgument, InvalidRequest, JobCancelled, JobFailed, NotAllowedNow, NotFound
 from pliant.client.events import events as follow
 from pliant.client.events import told
 from pliant.client.exchange import answered, parse, record
@@ -20,6 +20,7 @@ from pliant.client.options import Options
 from pliant.client.parts import Inputs, OnBytes, checked_options
 from pliant.client.policy import Attempts
 from pliant.client.schemas import Interpretation, Job, JobPage, Problem, ServiceLimits, Status
+from pliant.client.upload import removed, sent_ahead
 
 OnJob = Callable[[Job], None]
 """Told the job each time something about it is new."""
@@ -40,15 +41,26 @@ def submit(
 ) -> Flow[Job]:
     """Send inputs; the answer is the new job. Temporary files go into `folder`, which the caller removes."""
     fields = _fields(options) | ({"name": name} if name != "" else {})
-    form = yield Do(lambda: inputs.form(folder, fields, on_upload))
+    whole = yield Do(lambda: inputs.form(folder, fields, on_upload))
     key = idempotency_key if idempotency_key is not None else secrets.token_urlsafe(16)
-    call = Call(
-        method="POST" if job_id is None else "PUT",
-        path="/v1/jobs" if job_id is None else _path(job_id),
-        headers={"Idempotency-Key": key} if job_id is None else {},
-        form=form,
-    )
-    return (yield from record(attempts, call, Job))
+    for chance in (1, 2, 3):
+        form = yield from sent_ahead(attempts, whole, key if job_id is None else f"id:{job_id}")
+        call = Call(
+            method="POST" if job_id is None else "PUT",
+            path="/v1/jobs" if job_id is None else _path(job_id),
+            headers={"Idempotency-Key": key} if job_id is None else {},
+            form=form,
+        )
+        try:
+            job = yield from record(attempts, call, Job)
+        except InvalidRequest as refused:
+            if refused.code == "unknown_upload" and chance < 3:
+                continue  # it has expired, or another run with the same key has removed it
+            yield from removed(attempts, form)
+            raise
+        yield from removed(attempts, form)
+        return job
+    raise AssertionError("unreachable: the last chance returns or raises")
 
 
 def inspect(

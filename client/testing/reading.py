@@ -7,24 +7,15 @@ import json
 import zipfile
 from email.message import Message
 from email.parser import BytesParser
-from typing import Any, cast
+from typing import cast
 
 import httpx
 import numpy as np
 from numpy.typing import NDArray
 from pliant.client.options import Options
-from pliant.client.schemas import Problem
+from pliant.client.testing.refusal import Refusal as Refusal
+from pliant.client.testing.uploads import Uploads
 from pydantic import ValidationError
-
-
-class Refusal(Exception):
-    """What the double answers instead of a result."""
-
-    def __init__(self, status: int, code: str, detail: str, **more: Any) -> None:
-        super().__init__(detail)
-        self.problem = Problem(
-            title=code.replace("_", " ").capitalize(), status=status, code=code, detail=detail, **more
-        )
 
 
 def multipart(request: httpx.Request) -> tuple[dict[str, str], dict[str, bytes]]:
@@ -44,9 +35,12 @@ def multipart(request: httpx.Request) -> tuple[dict[str, str], dict[str, bytes]]
     return fields, files
 
 
-def inputs_of(request: httpx.Request) -> tuple[dict[str, str], dict[str, bytes]]:
-    """Return the text fields and the files of a submission; there are tracks among them."""
+def inputs_of(request: httpx.Request, uploads: Uploads) -> tuple[dict[str, str], dict[str, bytes]]:
+    """Return the text fields and the files of a submission, uploads that it names included; there are tracks among them."""
     fields, files = multipart(request)
+    for part in ("tracks", "mesh", "ground_truth", "rotations"):
+        if f"{part}_upload" in fields:
+            files[part] = uploads.take(fields.pop(f"{part}_upload"), f"{part}_upload")
     if "tracks" not in files:
         raise Refusal(422, "missing_part", "tracks: expected a file, got none. Send one.", field="tracks")
     return fields, files

@@ -16,6 +16,7 @@ from pliant.client.options import Options
 from pliant.client.schemas import JobPage, Problem, ServiceLimits, Status
 from pliant.client.testing.ledger import Entry, Ledger, understood
 from pliant.client.testing.reading import Refusal, inputs_of, options_of, tracks_of
+from pliant.client.testing.uploads import Uploads
 
 Reconstruct = Callable[[NDArray[np.float64], Options], NDArray[np.float64]]
 """From points (F, P, 2) and options to shapes (F, P, 3)."""
@@ -24,6 +25,7 @@ WHOLE_PAGE = 200
 LIMITS = ServiceLimits(
     max_body_bytes=1 << 30,
     max_text_bytes=1 << 20,
+    max_upload_bytes=1 << 30,
     max_bytes=1 << 30,
     max_frames=1000,
     max_points=100_000,
@@ -59,6 +61,8 @@ class FakeService(httpx.MockTransport):
     ----------
     requests : list of httpx.Request
         What was received, for asserting on.
+    uploads : Uploads
+        Large inputs that were sent ahead of their jobs and not removed yet.
     """
 
     def __init__(
@@ -71,6 +75,7 @@ class FakeService(httpx.MockTransport):
     ) -> None:
         super().__init__(self._answer)
         self.requests: list[httpx.Request] = []
+        self.uploads = Uploads()
         self._token = token
         self._ledger = Ledger(reconstruct, looks=looks, problem=problem)
 
@@ -95,7 +100,7 @@ class FakeService(httpx.MockTransport):
         raise Refusal(404, "not_found", f"There is nothing at {request.method} {request.url.path}.")
 
     def _submit(self, request: httpx.Request, job_id: str | None = None) -> httpx.Response:
-        fields, files = inputs_of(request)
+        fields, files = inputs_of(request, self.uploads)
         key = request.headers.get("idempotency-key") if job_id is None else f"id:{job_id}"
         entry, new = self._ledger.submit(
             points=tracks_of(files["tracks"]),
@@ -110,7 +115,7 @@ class FakeService(httpx.MockTransport):
         return self._job(entry, status=202 if new else 200, headers={"Location": f"/v1/jobs/{entry.job.id}"})
 
     def _inspect(self, request: httpx.Request) -> httpx.Response:
-        fields, files = inputs_of(request)
+        fields, files = inputs_of(request, self.uploads)
         options_of(fields.get("options", "{}"))
         points = tracks_of(files["tracks"])
         said = understood(points, ground_truth="ground_truth" in files, rotations="rotations" in files)
@@ -162,6 +167,20 @@ class FakeService(httpx.MockTransport):
         self._ledger.delete(job_id)
         return httpx.Response(204)
 
+    def _send(self, request: httpx.Request, upload_id: str) -> httpx.Response:
+        begun = upload_id in self.uploads.held
+        there = self.uploads.write(upload_id, request.content, request.headers)
+        return _json(200 if begun else 201, there.model_dump_json())
+
+    def _upload(self, _request: httpx.Request, upload_id: str) -> httpx.Response:
+        there = self.uploads.get(upload_id)
+        state = {"Upload-Offset": str(there.offset), "Upload-Complete": "?1" if there.complete else "?0"}
+        return _json(200, there.model_dump_json(), state)
+
+    def _remove(self, _request: httpx.Request, upload_id: str) -> httpx.Response:
+        self.uploads.delete(upload_id)
+        return httpx.Response(204)
+
     def _artifacts(self, _request: httpx.Request, job_id: str) -> httpx.Response:
         held = self._ledger.find(job_id).job.artifacts
         return _json(200, json.dumps([artifact.model_dump() for artifact in held]))
@@ -189,6 +208,7 @@ class FakeService(httpx.MockTransport):
 
 
 _JOB = r"/v1/jobs/([A-Za-z0-9_-]+)"
+_UPLOAD = r"/v1/uploads/([A-Za-z0-9_-]+)"
 _ROUTES: tuple[tuple[str, str, Callable[..., httpx.Response]], ...] = (
     ("POST", r"/v1/jobs", FakeService._submit),
     ("POST", r"/v1/inspect", FakeService._inspect),
@@ -202,6 +222,10 @@ _ROUTES: tuple[tuple[str, str, Callable[..., httpx.Response]], ...] = (
     ("POST", _JOB + "/retry", FakeService._retry),
     ("GET", _JOB + "/artifacts", FakeService._artifacts),
     ("GET", _JOB + r"/artifacts/([^/]+)", FakeService._artifact),
+    ("PUT", _UPLOAD, FakeService._send),
+    ("PATCH", _UPLOAD, FakeService._send),
+    ("GET", _UPLOAD, FakeService._upload),
+    ("DELETE", _UPLOAD, FakeService._remove),
     ("GET", r"/v1/options", FakeService._options),
     ("GET", r"/v1/limits", FakeService._limits),
     ("GET", r"/healthz", FakeService._healthy),

@@ -223,3 +223,23 @@ def test_cancelling_ends_the_wait_and_a_retry_is_a_new_job(kind: str, asked: dic
         with pytest.raises(NotAllowedNow):
             again.delete()
         again.cancel()
+
+
+def test_what_is_large_is_sent_ahead_and_comes_to_the_same(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
+    points, key = moving_points(6, 4000), secrets.token_hex()
+    carried = client.submit(points, idempotency_key=key)
+    monkeypatch.setattr("pliant.client.upload.LARGE", 100_000)
+    monkeypatch.setattr("pliant.client.upload.SMALL", 1000)
+    told: list[tuple[int, int]] = []
+    ahead = client.submit(points, idempotency_key=key, on_upload=lambda *now: told.append(now))
+    assert ahead.id == carried.id, "the same content is the same request by either road"
+    assert [done for done, _ in told] == sorted(done for done, _ in told)
+    assert told[-1][0] == told[-1][1] > points.nbytes
+    truth = np.zeros((6, 4000, 3)) + np.arange(4000)[:, None]
+    job = client.submit(points, ground_truth=truth, mesh="none")
+    assert job.record.interpretation.has_ground_truth
+    job.cancel()
+    carried.cancel()
+    with pytest.raises(InvalidRequest) as caught:
+        client.submit(np.ones((2, 9000, 2)))
+    assert caught.value.code == "too_few_frames"
