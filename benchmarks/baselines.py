@@ -98,11 +98,23 @@ def normal_matrix(problem: Problem) -> sparse.csr_array:
     frames, _, points = problem.points.shape
     order, weights = len(problem.bands) - 1, problem.weights
     steps = sparse.csr_array(differences(np.eye(frames), order))
-    matrix = weights.temporal * sparse.kron(steps.T @ steps, sparse.eye_array(3 * points), format="csr")
+    matrix = sparse.csr_array(
+        weights.temporal * sparse.kron(steps.T @ steps, sparse.eye_array(3 * points), format="csr")
+    )
     if problem.laplacian is not None and weights.spatial > 0:
-        bend = problem.laplacian.matrix.T @ problem.laplacian.matrix
-        matrix = matrix + weights.spatial * sparse.kron(sparse.eye_array(3 * frames), bend, format="csr")
+        bend = sparse.csr_array(weights.spatial * (problem.laplacian.matrix.T @ problem.laplacian.matrix))
+        matrix = matrix + _repeated(bend, 3 * frames)
     return sparse.csr_array(matrix)
+
+
+def _repeated(block: sparse.csr_array, times: int) -> sparse.csr_array:
+    """Return I ⊗ block; what `sparse.kron` gives, without its detour over coordinates, which needs several times the memory."""
+    size, entries = block.shape[0], block.nnz
+    kind = np.int32 if times * max(entries, size) < 2**31 else np.int64
+    shift = np.arange(times, dtype=kind)[:, None]
+    columns = (block.indices.astype(kind)[None] + size * shift).ravel()
+    starts = np.append((block.indptr[:-1].astype(kind)[None] + entries * shift).ravel(), kind(times * entries))
+    return sparse.csr_array((np.tile(block.data, times), columns, starts), shape=(times * size,) * 2)
 
 
 def data_matrix(problem: Problem, omega: np.ndarray) -> sparse.csr_array:

@@ -1,0 +1,82 @@
+"""The speed benchmark at tiny sizes: what it times, what it says when something does not fit, and its arithmetic."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+import pytest
+from holding import hold
+
+ROOT = Path(__file__).parent.parent.parent
+
+
+@pytest.fixture
+def bench(monkeypatch):
+    """Import a module of the benchmarks as they import each other: from the root of the repository."""
+    monkeypatch.syspath_prepend(str(ROOT))
+    return lambda name: import_module(f"benchmarks.{name}")
+
+
+def speed(*arguments: str) -> list[str]:
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, "-m", "benchmarks.speed", *arguments]
+    ran = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=200, check=False)
+    assert ran.returncode == 0, ran.stderr
+    return ran.stdout.splitlines()
+
+
+def test_every_baseline_stands_beside_the_solver():
+    lines = speed("compare", "--frames", "6", "--points", "80", "--cap", "60")
+    cells = {
+        line.split("|")[1].strip(): [cell.strip() for cell in line.split("|")[2:-1]] for line in lines if "|" in line
+    }
+    assert {"ours, within 1 %", "ours, to the end", "conjugate gradients", "gradient descent", "direct"} <= set(cells)
+    for name in ("conjugate gradients", "gradient descent", "direct"):
+        energy, seconds, times, iterations, memory = cells[name]
+        assert 0.9 < float(energy) <= 1.011
+        assert float(seconds.split()[0]) >= 0
+        assert float(times.split()[0]) >= 0
+        assert int(iterations) > 0
+        assert 0.02 < float(memory.split()[0]) < 2
+
+
+def test_growth_prints_an_exponent_for_each_size():
+    lines = speed("growth", "--against-points", "100,200", "--against-frames", "4,8")
+    assert sum(line.startswith(("| 100 ", "| 200 ", "| 4 ", "| 8 ")) for line in lines) == 4
+    assert sum(line.startswith("exponent in P of") for line in lines) == 3
+    assert sum(line.startswith("exponent in F of") for line in lines) == 3
+
+
+def test_mesh_bandwidth_and_profile_run():
+    assert any("× the grid's time" in line for line in speed("mesh", "--frames", "6", "--points", "100"))
+    assert any(line.startswith("ratio: ") for line in speed("bandwidth", "--frames", "6", "--points", "100"))
+    assert any("conjugate_gradient" in line for line in speed("profile", "--frames", "6", "--points", "100"))
+
+
+def test_exponent_of_a_known_law(bench):
+    sizes = np.array([10.0, 20.0, 80.0])
+    assert bench("growth").exponent(sizes, 3 * sizes**1.25) == pytest.approx(1.25)
+
+
+def test_memory_of_one_process_is_its_own(bench):
+    measured = bench("apart").apart(hold, 200_000_000)
+    assert measured.value == 25_000_000
+    assert 190e6 < measured.growth < 230e6
+    assert measured.peak > measured.growth
+
+
+def test_too_little_memory_is_no_number(bench):
+    assert bench("apart").apart(hold, 1 << 40, limit=1 << 32) is None
+
+
+def test_an_unfinished_run_is_extrapolated_at_its_last_rate(bench):
+    """The gap halves every second: from 64 % to 1 % in six."""
+    run = bench("baselines").Run([0.0, 1.0, 2.0], [1.64, 1.32, 1.16])
+    assert bench("side_by_side").extrapolated(run, best=1.0) == pytest.approx(6.0)
+    stuck = bench("baselines").Run([0.0, 1.0, 2.0], [1.64, 1.64, 1.64])
+    assert bench("side_by_side").extrapolated(stuck, best=1.0) == float("inf")
