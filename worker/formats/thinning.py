@@ -16,6 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.client.options import Options
 from pliant.solver import Mesh
+from pliant.solver.records import MIN_POINTS
+from pliant.worker.formats.errors import refusal
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
@@ -52,6 +54,11 @@ def thin(
         The mesh of the kept points; None where none was given.
     notes : list of str
         What was done.
+
+    Raises
+    ------
+    InvalidInput
+        Code too_few_points, when a grid's stride leaves fewer than four.
     """
     count = points.shape[1]
     limit = count if options.max_points is None else options.max_points
@@ -77,6 +84,11 @@ def _thin_grid(grid: NDArray[np.int32], stride: int, limit: int) -> tuple[Indice
         stride += 1
     coarse = grid[::stride, ::stride]
     kept = np.sort(coarse[coarse >= 0])
+    if len(kept) < MIN_POINTS:
+        raise refusal(
+            "too_few_points", "options.stride", expected=f"a stride that leaves {MIN_POINTS} points or more",
+            got=f"{len(kept)} points at stride {stride}", hint="Use a smaller stride, or a larger max_points.",
+        )  # fmt: skip
     numbers = np.full(int(grid.max()) + 1, -1)
     numbers[kept] = np.arange(len(kept))
     renumbered = np.where(coarse >= 0, numbers[np.maximum(coarse, 0)], -1)
@@ -99,7 +111,7 @@ def _thin_mesh(
         cluster = _nearest(graph, seeds)
     order = np.argsort(seeds)
     kept = seeds[order]
-    numbers = np.full(len(places) + 1, -1)
+    numbers = np.full(places.shape[1] + 1, -1)
     numbers[kept] = np.arange(len(kept))
     faces = numbers[np.where(cluster >= 0, seeds[np.maximum(cluster, 0)], -1)][triangles]
     apart = (
@@ -112,7 +124,8 @@ def _thin_mesh(
     coarse = Mesh.from_faces(faces[apart][np.sort(first)].astype(np.int32), len(kept))
     alone = len(kept) - len(np.unique(coarse.faces))
     notes = [
-        f"{len(kept)} of {len(places)} points are used, spread evenly over the mesh; {len(mesh.faces)} faces became {len(coarse.faces)}."
+        f"{len(kept)} of {places.shape[1]} points are used, spread evenly over the mesh; "
+        f"{len(mesh.faces)} faces became {len(coarse.faces)}."
     ]
     if alone:
         notes.append(f"{alone} of the points used belong to no face, so no smoothness in space reaches them.")
