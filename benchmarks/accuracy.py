@@ -3,10 +3,12 @@
     python -m benchmarks.accuracy                          the gallery, clean
     python -m benchmarks.accuracy --data DIR --points 2500  recorded sequences, thinned
     python -m benchmarks.accuracy --data DIR --only face --corruptions all
-    python -m benchmarks.accuracy --tables                  print what has been measured so far
+    python -m benchmarks.accuracy --data DIR --plan        the whole table, part by part (see plan.py)
+    python -m benchmarks.accuracy --tables                  print what has been measured so far, and the aims beside it
     python -m benchmarks.accuracy --gate                    small gallery sequences against the committed baseline
 
-Every finished cell is a line of JSON in `--results`; a second run skips what is there.
+Every finished cell is a line of JSON in `--results`, with the commit that it was measured at; a second run skips what is there, or,
+with `--remeasure`, what is there from the same commit.
 """
 
 from __future__ import annotations
@@ -14,12 +16,16 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 
 from pliant.solver import InvalidInput
 
 from benchmarks import gate
+from benchmarks.aims import aims_table
 from benchmarks.cells import CORRUPTIONS, METHODS, Key, append_row, measure, read_rows
+from benchmarks.commit import commit
+from benchmarks.plan import PARTS
 from benchmarks.sequences import Case, cases, wanted
 from benchmarks.tables import METRICS, clean_table, corruption_table, cost_table, number
 
@@ -32,18 +38,28 @@ def main() -> int:
     options = _parser().parse_args()
     if options.gate or options.update_baseline:
         return gate.main(update=options.update_baseline)
-    if not options.tables:
-        for case in cases(options.data, points=options.points, visibility=options.visibility, only=options.only):
-            measure_case(case, options)
+    if options.plan:
+        for part in PARTS:
+            measure_all(argparse.Namespace(**{**vars(options), **asdict(part)}))
+    elif not options.tables:
+        measure_all(options)
     print_tables(options)
     return 0
+
+
+def measure_all(options: argparse.Namespace) -> None:
+    """Measure every missing cell of every sequence that the options name."""
+    for case in cases(options.data, points=options.points, visibility=options.visibility, only=list(options.only)):
+        measure_case(case, options)
 
 
 def measure_case(case: Case, options: argparse.Namespace) -> None:
     """Measure every missing cell of one sequence."""
     seconds: dict[tuple[str, str], float] = {}
+    done = read_rows(options.results)
+    if options.remeasure:
+        done = {key: row for key, row in done.items() if row.get("commit") == commit()}
     for key in keys(case, options):
-        done = read_rows(options.results)
         if key.trial >= 3 and seconds.get((key.method, key.corruption), 0.0) > SLOW:
             continue
         if key not in done:
@@ -66,7 +82,11 @@ def measure_case(case: Case, options: argparse.Namespace) -> None:
 def keys(case: Case, options: argparse.Namespace) -> Iterator[Key]:
     """List the cells of one sequence, in the order in which they are measured."""
     for corruption in CORRUPTIONS:
-        if corruption != "clean" and "all" not in options.corruptions and not wanted(corruption, options.corruptions):
+        if (
+            corruption != "clean"
+            and "all" not in options.corruptions
+            and not wanted(corruption, list(options.corruptions))
+        ):
             continue
         if corruption == "clean" and not {"all", "clean"} & set(options.corruptions):
             continue
@@ -93,6 +113,8 @@ def print_tables(options: argparse.Namespace) -> None:
         for cameras in options.cameras:
             if any(row["corruption"] != "clean" and row["cameras"] == cameras for row in rows):
                 print(f"\n### {metric}, corrupted, {cameras} cameras\n\n{corruption_table(rows, metric, cameras)}")
+    commits = sorted({str(row.get("commit", "unknown")) for row in rows})
+    print(f"\n### Aims\n\n{aims_table(rows)}\n\n{len(rows)} cells, measured at {', '.join(commits) or '–'}")
     if {"true", "estimated"} <= set(options.cameras):
         print(f"\n### e3d_frame, estimated over true cameras, clean\n\n{cost_table(rows, 'e3d_frame')}")
 
@@ -114,6 +136,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--settings", default="", help="further settings, name=value,…")
     parser.add_argument("--results", type=Path, default=Path("build/benchmarks/accuracy.jsonl"))
     parser.add_argument("--metrics", type=words, default=["e3d_frame"], help="of: " + ", ".join(METRICS))
+    parser.add_argument("--plan", action="store_true", help="the whole table of the recorded sequences; needs --data")
+    parser.add_argument("--remeasure", action="store_true", help="measure cells of other commits anew")
     parser.add_argument("--tables", action="store_true", help="measure nothing")
     parser.add_argument("--gate", action="store_true", help="exit 1 if a small sequence got worse than the baseline")
     parser.add_argument("--update-baseline", action="store_true", help="write the baseline anew")

@@ -13,6 +13,7 @@ from pliant.solver import Settings, solve
 from pliant.solver.gallery import corrupt_tracks
 from pliant.solver.metrics import evaluate
 
+from benchmarks.commit import commit
 from benchmarks.sequences import Case
 
 METHODS: dict[str, dict[str, str]] = {
@@ -80,6 +81,8 @@ def measure(case: Case, key: Key) -> dict[str, Any]:
     }
     return {
         **asdict(key),
+        "frames": tracks.num_frames,
+        "commit": commit(),
         "metrics": metrics,
         "chosen": chosen,
         "warnings": list(choices.warnings),
@@ -88,6 +91,7 @@ def measure(case: Case, key: Key) -> dict[str, Any]:
         "reweightings": len(solution.trace.objective) - 1,
         "seconds": wall,
         "cpu_seconds": cpu,
+        "stages": {stage: round(seconds, 3) for stage, seconds in solution.seconds.items()},
     }
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from pliant.solver.gallery import face, flag, sphere
 
 from benchmarks.cells import METHODS, Key, measure
+from benchmarks.commit import commit
 from benchmarks.sequences import from_gallery
 
 BASELINE = Path(__file__).parent / "baseline.json"
@@ -26,10 +27,11 @@ def main(*, update: bool) -> int:
     """Measure; write the baseline or compare with it. Returns 1 if something got worse."""
     measured = measure_all()
     if update:
-        BASELINE.write_text(json.dumps(measured, indent=1, sort_keys=True) + "\n")
+        BASELINE.write_text(json.dumps({"commit": commit(), "numbers": measured}, indent=1, sort_keys=True) + "\n")
         print(f"wrote {len(measured)} numbers to {BASELINE}")
         return 0
-    baseline = json.loads(BASELINE.read_text())
+    kept = json.loads(BASELINE.read_text())
+    baseline = kept["numbers"]
     worse = regressions(measured, baseline)
     for name in sorted(measured):
         print(
@@ -38,7 +40,7 @@ def main(*, update: bool) -> int:
     missing = sorted(set(baseline) - set(measured))
     if missing:
         print("not measured any more: " + ", ".join(missing))
-    print(f"{len(worse)} of {len(measured)} worse than the baseline")
+    print(f"{len(worse)} of {len(measured)} worse than the baseline of {kept['commit']}")
     return 1 if worse or missing else 0
 
 

@@ -27,8 +27,8 @@ def clean_table(rows: Rows, metric: str) -> str:
     if metric == "e3d_frame":
         head += ["K", "seconds"]
     body = []
-    for sequence in _ordered(found, "case"):
-        cells = {_column(row): row for row in found if row["case"] == sequence}
+    for sequence in _ordered(found):
+        cells = {_column(row): row for row in found if _name(row) == sequence}
         line = [sequence, *(number(cells[c]["metrics"][metric]) if c in cells else "–" for c in columns)]
         if metric == "e3d_frame":
             last = cells.get(columns[-1], next(iter(cells.values())))
@@ -42,11 +42,11 @@ def corruption_table(rows: Rows, metric: str, cameras: str) -> str:
     found = [row for row in rows if row["cameras"] == cameras and metric in row["metrics"]]
     groups: dict[tuple[str, str, str], list[float]] = defaultdict(list)
     for row in found:
-        groups[row["case"], row["corruption"], row["method"]].append(row["metrics"][metric])
+        groups[_name(row), row["corruption"], row["method"]].append(row["metrics"][metric])
     spoilt = {sequence for sequence, corruption, _ in groups if corruption != "clean"}
     methods = [method for method in METHODS if any(key[2] == method and key[0] in spoilt for key in groups)]
     body = []
-    for sequence in _ordered(found, "case"):
+    for sequence in _ordered(found):
         for corruption in CORRUPTIONS:
             values = [groups.get((sequence, corruption, method), []) for method in methods]
             if sequence in spoilt and any(values):
@@ -58,7 +58,7 @@ def corruption_table(rows: Rows, metric: str, cameras: str) -> str:
 def cost_table(rows: Rows, metric: str) -> str:
     """What estimating the cameras costs: estimated over true, for every method, clean."""
     found = {
-        (row["case"], *_column(row)): row for row in rows if row["corruption"] == "clean" and metric in row["metrics"]
+        (_name(row), *_column(row)): row for row in rows if row["corruption"] == "clean" and metric in row["metrics"]
     }
     names = list(dict.fromkeys(case for case, cameras, _ in found if cameras == "true"))
     methods = [method for method in METHODS if any(key[2] == method for key in found)]
@@ -93,8 +93,12 @@ def _column(row: dict[str, Any]) -> tuple[str, str]:
     return row["cameras"], row["method"]
 
 
-def _ordered(rows: list[dict[str, Any]], name: str) -> list[str]:
-    return list(dict.fromkeys(row[name] for row in rows))
+def _name(row: dict[str, Any]) -> str:
+    return f"{row['case']}, {row['frames']} × {row['points']}"
+
+
+def _ordered(rows: list[dict[str, Any]]) -> list[str]:
+    return list(dict.fromkeys(_name(row) for row in rows))
 
 
 def _markdown(head: list[str], body: list[list[str]]) -> str:

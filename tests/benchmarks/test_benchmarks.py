@@ -50,7 +50,9 @@ def test_accuracy_measures_once_and_resumes(tmp_path):
     rows = [json.loads(line) for line in results.read_text().splitlines()]
     assert len(rows) == 2 * 2 * (1 + 2)  # cameras × methods × (clean once, outliers twice)
     assert {row["points"] for row in rows} == {60}
-    assert "| tiny | outliers 6 % | 2 |" in first.stdout
+    assert all(row["commit"] for row in rows)
+    assert "| tiny, 5 × 60 | outliers 6 % | 2 |" in first.stdout
+    assert f"{len(rows)} cells, measured at {rows[0]['commit']}" in first.stdout
     assert "### e3d_frame, estimated over true cameras, clean" in first.stdout
     kept = results.read_text()
     results.write_text(kept[:-40])  # the last line was cut off by an interruption
@@ -60,6 +62,55 @@ def test_accuracy_measures_once_and_resumes(tmp_path):
     assert lines[:-2] == kept.splitlines()[:-1]  # nothing else was measured anew
     remade, original = json.loads(lines[-1]), json.loads(kept.splitlines()[-1])
     assert remade["metrics"] == pytest.approx(original["metrics"])
+
+
+def row_of(case, value, *, corruption="clean", cameras="estimated", method="robust+low_rank", points=9):
+    return {"case": case, "points": points, "corruption": corruption, "cameras": cameras, "method": method,
+            "metrics": {"e3d_frame": value}}  # fmt: skip
+
+
+def test_aims_are_met_or_missed_by_what_was_measured(bench):
+    rows = [
+        row_of("facescan10_rot90", 0.040), row_of("facescan10_rot90", 0.030, cameras="true"),
+        row_of("facescan10_rot90", 0.90, points=3),  # thinned: not the headline
+        row_of("facescan10_rot90", 0.039, method="robust"), row_of("akhter_drink", 0.0030),
+        *(row_of("facescan10_rot90", value, corruption="outliers 10 %") for value in (0.048, 0.050)),
+    ]  # fmt: skip
+    found = {aim.what: (round(aim.measured, 4), aim.met) for aim in bench("aims").aims(rows)}
+    assert found == {
+        "facescan10_rot90: default settings": (0.04, True),
+        "akhter_drink: default settings": (0.003, False),
+        "facescan10_rot90, 9 points: estimated over true cameras": (1.3333, False),
+        "facescan10_rot90, 9 points, estimated cameras: low rank over smooth": (1.0256, True),
+        "facescan10_rot90, 9 points: 10 % outliers": (0.049, True),
+        "facescan10_rot90, 9 points: 10 % outliers over clean": (1.225, True),
+    }
+    table = bench("aims").aims_table(rows).splitlines()
+    assert table[2] == "| akhter_drink: default settings | 0.0025 | 0.003 | missed by 20% |"
+    assert table[-1].endswith("| met |")
+
+
+def test_cells_of_another_commit_are_measured_anew_only_on_request(tmp_path):
+    write_case(tmp_path / "data" / "tiny")
+    results = tmp_path / "cells.jsonl"
+    arguments = ("--data", tmp_path / "data", "--methods", "pseudo_inverse", "--cameras", "true", "--results", results)
+    assert run(*arguments).returncode == 0
+    old = json.loads(results.read_text())
+    results.write_text(json.dumps({**old, "commit": "0ld"}) + "\n")
+    assert "measured at 0ld" in run(*arguments).stdout
+    assert len(results.read_text().splitlines()) == 1
+    again = run(*arguments, "--remeasure").stdout
+    assert f"1 cells, measured at {old['commit']}" in again
+    assert len(results.read_text().splitlines()) == 2
+
+
+def test_the_plan_names_sequences_methods_and_corruptions_that_there_are(bench):
+    plan, cells, aims = bench("plan"), bench("cells"), bench("aims")
+    for part in plan.PARTS:
+        assert set(part.methods) <= set(cells.METHODS)
+        for word in part.corruptions:
+            assert word in ("all", "clean") or any(word in name for name in cells.CORRUPTIONS)
+    assert set(plan.CORRUPTED) | set(plan.FACES) <= set(aims.LARGEST)
 
 
 def test_thinning_keeps_a_closed_surface_closed(bench):

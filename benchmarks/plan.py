@@ -1,0 +1,40 @@
+"""The whole accuracy table as parts, small enough for one machine in one sitting.
+
+Clean sequences and the headline's outliers keep every point. The trials of the corruption table, hundreds of solves, are thinned: what
+noise, outliers and hidden points do to an estimate is settled long before the points run out, and the table says how many there were.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from benchmarks.cells import METHODS
+
+CORRUPTED = ("facescan10_rot90", "facescan99_rot30", "aura_anim_rot45", "akhter_drink")
+FACES = ("facescan10_rot90", "facescan99_rot30", "ict_beat_9k_rot30", "aura_anim_rot45")
+THINNED = 1_000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Part:
+    """Some cells of the table."""
+
+    only: tuple[str, ...] = ()
+    points: int | None = None
+    corruptions: tuple[str, ...] = ("clean",)
+    cameras: tuple[str, ...] = ("true", "estimated")
+    methods: tuple[str, ...] = field(default=tuple(METHODS))
+    trials: int = 5
+
+
+PARTS = (
+    Part(),
+    Part(
+        only=FACES,
+        corruptions=("outliers 10",),
+        cameras=("estimated",),
+        methods=("robust", "robust+low_rank"),
+        trials=1,
+    ),
+    Part(only=CORRUPTED, points=THINNED, corruptions=("all",)),
+)
