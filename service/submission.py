@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from pliant.client.options import Options
-from pliant.client.schemas import Job
+from pliant.client.schemas import Interpretation, Job
 from pliant.service.forms import File, Form
 from pliant.service.problems import Refusal, from_validation
 from pliant.worker.artifacts import kinds_for
 from pliant.worker.errors import Conflict, UnknownUpload
-from pliant.worker.formats import Inputs, Limits, read_inputs, save_inputs
+from pliant.worker.formats import Limits, store_inputs
 from pliant.worker.jobs import Jobs
 from pliant.worker.uploads import Uploads
 from pydantic import ValidationError
@@ -70,13 +70,12 @@ def accept(
     known = jobs.known(id=id, idempotency_key=idempotency_key, fingerprint=form.fingerprint)
     if known is not None:
         return known, False
-    inputs = read_form(form, options, limits)
     canonical = room / "canonical.npz"
-    save_inputs(inputs, canonical)
+    interpretation = read_form(form, options, limits, target=canonical)
     job = jobs.submit(
         canonical,
         options=options,
-        interpretation=inputs.interpretation,
+        interpretation=interpretation,
         name=name,
         id=id,
         idempotency_key=idempotency_key,
@@ -119,8 +118,8 @@ def _unfit(code: str, field: str, *, expected: str, got: str, hint: str) -> Refu
     return Refusal(422, code, detail=detail, field=field, expected=expected, got=got, hint=hint)
 
 
-def read_form(form: Form, options: Options, limits: Limits) -> Inputs:
-    """Read, check and interpret the files of a form. Blocks; call it on a thread.
+def read_form(form: Form, options: Options, limits: Limits, *, target: Path | None) -> Interpretation:
+    """Read, check and interpret the files of a form, and store them if a target is given. Blocks; call it on a thread.
 
     Raises
     ------
@@ -133,7 +132,7 @@ def read_form(form: Form, options: Options, limits: Limits) -> Inputs:
     files: dict[str, Path | str | None] = {part: file.path for part, file in form.files.items()}
     if form.texts.get("mesh", "").strip():
         files["mesh"] = form.texts["mesh"].strip()
-    return read_inputs(**files, options=options, limits=limits)  # type: ignore[arg-type]
+    return store_inputs(**files, options=options, limits=limits, target=target)  # type: ignore[arg-type]
 
 
 def missing(part: str) -> Refusal:

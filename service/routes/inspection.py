@@ -44,4 +44,4 @@ async def inspect(request: Request, core: Core, bounds: Bound, uploads: MyUpload
 def understood(form: Form, room: Path, uploads: Uploads, limits: Limits) -> Interpretation:
     """Read a form as for a job, and forget all but how it was understood. Blocks; call it on a thread."""
     whole = with_uploads(form, room, uploads)
-    return read_form(whole, parse_options(whole.texts.get("options", "")), limits).interpretation
+    return read_form(whole, parse_options(whole.texts.get("options", "")), limits, target=None)

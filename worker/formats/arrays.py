@@ -109,7 +109,7 @@ def read_npz(
     passed_over: dict[str, str] = {}
     try:
         with zipfile.ZipFile(path) as archive:
-            members = checked_members(archive, field=field, limits=limits)
+            members = checked_members(archive, field=field, limits=limits, wanted=wanted)
             for name, member in members.items():
                 if wanted is not None and name not in wanted:
                     passed_over[name] = "not known"
@@ -135,8 +135,10 @@ def check_directory(path: Path, *, field: str) -> None:
         raise too_large(field, expected="a zip directory below 1 MiB", got=f"{directory} bytes or a 64-bit directory")
 
 
-def checked_members(archive: zipfile.ZipFile, *, field: str, limits: Limits) -> dict[str, zipfile.ZipInfo]:
-    """Members by array name, once names, number, methods and declared sizes are found in order."""
+def checked_members(
+    archive: zipfile.ZipFile, *, field: str, limits: Limits, wanted: Collection[str] | None = None
+) -> dict[str, zipfile.ZipInfo]:
+    """Members by array name, once names, number, methods and the declared sizes of the wanted ones are found in order."""
     infos = archive.infolist()
     if len(infos) > limits.max_members:
         raise too_large(field, expected=f"at most {limits.max_members} members", got=f"{len(infos)}")
@@ -161,7 +163,7 @@ def checked_members(archive: zipfile.ZipFile, *, field: str, limits: Limits) -> 
                 hint="Write the file with numpy.savez or numpy.savez_compressed.",
             )  # fmt: skip
         members[name] = info
-    declared = sum(info.file_size for info in infos)
+    declared = sum(info.file_size for name, info in members.items() if wanted is None or name in wanted)
     if declared > limits.max_bytes:
         raise too_large(field, expected=f"at most {limits.max_bytes} bytes inflated", got=f"{declared} bytes")
     return members

@@ -96,7 +96,7 @@ def _told(answer: Path, field: str) -> InvalidInput:
 def main() -> int:
     """Parse the file of the given descriptor under the given limits; the child's whole life."""
     parser, field, given, answer, parent, bounds = sys.argv[1:]
-    _die_with(int(parent))
+    die_with(int(parent))
     import numpy as np
     from pliant.worker.formats.parsers import PARSERS, parse
 
@@ -117,7 +117,7 @@ def main() -> int:
     return DONE
 
 
-def _die_with(parent: int) -> None:
+def die_with(parent: int) -> None:
     """Let the kernel kill this process with its parent; Linux only, elsewhere the processor limit ends it."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)

@@ -42,6 +42,12 @@ class Limits:
     parse_memory: int = 4 << 30
     """Address space of the process that parses a file."""
 
+    read_seconds: float = 600.0
+    """Wall time of the process that reads large inputs."""
+
+    read_memory: int = 8 << 30
+    """Address space of the process that reads large inputs."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GroundTruth:
