@@ -1,16 +1,45 @@
 """Dense non-rigid structure from motion: tracks in, a shape for every frame out.
 
-Numerics alone: no files, no environment, no logging set-up, no network.
+Numerics alone: no files, no environment, no logging set-up, no network. Names are looked up when first used, so that whoever
+needs only a record or an error loads no solver.
 """
 
 if __name__ != "pliant.solver":
     raise ImportError(f"import this folder as pliant.solver, not as {__name__!r}: install it with pip install -e .")
 
-from pliant.solver.errors import InvalidInput, InvalidSettings, NotFinite, SolverError
-from pliant.solver.parallel import threads_limited
-from pliant.solver.reconstruct import solve
-from pliant.solver.records import Camera, Choices, KnownCamera, Mesh, Outcome, Solution, Step, Trace, Tracks
-from pliant.solver.settings import Settings
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pliant.solver.errors import InvalidInput, InvalidSettings, NotFinite, SolverError
+    from pliant.solver.parallel import threads_limited
+    from pliant.solver.reconstruct import solve
+    from pliant.solver.records import Camera, Choices, KnownCamera, Mesh, Outcome, Solution, Step, Trace, Tracks
+    from pliant.solver.settings import Settings
+
+_HOMES = {
+    "errors": (
+        "InvalidInput",
+        "InvalidSettings",
+        "NotFinite",
+        "SolverError",
+    ),
+    "parallel": ("threads_limited",),
+    "reconstruct": ("solve",),
+    "records": (
+        "Camera",
+        "Choices",
+        "KnownCamera",
+        "Mesh",
+        "Outcome",
+        "Solution",
+        "Step",
+        "Trace",
+        "Tracks",
+    ),
+    "settings": ("Settings",),
+}
+_HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 
 __all__ = [
     "Camera",
@@ -30,3 +59,9 @@ __all__ = [
     "solve",
     "threads_limited",
 ]
+
+
+def __getattr__(name: str) -> object:
+    if name not in _HOME_OF:
+        raise AttributeError(f"module 'pliant.solver' has no attribute {name!r}")
+    return getattr(import_module(f"pliant.solver.{_HOME_OF[name]}"), name)

@@ -23,7 +23,7 @@ from pliant.worker.settings import NUMERICAL_THREADS, Settings
 
 USAGE = "usage: python -m pliant.worker [work|keep|audit]"
 
-PRELOADED = ("pliant.worker.formats", "pliant.worker.run")
+PRELOADED = ("pliant.worker.formats.canonical", "pliant.worker.run")
 
 WATCH_ANSWERS_WITHIN = 2.0
 """Seconds a sign of life may take: the watcher must go on watching when the store hangs."""

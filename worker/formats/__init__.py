@@ -1,11 +1,30 @@
-"""Readers: files as people have them in, checked records out. What cannot be read is refused with a code and a hint."""
+"""Readers: files as people have them in, checked records out. What cannot be read is refused with a code and a hint.
 
-from pliant.solver import InvalidInput
-from pliant.worker.formats.apart import store_inputs
-from pliant.worker.formats.canonical import load_inputs, save_inputs
-from pliant.worker.formats.errors import AmbiguousInput
-from pliant.worker.formats.read import read_inputs
-from pliant.worker.formats.records import GroundTruth, Inputs, Limits
+Names are looked up when first used, so that the child process that parses a stranger's file loads its parser and no more.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pliant.solver import InvalidInput
+    from pliant.worker.formats.apart import store_inputs
+    from pliant.worker.formats.canonical import load_inputs, save_inputs
+    from pliant.worker.formats.errors import AmbiguousInput
+    from pliant.worker.formats.read import read_inputs
+    from pliant.worker.formats.records import GroundTruth, Inputs, Limits
+
+_HOME_OF = {
+    "AmbiguousInput": "pliant.worker.formats.errors",
+    "GroundTruth": "pliant.worker.formats.records",
+    "Inputs": "pliant.worker.formats.records",
+    "InvalidInput": "pliant.solver.errors",
+    "Limits": "pliant.worker.formats.records",
+    "load_inputs": "pliant.worker.formats.canonical",
+    "read_inputs": "pliant.worker.formats.read",
+    "save_inputs": "pliant.worker.formats.canonical",
+    "store_inputs": "pliant.worker.formats.apart",
+}
 
 __all__ = [
     "AmbiguousInput",
@@ -18,3 +37,9 @@ __all__ = [
     "save_inputs",
     "store_inputs",
 ]
+
+
+def __getattr__(name: str) -> object:
+    if name not in _HOME_OF:
+        raise AttributeError(f"module 'pliant.worker.formats' has no attribute {name!r}")
+    return getattr(import_module(_HOME_OF[name]), name)

@@ -98,7 +98,10 @@ def main() -> int:
     parser, field, given, answer, parent, bounds = sys.argv[1:]
     die_with(int(parent))
     import numpy as np
+    import numpy.ma  # np.unique loads it when first used, which is too late once no file can be opened
     from pliant.worker.formats.parsers import PARSERS, parse
+
+    read = PARSERS[parser].load()
 
     limits = Limits(**json.loads(bounds))
     with os.fdopen(int(given), "rb") as source, os.fdopen(int(answer), "wb") as target:
@@ -106,7 +109,7 @@ def main() -> int:
             codecs.lookup(codec)
         _shut_the_door(limits)
         try:
-            arrays = parse(PARSERS[parser], source, field=field, limits=limits)
+            arrays = parse(read, source, field=field, limits=limits)
             np.savez(target, allow_pickle=False, **arrays)
         except InvalidInput as error:
             target.seek(0)

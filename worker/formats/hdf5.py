@@ -14,7 +14,6 @@ import numpy as np
 from pliant.worker.formats.errors import damaged, refusal, too_large
 from pliant.worker.formats.records import Arrays, Limits
 
-SIGNATURE = b"\x89HDF\r\n\x1a\n"
 MAX_OBJECTS = 512
 MAX_DEPTH = 4
 MAX_CELLS = 20_000

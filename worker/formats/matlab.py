@@ -18,7 +18,6 @@ from pliant.worker.formats.records import Arrays, Limits
 
 MAX_DEPTH = 4
 MAX_ARRAYS = 256
-VERSION_5 = b"MATLAB 5.0"
 
 
 def read_matlab5(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:

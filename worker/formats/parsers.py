@@ -3,31 +3,45 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
 from typing import IO
 
 from pliant.solver import InvalidInput
 from pliant.worker.formats.arrays import pickle_refusal
-from pliant.worker.formats.csv_tracks import looks_like_csv, read_csv
+from pliant.worker.formats.csv_tracks import looks_like_csv
 from pliant.worker.formats.errors import refusal, too_large
-from pliant.worker.formats.gltf_mesh import read_glb, read_gltf
-from pliant.worker.formats.hdf5 import SIGNATURE, read_matlab73
-from pliant.worker.formats.mask import read_png
-from pliant.worker.formats.matlab import VERSION_5, read_matlab5
-from pliant.worker.formats.meshes import read_obj, read_ply
 from pliant.worker.formats.records import Arrays, Limits
 
-Parser = Callable[..., Arrays]
 
-PARSERS: dict[str, Parser] = {
-    "matlab5": read_matlab5,
-    "matlab73": read_matlab73,
-    "csv": read_csv,
-    "obj": read_obj,
-    "ply": read_ply,
-    "glb": read_glb,
-    "gltf": read_gltf,
-    "png": read_png,
+@dataclass(frozen=True, slots=True)
+class Parser:
+    """A parser by name: its libraries are loaded when they are needed, since a child that parses a PNG needs no SciPy."""
+
+    module: str
+    function: str
+
+    def load(self) -> Callable[..., Arrays]:
+        """Return the function; a contained child calls this before it gives up the right to open files."""
+        found: Callable[..., Arrays] = getattr(import_module(f"pliant.worker.formats.{self.module}"), self.function)
+        return found
+
+    def __call__(self, stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
+        """Parse."""
+        return self.load()(stream, field=field, limits=limits)
+
+
+PARSERS = {
+    "matlab5": Parser("matlab", "read_matlab5"),
+    "matlab73": Parser("hdf5", "read_matlab73"),
+    "csv": Parser("csv_tracks", "read_csv"),
+    "obj": Parser("meshes", "read_obj"),
+    "ply": Parser("meshes", "read_ply"),
+    "glb": Parser("gltf_mesh", "read_glb"),
+    "gltf": Parser("gltf_mesh", "read_gltf"),
+    "png": Parser("mask", "read_png"),
 }
+MATLAB_5, HDF5 = b"MATLAB 5.0", b"\x89HDF\r\n\x1a\n"
 PICKLE = tuple(bytes([0x80, version]) for version in range(2, 6))
 
 
@@ -41,11 +55,11 @@ def recognise(head: bytes, field: str) -> str:
     """
     if head.startswith(PICKLE):
         raise pickle_refusal(field)
-    starts = {VERSION_5: "matlab5", b"ply\n": "ply", b"ply\r": "ply", b"glTF": "glb", b"\x89PNG\r\n": "png"}
+    starts = {MATLAB_5: "matlab5", b"ply\n": "ply", b"ply\r": "ply", b"glTF": "glb", b"\x89PNG\r\n": "png"}
     for start, name in starts.items():
         if head.startswith(start):
             return name
-    if head.startswith(SIGNATURE) or head[512:].startswith(SIGNATURE):
+    if head.startswith(HDF5) or head[512:].startswith(HDF5):
         return "matlab73"
     if _is_text(head):
         if field == "mesh":
@@ -55,7 +69,7 @@ def recognise(head: bytes, field: str) -> str:
     raise unknown_format(field, head)
 
 
-def parse(parser: Parser, stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
+def parse(parser: Callable[..., Arrays], stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
     """Run a parser; running out of memory is the file's fault, since the limits left enough for honest ones."""
     try:
         return parser(stream, field=field, limits=limits)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pliant.client.schemas import Interpretation
 from pliant.solver import KnownCamera, Mesh, Tracks
 from pliant.worker.formats.errors import refusal
+
+if TYPE_CHECKING:  # a contained child needs none of it
+    from pliant.client.schemas import Interpretation
 
 Arrays = dict[str, NDArray[np.generic]]
 """Named arrays as a file holds them, not yet interpreted; members of nested structures have dotted names."""
