@@ -92,6 +92,17 @@ SUBMIT_BODY: dict[str, Any] = {
                     },
                     "options": {"type": "string", "description": "A JSON object; its schema is at /v1/options."},
                     "name": {"type": "string", "maxLength": 200, "description": "A label of your own."},
+                    "webhook": {
+                        "type": "string",
+                        "format": "uri",
+                        "maxLength": 2000,
+                        "description": "An http(s) address that gets a POST once the job has ended, signed as Standard Webhooks 1.0 says.",
+                    },
+                    "webhook_secret": {
+                        "type": "string",
+                        "pattern": "^whsec_[A-Za-z0-9+/=]{32,}$",
+                        "description": "The key of that signature: `whsec_` and 24 to 64 random bytes in base64. Goes with `webhook`.",
+                    },
                     **{
                         f"{part}_upload": {
                             "type": "string",

@@ -15,12 +15,13 @@ from pliant.worker.errors import Conflict, UnknownUpload
 from pliant.worker.formats import Limits, store_inputs
 from pliant.worker.jobs import Jobs
 from pliant.worker.uploads import Uploads
+from pliant.worker.webhooks import parse_webhook
 from pydantic import ValidationError
 
 FILES = frozenset({"tracks", "mesh", "ground_truth", "rotations"})
 UPLOADS = {f"{part}_upload": part for part in sorted(FILES)}
 """Texts that name an upload, and the part that it stands for."""
-TEXTS = frozenset({"mesh", "options", "name", *UPLOADS})
+TEXTS = frozenset({"mesh", "options", "name", "webhook", "webhook_secret", *UPLOADS})
 LONGEST_NAME = 200
 """Characters of the user's label."""
 
@@ -67,6 +68,11 @@ def accept(
     form = with_uploads(form, room, uploads)
     options = parse_options(form.texts.get("options", ""))
     name = _name(form.texts.get("name", ""))
+    webhook = parse_webhook(
+        form.texts.get("webhook", "").strip(),
+        form.texts.get("webhook_secret", "").strip(),
+        networks=jobs.settings.webhook_networks,
+    )
     known = jobs.known(id=id, idempotency_key=idempotency_key, fingerprint=form.fingerprint)
     if known is not None:
         return known, False
@@ -80,6 +86,7 @@ def accept(
         id=id,
         idempotency_key=idempotency_key,
         fingerprint=form.fingerprint,
+        webhook=webhook,
     )
     return job, True
 

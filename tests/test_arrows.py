@@ -29,7 +29,7 @@ AT_HOME = {
     "uvicorn": {"service", "client/cli"},
     "typer": {"client/cli"},
     "rich": {"client/cli", "client"},
-    "httpx": {"client", "client/cli"},
+    "httpx": {"client", "client/cli", "worker"},
     "scipy": {"solver", "worker"},
 }
 

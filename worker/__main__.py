@@ -16,6 +16,7 @@ from pliant.worker.connection import connect
 from pliant.worker.errors import WorkerError
 from pliant.worker.jobs import Jobs
 from pliant.worker.keeper import Keeper
+from pliant.worker.postman import Postman
 from pliant.worker.queue import RedisQueue
 from pliant.worker.redis_records import RedisRecords
 from pliant.worker.rq_worker import PliantWorker
@@ -64,7 +65,11 @@ def keep(settings: Settings) -> int:
 
     signal.signal(signal.SIGTERM, stop)
     signal.signal(signal.SIGINT, stop)
-    Keeper(jobs=Jobs.open(settings)).run(lambda: told)
+    jobs = Jobs.open(settings)
+    postman = Postman.open(settings, jobs.records)
+    postman.start()
+    Keeper(jobs=jobs).run(lambda: told or not postman.alive)  # without its postman it ends and is started anew
+    postman.stop()
     return 0
 
 

@@ -26,7 +26,7 @@ from pliant.worker.errors import (
     UnknownJob,
 )
 from pliant.worker.queue import Queue, RedisQueue
-from pliant.worker.records import Event, Records, Stored, new_token
+from pliant.worker.records import Event, Records, Stored, Webhook, new_token
 from pliant.worker.redis_records import RedisRecords
 from pliant.worker.settings import Settings
 
@@ -77,6 +77,7 @@ class Jobs:
         id: str | None = None,
         idempotency_key: str | None = None,
         fingerprint: str | None = None,
+        webhook: Webhook | None = None,
     ) -> Job:
         """Accept a job: once this returns, it will be done or end with a reason, whatever is killed meanwhile.
 
@@ -90,6 +91,8 @@ class Jobs:
             A repeated request with the same key returns the first job; keys live as long as their job.
         fingerprint : str, optional
             Digest of the whole request, by which a repeated request is told from a different one.
+        webhook : Webhook, optional
+            Whom to tell when the job has ended.
 
         Raises
         ------
@@ -120,6 +123,7 @@ class Jobs:
             lambda key: self.blobs.put(key, inputs_file),
             key=self._digest(idempotency_key),
             fingerprint=fingerprint,
+            webhook=webhook,
         )
 
     def known(
@@ -219,16 +223,29 @@ class Jobs:
             self.queue.remove(token)
         return after.job
 
-    def retry(self, id: str) -> Job:
-        """Run a failed or cancelled job again, as a new job with the same inputs, options and name.
+    def retry(self, id: str, *, idempotency_key: str | None = None) -> Job:
+        """Run a failed or cancelled job again, as a new job with the same inputs, options, name and webhook.
+
+        Parameters
+        ----------
+        idempotency_key : str, optional
+            A repeated request with the same key returns the first new job.
 
         Raises
         ------
+        Conflict
+            The key belongs to a different request.
+        InvalidRequest
+            The key cannot be one.
         NotAllowedNow
             The job is not finished, or has succeeded.
         """
         stored = self._stored(id)
         job = stored.job
+        fingerprint = hashlib.sha256(f"retry of {id}".encode()).hexdigest()
+        known = self.known(idempotency_key=idempotency_key, fingerprint=fingerprint)
+        if known is not None:
+            return known
         if job.status not in (Status.FAILED, Status.CANCELLED):
             hint = "It has its result." if job.status is Status.SUCCEEDED else "Wait until it ends, or cancel it first."
             raise NotAllowedNow(id, job.status, wanted="run again", hint=hint)
@@ -248,7 +265,14 @@ class Jobs:
             self.blobs.copy(stored.inputs, key)
             return size
 
-        return self._create(again, copy, key=None, fingerprint=None, owner=stored.owner)
+        return self._create(
+            again,
+            copy,
+            key=self._digest(idempotency_key),
+            fingerprint=fingerprint,
+            owner=stored.owner,
+            webhook=stored.webhook,
+        )
 
     def delete(self, id: str) -> None:
         """Remove a finished job, its record and its files.
@@ -341,6 +365,7 @@ class Jobs:
         key: str | None,
         fingerprint: str | None,
         owner: str | None = None,
+        webhook: Webhook | None = None,
     ) -> Job:
         """Blobs, then record, then queue: whatever fails between leaves nothing that is promised and not there."""
         token = new_token(job.id)
@@ -354,6 +379,7 @@ class Jobs:
             bytes=size,
             key=key,
             fingerprint=fingerprint,
+            webhook=webhook,
         )
         try:
             kept = self.records.create(mine, max_queued=self.max_queued)

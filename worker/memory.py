@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterable, Sequence
+from datetime import datetime
 
 from pliant.client.schemas import Status
 from pliant.worker.errors import TooManyQueued, UnknownJob
 from pliant.worker.queue import Queue
-from pliant.worker.records import LOG_KEPT, Beat, Event, Records, Stored, event_of, events_kept
+from pliant.worker.records import LOG_KEPT, Beat, Event, Records, Stored, counted, event_of, events_kept
 
 
 class MemoryRecords(Records):
@@ -22,6 +24,7 @@ class MemoryRecords(Records):
         self._beats: dict[str, int] = {}
         self._events: dict[str, list[Event]] = {}
         self._logs: dict[str, list[str]] = {}
+        self._tallies: Counter[str] = Counter()
         self._clock = 0
 
     def create(self, stored: Stored, *, max_queued: int = 0) -> Stored:
@@ -63,6 +66,7 @@ class MemoryRecords(Records):
             if held is None or held.version != before.version:
                 return False
             self._records[id] = after
+            self._tallies.update(counted(before, after))
             self._tell(before, after)
             return True
 
@@ -105,6 +109,18 @@ class MemoryRecords(Records):
                 each.job.status in statuses and (owner is None or each.owner == owner)
                 for each in self._records.values()
             )
+
+    def oldest(self, status: Status) -> datetime | None:
+        """See `Records.oldest`."""
+        with self._changed:
+            return min(
+                (each.job.created_at for each in self._records.values() if each.job.status is status), default=None
+            )
+
+    def tallies(self) -> dict[str, float]:
+        """See `Records.tallies`."""
+        with self._changed:
+            return dict(self._tallies)
 
     def used(self) -> int:
         """See `Records.used`."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 import secrets
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
-from datetime import datetime
+from datetime import UTC, datetime
 from typing import NamedTuple
 
 from pliant.client.schemas import Job, Status
@@ -24,6 +24,19 @@ EVENTS_KEPT_AT_LAST = 16
 
 LOG_KEPT = 2000
 """Lines of one job's log; older ones are dropped."""
+
+
+RUN_SECONDS = (1.0, 2.5, 5.0, 10.0, 30.0, 60.0, 120.0, 300.0, 600.0, 1800.0, 3600.0)
+"""Upper bounds of the histogram of how long jobs ran, in seconds."""
+
+
+class Webhook(BaseModel):
+    """Where the end of a job is told, and the secret that signs the message. Never shown to anybody."""
+
+    model_config = ConfigDict(frozen=True)
+
+    url: str
+    secret: str
 
 
 class Stored(BaseModel):
@@ -55,6 +68,9 @@ class Stored(BaseModel):
 
     fingerprint: str | None = None
     """Digest of the request, to tell a repeated request from a different one under the same key or id."""
+
+    webhook: Webhook | None = None
+    """Told once the job has ended."""
 
     version: int = 0
     """Counts the changes; the compare-and-set compares it."""
@@ -101,6 +117,33 @@ def event_of(before: Stored | None, after: Stored) -> tuple[str, str]:
         if before.job.model_copy(update=still) == after.job.model_copy(update=still):
             return "progress", after.job.progress.model_dump_json()
     return "job", after.job.model_dump_json()
+
+
+def counted(before: Stored, after: Stored) -> dict[str, float]:
+    """Return what to add to which tally because of this change: nothing, unless it ends the job.
+
+    ``ended:<status>`` counts jobs, ``failed:<code>`` their reasons, ``ran:<status>:<bound>`` how many ran up to so many
+    seconds and longer than the bound before, ``ran:<status>:sum`` the seconds of all.
+    """
+    job = after.job
+    if before.job.status.final or not job.status.final:
+        return {}
+    adding: dict[str, float] = {f"ended:{job.status.value}": 1}
+    if job.error is not None:
+        adding[f"failed:{job.error.code}"] = 1
+    if job.started_at is not None and job.finished_at is not None:
+        seconds = max(0.0, (job.finished_at - job.started_at).total_seconds())
+        bound = next((f"{each:g}" for each in RUN_SECONDS if seconds <= each), "+Inf")
+        adding |= {f"ran:{job.status.value}:{bound}": 1, f"ran:{job.status.value}:sum": seconds}
+    return adding
+
+
+def told_at(before: Stored, after: Stored) -> int | None:
+    """Return when this change is due to be told by webhook, in milliseconds since 1970; None if it is not told."""
+    job = after.job
+    if after.webhook is None or before.job.status.final or not job.status.final or job.finished_at is None:
+        return None
+    return milliseconds(job.finished_at)
 
 
 def events_kept(after: Stored) -> int:
@@ -169,6 +212,14 @@ class Records(ABC):
         """Return how many jobs have one of these statuses."""
 
     @abstractmethod
+    def oldest(self, status: Status) -> datetime | None:
+        """Return when the oldest job of one status was made, None if there is none."""
+
+    @abstractmethod
+    def tallies(self) -> dict[str, float]:
+        """Return what has been counted since the installation began; see `counted` and `worker.outbox`."""
+
+    @abstractmethod
     def used(self) -> int:
         """Return the bytes that all jobs hold together."""
 
@@ -227,3 +278,8 @@ class Records(ABC):
 def milliseconds(moment: datetime) -> int:
     """Return a moment as whole milliseconds since 1970."""
     return int(moment.timestamp() * 1000)
+
+
+def moment(since: int) -> datetime:
+    """Return the moment that is so many milliseconds after 1970 began."""
+    return datetime.fromtimestamp(since / 1000, UTC)

@@ -7,6 +7,8 @@ Keys, all under one prefix::
     events:<id>, log:<id> stream and list, both capped
     key:<digest>          the job of an idempotency key
     used                  bytes that all jobs hold
+    tally                 hash: what has been counted since the installation began
+    outbox, outbox:tries  jobs whose end is to be told by webhook and when; how often it was tried (`worker.outbox`)
 
 Each write is one Lua script, hence atomic; the append-only file holds it wholly or not at all.
 """
@@ -14,13 +16,25 @@ Each write is one Lua script, hence atomic; the append-only file holds it wholly
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from datetime import datetime
 from typing import Any
 
 import redis
 from pliant.client.schemas import Status
 from pliant.worker.connection import reachable
 from pliant.worker.errors import TooManyQueued, UnknownJob
-from pliant.worker.records import LOG_KEPT, Beat, Event, Records, Stored, event_of, events_kept
+from pliant.worker.records import (
+    LOG_KEPT,
+    Beat,
+    Event,
+    Records,
+    Stored,
+    counted,
+    event_of,
+    events_kept,
+    moment,
+    told_at,
+)
 
 LONGEST_WAIT = 20.0
 """Seconds one blocking read waits at most: below the connection's own timeout."""
@@ -49,7 +63,8 @@ return false
 _FULL = "!full"
 """What `_CREATE` answers instead of an id when the owner's queue is full; no id begins with this sign."""
 
-# ARGV: 1 prefix, 2 id, 3 version before, 4 version, 5 status, 6 token, 7 bytes, 8 body, 9 event, 10 data, 11 cap
+# ARGV: 1 prefix, 2 id, 3 version before, 4 version, 5 status, 6 token, 7 bytes, 8 body, 9 event, 10 data, 11 cap,
+# 12 when to tell it by webhook ('': never), 13 … tallies and what to add to them
 _REPLACE = """
 local at, job = ARGV[1], ARGV[1] .. 'job:' .. ARGV[2]
 local held = redis.call('HMGET', job, 'version', 'status', 'owner', 'sort', 'bytes')
@@ -63,6 +78,8 @@ if held[2] ~= ARGV[5] then
 end
 if held[5] ~= ARGV[7] then redis.call('INCRBY', at .. 'used', tonumber(ARGV[7]) - tonumber(held[5])) end
 redis.call('XADD', at .. 'events:' .. ARGV[2], 'MAXLEN', ARGV[11], '*', 'name', ARGV[9], 'data', ARGV[10])
+if ARGV[12] ~= '' then redis.call('ZADD', at .. 'outbox', ARGV[12], ARGV[2]) end
+for i = 13, #ARGV, 2 do redis.call('HINCRBYFLOAT', at .. 'tally', ARGV[i], ARGV[i + 1]) end
 return 1
 """
 
@@ -75,6 +92,8 @@ redis.call('ZREM', at .. 'index:*:' .. held[1], held[3])
 redis.call('ZREM', at .. 'index:@' .. held[2] .. ':' .. held[1], held[3])
 redis.call('DECRBY', at .. 'used', held[4])
 if held[5] ~= '' then redis.call('DEL', at .. 'key:' .. held[5]) end
+redis.call('ZREM', at .. 'outbox', ARGV[2])
+redis.call('HDEL', at .. 'outbox:tries', ARGV[2])
 redis.call('DEL', job, at .. 'events:' .. ARGV[2], at .. 'log:' .. ARGV[2])
 return 1
 """
@@ -142,12 +161,13 @@ class RedisRecords(Records):
     def replace(self, before: Stored, after: Stored) -> bool:
         """See `Records.replace`."""
         name, data = event_of(before, after)
-        job = after.job
+        job, due = after.job, told_at(before, after)
         with reachable():
             written = self._replace(
                 args=[
                     self._at, job.id, before.version, after.version, job.status.value, after.token, after.bytes,
                     after.model_dump_json(), name, data, events_kept(after),
+                    "" if due is None else due, *(part for each in counted(before, after).items() for part in each),
                 ]
             )  # fmt: skip
         return bool(written)
@@ -184,6 +204,17 @@ class RedisRecords(Records):
         """See `Records.count`."""
         with reachable():
             return sum(self._redis.zcard(self._index(owner, status)) for status in dict.fromkeys(statuses))
+
+    def oldest(self, status: Status) -> datetime | None:
+        """See `Records.oldest`."""
+        with reachable():
+            first = self._redis.zrange(self._index(None, status), 0, 0)
+        return moment(int(first[0].split(":", 1)[0])) if first else None
+
+    def tallies(self) -> dict[str, float]:
+        """See `Records.tallies`."""
+        with reachable():
+            return {name: float(value) for name, value in self._redis.hgetall(f"{self._at}tally").items()}
 
     def used(self) -> int:
         """See `Records.used`."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 import math
 import os
 from collections.abc import Callable, Mapping
@@ -70,6 +71,10 @@ class Settings:
 
     max_attempts: int = 3
     """How often a job is begun anew when workers vanish under it."""
+
+    webhook_networks: str = ""
+    """Networks (CIDR, commas between them) whose addresses webhooks may be sent to although they are private, link-local,
+    loopback or otherwise not of the public internet."""
 
     max_running: int = 0
     """Jobs of one owner that are worked on at once, the others wait; 0: as many as there are workers. Where tokens are off,
@@ -145,6 +150,10 @@ def _at_least(low: float, parse: Callable[[str], float]) -> Callable[[str], floa
     return bounded
 
 
+def _networks(text: str) -> str:
+    return ",".join(str(ipaddress.ip_network(part.strip())) for part in text.split(",") if part.strip())
+
+
 _ONE = ("a whole number, at least 1", _at_least(1, int))
 _BYTES = ("a whole number of bytes, at least 0", _at_least(0, int))
 _SECONDS = ("a number of seconds, at least 0", _at_least(0, float))
@@ -162,6 +171,7 @@ VARIABLES: dict[str, tuple[str, str, Callable[[str], Any]]] = {
     "stop_grace": ("PLIANT_STOP_GRACE", *_SECONDS),
     "lost_after": ("PLIANT_LOST_AFTER", "a number of seconds, at least 1", _at_least(1, float)),
     "max_attempts": ("PLIANT_MAX_ATTEMPTS", *_ONE),
+    "webhook_networks": ("PLIANT_WEBHOOK_NETWORKS", "networks such as 10.0.0.0/8, commas between them", _networks),
     "max_running": ("PLIANT_MAX_RUNNING", "a whole number, at least 0", _at_least(0, int)),
     "retention": ("PLIANT_RETENTION", *_SECONDS),
     "disk_quota": ("PLIANT_DISK_QUOTA", *_BYTES),

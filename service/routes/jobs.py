@@ -106,11 +106,11 @@ def cancel(id: Id, jobs: Mine) -> Job:
     "/{id}/retry",
     status_code=202,
     summary="Run a failed or cancelled job again",
-    responses={202: {"headers": _LOCATION}, **problems(401, 403, 404, 409, 429, 503, 507)},
+    responses={202: {"headers": _LOCATION}, **problems(401, 403, 404, 409, 422, 429, 503, 507)},
 )
-def retry(id: Id, response: Response, jobs: Mine) -> Job:
+def retry(id: Id, response: Response, jobs: Mine, key: Key = None) -> Job:
     """Queue a new job with the same inputs, options and name; `retry_of` names the old one."""
-    job = jobs.retry(id)
+    job = jobs.retry(id, idempotency_key=key)
     response.headers["Location"] = f"/v1/jobs/{job.id}"
     return job
 

@@ -261,6 +261,11 @@ def test_cancel_retry_delete_follow_the_status(running: Running, http: httpx.Cli
     again = http.post(f"/v1/jobs/{job.id}/retry")
     assert (again.status_code, again.json()["retry_of"]) == (202, job.id)
     assert again.headers["location"] == f"/v1/jobs/{again.json()['id']}"
+    key = {"Idempotency-Key": "again"}
+    twice = [http.post(f"/v1/jobs/{job.id}/retry", headers=key) for _ in range(2)]
+    assert [each.status_code for each in twice] == [202, 202]
+    assert twice[0].json()["id"] == twice[1].json()["id"] != again.json()["id"]
+    assert http.post("/v1/jobs", files=form(), headers=key).json()["code"] == "idempotency_conflict"
     claim(running, again.json()["id"])
     assert http.post(f"/v1/jobs/{again.json()['id']}/cancel").json()["status"] == "cancelling"
     gone = http.delete(f"/v1/jobs/{job.id}")

@@ -17,7 +17,7 @@ def test_the_environment_round_trips() -> None:
     settings = Settings(
         data=Path("/some/where"), redis_url="redis://h/1", blob_url="s3://b/p", queue="q", workers=3, threads=2,
         time_limit=1.5, memory_limit=10, cancel_grace=2, stop_grace=3, lost_after=4, max_attempts=5, retention=0, disk_quota=7,
-        upload_expiry=8,
+        upload_expiry=8, max_running=9, webhook_networks="10.0.0.0/8,::1/128",
     )  # fmt: skip
     assert Settings.from_environment(settings.to_environment()) == settings
     assert len(settings.to_environment()) == len(VARIABLES) == len(Settings.__dataclass_fields__)
@@ -33,6 +33,14 @@ def test_the_environment_round_trips() -> None:
 def test_a_wrong_value_names_the_variable_and_both_sides(variable: str, text: str) -> None:
     with pytest.raises(InvalidSetting, match=f"{variable}: expected a .*, at least .*, got '{text}'"):
         Settings.from_environment({variable: text})
+
+
+def test_networks_are_networks() -> None:
+    given = Settings.from_environment({"PLIANT_WEBHOOK_NETWORKS": " 10.0.0.0/8, ::1 ,"})
+    assert given.webhook_networks == "10.0.0.0/8,::1/128"
+    for wrong in ("10.0.0.1/8", "localhost", "10/8/8"):
+        with pytest.raises(InvalidSetting, match="PLIANT_WEBHOOK_NETWORKS: expected networks"):
+            Settings.from_environment({"PLIANT_WEBHOOK_NETWORKS": wrong})
 
 
 def test_urls_default_to_the_data_directory() -> None:
