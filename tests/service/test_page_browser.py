@@ -222,11 +222,11 @@ def test_every_view_of_a_result_shows_something_else(page: Page, url: str, finis
     seek(page, 3)
     plain = canvas.screenshot()
     for colour in ("displacement", "residual", "3-D error"):
-        page.get_by_label("Colour").select_option(label=colour)
+        page.get_by_label("Colour", exact=True).select_option(label=colour)
         expect(page.locator(".legend")).to_be_visible()
         page.wait_for_timeout(200)
         assert differing_pixels(page, plain, canvas.screenshot()) > 0.02, colour
-    page.get_by_label("Colour").select_option("plain")
+    page.get_by_label("Colour", exact=True).select_option("plain")
     expect(page.locator(".legend")).to_be_hidden()
     for name in ("Wireframe", "Input tracks", "Ground truth beside it", "Flip depth"):
         page.get_by_label(name).click()
