@@ -38,6 +38,9 @@ have gross outliers."""
 SPATIAL_SHARE = 3e-4
 """λ2/λ1 of `auto`: neighbours help against outliers without flattening the depth."""
 
+LEAST_SQUARES_SHARE = 1e-2
+"""λ2/λ1 of `auto` against outliers without a robust loss: worth some flattening."""
+
 LOW_RANK_SHARE = 3e-4
 """λ3/λ1 of `auto` with the low-rank prior."""
 
@@ -101,11 +104,10 @@ def roughness_of(normalised: Normalised) -> Roughness:
 
 
 def _from_data(rough: Roughness, settings: Settings) -> tuple[Weights, str]:
-    if settings.method != "robust" or settings.loss == "l2":
-        chosen = replace(PAPER, spatial=PAPER.temporal * SPATIAL_SHARE, low_rank=PAPER.temporal * LOW_RANK_SHARE)
-        return chosen, f"Least squares: λ1 = {chosen.temporal:g} as published, λ2 = {SPATIAL_SHARE:g} λ1."
-    scale = float(np.clip(rough.noise, *SCALES))
     spoiled = rough.jumps > JUMPS
+    if settings.method != "robust" or settings.loss == "l2":
+        return _least_squares(rough, spoiled=spoiled)
+    scale = float(np.clip(rough.noise, *SCALES))
     stiff = STIFFEST if spoiled else float(np.clip(STIFFNESS / max(rough.noise, 1e-9), SOFTEST, STIFFEST))
     chosen = replace(
         PAPER, temporal=stiff, spatial=stiff * SPATIAL_SHARE, low_rank=stiff * LOW_RANK_SHARE, robust_scale=scale
@@ -117,3 +119,18 @@ def _from_data(rough: Roughness, settings: Settings) -> tuple[Weights, str]:
         f"λ1 = {stiff:.3g} because {why} ({rough.jumps:.1%} of the third differences are jumps); λ2 = {SPATIAL_SHARE:g} λ1 keeps "
         f"depth from flattening; the loss turns linear at {scale:.2g} RMS radii."
     )
+
+
+def _least_squares(rough: Roughness, *, spoiled: bool) -> tuple[Weights, str]:
+    """Return the weights without a robust loss.
+
+    At the published λ1 every frame is fitted all but exactly. An outlier is then in the shape in full, and the depth, which other
+    frames alone show, is made of their outliers: worse than no depth. Stiff paths and stiff neighbours are all the help there is.
+    """
+    stiff = STIFFEST if spoiled else PAPER.temporal
+    share = LEAST_SQUARES_SHARE if spoiled else SPATIAL_SHARE
+    chosen = replace(PAPER, temporal=stiff, spatial=stiff * share, low_rank=stiff * LOW_RANK_SHARE)
+    why = (
+        f"against gross outliers ({rough.jumps:.1%} of the third differences are jumps)" if spoiled else "as published"
+    )
+    return chosen, f"Least squares: λ1 = {stiff:g} {why}, λ2 = {share:g} λ1."
