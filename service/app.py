@@ -15,9 +15,10 @@ from pliant.service.follow import Followers
 from pliant.service.guard import OriginGuard, SecurityHeaders
 from pliant.service.incoming import Incoming
 from pliant.service.linger import LingeringClose
+from pliant.service.metrics import Counting, Requests
 from pliant.service.page import mount_page
 from pliant.service.rates import RateLimit
-from pliant.service.routes import about, artifacts, events, examples, inspection, jobs, uploads
+from pliant.service.routes import about, artifacts, events, examples, inspection, jobs, metrics, uploads
 from pliant.service.settings import ServiceSettings
 from pliant.service.turns import Turns
 from pliant.worker import errors
@@ -70,6 +71,7 @@ def create_app(
     limits : Limits
         What the readers accept.
     """
+    requests = Requests()
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
@@ -81,6 +83,7 @@ def create_app(
             limits=limits,
             incoming=incoming,
             followers=Followers(),
+            requests=requests,
             uploads=Uploads.open(jobs_of_all.settings),
             turns=Turns(),
             parsing=anyio.CapacityLimiter(settings.parsers),
@@ -94,21 +97,26 @@ def create_app(
         description=describe.DESCRIPTION,
         version=version("pliant"),
         lifespan=lifespan,
-        middleware=middleware(settings, tokens),
+        middleware=middleware(settings, tokens, requests),
         docs_url=None,  # FastAPI's page loads scripts from elsewhere, which our own content-security policy forbids
         redoc_url=None,
     )
     problems.install(app, STATUS_OF)
-    for each in (jobs, inspection, uploads, artifacts, events, about, examples):
+    for each in (jobs, inspection, uploads, artifacts, events, about, metrics, examples):
         app.include_router(each.router)
     mount_page(app)
     app.openapi = lambda: describe.document(app)  # type: ignore[method-assign]
     return app
 
 
-def middleware(settings: ServiceSettings, tokens: Tokens) -> list[Middleware]:
+def middleware(settings: ServiceSettings, tokens: Tokens, requests: Requests) -> list[Middleware]:
     """Return what every request passes, the outermost first."""
-    stack = [Middleware(SecurityHeaders), Middleware(LingeringClose), Middleware(OriginGuard, settings=settings)]
+    stack = [
+        Middleware(Counting, requests=requests),
+        Middleware(SecurityHeaders),
+        Middleware(LingeringClose),
+        Middleware(OriginGuard, settings=settings),
+    ]
     if settings.cors_origins:
         stack.append(
             Middleware(

@@ -68,7 +68,8 @@ class Authentication:
             await found(scope, receive, send)
             return
         owner = None if found.sees_all else found.owner
-        await self._app({**scope, "pliant.token": found, "pliant.owner": owner}, receive, send)
+        scope["pliant.token"], scope["pliant.owner"] = found, owner
+        await self._app(scope, receive, send)
 
     async def _judged(self, scope: AsgiScope) -> Token | Response:
         """Return the token of a request, or the answer that refuses it."""

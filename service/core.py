@@ -9,6 +9,7 @@ import anyio
 from fastapi import Depends, Request
 from pliant.service.follow import Followers
 from pliant.service.incoming import Incoming
+from pliant.service.metrics import Requests
 from pliant.service.settings import ServiceSettings
 from pliant.service.turns import Turns
 from pliant.worker.formats import Limits
@@ -31,6 +32,8 @@ class Service:
     uploads: Uploads
     """Everybody's uploads; a route takes `MyUploads` instead."""
     turns: Turns
+    requests: Requests
+    """What has been counted of them."""
     parsing: anyio.CapacityLimiter
     """Holds the number of inputs that are in memory at once."""
 

@@ -1,0 +1,29 @@
+"""Numbers for whoever runs the service."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter
+from fastapi.responses import PlainTextResponse, Response
+from pliant.service.core import Core
+from pliant.service.describe import problems
+from pliant.service.metrics import MEDIA_TYPE, exposition
+
+router = APIRouter(tags=["about"])
+
+_TEXT = {
+    "text/plain": {
+        "schema": {"type": "string"},
+        "example": '# TYPE pliant_jobs gauge\npliant_jobs{status="queued"} 3\n',
+    }
+}
+
+
+@router.get(
+    "/metrics",
+    summary="Numbers for Prometheus",
+    response_class=PlainTextResponse,
+    responses={200: {"content": _TEXT}, **problems(401, 403)},
+)
+def metrics(core: Core) -> Response:
+    """Return counts of jobs, queue, workers, files, webhooks and requests. Where tokens are asked for, one with the scope `admin`."""
+    return Response(exposition(core.jobs, core.requests), media_type=MEDIA_TYPE)
