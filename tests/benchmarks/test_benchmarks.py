@@ -190,3 +190,14 @@ def test_the_rasteriser_shows_the_nearer_surface_and_its_colour(bench):
     assert (image[2, 2] == 1).all()
     covered = (image != 1).any(axis=2)
     assert covered.sum() == pytest.approx(40 * 40, rel=0.02)
+
+
+def test_every_result_file_is_measured() -> None:
+    command = [sys.executable, "-m", "benchmarks.files", "--frames", "6", "--points", "80"]
+    ran = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=True)
+    sizes = {row.split("|")[1].strip(): float(row.split("|")[3]) for row in ran.stdout.splitlines()[3:]}
+    assert {"shapes.npz", "shapes.glb", "shapes.usdc", "shapes_obj.zip", "shapes.mat", "metrics_points.csv"} <= set(
+        sizes
+    )
+    assert 24 < sizes["shapes.npz"] < 60
+    assert 12 < sizes["shapes.glb"] < 60

@@ -15,11 +15,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy.linalg
 from pliant.worker.artifacts.geometry import Floats, Singles, upright
 
 MAX_FRAME_TARGETS = 200
 MAX_MODES = 200
-BLOCK = 4096
+BLOCK = 1 << 21
+"""Numbers (16 MB) of a block of points over all frames."""
+
 ERROR_BOUND = 1e-3
 """Largest distance between a point and its place in the file that is allowed to modes, as a share of the bounding box's diagonal."""
 
@@ -73,8 +76,7 @@ def _modes(shapes: Floats, y_axis: str) -> Animation:
     gram = np.zeros((frames, frames))
     for _, moved in _blocks(shapes, y_axis, mean):
         gram += moved @ moved.T
-    values, vectors = np.linalg.eigh(gram)
-    left = vectors[:, np.argsort(values)[::-1]]
+    left = scipy.linalg.eigh(gram, subset_by_index=(frames - MAX_MODES, frames - 1))[1][:, ::-1]
     allowed = ERROR_BOUND * float(np.linalg.norm(shapes.max(axis=(0, 1)) - shapes.min(axis=(0, 1))))
     kept = _smallest(shapes, y_axis, mean, left, allowed)
     coefficients = left[:, :kept] * np.sqrt(frames)
@@ -98,30 +100,31 @@ def _modes(shapes: Floats, y_axis: str) -> Animation:
 
 def _blocks(shapes: Floats, y_axis: str, origin: Floats | Singles) -> Iterator[tuple[slice, Floats]]:
     """Displacements from one shape `(P, 3)`, y up, as `(F, 3 · points)`, a block of points at a time."""
-    for start in range(0, shapes.shape[1], BLOCK):
-        some = slice(start, start + BLOCK)
+    points = max(1, BLOCK // (3 * len(shapes)))
+    for start in range(0, shapes.shape[1], points):
+        some = slice(start, start + points)
         yield some, (upright(shapes[:, some], y_axis) - origin[some]).reshape(len(shapes), -1)
 
 
 def _smallest(shapes: Floats, y_axis: str, mean: Floats, left: Floats, allowed: float) -> int:
     """Few modes whose worst point is within 90 % of what is allowed (the rest is for rounding), by bisection; at most 200."""
-    low, high = 1, min(MAX_MODES, int(left.shape[1]))
+    low, high = 1, MAX_MODES
     while low < high:
         middle = (low + high) // 2
-        if _worst(_blocks(shapes, y_axis, mean), left[:, :middle]) <= 0.9 * allowed:
+        if _within(0.9 * allowed, _blocks(shapes, y_axis, mean), left[:, :middle]):
             high = middle
         else:
             low = middle + 1
     return high
 
 
-def _worst(blocks: Iterator[tuple[slice, Floats]], left: Floats) -> float:
-    """Largest distance of a point from its projection on the modes."""
-    worst = 0.0
+def _within(distance: float, blocks: Iterator[tuple[slice, Floats]], left: Floats) -> bool:
+    """Whether every point of every frame is that near to its projection on the modes."""
     for _, moved in blocks:
         rest = moved - left @ (left.T @ moved)
-        worst = max(worst, float((rest.reshape(len(rest), -1, 3) ** 2).sum(axis=2).max()))
-    return float(np.sqrt(worst))
+        if (rest.reshape(len(rest), -1, 3) ** 2).sum(axis=2).max() > distance**2:
+            return False
+    return True
 
 
 def _rounded_errors(

@@ -1,0 +1,97 @@
+"""Size of every result file, and the time and memory that writing takes, on the gallery's face as a finished result.
+
+    python -m benchmarks.files                                   99 frames of 29,000 points
+    python -m benchmarks.files --frames 300 --points 2000 --options '{"colours": "error", "normals": "animated"}'
+
+Nothing is solved: the truth stands for the result, since no file's size hangs on how good it is, except what is compressed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import time
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+from pliant.client.options import Options
+from pliant.client.schemas import Interpretation
+from pliant.solver import Camera, Choices, Outcome, Solution, Trace
+from pliant.solver.gallery import face
+from pliant.worker.artifacts.kinds import kinds_for
+from pliant.worker.artifacts.result import Result
+from pliant.worker.formats import GroundTruth, Inputs
+
+ALL = "glb,ply,obj,usd,mat,csv"
+
+
+def main() -> None:
+    """Write every file once and print a table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--frames", type=int, default=99)
+    parser.add_argument("--points", type=int, default=29_000)
+    parser.add_argument("--options", type=json.loads, default={}, help="JSON object, as a job's")
+    given = parser.parse_args()
+    result = finished(given.frames, given.points, Options(**{"outputs": ALL, **given.options}))
+    frames, points = result.solution.residuals.shape
+    print(
+        f"{frames} frames × {points} points, {len(result.faces)} faces; a copy of the shapes is {24e-6 * frames * points:.0f} MB"
+    )
+    print("| file | MB | bytes per frame and point | seconds | MB held while writing |")
+    print("|---|---|---|---|---|")
+    with tempfile.TemporaryDirectory() as folder:
+        for kind in kinds_for(result.options):
+            size, seconds, held = measured(kind, result, Path(folder) / kind.name)
+            print(
+                f"| {kind.name} | {size / 1e6:.1f} | {size / (frames * points):.1f} | {seconds:.1f} | {held / 1e6:.0f} |"
+            )
+
+
+def measured(kind, result: Result, path: Path) -> tuple[int, float, int]:
+    """Bytes, seconds, and the most bytes of Python's and NumPy's memory that were held beside the result.
+
+    Written twice, since watching the memory takes time.
+    """
+    began = time.perf_counter()
+    with path.open("wb") as file:
+        kind.write(result, file, lambda _: None)
+    seconds = time.perf_counter() - began
+    tracemalloc.start()
+    with path.open("wb") as file:
+        kind.write(result, file, lambda _: None)
+    _, held = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    return path.stat().st_size, seconds, held
+
+
+def finished(frames: int, points: int, options: Options) -> Result:
+    """Return the face as the result of a job: truth turned by a little noise, residuals as a solve leaves them."""
+    made = face(frames, points, degrees=30)
+    count = made.shapes.shape[1]
+    random = np.random.default_rng(0)
+    residuals = np.abs(random.normal(0, 0.3, (frames, count))) * (made.tracks.visible > 0)
+    solution = Solution(
+        shapes=made.shapes + random.normal(0, 0.5, made.shapes.shape),
+        camera=Camera(made.rotations, made.scales, np.zeros((frames, 2))),
+        residuals=residuals,
+        weights=1 / (1 + residuals),
+        trace=Trace(np.array([2.0, 1.0]), np.array([1.0, 0.5]), np.array([0, 9], dtype=np.int32)),
+        outcome=Outcome.CONVERGED,
+        choices=Choices(
+            basis_size=1, temporal_weight=1.0, spatial_weight=1.0, robust_scale=1.0, temporal_order=1, low_rank_weight=0.0,
+            laplacian="grid8", unit=1.0, noise=0.0, reasons={}, warnings=(),
+        ),
+        seconds={},
+    )  # fmt: skip
+    interpretation = Interpretation(
+        num_frames=frames, num_points=count, num_faces=len(made.mesh.faces), hidden_fraction=0.0, mesh_source="grid",
+        has_ground_truth=True, has_rotations=False, layout="tracks (F, P, 2)",
+    )  # fmt: skip
+    truth = GroundTruth.from_arrays(made.shapes, None, like=(frames, count))
+    return Result(Inputs(made.tracks, made.mesh, truth, None, interpretation), solution, options)
+
+
+if __name__ == "__main__":
+    main()
