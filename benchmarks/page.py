@@ -59,7 +59,7 @@ def frame(page: Page) -> float:
 def play_example(page: Page) -> None:
     """Click once, wait until the mesh moves."""
     page.get_by_role("button", name="Show me with a made-up face").click()
-    page.locator("canvas").wait_for(timeout=300_000)
+    page.locator(".view canvas").wait_for(timeout=300_000)
     while frame(page) == 0:
         time.sleep(0.02)
 
@@ -113,12 +113,12 @@ def pictures(folder: Path) -> None:
                 )
                 page = view.new_page()
                 page.goto(address)
-                page.locator("canvas").wait_for(timeout=60_000)
+                page.locator(".view canvas").wait_for(timeout=60_000)
                 slider = page.get_by_role("slider", name="Frame")
                 slider.evaluate("(it) => { it.value = 12; it.dispatchEvent(new Event('input')); }")
                 if width > 1000:
-                    page.get_by_label("Ground truth beside it").check()
-                    page.get_by_label("Colour").select_option("error")
+                    page.get_by_role("checkbox", name="Ground truth").check()
+                    page.get_by_label("Colour", exact=True).select_option("error")
                 else:
                     page.locator(".detail").scroll_into_view_if_needed()
                     page.evaluate("document.querySelector('.detail').scrollIntoView()")

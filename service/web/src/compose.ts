@@ -1,33 +1,22 @@
-// The form for a new job: files by drop or by choice, what is in them, options, and the service's answer if it says no.
+// The form for a new job: files, how they are understood, options, and the service's answer if it says no.
 
 import { type Example, Refusal, exampleFile, getOptions, listExamples, newKey, submit } from "./api";
-import { button, h, uniqueId } from "./dom";
+import { button, h } from "./dom";
 import { OptionsForm } from "./options";
-import { type Entry, describe, peek } from "./peek";
 import { refusalBox } from "./refusal";
+import { Slots } from "./slots";
 import { type Job, PARTS, type Part } from "./types";
-import { bytes, percent } from "./words";
-
-const SLOTS: Record<Part, { label: string; hint: string }> = {
-  tracks: { label: "Tracks", hint: "npz, npy, mat, csv" },
-  mesh: { label: "Mesh", hint: "optional, obj, ply, npz" },
-  ground_truth: { label: "Ground truth", hint: "optional, for errors" },
-  rotations: { label: "Cameras", hint: "optional, if known" },
-};
-
-interface Slot {
-  input: HTMLInputElement;
-  name: HTMLElement;
-  contents: HTMLElement;
-  remove: HTMLButtonElement;
-  file: File | null;
-}
+import { Inspection } from "./understood";
+import { percent } from "./words";
 
 export class Compose {
   readonly element: HTMLDetailsElement;
   private readonly options = new OptionsForm();
-  private readonly slots = new Map<Part, Slot>();
-  private readonly grid = h("input", { type: "text", id: "grid", placeholder: "rows×columns", size: 10, autocomplete: "off" });
+  private readonly slots = new Slots(() => this.changed());
+  private readonly inspection = new Inspection(
+    () => this.form(),
+    (refusal) => (refusal ? this.refuse(refusal, () => undefined) : this.answer.replaceChildren()),
+  );
   private readonly label = h("input", { type: "text", id: "job-name", maxlength: 200, autocomplete: "off" });
   private readonly send = h("button", { type: "submit", class: "primary" }, "Reconstruct");
   private readonly stop = button("Stop", () => this.sending?.abort(), { hidden: true });
@@ -39,28 +28,29 @@ export class Compose {
   private offered: Example[] = [];
 
   constructor(private readonly onJob: (job: Job) => void) {
-    const zone = h(
-      "div",
-      { class: "zone" },
-      h("p", { class: "zone-title" }, "Drop tracks here, and a mesh"),
-      h("p", { class: "hint" }, "Files stay on this service; nothing is sent elsewhere."),
-      ...PARTS.map((part) => this.slot(part)),
-    );
     const form = h(
       "form",
       { class: "compose", onsubmit: (event: SubmitEvent) => void this.submit(event), "aria-labelledby": "compose-title" },
-      zone,
+      this.slots.element,
       this.examples,
+      this.inspection.element,
       this.options.first,
       this.options.more,
-      h("div", { class: "option" }, h("label", { for: "job-name" }, "name (optional)"), this.label),
-      h("div", { class: "row" }, this.send, this.stop),
+      h("div", { class: "option" }, h("label", { for: "job-name" }, "Name (optional)"), this.label),
+      h("div", { class: "row send" }, this.send, this.stop),
       this.answer,
     );
     const summary = h("summary", {}, h("h2", { id: "compose-title" }, "New reconstruction"));
     form.addEventListener("change", () => (this.key = null));
+    this.options.more.addEventListener("change", () => this.changed());
     this.element = h("details", { class: "card", open: true }, summary, form);
-    this.acceptDrops();
+    document.addEventListener("drop", () => (this.element.open = true));
+  }
+
+  /** Other files, or other options of reading them. */
+  private changed(): void {
+    this.key = null;
+    if (!this.sending) this.inspection.changed();
   }
 
   /** Fetch what the service knows about options and examples. */
@@ -91,7 +81,7 @@ export class Compose {
     if (example === undefined) return;
     this.element.open = true;
     await this.takeExample(example);
-    if (this.slots.get("tracks")?.file) this.send.form?.requestSubmit();
+    if (this.slots.file("tracks")) this.send.form?.requestSubmit();
   }
 
   /** True where the service makes examples. */
@@ -102,70 +92,17 @@ export class Compose {
   private async takeExample(example: Example): Promise<void> {
     this.answer.replaceChildren(h("p", { class: "muted" }, "Making the example…"));
     try {
-      for (const part of PARTS) await this.put(part, null);
-      for (const { part, file } of example.files) {
-        if (part in SLOTS) await this.put(part as Part, await exampleFile(example.name, file));
-      }
+      const known = example.files.filter(({ part }) => (PARTS as readonly string[]).includes(part));
+      const files = await Promise.all(
+        known.map(async ({ part, file }): Promise<[Part, File]> => [part as Part, await exampleFile(example.name, file)]),
+      );
       this.label.value = example.title;
       this.answer.replaceChildren();
+      await this.slots.fill(files);
       this.send.focus();
     } catch (error) {
       this.refuse(error);
     }
-  }
-
-  private slot(part: Part): HTMLElement {
-    const id = uniqueId("file");
-    const input = h("input", { type: "file", id, class: "visually-hidden", "aria-describedby": `${id}-hint` });
-    const name = h("span", { class: "file-name hint", id: `${id}-hint` }, SLOTS[part].hint);
-    const contents = h("span", { class: "contents hint" });
-    const remove = button("×", () => void this.put(part, null).then(() => input.focus()), {
-      class: "quiet",
-      hidden: true,
-      "aria-label": `Remove ${SLOTS[part].label.toLowerCase()}`,
-    });
-    input.addEventListener("change", () => void this.put(part, input.files?.[0] ?? null));
-    this.slots.set(part, { input, name, contents, remove, file: null });
-    const choose = h("label", { for: id, class: "choose" }, SLOTS[part].label);
-    const row = h("div", { class: "slot", "data-part": part }, input, choose, name, remove, contents);
-    if (part === "mesh") row.append(h("span", { class: "grid-size" }, h("label", { for: "grid" }, "or points on a grid"), this.grid));
-    return row;
-  }
-
-  private async put(part: Part, file: File | null): Promise<void> {
-    const slot = this.slots.get(part) as Slot;
-    slot.file = file;
-    this.key = null;
-    slot.remove.hidden = file === null;
-    slot.name.textContent = file === null ? SLOTS[part].hint : `${file.name}, ${bytes(file.size)}`;
-    slot.name.classList.toggle("hint", file === null);
-    slot.contents.textContent = "";
-    if (part === "mesh") this.grid.disabled = file !== null;
-    if (file === null) {
-      slot.input.value = "";
-      return;
-    }
-    const entries = await peek(file);
-    if (slot.file === file && entries.length > 0) slot.contents.textContent = describe(entries);
-  }
-
-  private acceptDrops(): void {
-    const over = (event: DragEvent): void => {
-      if (!event.dataTransfer?.types.includes("Files")) return;
-      event.preventDefault();
-      document.body.classList.toggle("dropping", event.type === "dragover");
-    };
-    document.addEventListener("dragover", over);
-    document.addEventListener("dragleave", over);
-    document.addEventListener("drop", (event) => {
-      over(event);
-      void this.take([...(event.dataTransfer?.files ?? [])]);
-    });
-  }
-
-  /** Put dropped files where their names and contents say they belong. */
-  async take(files: File[]): Promise<void> {
-    for (const file of files) await this.put(roleOf(file.name, await peek(file), this.slots.get("tracks")?.file != null), file);
   }
 
   private async submit(event: SubmitEvent): Promise<void> {
@@ -174,9 +111,10 @@ export class Compose {
     const form = this.form();
     if (form === null) {
       this.answer.replaceChildren(h("p", { class: "sentence bad" }, "Choose a track file first, or try the example."));
-      this.slots.get("tracks")?.input.focus();
+      this.slots.focus("tracks");
       return;
     }
+    this.inspection.stop();
     this.sending = new AbortController();
     this.busy(true);
     const meter = h("progress", { max: 1, value: 0, "aria-label": "Upload" });
@@ -205,13 +143,10 @@ export class Compose {
     const form = new FormData();
     form.append("options", JSON.stringify(this.options.values()));
     if (this.label.value.trim()) form.append("name", this.label.value.trim());
-    const grid = this.grid.value.trim().replace("×", "x");
-    if (grid && !this.slots.get("mesh")?.file) form.append("mesh", grid);
-    for (const part of PARTS) {
-      const file = this.slots.get(part)?.file;
-      if (file) form.append(part, file, file.name);
-      else if (part === "tracks") return null;
-    }
+    const { files, grid } = this.slots.given;
+    if (!files.some(([part]) => part === "tracks")) return null;
+    if (grid) form.append("mesh", grid);
+    for (const [part, file] of files) form.append(part, file, file.name);
     return form;
   }
 
@@ -220,35 +155,16 @@ export class Compose {
     this.stop.hidden = !busy;
   }
 
-  private refuse(error: unknown): void {
+  /** Show why not; `again` is called when one of several readings has been chosen. */
+  private refuse(error: unknown, again = (): void => this.send.form?.requestSubmit()): void {
     if (error instanceof DOMException && error.name === "AbortError") {
       this.answer.replaceChildren(h("p", { class: "muted" }, "Stopped; nothing was kept."));
     } else if (error instanceof Refusal) {
       const choose = (choice: Record<string, unknown>): void => {
         for (const [name, value] of Object.entries(choice)) this.options.set(name, value);
-        this.send.form?.requestSubmit();
+        again();
       };
       this.answer.replaceChildren(refusalBox(error.problem, choose));
     } else throw error;
   }
-}
-
-const WITHIN: [Part, RegExp][] = [
-  ["tracks", /^(tracks|points|pred_tracks|trajs?_e|W|tracks_xyz|visibility)$/],
-  ["ground_truth", /^(shapes|S|ground_truth|truth|points3d)$/i],
-  ["mesh", /^(faces|triangles|grid)$/i],
-  ["rotations", /^(rotations|Rs|R)$/],
-];
-const NAMED: [Part, RegExp][] = [
-  ["mesh", /\.(obj|ply|glb|gltf|png)$/i],
-  ["ground_truth", /truth|(^|[_-])gt([_.-]|$)/i],
-  ["rotations", /rotation|camera/i],
-  ["mesh", /mesh|faces/i],
-];
-
-/** Decide what a dropped file is: by the arrays in it, then by its name, then tracks first and a mesh second. */
-export function roleOf(name: string, entries: Entry[], haveTracks: boolean): Part {
-  for (const [part, pattern] of WITHIN) if (entries.some((entry) => pattern.test(entry.name))) return part;
-  for (const [part, pattern] of NAMED) if (pattern.test(name)) return part;
-  return haveTracks && !/track/i.test(name) ? "mesh" : "tracks";
 }

@@ -5,9 +5,12 @@ import { Curves } from "./curves";
 import { button, fill, h, say } from "./dom";
 import { follow } from "./events";
 import { refusalBox } from "./refusal";
-import { Files, Metrics, Understood } from "./results";
+import { Figures } from "./figures";
+import { newer, progressed } from "./news";
+import { Files, Metrics, saveLink } from "./results";
 import { Snippets } from "./snippets";
 import { type Job, type Progress, isFinal } from "./types";
+import { Understood } from "./understood";
 import { STATUS_WORDS, ago, bytes, percent, standing, title } from "./words";
 
 export interface DetailEvents {
@@ -16,6 +19,7 @@ export interface DetailEvents {
 }
 
 const PREVIEW = "preview.bin";
+const ANIMATION = "shapes.glb";
 
 export class Detail {
   readonly element: HTMLElement;
@@ -23,6 +27,7 @@ export class Detail {
   private readonly status = h("span", { class: "status" });
   private readonly when = h("span", { class: "muted" });
   private readonly actions = h("div", { class: "row actions" });
+  private readonly figures = new Figures();
   private readonly standing = h("p", { class: "standing", role: "status" });
   private readonly meter = h("progress", { max: 1, value: 0, "aria-label": "Progress of this job" });
   private readonly share = h("span", { class: "muted" });
@@ -46,6 +51,7 @@ export class Detail {
       "article",
       { class: "detail", "aria-labelledby": "job-title" },
       h("header", { class: "detail-head" }, h("div", {}, this.heading, h("p", { class: "row" }, this.status, this.when)), this.actions),
+      this.figures.element,
       this.standing,
       h("div", { class: "meter" }, this.meter, this.share),
       this.trouble,
@@ -86,27 +92,14 @@ export class Detail {
   /** A stream of events begins with those of the past: they make the curves whole, but do not turn the clock back. */
   private progress(progress: Progress): void {
     this.curves.progress(progress);
-    const job = this.job;
-    if (job === null || isFinal(job.status)) return;
-    if (job.progress !== null && job.progress.updated_at >= progress.updated_at) return;
-    this.show({ ...job, status: job.status === "queued" ? "running" : job.status, place_in_queue: null, progress });
-  }
-
-  private isNews(job: Job): boolean {
-    const known = this.job;
-    if (known === null || job.attempt !== known.attempt) return known === null || job.attempt > known.attempt;
-    const order: Job["status"][] = ["queued", "running", "cancelling"];
-    const rank = (status: Job["status"]): number => (isFinal(status) ? 3 : order.indexOf(status));
-    if (rank(job.status) !== rank(known.status)) return rank(job.status) > rank(known.status);
-    return (job.progress?.updated_at ?? "") >= (known.progress?.updated_at ?? "");
+    const job = progressed(this.job, progress);
+    if (job) this.show(job);
   }
 
   /** Take in a record that may be older than what is known. */
   learn(job: Job): void {
-    if (!this.isNews(job)) return;
-    // Events are written once, while the place in the queue moves on with the others: only a fresh answer knows it.
-    const place = job.place_in_queue ?? (job.status === "queued" ? (this.job?.place_in_queue ?? null) : null);
-    this.show({ ...job, place_in_queue: place });
+    const news = newer(this.job, job);
+    if (news) this.show(news);
   }
 
   private show(job: Job): void {
@@ -119,6 +112,7 @@ export class Detail {
     this.showMeter(job);
     this.showActions(job);
     fill(this.failure, JSON.stringify(job.error), () => (job.error ? [refusalBox(job.error)] : []));
+    this.figures.show(job);
     this.understood.show(job);
     this.metrics.show(job);
     this.files.show(job);
@@ -143,7 +137,11 @@ export class Detail {
     if (job.status === "queued" || job.status === "running") actions.push(["Cancel", () => cancelJob(job.id)]);
     if (job.status === "failed" || job.status === "cancelled") actions.push(["Try again", () => retryJob(job.id)]);
     if (isFinal(job.status)) actions.push(["Delete", () => deleteJob(job.id)]);
-    fill(this.actions, actions.map(([label]) => label).join(), () => actions.map(([label, act]) => this.action(label, act)));
+    const mesh = job.artifacts.find((artifact) => artifact.name === ANIMATION);
+    fill(this.actions, [mesh?.sha256, ...actions.map(([label]) => label)].join(), () => [
+      mesh && saveLink(job, mesh, "Download glTF", "button primary"),
+      ...actions.map(([label, act]) => this.action(label, act)),
+    ]);
   }
 
   private action(label: string, act: () => Promise<unknown>): HTMLButtonElement {
@@ -152,9 +150,11 @@ export class Detail {
       if (!sure) {
         sure = true;
         made.textContent = "Delete it for good?";
+        made.classList.add("danger");
         setTimeout(() => {
           sure = false;
           made.textContent = label;
+          made.classList.remove("danger");
         }, 4000);
         return;
       }
@@ -166,7 +166,7 @@ export class Detail {
           if (!(error instanceof Refusal)) throw error;
           this.trouble.replaceChildren(refusalBox(error.problem));
         });
-    });
+    }, { class: label === "Delete" ? "quiet" : null });
     return made;
   }
 

@@ -1,9 +1,14 @@
 // The list of jobs, newest first.
 
 import { type Refusal, listJobs } from "./api";
-import { button, fill, h, say } from "./dom";
-import { type Job, isFinal } from "./types";
-import { STATUS_WORDS, ago, count, title } from "./words";
+import { button, h, say } from "./dom";
+import { follow } from "./events";
+import { newer, progressed } from "./news";
+import { type Job, type Progress, isFinal } from "./types";
+import { STATUS_WORDS, ago, count, percent, title } from "./words";
+
+/** Running jobs that are followed beside the one that is shown; a browser opens six connections to a host. */
+const FOLLOWED = 2;
 
 interface Row {
   element: HTMLLIElement;
@@ -15,18 +20,19 @@ interface Row {
 }
 
 export class JobList {
-  readonly element: HTMLElement;
+  readonly element: HTMLDetailsElement;
   private readonly items = h("ol", { class: "jobs" });
   private readonly empty = h("p", { class: "muted" }, "No jobs yet.");
   private readonly older = button("Older jobs", () => void this.more(), { class: "link", hidden: true });
   private readonly rows = new Map<string, Row>();
+  private readonly followed = new Map<string, AbortController>();
   private jobs: Job[] = [];
   private next: string | null = null;
   private selected: string | null = null;
 
   constructor() {
-    this.element = h("section", { class: "card", "aria-labelledby": "jobs-title" });
-    this.element.append(h("h2", { id: "jobs-title" }, "Jobs"), this.empty, this.items, this.older);
+    const summary = h("summary", {}, h("h2", { id: "jobs-title" }, "Jobs"));
+    this.element = h("details", { class: "card", open: true }, summary, this.empty, this.items, this.older);
   }
 
   /** True while a listed job may still change. */
@@ -42,7 +48,8 @@ export class JobList {
     // Beyond the newest page only what is older than it can still exist unseen; the rest has been deleted.
     const kept = this.jobs.filter((job) => !fresh.has(job.id) && page.next !== null && oldest !== undefined && job.created_at < oldest);
     if (kept.length === 0) this.next = page.next;
-    this.jobs = [...page.jobs, ...kept];
+    const known = new Map(this.jobs.map((job) => [job.id, job]));
+    this.jobs = [...page.jobs.map((job) => newer(known.get(job.id) ?? null, job) ?? (known.get(job.id) as Job)), ...kept];
     this.show();
     return page.jobs;
   }
@@ -60,9 +67,35 @@ export class JobList {
   /** Put in what has just been learned about one job. */
   update(job: Job): void {
     const at = this.jobs.findIndex((one) => one.id === job.id);
-    if (at >= 0) this.jobs[at] = job;
+    if (at >= 0) this.jobs[at] = newer(this.jobs[at] ?? null, job) ?? (this.jobs[at] as Job);
     else this.jobs.unshift(job);
     this.show();
+  }
+
+  /** Follow the events of the first running jobs; the one that is shown is followed by whoever shows it. */
+  private followRunning(): void {
+    const running = this.jobs.filter((job) => job.id !== this.selected && (job.status === "running" || job.status === "cancelling"));
+    const wanted = new Set(running.slice(0, FOLLOWED).map((job) => job.id));
+    for (const [id, leaving] of this.followed) {
+      if (wanted.has(id)) continue;
+      leaving.abort();
+      this.followed.delete(id);
+    }
+    for (const id of wanted) if (!this.followed.has(id)) this.follow(id);
+  }
+
+  private follow(id: string): void {
+    const leaving = new AbortController();
+    this.followed.set(id, leaving);
+    const follower = {
+      onJob: (job: Job) => this.update(job),
+      onProgress: (progress: Progress) => {
+        const job = progressed(this.jobs.find((one) => one.id === id) ?? null, progress);
+        if (job) this.update(job);
+      },
+      onTrouble: () => undefined, // said at the top of the page by the next look at the list
+    };
+    void follow(id, follower, leaving.signal);
   }
 
   remove(id: string): void {
@@ -76,6 +109,7 @@ export class JobList {
   }
 
   private show(): void {
+    this.followRunning();
     this.empty.hidden = this.jobs.length > 0;
     this.older.hidden = this.next === null;
     const shown = new Set(this.jobs.map((job) => job.id));
@@ -106,11 +140,19 @@ export class JobList {
     const seen = job.interpretation;
     say(row.name, title(job));
     say(row.about, `${count(seen.num_frames, "frame")}, ${count(seen.num_points, "point")}, ${ago(job.created_at)}`);
-    fill(row.status, job.status, () => [STATUS_WORDS[job.status]]);
+    say(row.status, place(job));
     row.status.dataset["status"] = job.status;
     row.meter.hidden = job.status !== "running";
     row.meter.value = job.progress?.fraction ?? 0;
     if (job.id === this.selected) row.link.setAttribute("aria-current", "true");
     else row.link.removeAttribute("aria-current");
   }
+}
+
+/** The status in a word or two, with how far the job is or how many are before it. */
+function place(job: Job): string {
+  const { status, progress, place_in_queue: ahead } = job;
+  if (status === "running" && progress) return `${STATUS_WORDS[status]}, ${percent(Math.round(100 * progress.fraction) / 100)}`;
+  if (status === "queued" && ahead !== null) return ahead === 0 ? "Next" : `${ahead} before it`;
+  return STATUS_WORDS[status];
 }

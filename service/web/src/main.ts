@@ -4,6 +4,7 @@ import { Refusal, setToken } from "./api";
 import { Compose } from "./compose";
 import { Detail } from "./detail";
 import { button, h } from "./dom";
+import { Hero } from "./hero";
 import { JobList } from "./list";
 import { refusalBox } from "./refusal";
 import type { Job } from "./types";
@@ -20,6 +21,8 @@ const compose = new Compose((job: Job) => {
 });
 side.append(compose.element, list.element);
 
+document.getElementById("hero")?.append(new Hero().canvas);
+
 let detail: Detail | null = null;
 
 function show(id: string | null, byPerson: boolean): void {
@@ -28,8 +31,9 @@ function show(id: string | null, byPerson: boolean): void {
   detail = null;
   list.select(id);
   welcome.hidden = id !== null;
-  // On a telephone the form folds away in favour of the job.
-  compose.element.open = id === null || !matchMedia("(max-width: 56rem)").matches;
+  // The form folds away in favour of the job; on a telephone the list does, too.
+  compose.element.open = id === null;
+  list.element.open = id === null || !matchMedia("(max-width: 56rem)").matches;
   if (id === null) return;
   detail = new Detail(id, {
     onJob: (job) => list.update(job),
@@ -73,7 +77,7 @@ function tokenForm(): HTMLElement {
 function offer(): void {
   const place = document.getElementById("try") as HTMLElement;
   place.hidden = !compose.hasExamples;
-  place.replaceChildren(button("Show me with a made-up face", () => void compose.tryOut()));
+  place.replaceChildren(button("Show me with a made-up face", () => void compose.tryOut(), { class: "primary large" }));
 }
 
 let loaded = false;

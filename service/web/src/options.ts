@@ -71,7 +71,7 @@ export class OptionsForm {
     control.element.addEventListener("change", () => {
       hint.textContent = describe(schema, String(control.read() ?? ""));
     });
-    const title = name.replaceAll("_", " ");
+    const title = sentence(name.replaceAll("_", " "));
     const group = control.element.getAttribute("role") === "group";
     if (group) control.element.setAttribute("aria-label", title);
     const label = group ? h("span", {}, title) : h("label", { for: id }, title);
@@ -164,5 +164,9 @@ function describe(schema: Schema, chosen: string): string {
   if (!chosen || !starts.includes(from)) return text;
   const to = Math.min(...starts.filter((at) => at > from), text.length);
   const part = text.slice(from + chosen.length + 2, to).replace(/[.;, ]+$/, "");
-  return `${part.charAt(0).toUpperCase()}${part.slice(1)}.`;
+  return `${sentence(part)}.`;
+}
+
+function sentence(text: string): string {
+  return `${text.charAt(0).toUpperCase()}${text.slice(1)}`;
 }

@@ -1,54 +1,20 @@
-// What a job was understood as, its metrics, and its files.
+// The metrics and the files of a job.
 
 import { artifactPath, call, headers } from "./api";
 import { fill, h } from "./dom";
 import type { Artifact, Job } from "./types";
-import { bytes, count, number, percent } from "./words";
+import { bytes, number } from "./words";
 
-const MESHES: Record<string, string> = {
-  given: "as given",
-  grid: "from the grid",
-  delaunay: "made by triangulating the best-seen frame",
-  none: "none: points alone",
+/** What people call a metric, and what exactly it is; the name of the record stands beside it. */
+const METRICS: Record<string, [string, string]> = {
+  e3d_sequence: ["3-D error", "one orthogonal alignment for the whole sequence; relative"],
+  e3d_frame: ["3-D error, frame by frame", "each frame turned to fit best; relative"],
+  e3d_frame_similarity: ["Shape error, frame by frame", "each frame turned, mirrored and scaled to fit; relative"],
+  e3d_mocap: ["3-D error, motion capture", "as that literature has it; relative to the shape's spread"],
+  reprojection_median: ["Reprojection, median", "from a seen track to the projected shape; the tracks' unit"],
+  reprojection_rms: ["Reprojection, root mean square", "outliers count here; the tracks' unit"],
+  rotation_degrees: ["Camera error", "angle between estimated and true cameras, mean; degrees"],
 };
-
-const METRICS: Record<string, string> = {
-  e3d_sequence: "3-D error, one orthogonal alignment for the whole sequence; relative",
-  e3d_frame: "3-D error, each frame turned to fit best; relative",
-  e3d_frame_similarity: "3-D error, each frame turned, mirrored and scaled to fit; relative",
-  e3d_mocap: "3-D error in the motion-capture literature's way; relative to the shape's spread",
-  reprojection_median: "Distance between a seen track and the projected shape, median; the tracks' unit",
-  reprojection_rms: "The same, root mean square: outliers count here",
-  rotation_degrees: "Angle between estimated and true cameras, mean; degrees",
-};
-
-/** The panel "Understood as". */
-export class Understood {
-  private readonly facts = h("dl", { class: "facts" });
-  private readonly notes = h("ul", { class: "notes" });
-  readonly element = h(
-    "section",
-    { class: "panel", "aria-labelledby": "understood-title" },
-    h("h3", { id: "understood-title" }, "Understood as"),
-    this.facts,
-    this.notes,
-  );
-
-  show(job: Job): void {
-    const seen = job.interpretation;
-    const rows: [string, string][] = [
-      ["Tracks", `${count(seen.num_frames, "frame")} of ${count(seen.num_points, "point")}, ${percent(seen.hidden_fraction)} hidden`],
-      ["Read as", `${seen.layout}, y ${seen.y_axis}`],
-      ["Mesh", `${count(seen.num_faces, "face")}, ${MESHES[seen.mesh_source] ?? seen.mesh_source}`],
-      ["Ground truth", seen.has_ground_truth ? "given; errors are measured against it" : "none"],
-      ["Cameras", seen.has_rotations ? "given" : "estimated"],
-      ["Method", `${String(job.options["method"])}, preset ${String(job.options["preset"])}`],
-    ];
-    fill(this.facts, JSON.stringify(rows), () => rows.flatMap(([term, value]) => [h("dt", {}, term), h("dd", {}, value)]));
-    fill(this.notes, seen.notes.join("\n"), () => seen.notes.map((note) => h("li", {}, note)));
-    this.notes.hidden = seen.notes.length === 0;
-  }
-}
 
 /** The panel "Metrics". */
 export class Metrics {
@@ -63,14 +29,16 @@ export class Metrics {
   );
 
   show(job: Job): void {
-    const metrics = Object.entries(job.metrics ?? {});
+    const order = Object.keys(METRICS);
+    const place = (name: string): number => (order.includes(name) ? order.indexOf(name) : order.length);
+    const metrics = Object.entries(job.metrics ?? {}).sort(([one], [other]) => place(one) - place(other));
     this.element.hidden = metrics.length === 0 && job.warnings.length === 0;
     fill(this.rows, JSON.stringify(metrics), () =>
       metrics.map(([name, value]) =>
         h(
           "tr",
           {},
-          h("th", { scope: "row" }, h("code", {}, name), METRICS[name] ? h("span", { class: "hint" }, METRICS[name]) : null),
+          metricHead(name),
           h("td", { class: "figure" }, number(value)),
         ),
       ),
@@ -78,6 +46,13 @@ export class Metrics {
     fill(this.warnings, job.warnings.join("\n"), () => job.warnings.map((warning) => h("li", {}, warning)));
     this.warnings.hidden = job.warnings.length === 0;
   }
+}
+
+function metricHead(name: string): HTMLElement {
+  const known = METRICS[name];
+  if (known === undefined) return h("th", { scope: "row" }, h("code", {}, name));
+  const [title, meaning] = known;
+  return h("th", { scope: "row" }, h("span", { class: "metric" }, title), h("span", { class: "hint" }, h("code", {}, name), ` ${meaning}`));
 }
 
 /** The panel "Files". */
@@ -96,15 +71,21 @@ export class Files {
   }
 
   private item(job: Job, artifact: Artifact): HTMLElement {
-    const path = artifactPath(job.id, artifact.name);
-    const link = h("a", { href: path, download: artifact.name }, artifact.name);
-    link.addEventListener("click", (event) => {
-      if (!("Authorization" in headers())) return;
-      event.preventDefault(); // a plain link cannot carry the token
-      void saveWithToken(path, artifact.name);
-    });
+    const link = saveLink(job, artifact, artifact.name);
     return h("li", {}, link, h("span", { class: "muted" }, bytes(artifact.bytes)), h("span", { class: "hint" }, artifact.description));
   }
+}
+
+/** A link that saves a file of a job. */
+export function saveLink(job: Job, artifact: Artifact, words: string, kind: string | null = null): HTMLAnchorElement {
+  const path = artifactPath(job.id, artifact.name);
+  const link = h("a", { href: path, download: artifact.name, class: kind }, words);
+  link.addEventListener("click", (event) => {
+    if (!("Authorization" in headers())) return;
+    event.preventDefault(); // a plain link cannot carry the token
+    void saveWithToken(path, artifact.name);
+  });
+  return link;
 }
 
 async function saveWithToken(path: string, name: string): Promise<void> {

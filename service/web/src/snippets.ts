@@ -69,15 +69,13 @@ function given(job: Job, schema: Schema): Given {
   return Object.entries(job.options).filter(([name, value]) => differs(name, value));
 }
 
-/** The record does not say the grid's size; like the names of the files, it stands for the reader's own. */
-const GRID = "ROWSxCOLUMNS";
-
-/** The parts of the form, with names that stand for the reader's own files. */
+/** The parts of the form, with names that stand for the reader's own files; a grid and "no mesh" are said in words. */
 function parts(job: Job): [string, string][] {
   const seen = job.interpretation;
   const found: [string, string][] = [["tracks", "tracks.npz"]];
-  if (seen.mesh_source === "given") found.push(["mesh", "mesh.npz"]);
-  if (seen.mesh_source === "grid") found.push(["mesh", GRID]);
+  if (seen.mesh_grid) found.push(["mesh", seen.mesh_grid.join("x")]);
+  else if (seen.mesh_source === "given" || seen.mesh_source === "grid") found.push(["mesh", "mesh.npz"]);
+  else if (seen.mesh_source === "none") found.push(["mesh", "none"]);
   if (seen.has_ground_truth) found.push(["ground_truth", "truth.npz"]);
   if (seen.has_rotations) found.push(["rotations", "cameras.npz"]);
   return found;
@@ -118,7 +116,7 @@ function shell(job: Job, chosen: Given, url: string): string {
 
 function curl(job: Job, chosen: Given, url: string): string {
   const fields = [
-    ...parts(job).map(([part, file]) => `-F ${part}=${file === GRID ? "" : "@"}${file}`),
+    ...parts(job).map(([part, file]) => `-F ${part}=${file.endsWith(".npz") ? "@" : ""}${file}`),
     ...(job.name ? [`-F ${quote(`name=${job.name}`)}`] : []),
     ...(chosen.length > 0 ? [`-F ${quote(`options=${JSON.stringify(Object.fromEntries(chosen))}`)}`] : []),
   ];

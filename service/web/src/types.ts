@@ -40,6 +40,7 @@ export interface Interpretation {
   num_faces: number;
   hidden_fraction: number;
   mesh_source: string;
+  mesh_grid: [number, number] | null;
   has_ground_truth: boolean;
   has_rotations: boolean;
   layout: string;

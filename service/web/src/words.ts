@@ -41,6 +41,13 @@ export function seconds(value: number): string {
   return `${(value / 3600).toFixed(1)} hours`;
 }
 
+/** The same in few letters, for a heading. */
+export function duration(value: number): string {
+  if (value < 60) return `${value < 9.95 ? value.toFixed(1) : Math.round(value)} s`;
+  if (value < 5400) return `${Math.floor(value / 60)} min ${Math.round(value % 60)} s`;
+  return `${(value / 3600).toFixed(1)} h`;
+}
+
 export function ago(iso: string, now = Date.now()): string {
   const age = (now - Date.parse(iso)) / 1000;
   if (age < 5) return "just now";

@@ -30,7 +30,8 @@ void main() {
   gl_PointSize = dot_size;
 }`;
 
-// Light from the upper left and a weaker one from behind, both fixed to the viewer; both sides of a surface are lit.
+// A warm light from the upper left, a weak cool one from the right, more sky than ground, and a rim: all fixed to the viewer.
+// Both sides of a surface are lit.
 const FRAGMENT = `
 uniform vec3 plain; uniform vec3 scale[6]; uniform float coloured; uniform float lit;
 varying vec3 normal_; varying float value;
@@ -41,10 +42,13 @@ void main() {
   vec3 base = mix(plain, shade, coloured);
   vec3 n = normalize(normal_ + vec3(1e-9));
   if (n.z < 0.0) n = -n;
-  float key = max(dot(n, normalize(vec3(-0.45, 0.6, 0.66))), 0.0);
-  float fill = max(dot(n, normalize(vec3(0.7, -0.25, 0.6))), 0.0);
-  float shine = pow(max(dot(n, normalize(vec3(-0.24, 0.33, 0.91))), 0.0), 40.0) * 0.10;
-  vec3 c = mix(base, base * (0.36 + 0.62 * key + 0.20 * fill) + shine, lit);
+  float key = max(dot(n, normalize(vec3(-0.5, 0.62, 0.6))), 0.0);
+  float fill = max(dot(n, normalize(vec3(0.75, -0.1, 0.55))), 0.0);
+  float edge = pow(1.0 - clamp(n.z, 0.0, 1.0), 3.0);
+  float shine = pow(max(dot(n, normalize(vec3(-0.27, 0.34, 0.9))), 0.0), 32.0) * 0.11;
+  vec3 sky = mix(vec3(0.23, 0.25, 0.28), vec3(0.42, 0.41, 0.40), 0.5 + 0.5 * n.y);
+  vec3 light = sky + 0.72 * key * vec3(1.0, 0.97, 0.93) + 0.20 * fill * vec3(0.86, 0.93, 1.0);
+  vec3 c = mix(base, base * light + shine + 0.10 * edge * vec3(0.9, 0.95, 1.0), lit);
   gl_FragColor = vec4(c, 1.0);
   #include <colorspace_fragment>
 }`;

@@ -23,7 +23,7 @@ export class TrackDots {
     const geometry = (): BufferGeometry => new BufferGeometry();
     this.lines = new LineSegments(geometry(), new LineBasicMaterial());
     this.lines.geometry.setAttribute("position", new BufferAttribute(this.ends, 3).setUsage(DynamicDrawUsage));
-    this.dots = new Points(geometry(), new PointsMaterial({ size: 3 * devicePixelRatio, sizeAttenuation: false, depthTest: false }));
+    this.dots = new Points(geometry(), new PointsMaterial({ size: 3.5, sizeAttenuation: false, depthTest: false }));
     this.dots.geometry.setAttribute("position", new BufferAttribute(new Float32Array(3 * most), 3).setUsage(DynamicDrawUsage));
     for (const object of [this.lines, this.dots]) {
       object.frustumCulled = false;

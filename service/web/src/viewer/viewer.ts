@@ -3,7 +3,7 @@
 import { button, fill, h, say, uniqueId } from "../dom";
 import { number } from "../words";
 import { Body } from "./body";
-import { type Colouring, SCALE, valuesFor } from "./colours";
+import { type Colouring, valuesFor } from "./colours";
 import { type Ending, Player } from "./player";
 import { Preview } from "./preview";
 import { Stage } from "./stage";
@@ -22,7 +22,7 @@ export class Viewer {
   private readonly view = h("div", { class: "view" });
   private readonly labels = h("div", { class: "view-labels", hidden: true }, h("span", {}, "result"), h("span", {}, "ground truth"));
   private readonly legend = h("div", { class: "legend", hidden: true });
-  private readonly play = h("button", { type: "button", class: "primary play" });
+  private readonly play = h("button", { type: "button", class: "play" });
   private readonly scrub = h("input", { type: "range", min: 0, step: "any", "aria-label": "Frame" });
   private readonly clock = h("output", { class: "clock" });
   private readonly trouble = h("p", { class: "muted", role: "status" });
@@ -72,7 +72,17 @@ export class Viewer {
       this.player.seek(Number(this.scrub.value));
     });
     this.view.append(canvas, this.labels, this.legend);
-    const time = h("div", { class: "timeline" }, this.play, this.scrub, this.clock);
+    const speeds: [string, string][] = [["1", "1 ×"], ["0.5", "½ ×"], ["0.25", "¼ ×"], ["2", "2 ×"], ["4", "4 ×"]];
+    const endings: [string, string][] = [["loop", "loop"], ["back and forth", "back and forth"], ["once", "stop"]];
+    const time = h(
+      "div",
+      { class: "timeline" },
+      this.play,
+      this.scrub,
+      this.clock,
+      choice("Speed", speeds, (value) => (this.player.speed = Number(value))),
+      choice("At the end", endings, (value) => (this.player.ending = value as Ending)),
+    );
     const thinned = preview.header.frame_stride > 1 ? `Every ${ordinal(preview.header.frame_stride)} frame is shown; the files hold them all.` : "";
     holder.replaceChildren(this.view, time, this.tools(), h("p", { class: "hint", hidden: !thinned }, thinned), this.trouble);
   }
@@ -85,19 +95,19 @@ export class Viewer {
       "div",
       { class: "tools" },
       choice("Colour", colours, (value) => void this.colour(value as Colouring)),
-      choice("Speed", [["1", "1 ×"], ["0.5", "½ ×"], ["0.25", "¼ ×"], ["2", "2 ×"], ["4", "4 ×"]], (value) => (this.player.speed = Number(value))),
-      choice("At the end", [["loop", "loop"], ["back and forth", "back and forth"], ["once", "stop"]], (value) => (this.player.ending = value as Ending)),
       preview.faces.length > 0 && toggle("Wireframe", (on) => this.wireframe(on)),
       toggle("Input tracks", (on) => void this.tracks(on)),
-      preview.has("truth") && toggle("Ground truth beside it", (on) => void this.beside(on)),
-      toggle("Through the camera", (on) => this.follow(on), "follow"),
+      preview.has("truth") && toggle("Ground truth", (on) => void this.beside(on)),
+      toggle("Camera's view", (on) => this.follow(on), "follow"),
       toggle("Flip depth", (on) => this.stage.flip(on), "flip", preview.header.mirrored),
-      button("Reset view", () => {
-        this.follow(false);
-        this.stage.reset();
-      }),
+      button("Reset view", () => this.reset(), { class: "quiet" }),
     );
     return tools;
+  }
+
+  private reset(): void {
+    this.follow(false);
+    this.stage.reset();
   }
 
   private key(event: KeyboardEvent): void {
@@ -131,7 +141,8 @@ export class Viewer {
   }
 
   private showState(): void {
-    say(this.play, this.player.playing ? "Pause" : "Play");
+    this.play.setAttribute("aria-label", this.player.playing ? "Pause" : "Play");
+    this.play.dataset["playing"] = String(this.player.playing);
   }
 
   private moved(): void {
@@ -157,9 +168,9 @@ export class Viewer {
       this.body.colour(values);
       this.legend.hidden = values === null;
       fill(this.legend, `${colouring} ${values?.top}`, () => [
-        h("span", {}, "0"),
-        h("span", { class: "ramp" }, ...SCALE.map((_, index) => h("i", { class: `ramp-${index}` }))),
-        h("span", {}, `${number(values?.top)} ${LEGENDS[colouring]}`),
+        h("span", {}, `${LEGENDS[colouring]}: 0`),
+        h("span", { class: "ramp" }),
+        h("span", {}, number(values?.top)),
       ]);
       this.stage.redraw();
     });
@@ -237,9 +248,9 @@ export class Viewer {
 
 const LEGENDS: Record<Colouring, string> = {
   plain: "",
-  displacement: "from the mean position, the tracks' unit",
-  error: "from ground truth, each frame aligned",
-  residual: "between track and projection, the tracks' unit",
+  displacement: "From its mean position",
+  error: "From ground truth",
+  residual: "From track to projection",
 };
 
 function ordinal(value: number): string {
@@ -257,5 +268,5 @@ function toggle(label: string, onChange: (on: boolean) => void, name = "", on = 
   const box = h("input", { type: "checkbox", "data-tool": name || null });
   box.checked = on;
   box.addEventListener("change", () => onChange(box.checked));
-  return h("label", { class: "tool" }, box, label);
+  return h("label", { class: "chip" }, box, label);
 }

@@ -1,0 +1,33 @@
+// The few numbers of a job that people look for first.
+
+import { fill, h } from "./dom";
+import { type Job, isFinal } from "./types";
+import { duration, number, percent } from "./words";
+
+const whole = new Intl.NumberFormat("en");
+
+export class Figures {
+  readonly element = h("dl", { class: "figures" });
+
+  show(job: Job): void {
+    const rows = figures(job);
+    fill(this.element, JSON.stringify(rows), () => rows.map(([term, value]) => h("div", {}, h("dt", {}, term), h("dd", {}, value))));
+  }
+}
+
+function figures(job: Job): [string, string][] {
+  const rows: [string, string][] = [
+    ["Frames", whole.format(job.interpretation.num_frames)],
+    ["Points", whole.format(job.interpretation.num_points)],
+  ];
+  const { e3d_sequence: error, reprojection_median: residual } = job.metrics ?? {};
+  if (error !== undefined) rows.push(["3-D error", percent(error)]);
+  if (residual !== undefined) rows.push(["Reprojection", number(residual)]);
+  if (job.started_at && job.finished_at) rows.push(["Took", duration((Date.parse(job.finished_at) - Date.parse(job.started_at)) / 1000)]);
+  const { progress } = job;
+  if (progress && !isFinal(job.status)) {
+    if (progress.residual !== null) rows.push(["Residual", number(progress.residual)]);
+    rows.push(["Left", progress.seconds_left === null ? "–" : duration(progress.seconds_left)]);
+  }
+  return rows;
+}

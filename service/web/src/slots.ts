@@ -1,0 +1,144 @@
+// The files of a new job: four places, filled by drop or by choice, each saying what it holds.
+
+import { button, h, uniqueId } from "./dom";
+import { type Entry, describe, peek } from "./peek";
+import { PARTS, type Part } from "./types";
+import { bytes } from "./words";
+
+const PLACES: Record<Part, { label: string; hint: string }> = {
+  tracks: { label: "Tracks", hint: "npz, npy, mat, csv …" },
+  mesh: { label: "Mesh", hint: "optional: obj, ply, glb, npz" },
+  ground_truth: { label: "Ground truth", hint: "optional: errors are measured" },
+  rotations: { label: "Cameras", hint: "optional: if they are known" },
+};
+
+interface Slot {
+  row: HTMLElement;
+  input: HTMLInputElement;
+  hint: HTMLElement;
+  contents: HTMLElement;
+  remove: HTMLButtonElement;
+  file: File | null;
+}
+
+export class Slots {
+  readonly element = h("div", { class: "zone" });
+  private readonly slots = new Map<Part, Slot>();
+  private readonly grid = h("input", { type: "text", id: "grid", placeholder: "rows×columns", size: 10, autocomplete: "off" });
+
+  /** `onChange` is told when another set of files is there. */
+  constructor(private readonly onChange: () => void) {
+    const title = h("p", { class: "zone-title" }, "Drop tracks here, and a mesh");
+    const promise = h("p", { class: "hint" }, "Files stay on this service; nothing is sent elsewhere.");
+    this.element.append(title, promise, ...PARTS.map((part) => this.slot(part)));
+    this.grid.addEventListener("change", onChange);
+    this.acceptDrops();
+  }
+
+  /** The files there are, and a grid's size where there is no mesh file. */
+  get given(): { files: [Part, File][]; grid: string } {
+    const files = PARTS.map((part): [Part, File | null] => [part, this.file(part)]);
+    const grid = this.file("mesh") ? "" : this.grid.value.trim().replace("×", "x");
+    return { files: files.filter((one): one is [Part, File] => one[1] !== null), grid };
+  }
+
+  file(part: Part): File | null {
+    return this.slots.get(part)?.file ?? null;
+  }
+
+  focus(part: Part): void {
+    this.slots.get(part)?.input.focus();
+  }
+
+  /** Put these files into their places, and nothing else. */
+  async fill(files: [Part, File][]): Promise<void> {
+    for (const part of PARTS) await this.show(part, files.find(([of]) => of === part)?.[1] ?? null);
+    this.onChange();
+  }
+
+  /** Put dropped files where their names and contents say they belong. */
+  async take(files: File[]): Promise<void> {
+    for (const file of files) await this.show(roleOf(file.name, await peek(file), this.file("tracks") !== null), file);
+    if (files.length > 0) this.onChange();
+  }
+
+  private slot(part: Part): HTMLElement {
+    const { label, hint } = PLACES[part];
+    const id = uniqueId("file");
+    const slot: Slot = {
+      row: h("div", { class: "slot", "data-part": part }),
+      input: h("input", { type: "file", id, class: "visually-hidden", "aria-describedby": `${id}-hint` }),
+      hint: h("span", { class: "hint", id: `${id}-hint` }, hint),
+      contents: h("p", { class: "contents hint" }),
+      remove: button("×", () => void this.put(part, null).then(() => slot.input.focus()), {
+        class: "quiet",
+        hidden: true,
+        "aria-label": `Remove ${label.toLowerCase()}`,
+      }),
+      file: null,
+    };
+    slot.input.addEventListener("change", () => void this.put(part, slot.input.files?.[0] ?? null));
+    this.slots.set(part, slot);
+    // The label reaches over the whole row, so that a thumb hits it.
+    const choose = h("label", { for: id, class: "choose" }, label);
+    const pick = h("span", { class: "pick", "aria-hidden": "true" }, "Choose");
+    slot.row.append(slot.input, choose, pick, slot.hint, slot.remove, slot.contents);
+    if (part === "mesh") slot.row.append(h("span", { class: "grid-size" }, h("label", { for: "grid" }, "or points on a grid"), this.grid));
+    return slot.row;
+  }
+
+  private async put(part: Part, file: File | null): Promise<void> {
+    await this.show(part, file);
+    this.onChange();
+  }
+
+  private async show(part: Part, file: File | null): Promise<void> {
+    const slot = this.slots.get(part) as Slot;
+    slot.file = file;
+    slot.remove.hidden = file === null;
+    slot.row.classList.toggle("full", file !== null);
+    slot.hint.textContent = file === null ? PLACES[part].hint : `${file.name}, ${bytes(file.size)}`;
+    slot.contents.textContent = "";
+    if (part === "mesh") (this.grid.parentElement as HTMLElement).hidden = file !== null;
+    if (file === null) {
+      slot.input.value = "";
+      return;
+    }
+    const entries = await peek(file);
+    if (slot.file === file && entries.length > 0) slot.contents.textContent = describe(entries);
+  }
+
+  private acceptDrops(): void {
+    const over = (event: DragEvent): void => {
+      if (!event.dataTransfer?.types.includes("Files")) return;
+      event.preventDefault();
+      document.body.classList.toggle("dropping", event.type === "dragover");
+    };
+    document.addEventListener("dragover", over);
+    document.addEventListener("dragleave", over);
+    document.addEventListener("drop", (event) => {
+      over(event);
+      void this.take([...(event.dataTransfer?.files ?? [])]);
+    });
+  }
+}
+
+const WITHIN: [Part, RegExp][] = [
+  ["tracks", /^(tracks|points|pred_tracks|trajs?_e|W|tracks_xyz|visibility)$/],
+  ["ground_truth", /^(shapes|S|ground_truth|truth|points3d)$/i],
+  ["mesh", /^(faces|triangles|grid)$/i],
+  ["rotations", /^(rotations|Rs|R)$/],
+];
+const NAMED: [Part, RegExp][] = [
+  ["mesh", /\.(obj|ply|glb|gltf|png)$/i],
+  ["ground_truth", /truth|(^|[_-])gt([_.-]|$)/i],
+  ["rotations", /rotation|camera/i],
+  ["mesh", /mesh|faces/i],
+];
+
+/** Decide what a dropped file is: by the arrays in it, then by its name, then tracks first and a mesh second. */
+export function roleOf(name: string, entries: Entry[], haveTracks: boolean): Part {
+  for (const [part, pattern] of WITHIN) if (entries.some((entry) => pattern.test(entry.name))) return part;
+  for (const [part, pattern] of NAMED) if (pattern.test(name)) return part;
+  return haveTracks && !/track/i.test(name) ? "mesh" : "tracks";
+}
