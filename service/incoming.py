@@ -12,7 +12,7 @@ import secrets
 import shutil
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 
@@ -61,6 +61,15 @@ class Incoming:
         assert self._own is not None, "open() comes first"
         with tempfile.TemporaryDirectory(dir=self._own, prefix="", ignore_cleanup_errors=True) as path:
             yield Path(path)
+
+    def abandoned(self) -> list[str]:
+        """Name the sub-folders whose process is gone, which the next one that starts will sweep."""
+        found = []
+        for lock in sorted(self.directory.glob("*.lock")):
+            with suppress(FileNotFoundError, BlockingIOError), lock.open("rb") as held:
+                fcntl.flock(held, fcntl.LOCK_SH | fcntl.LOCK_NB)
+                found.append(lock.stem)
+        return found
 
     def _sweep(self) -> None:
         """Remove the sub-folders whose process is gone, which is to say whose lock is free."""

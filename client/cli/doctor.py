@@ -44,6 +44,10 @@ def doctor(
     data: Annotated[Path, typer.Option("--data", envvar="PLIANT_DATA", help="Data directory.")] = Path("pliant-data"),
     port: Annotated[int, typer.Option("--port", help="Port that `pliant up` would use.", min=1, max=65535)] = 8000,
     url: Url = HOME,
+    audit: Annotated[
+        bool,
+        typer.Option("--audit", help="Compare everything stored with what the records say; needs a running queue."),
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Check the installation; exit code 8 if something has to be put right."""
@@ -58,6 +62,8 @@ def doctor(
         *check_valkey(),
     ]
     findings += [*check_port(port), *check_service(session, url)]
+    if audit:
+        findings += check_stored(data)
     if as_json:
         print_json([asdict(finding) for finding in findings])
     else:
@@ -191,6 +197,32 @@ def check_service(session: Session, url: str) -> Iterator[Finding]:
         )
         return
     yield Finding("service", "good", f"{url}: {', '.join(f'{name} {how}' for name, how in state.items())}")
+
+
+def check_stored(data: Path) -> Iterator[Finding]:
+    """Compare records, queue, blobs, working files, uploads and half-received bodies with one another."""
+    import os
+    from dataclasses import replace
+
+    from pliant.service.incoming import Incoming
+    from pliant.worker.audit import findings
+    from pliant.worker.errors import StoreUnavailable
+    from pliant.worker.jobs import Jobs
+    from pliant.worker.settings import Settings
+
+    settings = replace(Settings.from_environment(os.environ), data=data)
+    try:
+        found = findings(Jobs.open(settings))
+    except StoreUnavailable as fault:
+        yield Finding("stored", "bad", str(fault), "Start `pliant up` on this directory, then ask again.")
+        return
+    for sentence in found:
+        yield Finding("stored", "bad", sentence, "The keeper puts right what it can within minutes; report what stays.")
+    for name in Incoming(data / "incoming").abandoned():
+        advice = "The next start of the service removes it."
+        yield Finding("stored", "bad", f"Folder incoming/{name} belongs to a process that is gone.", advice)
+    if not found:
+        yield Finding("stored", "good", "everything stored is as the records say")
 
 
 def show(findings: list[Finding]) -> None:

@@ -153,6 +153,7 @@ def test_a_killed_process_folder_is_swept_and_a_living_ones_is_not(tmp_path: Pat
     (tmp_path / "dead.lock").touch()
     with living.room() as room:
         (room / "part").write_bytes(b"x")
+        assert Incoming(tmp_path).abandoned() == ["dead"]
         second = Incoming(tmp_path)
         second.open()
         assert not (tmp_path / "dead").exists()
