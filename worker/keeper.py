@@ -50,6 +50,13 @@ DEAD_AGE = timedelta(minutes=1)
 """Working files of an attempt that is over are removed when they are older: until then its worker may be reading them."""
 
 
+JUMP = 60.0
+"""Seconds by which the wall clock and the running time must part for it to be a jump."""
+
+HOLD = 3600.0
+"""Seconds after a jump of the clock in which nothing expires: a wrong clock is mostly put right soon, a deletion never."""
+
+
 @dataclass(slots=True)
 class Stillness:
     """For how long each thing has not changed, by our own watch."""
@@ -75,6 +82,9 @@ class Keeper:
     _running: Stillness = field(default_factory=Stillness)
     _queued: Stillness = field(default_factory=Stillness)
     _looked: float | None = None
+    _ahead: float | None = None
+    """Seconds that the wall clock is ahead of the running time."""
+    _held_until: float | None = None
     _tidied: float | None = None
     _swept: float | None = None
     _cleaned: set[str] = field(default_factory=set)
@@ -91,13 +101,15 @@ class Keeper:
         now = self.clock()
         gap = 0.0 if self._looked is None else min(now - self._looked, 2 * LOOK_EVERY)
         self._looked = now
+        self._mind_the_clock(now)
         self._take_from_lost_workers(gap)
         self._queue_forgotten(gap)
         if self._tidied is None or now >= self._tidied + TIDY_EVERY:
-            self._expire()
+            if self._held_until is None or now >= self._held_until:
+                self._expire()
+                self._expire_uploads()
             self._clean_up_after_failures()
             self._clear_work()
-            self._expire_uploads()
             self.jobs.queue.tidy()
             self._tidied = now
         if self._swept is None or now >= self._swept + SWEEP_EVERY:
@@ -181,6 +193,14 @@ class Keeper:
         self.jobs.queue.remove(old)
         self.jobs.queue.push(id, fresh, front=front)
         return True
+
+    def _mind_the_clock(self, now: float) -> None:
+        """Let nothing expire for a while if the wall clock has jumped: what expires is told by it, and by it alone."""
+        ahead = self.jobs.clock().timestamp() - now
+        if self._ahead is not None and abs(ahead - self._ahead) > JUMP:
+            self._held_until = now + HOLD
+            logger.warning("the clock jumped by %.0f s; nothing expires for %.0f s", ahead - self._ahead, HOLD)
+        self._ahead = ahead
 
     def _expire(self) -> None:
         """Remove the jobs whose time is over. Nothing that is not finished, or has no `expires_at`, is ever touched."""

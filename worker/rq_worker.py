@@ -20,8 +20,9 @@ from typing import Any
 import redis
 from pliant.client.schemas import Status
 from pliant.worker import job as work
-from pliant.worker.errors import StoreUnavailable
+from pliant.worker.errors import StoreUnavailable, UnknownJob
 from pliant.worker.files import clean_up, last_words
+from pliant.worker.lifecycle import ACTIVE
 from pliant.worker.processes import die_with_parent
 from pliant.worker.queue import FUNCTION, Queue, alive_key
 from pliant.worker.records import Records
@@ -202,4 +203,15 @@ class PliantWorker(Worker):
         except StoreUnavailable as error:
             logger.warning("job %s: %s; the keeper will look after it", watch.id, error)
         finally:
-            clean_up(self._settings, watch.token)
+            if not self._elsewhere(watch):
+                clean_up(self._settings, watch.token)
+
+    def _elsewhere(self, watch: Watch) -> bool:
+        """Tell whether another worker is at this very attempt: ours was a second delivery, and the working files are not ours."""
+        try:
+            held = self._records.get(watch.id)
+        except UnknownJob:
+            return False
+        except StoreUnavailable:
+            return True  # the keeper clears what is left
+        return held.token == watch.token and held.worker != watch.worker and held.job.status in ACTIVE

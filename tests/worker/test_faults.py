@@ -207,6 +207,7 @@ def test_a_second_delivery_of_an_attempt_is_dropped(house: House) -> None:
     time.sleep(0.5)
     held = house.jobs.records.get(id)
     assert (held.token, held.job.status, held.job.attempt) == (token, Status.RUNNING, job.attempt)
+    assert house.files_at_work() == [token], "the second worker has not cleared the first one's files away"
     house.jobs.cancel(id)
     house.final(id)
 

@@ -312,3 +312,30 @@ def test_a_job_on_its_way_to_a_worker_counts_as_running(
     world.pass_seconds(2)
     assert [each.rpartition("-")[0] for each in world.jobs.queue.waiting()] == [first], "lost on its way: queued again"
     assert world.jobs.get(second).status is Status.QUEUED
+
+
+@pytest.mark.parametrize("jump", [timedelta(days=365), timedelta(days=-365)])
+def test_a_jump_of_the_clock_loses_nothing(
+    world: World, jump: timedelta, inputs_file: Path, interpretation: Interpretation
+) -> None:
+    def submit() -> str:
+        return world.jobs.submit(inputs_file, options=Options(), interpretation=interpretation).id
+
+    done, busy, waiting = submit(), submit(), submit()
+    world.claim(done)
+    world.jobs.cancel(done)
+    token = world.jobs.records.get(done).token
+    world.jobs.records.update(done, lambda held: lifecycle.stop(held, token=token, now=world.now, retention=60.0))
+    token = world.claim(busy)
+    world.pass_seconds(2, meanwhile=lambda: world.jobs.records.beat(busy, token))
+    world.now += jump
+    world.pass_seconds(70, meanwhile=lambda: world.jobs.records.beat(busy, token))
+    assert world.jobs.get(done).status is Status.CANCELLED, "held, although by the new clock its time may be over"
+    assert (world.jobs.get(busy).status, world.jobs.get(busy).attempt) == (Status.RUNNING, 1)
+    assert world.jobs.get(waiting).place_in_queue == 0
+    assert findings(world.jobs, settle=0) == []
+    world.now -= jump  # put right
+    world.pass_seconds(3700, meanwhile=lambda: world.jobs.records.beat(busy, token))
+    with pytest.raises(UnknownJob):
+        world.jobs.get(done)
+    assert world.jobs.get(busy).attempt == 1

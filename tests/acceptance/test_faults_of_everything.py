@@ -1,0 +1,49 @@
+"""A whole installation, hit at every kind of moment; afterwards nothing is lost, doubled, half-written or left over.
+
+What `python -m benchmarks.faults` makes its table of. Faults that tests/worker commits on workers alone are not repeated here.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="finds processes in /proc")
+
+WANTED = (
+    "horse_writing", "horse_storing", "valkey_down", "api_uploading", "api_receiving", "api_waiting", "api_downloading",
+    "everything", "stopped", "frozen", "twice", "cancel_queued", "cancel_loading", "cancel_cameras", "cancel_reweight",
+    "cancel_exporting",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module", autouse=True)
+def root() -> Iterator[None]:
+    """Import the benchmarks as they import each other: from the root of the repository."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(Path(__file__).parents[2]))
+        yield
+
+
+@pytest.fixture(scope="module")
+def house(root: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    with import_module("benchmarks.house").House(tmp_path_factory.mktemp("house")) as house:
+        yield house
+
+
+@pytest.mark.parametrize("name", WANTED)
+def test_nothing_is_lost_doubled_half_written_or_left_over(house: Any, name: str) -> None:
+    listed = import_module("benchmarks.faults").FAULTS
+    _, commit = listed[name]
+    told = commit(house)
+    assert told.said
+    assert house.misfits() == []
+
+
+def test_every_fault_is_known(root: None) -> None:
+    assert set(WANTED) < set(import_module("benchmarks.faults").FAULTS)
