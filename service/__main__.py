@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import signal
 import sys
 from collections.abc import Callable
 from types import FrameType
@@ -93,6 +94,11 @@ def main() -> int:
         timeout_graceful_shutdown=STOP_WITHIN,
     )
     server = Server(config, on_stop=lambda: stop_streams(app))
+    for number in (
+        signal.SIGTERM,
+        signal.SIGINT,
+    ):  # uvicorn raises them again when it has stopped, which would be our end by signal
+        signal.signal(number, lambda *_: setattr(server, "should_exit", True))
     server.run()
     return 0 if server.started else 1
 

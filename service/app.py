@@ -12,7 +12,7 @@ from pliant.service import describe, problems
 from pliant.service.auth import Authentication
 from pliant.service.core import Service
 from pliant.service.follow import Followers
-from pliant.service.guard import OriginGuard, SecurityHeaders
+from pliant.service.guard import EVERY_ANSWER, OriginGuard, SecurityHeaders
 from pliant.service.incoming import Incoming
 from pliant.service.linger import LingeringClose
 from pliant.service.metrics import Counting, Requests
@@ -101,7 +101,7 @@ def create_app(
         docs_url=None,  # FastAPI's page loads scripts from elsewhere, which our own content-security policy forbids
         redoc_url=None,
     )
-    problems.install(app, STATUS_OF)
+    problems.install(app, STATUS_OF, careful=EVERY_ANSWER)
     for each in (jobs, inspection, uploads, artifacts, events, about, metrics, examples):
         app.include_router(each.router)
     mount_page(app)

@@ -81,7 +81,7 @@ SUBMIT_BODY: dict[str, Any] = {
                         "or another layout that docs/formats.md lists.",
                     },
                     "mesh": {
-                        "oneOf": [_FILE, {"type": "string", "pattern": "^[0-9]+x[0-9]+$"}],
+                        "anyOf": [_FILE, {"type": "string", "pattern": "^([0-9]{1,6}x[0-9]{1,6}|none)$"}],
                         "description": "A mesh file whose vertex i is point i, or the text ROWSxCOLUMNS for a pixel grid. "
                         "Left out: one is made, and the report says how.",
                     },
@@ -124,31 +124,59 @@ SUBMIT_BODY: dict[str, Any] = {
 
 def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
     """Return the OpenAPI entries of these error statuses."""
-    schema = {"$ref": "#/components/schemas/Problem"}
-    return {
-        status: {
-            "description": HTTPStatus(status).phrase,
-            "content": {MEDIA_TYPE: {"schema": schema, **({"example": _PROBLEM_EXAMPLE} if status == 422 else {})}},
-        }
-        for status in statuses
+    return {status: _problem(status) for status in statuses}
+
+
+def _problem(status: int) -> dict[str, Any]:
+    shown = {"example": _PROBLEM_EXAMPLE} if status == 422 else {}
+    entry: dict[str, Any] = {
+        "description": HTTPStatus(status).phrase,
+        "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}, **shown}},
     }
+    if status in _SAID_IN_HEADERS:
+        name, meaning = _SAID_IN_HEADERS[status]
+        entry["headers"] = {name: {"description": meaning, "schema": {"type": "string"}}}
+    return entry
+
+
+_SAID_IN_HEADERS = {
+    401: ("WWW-Authenticate", "How to authenticate (RFC 6750)."),
+    429: ("Retry-After", "Seconds to wait."),
+    503: ("Retry-After", "Seconds to wait."),
+}
+_FROM_THE_GUARD = (421, 500)
+"""What any address may answer: a Host that is not this service's, a defect."""
+_FROM_THE_DOOR = (401, 403, 429, 503)
+"""What any address that is not public may answer: no token, not one that may, too often, no store to look the token up."""
 
 
 def document(app: FastAPI) -> dict[str, Any]:
-    """Return the OpenAPI document, made once: FastAPI's, with the schema of problems added to it."""
+    """Return the OpenAPI document, made once: FastAPI's, and what is answered before a route is reached."""
     if app.openapi_schema is None:
         made = FastAPI.openapi(app)
         schemas = made.setdefault("components", {}).setdefault("schemas", {})
-        made["components"]["securitySchemes"] = {
-            "token": {
-                "type": "http",
-                "scheme": "bearer",
-                "description": "Where the service asks for tokens; `pliant token create`.",
-            }
-        }
         for path, operations in made["paths"].items():
             for operation in operations.values():
-                operation["security"] = [] if is_public(path) else [{"token": []}]
+                _complete(operation, path)
         schemas["Problem"] = Problem.model_json_schema(ref_template="#/components/schemas/{model}")
+        for name in ("HTTPValidationError", "ValidationError"):  # FastAPI's own, which nothing here answers with
+            schemas.pop(name, None)
+        said = "Where the service asks for tokens. Whoever runs it makes them with `pliant token create`."
+        made["components"]["securitySchemes"] = {"token": {"type": "http", "scheme": "bearer", "description": said}}
         app.openapi_schema = made
     return app.openapi_schema
+
+
+def _complete(operation: dict[str, Any], path: str) -> None:
+    """Add to an operation what is true of all, and make every error a problem."""
+    open_to_all = is_public(path)
+    operation["security"] = [] if open_to_all else [{"token": []}]
+    responses = operation["responses"]
+    if "422" in responses:
+        responses["422"] = _problem(422)
+    usual: tuple[int, ...] = _FROM_THE_GUARD if open_to_all else _FROM_THE_GUARD + _FROM_THE_DOOR
+    if "{" in path:
+        usual += (404,)
+    for status in usual:
+        responses.setdefault(str(status), _problem(status))
+    operation["responses"] = dict(sorted(responses.items()))

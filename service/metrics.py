@@ -91,6 +91,10 @@ class Counting:
         self._requests.under_way += 1
         try:
             await self._app(scope, receive, watched)
+        except Exception:
+            if not counted:  # a defect; its answer is made outside of us
+                self._requests.count(scope["method"], _route(scope), 500, self._clock() - begun)
+            raise
         finally:
             self._requests.under_way -= 1
 

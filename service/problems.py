@@ -140,7 +140,7 @@ def _short(value: object) -> str:
     return text if len(text) <= 80 else text[:77] + "…"
 
 
-def install(app: FastAPI, table: Mapping[type[Exception], int]) -> None:
+def install(app: FastAPI, table: Mapping[type[Exception], int], *, careful: Mapping[str, str]) -> None:
     """Make every error of the app a problem.
 
     Parameters
@@ -149,6 +149,8 @@ def install(app: FastAPI, table: Mapping[type[Exception], int]) -> None:
         The application.
     table : mapping of exception class to int
         Status code by class; a subclass not named takes its nearest base's.
+    careful : mapping of str to str
+        Headers of the answer to a defect, which is made outside all middleware.
     """
 
     async def refused(_: Request, error: Exception) -> Response:
@@ -183,7 +185,7 @@ def install(app: FastAPI, table: Mapping[type[Exception], int]) -> None:
         # Starlette raises it again after this answer, so the server's log has the traceback; the client never sees it.
         _log.error("unforeseen %s at %s %s", type(error).__name__, request.method, request.url.path)
         code, detail = _SAID_BY_STATUS[500]
-        return answer(problem(500, code, detail=detail))
+        return answer(problem(500, code, detail=detail), headers={**careful, "Cache-Control": "no-store"})
 
     app.add_exception_handler(Refusal, refused)
     app.add_exception_handler(HTTPException, of_http)

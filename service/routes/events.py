@@ -19,7 +19,16 @@ router = APIRouter(prefix="/v1/jobs/{id}", tags=["jobs"])
 
 _STREAM = {
     "text/event-stream": {
-        "schema": {"type": "string"},
+        "schema": {
+            "type": "object",
+            "description": "One event; `data` is the JSON of a `Job` or of its `Progress`.",
+            "required": ["id", "event", "data"],
+            "properties": {
+                "id": {"type": "string", "description": "Ascending; send the last one as `Last-Event-ID` to go on."},
+                "event": {"enum": ["job", "progress"]},
+                "data": {"type": "string", "contentMediaType": "application/json"},
+            },
+        },
         "example": 'id: 1-0\nevent: progress\ndata: {"stage": "reweight"}\n\n',
     }
 }

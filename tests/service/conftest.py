@@ -44,13 +44,15 @@ def serve(valkey_url: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator
         settings = dataclasses.replace(ServiceSettings(port=0, incoming=data / "incoming"), **given)
         tokens = Tokens.open(jobs.settings)
         app = create_app(jobs, settings, tokens=tokens, limits=limits)
-        server = uvicorn.Server(uvicorn.Config(app, port=0, log_config=None, timeout_graceful_shutdown=3))
+        server = uvicorn.Server(
+            uvicorn.Config(app, port=0, log_config=None, server_header=False, timeout_graceful_shutdown=3)
+        )
         thread = threading.Thread(target=server.run)
         thread.start()
         started.append((server, thread))
         until(lambda: server.started)
         port = server.servers[0].sockets[0].getsockname()[1]
-        return Running(f"http://127.0.0.1:{port}", jobs, settings, server, tokens)
+        return Running(f"http://127.0.0.1:{port}", jobs, settings, server, tokens, app)
 
     yield start
     for server, thread in started:

@@ -89,7 +89,7 @@ def test_waiting_ends_when_the_job_does_or_patience_does(running: Running, http:
 
 def test_every_answer_tells_the_browser_to_be_careful(http: httpx.Client) -> None:
     for answer in (http.get("/healthz"), http.get("/nowhere"), http.get("/v1/jobs/nobody")):
-        assert answer.headers["content-security-policy"].startswith("default-src 'self'")
+        assert answer.headers["content-security-policy"].startswith("default-src 'none'")
         assert answer.headers["x-content-type-options"] == "nosniff"
         assert "access-control-allow-origin" not in answer.headers
 

@@ -15,6 +15,7 @@ from typing import Any
 import httpx
 import numpy as np
 import uvicorn
+from fastapi import FastAPI
 from pliant.client.schemas import Artifact, Job
 from pliant.service.settings import ServiceSettings
 from pliant.worker import lifecycle
@@ -33,6 +34,7 @@ class Running:
     settings: ServiceSettings
     server: uvicorn.Server
     tokens: Tokens
+    app: FastAPI
 
     @property
     def left_on_disk(self) -> list[Path]:

@@ -1,0 +1,154 @@
+"""What lasts: event streams with nothing to say, streams when the service stops, answers that wait; and what a log says."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import pytest
+from pliant.worker.settings import Settings
+from serving import Running, Serve, claim, finish, form, submit, tracks, until
+
+
+@pytest.fixture(scope="module")
+def restless(serve: Serve) -> Running:
+    return serve(heartbeat_seconds=0.2)
+
+
+def test_a_stream_with_nothing_to_say_says_that_it_is_there(restless: Running) -> None:
+    with httpx.Client(base_url=restless.url, timeout=10) as http:
+        job = submit(http, name="quiet")
+        begun = time.monotonic()
+        with http.stream("GET", f"/v1/jobs/{job.id}/events") as answer:
+            assert answer.headers["content-type"].startswith("text/event-stream")
+            assert answer.headers["cache-control"] == "no-store"
+            lines = answer.iter_lines()
+            signs = [next(line for line in lines if line.startswith(":")) for _ in range(4)]
+        assert signs == [": still here"] * 4
+        assert 0.6 < time.monotonic() - begun < 5
+
+
+def test_a_listener_who_leaves_is_forgotten(restless: Running) -> None:
+    service = restless.app.state.service
+    with httpx.Client(base_url=restless.url, timeout=10) as http:
+        job = submit(http, name="left")
+        with http.stream("GET", f"/v1/jobs/{job.id}/events") as answer:
+            next(answer.iter_lines())
+            until(lambda: service.followers.watched == 1)
+        until(lambda: service.followers.watched == 0)
+
+
+@pytest.mark.parametrize("verb", ["POST", "PUT"])
+def test_a_submission_may_wait_for_the_end(running: Running, http: httpx.Client, verb: str) -> None:
+    path = "/v1/jobs" if verb == "POST" else "/v1/jobs/awaited-at-once"
+    body = form(tracks(seed=7), name=f"awaited {verb}")
+    begun = time.monotonic()
+    early = http.request(verb, path, files=body, headers={"Prefer": "wait=1", "Idempotency-Key": "awaited"})
+    assert 0.9 < time.monotonic() - begun < 8
+    assert (early.status_code, early.json()["status"]) == (202, "queued")
+    assert early.headers["preference-applied"] == "wait=1"
+    timer = threading.Timer(0.5, finish, (running, early.json()["id"], b"x"))
+    timer.start()
+    late = http.request(verb, path, files=body, headers={"Prefer": "wait=15", "Idempotency-Key": "awaited"})
+    timer.join()
+    assert late.json()["id"] == early.json()["id"]
+    assert late.json()["status"] == "succeeded"
+
+
+@pytest.mark.parametrize("wish", ["wait", "wait=", "wait=x", "wait=-1", "return=minimal", "wait=1.5", "wait=٣"])
+def test_a_wish_that_is_none_is_passed_over(http: httpx.Client, wish: str) -> None:
+    job = submit(http)
+    begun = time.monotonic()
+    answer = http.get(f"/v1/jobs/{job.id}", headers={b"Prefer": wish.encode()})
+    assert answer.status_code == 200
+    assert "preference-applied" not in answer.headers
+    assert time.monotonic() - begun < 0.9
+
+
+def test_nobody_waits_longer_than_the_service_lets_him(serve: Serve) -> None:
+    running = serve(max_wait_seconds=1)
+    with httpx.Client(base_url=running.url, timeout=10) as http:
+        job = submit(http)
+        begun = time.monotonic()
+        answer = http.get(f"/v1/jobs/{job.id}", headers={"Prefer": "wait=600"})
+        assert answer.headers["preference-applied"] == "wait=1"
+        assert time.monotonic() - begun < 5
+
+
+def test_a_log_is_what_the_attempts_said_line_by_line(running: Running, http: httpx.Client) -> None:
+    job = submit(http, name="logged")
+    empty = http.get(f"/v1/jobs/{job.id}/log")
+    assert (empty.status_code, empty.text) == (200, "")
+    claim(running, job.id)
+    said = ["2026-05-04T09:30:00Z Attempt 1 began on worker w.", "Größe: 3 × 4 <b>not markup</b>"]
+    running.jobs.records.append_log(job.id, said)
+    answer = http.get(f"/v1/jobs/{job.id}/log")
+    assert answer.text.splitlines() == said
+    assert answer.headers["content-type"] == "text/plain; charset=utf-8"
+    assert answer.headers["x-content-type-options"] == "nosniff"
+
+
+@pytest.fixture
+def process(valkey_url: str, tmp_path: Path) -> Iterator[tuple[subprocess.Popen[bytes], str, Path]]:
+    """The service as a process of its own, as `pliant up` starts it."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    settings = Settings(data=tmp_path, redis_url=valkey_url, queue=f"stop-{os.getpid()}")
+    env = {**os.environ, **settings.to_environment(), "PLIANT_HOST": "127.0.0.1", "PLIANT_PORT": str(port)}
+    log = tmp_path / "service.log"
+    with log.open("wb") as errors:
+        started = subprocess.Popen([sys.executable, "-m", "pliant.service"], env=env, stdout=errors, stderr=errors)
+    url = f"http://127.0.0.1:{port}"
+
+    def answers() -> bool:
+        try:
+            return httpx.get(f"{url}/healthz").status_code == 200
+        except httpx.TransportError:
+            return False
+
+    until(answers, seconds=60)
+    yield started, url, log
+    if started.poll() is None:
+        started.kill()
+    started.wait(10)
+
+
+def test_sigterm_ends_streams_and_waits_at_once_and_cleanly(
+    process: tuple[subprocess.Popen[bytes], str, Path],
+) -> None:
+    service, url, log = process
+    ended: dict[str, float] = {}
+    with httpx.Client(base_url=url, timeout=60) as http:
+        job = submit(http)
+
+        def listen() -> None:
+            text = http.get(f"/v1/jobs/{job.id}/events").text
+            assert text.endswith("\n\n"), "no event is cut in half"
+            ended["stream"] = time.monotonic()
+
+        def wait() -> None:
+            assert http.get(f"/v1/jobs/{job.id}", headers={"Prefer": "wait=50"}).json()["status"] == "queued"
+            ended["wait"] = time.monotonic()
+
+        threads = [threading.Thread(target=each) for each in (listen, wait)]
+        for thread in threads:
+            thread.start()
+        time.sleep(1.0)
+        told = time.monotonic()
+        service.send_signal(signal.SIGTERM)
+        assert service.wait(20) == 0
+        gone = time.monotonic()
+        for thread in threads:
+            thread.join(20)
+    assert {name: at - told < 3 for name, at in ended.items()} == {"stream": True, "wait": True}
+    assert gone - told < 5
+    assert log.read_text() == "", "neither a traceback nor chatter"
