@@ -17,6 +17,7 @@ import typer
 from pliant.client.cli.exits import Exit
 from pliant.client.cli.session import HOME, Json, Session, Url
 from pliant.client.cli.show import out, print_json
+from pliant.client.cli.solve import THREAD_VARIABLES
 
 OLDEST_PYTHON = (3, 11)
 ROOM = 2 * 1024**3
@@ -103,19 +104,32 @@ def check_packages(version_of: Callable[[str], str] = version) -> Iterator[Findi
 
 
 def check_blas() -> Iterator[Finding]:
-    """Time one product of matrices, which tells a BLAS that is missing or fights for cores."""
-    import numpy as np
+    """Time products of matrices, which tells a BLAS that is missing or fights for cores, and count the threads at work.
 
-    a = np.random.default_rng(0).normal(size=(600, 600))
+    Processor time over time is the number of threads that really ran; it is less where the machine is busy.
+    """
+    import os
+
+    import numpy as np
+    from pliant.worker.settings import usable_cores
+
+    a = np.random.default_rng(0).normal(size=(1000, 1000))
     a @ a
-    begin = time.perf_counter()
-    for _ in range(5):
+    begin, used = time.perf_counter(), time.process_time()
+    for _ in range(3):
         a @ a
-    speed = 5 * 2 * 600**3 / (time.perf_counter() - begin) / 1e9
+    seconds = time.perf_counter() - begin
+    threads, speed = (time.process_time() - used) / seconds, 3 * 2 * 1000**3 / seconds / 1e9
     blas = np.show_config(mode="dicts")["Build Dependencies"]["blas"]["name"]
-    found = f"{blas}, {speed:.0f} Gflop/s"
+    asked = {name: os.environ[name] for name in THREAD_VARIABLES if os.environ.get(name)}
+    said = ", ".join(f"{name}={value}" for name, value in asked.items()) or "no variable limits them"
+    found = f"{blas}, {speed:.0f} Gflop/s, {threads:.1f} threads at work ({said})"
     if speed < 1:
         yield Finding("BLAS", "note", found, "That is slow: is the machine busy, or NumPy built without a BLAS?")
+    elif any(value.isdigit() and int(value) > usable_cores() for value in asked.values()):
+        yield Finding(
+            "BLAS", "note", found, f"More threads than the {usable_cores()} usable cores: lower the variable."
+        )
     else:
         yield Finding("BLAS", "good", found)
 

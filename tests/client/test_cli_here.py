@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import io
 import os
+import re
 import socket
 import subprocess
 import sys
@@ -123,8 +124,15 @@ def test_the_doctor_misses_packages(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_doctor_measures_and_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in doctor.THREAD_VARIABLES:
+        monkeypatch.delenv(name, raising=False)
     (blas,) = doctor.check_blas()
-    assert "Gflop/s" in blas.found
+    assert re.search(r"\d+ Gflop/s, \d+\.\d threads at work \(no variable limits them\)", blas.found)
+    monkeypatch.setenv("OMP_NUM_THREADS", "1000")
+    (blas,) = doctor.check_blas()
+    assert blas.verdict == "note"
+    assert "OMP_NUM_THREADS=1000" in blas.found
+    assert "lower the variable" in blas.advice
     monkeypatch.delenv("PLIANT_WORKERS", raising=False)
     assert verdicts(doctor.check_cores()) == {"cores": "good"}
     monkeypatch.setenv("PLIANT_THREADS", "1000")
