@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import signal
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from browsing import Browsing, why_not
+from pliant.client import AsyncClient, Client, NotAuthorized
 from pliant.client.cli.demo import announced
 from pliant.client.cli.exits import Exit
 
@@ -121,6 +123,25 @@ def test_what_cannot_be_a_token_is_refused_in_a_sentence(url: str, data: Path, a
     assert said in ran.stderr
 
 
+def test_both_clients_work_with_a_token_and_not_without(url: str, first: dict[str, Any], tracks: Path) -> None:
+    async def asked(token: str | None) -> tuple[int, ...]:
+        async with AsyncClient(url, token=token) as client:
+            return (await (await client.submit(tracks)).wait(timeout=60)).shapes.shape
+
+    with Client(url, token=first["token"]) as client:
+        assert client.inspect(tracks).num_points == 12
+        job = client.submit(tracks)
+        assert [now.status for now in job.events(timeout=60)][-1] == "succeeded"
+        assert job.wait(timeout=60).shapes.shape == (5, 12, 3)
+    assert asyncio.run(asked(first["token"])) == (5, 12, 3)
+    for wrong in (None, "nonsense"):
+        with Client(url, token=wrong) as stranger, pytest.raises(NotAuthorized, match="token") as caught:
+            stranger.get(job.id)
+        assert caught.value.status == 401
+        with pytest.raises(NotAuthorized):
+            asyncio.run(asked(wrong))
+
+
 @pytest.mark.chromium
 @pytest.mark.skipif(why_not() is not None and not os.environ.get("CI"), reason=str(why_not()))
 def test_the_page_asks_for_the_token_and_shows_its_jobs(url: str, first: dict[str, Any], tracks: Path) -> None:
@@ -140,6 +161,16 @@ def test_the_page_asks_for_the_token_and_shows_its_jobs(url: str, first: dict[st
         page.get_by_role("button", name="Use it").click()
         expect(page.get_by_role("alert")).to_have_count(0, timeout=20_000)
         expect(page.get_by_text("seen in the page").first).to_be_visible(timeout=20_000)
+        page.locator(".view canvas").wait_for(timeout=20_000)
         with page.expect_download() as download:
             page.get_by_role("link", name="report.json").click()
         assert "metrics" in json.loads(Path(download.value.path()).read_text())
+        page.get_by_text("New reconstruction").click()
+        page.get_by_role("button", name="waving flag").click()
+        expect(page.get_by_role("region", name="How your files are understood")).to_contain_text(
+            "30 frames", timeout=20_000
+        )
+        page.get_by_role("button", name="Reconstruct").click()
+        expect(page.get_by_role("heading", name="waving flag")).to_be_visible(timeout=20_000)
+        page.get_by_role("button", name="Cancel").click()
+        expect(page.get_by_role("article").get_by_text("Cancelled", exact=True)).to_be_visible(timeout=30_000)

@@ -21,9 +21,7 @@ import numpy as np
 import pytest
 from browsing import Browsing, differing_pixels, why_not
 from playwright.sync_api import Browser, Locator, Page, Route, expect
-from pliant.solver import Camera, Solution
 from pliant.solver.gallery import corrupt, face, flag
-from pliant.worker import preview
 
 pytestmark = [
     pytest.mark.chromium,
@@ -200,7 +198,7 @@ def seek(page: Page, frame: float) -> None:
 def test_from_an_upload_to_a_playing_mesh(page: Page, url: str, small: dict[str, bytes]) -> None:
     choose(page, small)
     expect(page.locator("[data-part=tracks]")).to_contain_text("tracks 10 × 300 × 2 float64")
-    seen = page.get_by_role("region", name="Understood as")
+    seen = page.get_by_role("region", name="How your files are understood")
     expect(seen).to_contain_text("10 frames of 300 points")
     expect(seen).to_contain_text("tracks (F, P, 2), y down")
     expect(seen).to_contain_text("given; errors are measured against it")
@@ -291,12 +289,12 @@ def test_dropped_files_find_their_places_and_say_what_they_are(page: Page, url: 
     drop(page, small)
     for part, name in (("tracks", TRACKS), ("mesh", "mesh.npz"), ("ground_truth", "truth.npz")):
         expect(page.locator(f"[data-part={part}]")).to_contain_text(name)
-    expect(page.get_by_role("region", name="Understood as")).to_contain_text("10 frames of 300 points")
+    expect(page.get_by_role("region", name="How your files are understood")).to_contain_text("10 frames of 300 points")
     page.get_by_role("button", name="Remove mesh").click()
-    expect(page.get_by_role("region", name="Understood as")).to_contain_text("made by triangulating")
+    expect(page.get_by_role("region", name="How your files are understood")).to_contain_text("made by triangulating")
     page.get_by_label("or points on a grid").fill("15×20")
     page.get_by_label("or points on a grid").press("Tab")
-    expect(page.get_by_role("region", name="Understood as")).to_contain_text("266 faces, from the grid")
+    expect(page.get_by_role("region", name="How your files are understood")).to_contain_text("266 faces, from the grid")
     page.get_by_label("or points on a grid").fill("3x3")
     page.get_by_label("or points on a grid").press("Tab")
     expect(page.get_by_role("alert")).to_contain_text("vertex_count_mismatch")
@@ -307,7 +305,7 @@ def test_a_reading_can_be_chosen_before_anything_is_made_of_it(page: Page, url: 
     jobs = len(httpx.get(f"{url}/v1/jobs?limit=100").json()["jobs"])
     choose(page, {TRACKS: packed(W=np.random.default_rng(0).normal(size=(40, 50)))})
     page.get_by_role("button", name="W (2F, P), rows stacked").click()
-    expect(page.get_by_role("region", name="Understood as")).to_contain_text("W (2F, P), rows stacked")
+    expect(page.get_by_role("region", name="How your files are understood")).to_contain_text("W (2F, P), rows stacked")
     expect(page.get_by_role("alert")).to_have_count(0)
     assert len(httpx.get(f"{url}/v1/jobs?limit=100").json()["jobs"]) == jobs
 
@@ -525,32 +523,31 @@ def test_a_token_is_asked_for_and_then_sent_with_everything(page: Page, url: str
     assert "metrics" in json.loads(Path(download.value.path()).read_text())
 
 
-def test_a_dense_result_plays_within_time_and_memory(page: Page, url: str, finished: str, tmp_path: Path) -> None:
-    """99 frames of 29,000 points, put in the place of a small job's preview."""
+def test_a_dense_result_plays_within_time_and_memory(page: Page, tmp_path: Path) -> None:
+    """99 frames of 29,000 points on the whole road, with known cameras and the method that takes seconds."""
     sequence = face(99, 29_000)
-    shapes = sequence.shapes - sequence.shapes.mean(axis=1, keepdims=True)
-    camera = Camera(sequence.rotations, sequence.scales, np.zeros((99, 2)))
-    rest: dict[str, Any] = dict.fromkeys(("residuals", "weights", "trace", "outcome", "choices", "seconds"))
-    with (tmp_path / "preview.bin").open("w+b") as file:
-        preview.write_preview(
-            file, tracks=sequence.tracks, mesh=sequence.mesh, solution=Solution(shapes=shapes, camera=camera, **rest)
-        )
-        file.seek(0)
-        whole = file.read()
-
-    def dense(route: Route) -> None:
-        start, end = (int(part) for part in route.request.headers["range"].removeprefix("bytes=").split("-"))
-        headers = {"Content-Range": f"bytes {start}-{min(end, len(whole) - 1)}/{len(whole)}"}
-        route.fulfill(status=206, headers=headers, body=whole[start : end + 1])
-
-    page.route("**/artifacts/preview.bin", dense)
-    page.goto(f"{url}/#job={finished}")
-    page.reload()
-    page.locator(".view canvas").wait_for(timeout=20_000)
+    for part, label, arrays in (
+        ("tracks", "Tracks", {"tracks": sequence.tracks.points.astype(np.float32)}),
+        ("mesh", "Mesh", {"faces": sequence.mesh.faces}),
+        ("cameras", "Cameras", {"rotations": sequence.rotations}),
+    ):
+        np.savez(tmp_path / f"{part}.npz", **arrays)
+        page.get_by_label(label, exact=True).set_input_files(tmp_path / f"{part}.npz")
+    seen = page.get_by_role("region", name="How your files are understood")
+    expect(seen).to_contain_text("99 frames of 29,000 points", timeout=30_000)
+    page.get_by_label("Method").select_option(label="pseudo-inverse")
+    page.get_by_text("More options").click()
+    page.get_by_label("Refine rotations").uncheck()
+    page.get_by_role("button", name="Reconstruct").click()
+    page.locator(".view canvas").wait_for(timeout=DONE)
     expect(page.locator(".clock")).to_have_text("1 / 99")
+    first = page.locator(".view canvas").screenshot()
+    began = time.monotonic()
     page.get_by_role("button", name="Play").click()
     until(lambda: float(page.get_by_role("slider", name="Frame").input_value()) > 20)
     page.get_by_role("button", name="Pause").click()
+    assert time.monotonic() - began < 20
+    assert differing_pixels(page, first, page.locator(".view canvas").screenshot()) > 0.001
     megabytes = page.evaluate("performance.memory.usedJSHeapSize") / 1e6
     positions = 99 * 29_000 * 6 / 1e6
     assert positions < megabytes < 6 * positions

@@ -61,7 +61,7 @@ export class Inspection {
   private readonly facts = new Facts();
   private readonly words = h("p", { class: "muted", role: "status" });
   private readonly ask = button("See how it is understood", () => void this.send());
-  private readonly found = h("div", { class: "found", hidden: true }, h("h3", { id: "found-title" }, "Understood as"), this.facts.list, this.facts.notes);
+  private readonly found = h("div", { class: "found", hidden: true }, h("h3", { id: "found-title" }, "How your files are understood"), this.facts.list, this.facts.notes);
   readonly element = h("section", { class: "inspection", "aria-labelledby": "found-title" }, this.words, this.ask, this.found);
   private asking: AbortController | null = null;
   private timer = 0;
