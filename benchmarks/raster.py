@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-LIGHTS = (((-0.45, -0.55, -0.75), 0.75), ((0.75, -0.10, -0.55), 0.25))
-"""Directions towards the light (x right, y down, z away from the viewer) and strengths."""
-AMBIENT = 0.16
+LIGHTS = (((-0.55, -0.65, -0.60), 0.52), ((0.80, -0.05, -0.60), 0.20), ((0.0, 0.0, -1.0), 0.22))
+"""Directions towards the light (x right, y down, z away from the viewer) and strengths: a key, a fill, and one beside the eye."""
+AMBIENT = 0.14
+COLOURED = 0.45
+"""Share of the shading that is kept where colours mean something, so that dark stays the scale's dark."""
 SUPERSAMPLING = 2
+GREY = 0.86
 
 
 def draw_mesh(
@@ -49,10 +52,11 @@ def draw_mesh(
     nearest[pixel] = np.arange(len(pixel))
     hit = nearest[nearest >= 0]
     normal = np.einsum("nk,nkc->nc", inside[hit], normals[corner[hit]])
-    base = np.full((len(points), 3), 0.78) if colours is None else colours
+    base = np.full((len(points), 3), GREY) if colours is None else colours
     colour = np.einsum("nk,nkc->nc", inside[hit], base[corner[hit]])
+    light = _shade(normal) if colours is None else 1 + COLOURED * (_shade(normal) - 1)
     image = np.full((height * width, 3), background)
-    image[pixel[hit]] = np.clip(colour * _shade(normal)[:, None], 0, 1)
+    image[pixel[hit]] = np.clip(colour * light[:, None], 0, 1)
     return image.reshape(size[0], fine, size[1], fine, 3).mean(axis=(1, 3))
 
 

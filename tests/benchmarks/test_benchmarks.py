@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
@@ -201,3 +202,51 @@ def test_every_result_file_is_measured() -> None:
     )
     assert 24 < sizes["shapes.npz"] < 60
     assert 12 < sizes["shapes.glb"] < 60
+
+
+@pytest.mark.parametrize("y_up", [False, True])
+def test_pictures_show_what_the_camera_saw(bench, y_up: bool) -> None:
+    pictures, sequences = bench("pictures"), bench("sequences")
+    case = replace(sequences.from_gallery(face(6, 120, degrees=30), "face"), y_up=y_up)
+    solution = solve(case.tracks, case.mesh, cameras=case.cameras, settings=Settings(max_reweightings=2))
+    exact = replace(solution, shapes=case.shapes)
+    film = pictures.scene_of(case, exact, fixed=False, side=0)
+    seen = case.tracks.points - case.tracks.points.mean(axis=1, keepdims=True)
+    flip = [1, -1] if y_up else [1, 1]
+    scales = np.asarray(case.cameras.scales)[:, None, None]
+    np.testing.assert_allclose(scales * film.ours[..., :2] * flip, seen, atol=1e-9 * np.ptp(seen))
+    np.testing.assert_allclose(film.ours, film.truth, atol=1e-9 * np.ptp(seen))
+    assert film.share.max() < 1e-9
+    fixed = pictures.scene_of(case, solution, fixed=True, side=0)
+    assert fixed.share.max() > 1e-4
+    turned = film.truth[0] @ np.linalg.pinv(fixed.truth[0])  # (P, P) of rank 3: another view of the same points
+    np.testing.assert_allclose(turned @ fixed.truth[0], film.truth[0], atol=1e-9 * np.ptp(seen))
+    alone = pictures.scene_of(replace(case, shapes=None), solution, fixed=True, side=20)
+    assert (alone.truth, alone.relative, alone.quantity) == (None, None, "reprojection residual")
+
+
+@pytest.mark.parametrize("given", ["mesh and truth", "tracks alone"])
+def test_pictures_are_drawn_of_anything(tmp_path: Path, given: str) -> None:
+    from PIL import Image
+
+    write_case(tmp_path / "some")
+    if given == "tracks alone":
+        for name in ("mesh", "truth"):
+            (tmp_path / "some" / f"{name}.npz").unlink()
+    command = [
+        sys.executable,
+        "-m",
+        "benchmarks.pictures",
+        "--data",
+        tmp_path,
+        "--at",
+        "0,4",
+        "--out",
+        tmp_path / "out",
+    ]
+    command += ["--settings", "max_reweightings=2"]
+    ran = subprocess.run(map(str, command), cwd=ROOT, capture_output=True, text=True, timeout=240, check=False)
+    assert ran.returncode == 0, ran.stderr
+    assert ("e3d_frame" in ran.stdout) == (given == "mesh and truth")
+    image = np.asarray(Image.open(tmp_path / "out" / "some.png").convert("L"))
+    assert (image < 250).mean() > 0.01
