@@ -32,6 +32,10 @@ from pliant.worker.supervisor import Supervisor, valkey_child, worker_children
 from pliant.worker.valkey import Valkey
 
 FAULTS = ("kill horse", "kill worker", "stop worker for 5 s", "kill keeper", "kill Valkey", "SIGTERM worker", "cancel")
+OUTAGE = "Valkey hangs for 30 s"
+"""Comes by the clock, every five minutes, since it takes so long."""
+OUTAGE_EVERY = 300.0
+
 ALLOWED = {"kill horse": Status.FAILED, "cancel": Status.CANCELLED}
 """How a job may end, besides succeeding, that a fault hit."""
 
@@ -112,17 +116,19 @@ class Soak:
             victim = next(iter(_children(victim)), None) if victim is not None else None
         elif fault == "kill keeper":
             victim = pids.get("keeper")
-        elif fault == "kill Valkey":
+        elif fault in ("kill Valkey", OUTAGE):
             victim = pids.get("valkey")
         if victim is None:
             return
         for job in running:
             self.hit[job.id].append((fault, now))
-        number = {"stop worker for 5 s": signal.SIGSTOP, "SIGTERM worker": signal.SIGTERM}.get(fault, signal.SIGKILL)
-        _send(victim, number)
-        if number is signal.SIGSTOP:
-            self.wait(5.0)
+        stops = {"stop worker for 5 s": 5.0, OUTAGE: 30.0}
+        if fault in stops:
+            _send(victim, signal.SIGSTOP)
+            self.wait(stops[fault])
             _send(victim, signal.SIGCONT)
+        else:
+            _send(victim, signal.SIGTERM if fault == "SIGTERM worker" else signal.SIGKILL)
 
     def wait(self, seconds: float, until: Callable[[], bool] = lambda: False) -> bool:
         """Keep everything running for a while; tell whether `until` came true."""
@@ -174,9 +180,12 @@ def main() -> int:
 def run(soak: Soak, seconds: float, every: float) -> int:
     """Strike at random, then let everything end; report."""
     began, faults = time.monotonic(), Counter[str]()
+    outage = began + OUTAGE_EVERY / 2
     while time.monotonic() < began + seconds:
         soak.wait(soak.random.expovariate(1 / every))
         fault = soak.random.choice(FAULTS)
+        if time.monotonic() > outage:
+            fault, outage = OUTAGE, time.monotonic() + OUTAGE_EVERY
         try:
             soak.strike(fault)
         except StoreUnavailable:
@@ -190,7 +199,7 @@ def run(soak: Soak, seconds: float, every: float) -> int:
     print(f"{sum(soak.ends.values())} jobs acknowledged in {seconds / 60:g} min, {sum(faults.values())} faults")
     print(f"{soak.refused} submissions refused while Valkey was being started again (never acknowledged)\n")
     print("| fault | times | the jobs that ran then | seconds to their end, median / largest |\n|---|---|---|---|")
-    for fault in FAULTS:
+    for fault in (*FAULTS, OUTAGE):
         told = ", ".join(f"{count} {what}" for what, count in soak.told[fault].most_common())
         times = sorted(soak.seconds[fault]) or [0.0]
         print(f"| {fault} | {faults[fault]} | {told or 'none'} | {times[len(times) // 2]:.1f} / {times[-1]:.1f} |")

@@ -14,7 +14,6 @@ import httpx
 import numpy as np
 import pytest
 from pliant.client.schemas import Job, Problem, Upload
-from pliant.service.core import my_uploads
 from pliant.worker.formats import Limits
 from serving import Running, Serve, form, npz, tracks, until
 
@@ -220,10 +219,16 @@ def test_too_many_uploads_are_refused(serve: Serve, monkeypatch: pytest.MonkeyPa
     assert answers[-1].json()["code"] == "too_many_uploads"
 
 
-def test_a_token_sees_its_own_uploads_alone(running: Running) -> None:
-    from starlette.requests import Request
-
-    app = running.server.config.app
-    for owner, expected in ((None, ""), ("token-7", "token-7")):
-        scope = {"type": "http", "app": app, "headers": [], **({} if owner is None else {"pliant.owner": owner})}
-        assert my_uploads(Request(scope)).owner == expected
+def test_to_another_token_an_upload_is_not_there(serve: Serve) -> None:
+    running = serve(auth="required")
+    assert httpx.put(f"{running.url}/v1/uploads/mine", content=b"x").status_code == 401
+    with running.client() as ada, running.client() as bob:
+        sent = tracks(6, 12)
+        assert ada.put("/v1/uploads/mine", content=sent).status_code == 201
+        for verb in ("GET", "HEAD", "DELETE"):
+            assert bob.request(verb, "/v1/uploads/mine").status_code == 404
+        named = bob.post("/v1/jobs", files={"tracks_upload": (None, "mine")})
+        assert (named.status_code, named.json()["code"]) == (422, "unknown_upload")
+        assert bob.put("/v1/uploads/mine", content=b"his own").json()["offset"] == 7
+        assert ada.get("/v1/uploads/mine").json()["offset"] == len(sent)
+        assert ada.post("/v1/jobs", files={"tracks_upload": (None, "mine")}).status_code == 202
