@@ -118,6 +118,10 @@ def test_solve_and_the_service_give_the_same_bits(service_url: str, tmp_path: Pa
         "seed=3",
         "-O",
         "max_reweightings=6",
+        "-O",
+        "outputs=glb,ply,obj,usd,mat,csv",
+        "-O",
+        "colours=error",
     )
     here = pliant("solve", *inputs, "-o", "here", "--threads", 1, "--json", folder=tmp_path)
     assert here.returncode == 0, here.stderr
@@ -130,9 +134,18 @@ def test_solve_and_the_service_give_the_same_bits(service_url: str, tmp_path: Pa
     } == set()
     assert json.loads(here.stdout)["metrics"] == json.loads(there.stdout)["metrics"]
     assert one["shapes"].shape == sequence.shapes.shape
-    for name in ("shapes.glb", "shapes_ply.zip"):
-        assert (tmp_path / "here" / name).is_file()
-        assert (tmp_path / "there" / name).is_file()
+    names = {path.name for path in (tmp_path / "here").iterdir()}
+    assert names == {path.name for path in (tmp_path / "there").iterdir()}
+    assert {
+        "shapes.glb",
+        "shapes_ply.zip",
+        "shapes_obj.zip",
+        "shapes.usdc",
+        "shapes.mat",
+        "metrics_frames.csv",
+    } <= names
+    for name in names - {"report.json"}:
+        assert (tmp_path / "here" / name).read_bytes() == (tmp_path / "there" / name).read_bytes(), name
 
 
 def test_what_solve_is_refused_is_what_the_service_refuses(tmp_path: Path) -> None:
