@@ -22,6 +22,7 @@ if TYPE_CHECKING:
         NotAllowedNow,
         NotAuthorized,
         NotFound,
+        NotGenuine,
         NotLoaded,
         PliantError,
         Refused,
@@ -47,7 +48,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "errors": (
         "BadArgument", "CorruptDownload", "InvalidRequest", "JobCancelled", "JobEnded", "JobFailed", "NotAllowedNow",
-        "NotAuthorized", "NotFound", "NotLoaded", "PliantError", "Refused", "ServiceFailed", "TimeIsUp", "TooManyRequests",
+        "NotAuthorized", "NotFound", "NotGenuine", "NotLoaded", "PliantError", "Refused", "ServiceFailed", "TimeIsUp", "TooManyRequests",
         "UnexpectedAnswer", "Unreachable",
     ),
     "options": ("Options",),
@@ -61,7 +62,7 @@ _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 __all__ = [  # noqa: RUF022 - by use, not by alphabet
     "Client", "RemoteJob", "Result", "AsyncClient", "AsyncRemoteJob", "AsyncResult", "Policy", "Options",
     "Artifact", "Interpretation", "Job", "Problem", "Progress", "ServiceLimits", "Status",
-    "PliantError", "Unreachable", "TimeIsUp", "UnexpectedAnswer", "CorruptDownload", "BadArgument", "NotLoaded",
+    "PliantError", "Unreachable", "TimeIsUp", "UnexpectedAnswer", "CorruptDownload", "BadArgument", "NotLoaded", "NotGenuine",
     "Refused", "InvalidRequest", "NotAuthorized", "NotFound", "NotAllowedNow", "TooManyRequests", "ServiceFailed",
     "JobEnded", "JobFailed", "JobCancelled",
 ]  # fmt: skip

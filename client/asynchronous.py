@@ -79,6 +79,8 @@ class AsyncClient:
         name: str = "",
         job_id: str | None = None,
         idempotency_key: str | None = None,
+        webhook: str | None = None,
+        webhook_secret: str | None = None,
         on_upload: OnBytes | None = None,
         timeout: float | None = None,
     ) -> AsyncRemoteJob:
@@ -93,6 +95,8 @@ class AsyncClient:
                 name=name,
                 job_id=job_id,
                 idempotency_key=idempotency_key,
+                webhook=webhook,
+                webhook_secret=webhook_secret,
                 on_upload=on_upload,
             )
             return AsyncRemoteJob(self, await arun(self._http, flow))

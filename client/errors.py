@@ -7,6 +7,7 @@
     ├── CorruptDownload          a file did not have its SHA-256, twice
     ├── BadArgument              what was handed to the SDK cannot be sent
     ├── NotLoaded                a result's arrays were asked for before they were fetched
+    ├── NotGenuine               a webhook's message is not from the service, or too old
     ├── Refused                  the service said no: problem+json with code and sentence
     │   ├── InvalidRequest       400, 413, 415, 422: the input is at fault; `field`, `expected`, `got` say how
     │   ├── NotAuthorized        401, 403: no token, or not one that may do this
@@ -60,6 +61,10 @@ class BadArgument(PliantError, ValueError):
 
 class NotLoaded(PliantError):
     """A result's arrays were asked for before they were fetched."""
+
+
+class NotGenuine(PliantError):
+    """A webhook's message is not from the service, was changed, or is too old."""
 
 
 class Refused(PliantError):

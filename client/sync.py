@@ -79,6 +79,8 @@ class Client:
         name: str = "",
         job_id: str | None = None,
         idempotency_key: str | None = None,
+        webhook: str | None = None,
+        webhook_secret: str | None = None,
         on_upload: OnBytes | None = None,
         timeout: float | None = None,
     ) -> RemoteJob:
@@ -107,6 +109,10 @@ class Client:
         idempotency_key : str, optional
             Made up for each call when not given, so that a repetition inside the call never makes two jobs; give your own to have
             that across calls and restarts.
+        webhook : str, optional
+            Address that the service sends the finished job to; `pliant.client.webhooks.verified` checks what comes.
+        webhook_secret : str, optional
+            Signs that message, goes with `webhook`; `pliant.client.webhooks.new_secret` makes one.
         on_upload : callable, optional
             Told (bytes sent, bytes in all).
         timeout : float, optional
@@ -129,6 +135,8 @@ class Client:
                 name=name,
                 job_id=job_id,
                 idempotency_key=idempotency_key,
+                webhook=webhook,
+                webhook_secret=webhook_secret,
                 on_upload=on_upload,
             )
             return RemoteJob(self, run(self._http, flow))

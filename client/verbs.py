@@ -37,10 +37,13 @@ def submit(
     name: str,
     job_id: str | None,
     idempotency_key: str | None,
+    webhook: str | None,
+    webhook_secret: str | None,
     on_upload: OnBytes | None,
 ) -> Flow[Job]:
     """Send inputs; the answer is the new job. Temporary files go into `folder`, which the caller removes."""
-    fields = _fields(options) | ({"name": name} if name != "" else {})
+    texts = {"name": name, "webhook": webhook or "", "webhook_secret": webhook_secret or ""}
+    fields = _fields(options) | {key: text for key, text in texts.items() if text != ""}
     whole = yield Do(lambda: inputs.form(folder, fields, on_upload))
     key = idempotency_key if idempotency_key is not None else secrets.token_urlsafe(16)
     for chance in (1, 2, 3):
@@ -134,7 +137,8 @@ def cancel(attempts: Attempts, job: str) -> Flow[Job]:
 
 def retry(attempts: Attempts, job: str) -> Flow[Job]:
     """Queue a new job with the inputs and options of one that failed or was cancelled."""
-    return (yield from record(attempts, Call(method="POST", path=f"{_path(job)}/retry"), Job))
+    headers = {"Idempotency-Key": secrets.token_urlsafe(16)}
+    return (yield from record(attempts, Call(method="POST", path=f"{_path(job)}/retry", headers=headers), Job))
 
 
 def delete(attempts: Attempts, job: str) -> Flow[None]:

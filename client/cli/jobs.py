@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -37,6 +38,12 @@ def submit(
         str | None, typer.Option("--id", help="Your own id: the same id and content is the same job.")
     ] = None,
     key: Annotated[str | None, typer.Option("--key", help="Idempotency key: repeating it makes no second job.")] = None,
+    webhook: Annotated[
+        str | None,
+        typer.Option(
+            "--webhook", help="Address that gets the finished job; signed with PLIANT_WEBHOOK_SECRET.", metavar="URL"
+        ),
+    ] = None,
     wait: Annotated[bool, typer.Option("--wait", "-w", help="Wait until the job is over.")] = False,
     output: Folder = None,
     url: Url = HOME,
@@ -59,6 +66,8 @@ def submit(
                 name=name,
                 job_id=job_id,
                 idempotency_key=key,
+                webhook=webhook,
+                webhook_secret=None if webhook is None else os.environ.get("PLIANT_WEBHOOK_SECRET"),
                 on_upload=bar.on_upload,
                 timeout=timeout,
             )

@@ -130,9 +130,11 @@ class Ledger:
         entry.change(status=Status.CANCELLED, finished_at=datetime.now(UTC), place_in_queue=None, progress=None)
         return entry
 
-    def retry(self, job_id: str) -> Entry:
-        """Queue a new job with what a failed or cancelled one had."""
+    def retry(self, job_id: str, *, key: str | None = None) -> Entry:
+        """Queue a new job with what a failed or cancelled one had; the same key is the same new job."""
         entry = self.find(job_id)
+        if key is not None and key in self._keys:
+            return self.find(self._keys[key])
         if entry.job.status not in (Status.FAILED, Status.CANCELLED):
             raise Refusal(409, "not_allowed_now", f"Job {job_id} is {entry.job.status}. Wait for it to end.")
         fresh = Job(
@@ -146,6 +148,8 @@ class Ledger:
             interpretation=entry.job.interpretation,
         )
         again = self._entries[fresh.id] = Entry(job=fresh, points=entry.points, content=entry.content)
+        if key is not None:
+            self._keys[key] = fresh.id
         return again
 
     def delete(self, job_id: str) -> None:

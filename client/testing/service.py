@@ -159,8 +159,8 @@ class FakeService(httpx.MockTransport):
     def _cancel(self, _request: httpx.Request, job_id: str) -> httpx.Response:
         return self._job(self._ledger.cancel(job_id))
 
-    def _retry(self, _request: httpx.Request, job_id: str) -> httpx.Response:
-        entry = self._ledger.retry(job_id)
+    def _retry(self, request: httpx.Request, job_id: str) -> httpx.Response:
+        entry = self._ledger.retry(job_id, key=request.headers.get("idempotency-key"))
         return self._job(entry, status=202, headers={"Location": f"/v1/jobs/{entry.job.id}"})
 
     def _delete(self, _request: httpx.Request, job_id: str) -> httpx.Response:

@@ -8,7 +8,10 @@ import os
 import signal
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +21,7 @@ from browsing import Browsing, why_not
 from pliant.client import AsyncClient, Client, NotAuthorized
 from pliant.client.cli.demo import announced
 from pliant.client.cli.exits import Exit
+from pliant.client.webhooks import new_secret, verified
 
 PLIANT = [sys.executable, "-m", "pliant.client.cli"]
 CLEAN = {name: value for name, value in os.environ.items() if not name.startswith("PLIANT_")}
@@ -58,7 +62,8 @@ def url(data: Path, first: dict[str, Any], tmp_path_factory: pytest.TempPathFact
     log = tmp_path_factory.mktemp("log") / "up.log"
     command = [*PLIANT, "up", "--port", "0", "--auth", "required", "--data", str(data), "--json"]
     with log.open("wb") as errors:
-        up = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, env=CLEAN, text=True)
+        env = CLEAN | {"PLIANT_WEBHOOK_NETWORKS": "127.0.0.0/8"}
+        up = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, env=env, text=True)
     assert up.stdout is not None
     address = announced(up.stdout)
     assert address is not None, log.read_text()
@@ -93,6 +98,38 @@ def test_the_command_line_works_with_a_token_and_not_without(url: str, first: di
         refused = pliant("status", "mine", "--url", url, token=wrong)
         assert refused.returncode == Exit.NOT_NOW
         assert "token" in refused.stderr
+
+
+def test_the_end_of_a_job_arrives_signed_and_the_sdk_proves_it(url: str, first: dict[str, Any], tracks: Path) -> None:
+    got: list[tuple[dict[str, str], bytes]] = []
+
+    class Receiver(BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            got.append((dict(self.headers.items()), self.rfile.read(int(self.headers["content-length"]))))
+            self.send_response(204)
+            self.end_headers()
+
+        def log_message(self, *_: object) -> None:
+            pass
+
+    secret = new_secret()
+    with ThreadingHTTPServer(("127.0.0.1", 0), Receiver) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        hook = ["--webhook", f"http://127.0.0.1:{server.server_address[1]}/hook"]
+        where = ["--id", "hooked", "--url", url]
+        unsigned = pliant("submit", tracks, *hook, *where, token=first["token"])
+        assert unsigned.returncode == Exit.REFUSED
+        assert "webhook_secret" in unsigned.stderr
+        sent = pliant("submit", tracks, *hook, *where, token=first["token"], PLIANT_WEBHOOK_SECRET=secret)
+        assert sent.returncode == 0, sent.stderr
+        deadline = time.monotonic() + 60
+        while not got and time.monotonic() < deadline:
+            time.sleep(0.05)
+        server.shutdown()
+    ((headers, body),) = got
+    job = verified(headers, body, secret=secret)
+    assert (job.id, job.status) == ("hooked", "succeeded")
+    assert [each.name for each in job.artifacts]
 
 
 def test_tokens_are_made_and_revoked_while_the_service_runs(url: str, data: Path) -> None:

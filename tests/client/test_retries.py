@@ -20,6 +20,9 @@ from pliant.client import (
 )
 from pliant.client import drive as driving
 from pliant.client.errors import seconds_of
+from pliant.client.exchange import record
+from pliant.client.flow import Call
+from pliant.client.schemas import Job
 from pliant.client.testing import FakeService
 
 POINTS = np.random.default_rng(0).normal(size=(4, 9, 2))
@@ -96,15 +99,23 @@ def test_a_lost_answer_to_a_submission_makes_one_job(clock: Clock) -> None:
 
 
 def test_a_call_that_may_have_been_carried_out_is_not_repeated(clock: Clock) -> None:
-    service = Flaky()
+    service = Flaky(cut_off)
     client = client_of(service, clock)
-    job = client.submit(POINTS)
-    service.faults = [cut_off]
-    before = len(service.requests)
+    call = Call(method="POST", path="/v1/jobs/x/retry")  # without a key, as a client of another making might
     with pytest.raises(Unreachable, match="not sent again, because it may have been carried out"):
-        job.retry()
-    assert len(service.requests) == before + 1
+        driving.run(client._http, record(client._attempts(None), call, Job))
+    assert len(service.requests) == 1
     assert clock.pauses == []
+
+
+def test_a_job_run_again_is_one_new_job_though_the_answer_was_lost(clock: Clock) -> None:
+    service = Flaky(after=True)
+    client = client_of(service, clock)
+    job = client.submit(POINTS).cancel()
+    service.faults = [cut_off, cut_off]
+    again = job.retry()
+    assert again.record.retry_of == job.id
+    assert sorted(each.id for each in client.list()) == sorted([job.id, again.id])
 
 
 def test_a_question_is_asked_again_though_it_is_a_post(clock: Clock) -> None:

@@ -1,0 +1,101 @@
+"""Webhooks at the receiver: what the service signs is proved, and nothing else is."""
+
+from __future__ import annotations
+
+import base64
+from datetime import UTC, datetime
+
+import numpy as np
+import pytest
+from pliant.client import AsyncClient, BadArgument, Client, NotGenuine
+from pliant.client.options import Options
+from pliant.client.schemas import Interpretation, Job, Status
+from pliant.client.testing import FakeService
+from pliant.client.webhooks import new_secret, verified
+from pliant.worker.webhooks import message, parse_webhook, signed
+
+NOW = 1_900_000_000
+SECRET = new_secret()
+
+
+@pytest.fixture
+def job() -> Job:
+    read = Interpretation(
+        num_frames=4, num_points=5, num_faces=0, hidden_fraction=0, mesh_source="none", has_ground_truth=False,
+        has_rotations=False, layout="tracks (F, P, 2)",
+    )  # fmt: skip
+    moment = datetime(2030, 1, 1, tzinfo=UTC)
+    return Job(
+        id="one", status=Status.CANCELLED, created_at=moment, finished_at=moment, options=Options(), interpretation=read
+    )
+
+
+def test_what_the_service_signs_is_genuine(job: Job) -> None:
+    body = message(job)
+    headers = signed(SECRET, id="msg_one", timestamp=NOW, body=body)
+    assert verified(headers, body, secret=SECRET, now=NOW) == job
+    upper = {name.title(): value for name, value in headers.items()}
+    assert verified(upper, body, secret=SECRET, now=NOW + 299) == job
+    rotated = headers | {
+        "webhook-signature": f"v1,{base64.b64encode(b'x' * 32).decode()} {headers['webhook-signature']}"
+    }
+    assert verified(rotated, body, secret=SECRET, now=NOW - 299) == job
+
+
+def test_what_was_changed_is_not(job: Job) -> None:
+    body = message(job)
+    headers = signed(SECRET, id="msg_one", timestamp=NOW, body=body)
+    changed = [
+        (headers | {"webhook-id": "msg_two"}, body, SECRET),
+        (headers | {"webhook-timestamp": str(NOW + 1)}, body, SECRET),
+        (headers | {"webhook-timestamp": "now"}, body, SECRET),
+        (headers | {"webhook-timestamp": "٣"}, body, SECRET),
+        (headers | {"webhook-signature": ""}, body, SECRET),
+        (headers | {"webhook-signature": headers["webhook-signature"].replace("v1,", "v2,")}, body, SECRET),
+        (headers | {"webhook-signature": "v1,é"}, body, SECRET),
+        (headers, body.replace(b"cancelled", b"succeeded"), SECRET),
+        (headers, body + b" ", SECRET),
+        (headers, body, new_secret()),
+        *(({name: value for name, value in headers.items() if name != left}, body, SECRET) for left in headers),
+    ]
+    for said, sent, secret in changed:
+        with pytest.raises(NotGenuine):
+            verified(said, sent, secret=secret, now=NOW)
+
+
+@pytest.mark.parametrize("now", [NOW + 301, NOW - 301])
+def test_what_is_old_or_from_the_future_is_not(job: Job, now: int) -> None:
+    body = message(job)
+    with pytest.raises(NotGenuine, match="replay"):
+        verified(signed(SECRET, id="m", timestamp=NOW, body=body), body, secret=SECRET, now=now)
+
+
+@pytest.mark.parametrize("body", [b"", b"[]", b"{}", b'{"data": 1}', b'{"data": {"id": "x"}}', b"\xff"])
+def test_signed_and_yet_no_job(body: bytes) -> None:
+    with pytest.raises(NotGenuine, match="tells of no job"):
+        verified(signed(SECRET, id="m", timestamp=NOW, body=body), body, secret=SECRET, now=NOW)
+
+
+def test_a_secret_is_new_each_time_and_one_the_service_takes() -> None:
+    assert new_secret() != new_secret()
+    assert parse_webhook("https://receiver.example/", new_secret()) is not None
+    with pytest.raises(BadArgument, match="webhook_secret"):
+        verified({}, b"", secret="whsec_é!")
+
+
+async def _submitted(service: FakeService, **given: str) -> None:
+    async with AsyncClient("http://pliant.test", transport=service) as client:
+        await client.submit(np.ones((4, 5, 2)), **given)
+
+
+def test_both_clients_send_the_parts() -> None:
+    import asyncio
+
+    given = {"webhook": "https://receiver.example/x", "webhook_secret": SECRET}
+    one, other = FakeService(), FakeService()
+    Client("http://pliant.test", transport=one).submit(np.ones((4, 5, 2)), **given)
+    asyncio.run(_submitted(other, **given))
+    for service in (one, other):
+        sent = next(request for request in service.requests if request.url.path == "/v1/jobs").content
+        assert b'name="webhook"\r\n\r\nhttps://receiver.example/x\r\n' in sent
+        assert f'name="webhook_secret"\r\n\r\n{SECRET}\r\n'.encode() in sent
