@@ -9,6 +9,7 @@ Whoever writes to, removes or expires an upload holds a lock on its folder; the 
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import hashlib
 import os
@@ -247,13 +248,22 @@ class Writer:
     room: Room
     offset: int = 0
     """Bytes that it holds."""
+    _began: int = 0
     _file: BinaryIO | None = None
     _digest: hashlib._Hash = field(default_factory=hashlib.sha256)
 
     def open(self, offset: int) -> None:
-        """Begin, or go on after what is there, which is read once for its digest."""
+        """Begin, or go on after what is there, which is read once for its digest.
+
+        Raises
+        ------
+        OSError
+            ENOSPC: the disk has no room for the rest of it.
+        """
         if self.length is not None:
             self._check(self.length)
+            if self.length - offset > shutil.disk_usage(self.folder).free:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             fresh = self.folder / f"{LENGTH}.new"
             fresh.write_text(str(self.length))
             fresh.replace(self.folder / LENGTH)
@@ -264,7 +274,7 @@ class Writer:
             with part.open("rb") as before:
                 self._digest = hashlib.file_digest(before, "sha256")
         self._file = part.open("ab" if offset > 0 else "wb", buffering=0)
-        self.offset = offset
+        self.offset = self._began = offset
 
     def write(self, piece: bytes) -> None:
         """Add bytes.
@@ -277,17 +287,23 @@ class Writer:
             The upload is larger than it may be; it is removed, since it can never become whole.
         QuotaExceeded
             Everything stored is as much as it may be; what fitted is kept.
+        OSError
+            The disk is full; what this request brought is given back to it, since others need the room.
         """
         assert self._file is not None
         if self.length is not None and self.offset + len(piece) > self.length:
             raise _inconsistent(f"{self.length} bytes in all", "more")
         self._check(self.offset + len(piece))
         rest = memoryview(piece)
-        while rest:
-            count = self._file.write(rest)
-            self._digest.update(rest[:count])
-            rest = rest[count:]
-            self.offset += count
+        try:
+            while rest:
+                count = self._file.write(rest)
+                self._digest.update(rest[:count])
+                rest = rest[count:]
+                self.offset += count
+        except OSError:
+            self._file.truncate(self._began)
+            raise
 
     def finish(self, *, sha256: str | None) -> None:
         """Make the upload whole.

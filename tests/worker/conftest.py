@@ -138,3 +138,17 @@ def s3_url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         yield "s3://bucket/prefix"
     server.terminate()
     server.wait(10)
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of three megabytes."""
+    disk = tmp_path / "small"
+    disk.mkdir()
+    made = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=3m", "none", str(disk)], check=False, capture_output=True
+    )
+    if made.returncode != 0:
+        pytest.skip("may not mount a small file system here")
+    yield disk
+    subprocess.run(["umount", str(disk)], check=True)

@@ -11,7 +11,6 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -136,20 +135,6 @@ def test_killing_the_supervisor_kills_all_and_loses_nothing(tmp_path: Path, inpu
         assert house.final(busy).status is Status.CANCELLED
         assert house.final(waiting).status is Status.SUCCEEDED
         settled(house)
-
-
-@pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A file system of three megabytes."""
-    disk = tmp_path / "small"
-    disk.mkdir()
-    made = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=3m", "none", str(disk)], check=False, capture_output=True
-    )
-    if made.returncode != 0:
-        pytest.skip("may not mount a small file system here")
-    yield disk
-    subprocess.run(["umount", str(disk)], check=True)
 
 
 def test_a_full_disk_fails_the_job_and_the_next_one_is_done(

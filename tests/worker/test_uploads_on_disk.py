@@ -198,6 +198,20 @@ def test_the_audit_sees_what_does_not_belong(uploads: Uploads) -> None:
     assert list(uploads.findings(now())) == ["Upload part holds nothing, not one file."]
 
 
+def test_a_full_disk_gets_back_what_the_request_brought(small_disk: Path) -> None:
+    uploads, room = Uploads(directory=small_disk / "uploads", expiry=0), Room(max_bytes=2**30)
+    with pytest.raises(OSError, match="No space"):
+        send(uploads, "announced", b"", length=4_000_000, room=room)
+    send(uploads, "one", b"x" * 1_000_000, finish=False, room=room)
+    with uploads.write("one", offset=1_000_000, length=None, room=room) as writer:
+        writer.write(b"y" * 1_000_000)
+        with pytest.raises(OSError, match="No space"):
+            writer.write(b"y" * 2_000_000)
+    assert uploads.get("one").offset == 1_000_000
+    send(uploads, "one", b"z" * 1_000_000, offset=1_000_000, room=room)
+    assert uploads.get("one").sha256 == hashlib.sha256(b"x" * 1_000_000 + b"z" * 1_000_000).hexdigest()
+
+
 def test_a_file_system_without_links_gets_a_copy(
     uploads: Uploads, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
