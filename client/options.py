@@ -103,8 +103,8 @@ class Options(BaseModel):
     )
     normals: Literal["static", "animated", "none"] = Field(
         "static",
-        description="static: shapes.glb has normals of its first shape. animated: they move with the shape, and are in every frame of PLY, "
-        "OBJ and USD, too. none: viewers make their own.",
+        description="static: those of the first shape, in shapes.glb alone. animated: they move with the shape, and are in every "
+        "frame of PLY, OBJ and USD, too. none: viewers make their own.",
     )
     colours: Literal["none", "error"] = Field(
         "none",
@@ -113,8 +113,8 @@ class Options(BaseModel):
     )
     glb_quantized: bool = Field(
         False,
-        description="Write shapes.glb with 16-bit positions (KHR_mesh_quantization): two thirds of the size or less, and coarser by "
-        "a 65,534th of the largest extent.",
+        description="Write shapes.glb with 16-bit positions (KHR_mesh_quantization): two thirds of the size, and rounded to about a "
+        "65,000th of the largest extent.",
     )
 
     layout: Literal["auto", "frames_points", "points_frames"] = Field(

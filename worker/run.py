@@ -75,7 +75,8 @@ def reconstruct(
     InvalidInput
         The inputs and the options do not fit together, or a file is asked for that cannot be written here.
     """
-    kinds_for(options)  # what cannot be written is refused before anything is computed
+    # What cannot be written is refused before anything is computed.
+    kinds_for(options, size=(inputs.tracks.num_frames, inputs.tracks.num_points))
     teller = Teller(on_progress if on_progress is not None else _silent)
     directory.mkdir(parents=True, exist_ok=True)
     teller.part("loading", 1.0)

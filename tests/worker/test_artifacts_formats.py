@@ -18,7 +18,7 @@ from pliant.client.options import Options
 from pliant.solver import InvalidInput
 from pliant.solver.metrics import evaluate, point_errors
 from pliant.worker import run
-from pliant.worker.artifacts import build_report, kinds_for, write_artifacts
+from pliant.worker.artifacts import build_report, kinds_for, matlab, usd, write_artifacts
 from pliant.worker.artifacts.colours import STOPS, Painting, linear, shade
 from pliant.worker.artifacts.geometry import triangles_of, upright, vertex_normals, viewer_scale
 from results import make_result
@@ -252,3 +252,27 @@ def test_usd_is_refused_where_it_cannot_be_written(tmp_path: Path, monkeypatch: 
     with pytest.raises(InvalidInput, match="usd-core"):
         run.reconstruct(inputs, options, tmp_path)
     assert kinds_for(Options())
+
+
+def test_what_matlab_could_not_hold_is_refused_before_anything_is_computed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    inputs, _, options = make_result(outputs="mat")
+    assert kinds_for(options, size=(99, 900_000))
+    with pytest.raises(InvalidInput, match="less than 2 GiB") as refused:
+        kinds_for(options, size=(100, 900_000))
+    assert refused.value.got == "100 frames of 900000 points"
+    monkeypatch.setattr(matlab, "MOST_BYTES", 24 * 7 * 30)
+    monkeypatch.setattr(run, "solve", lambda *_, **__: pytest.fail("it was computed all the same"))
+    with pytest.raises(InvalidInput, match="Leave mat out"):
+        run.reconstruct(inputs, options, tmp_path)
+
+
+def test_a_usd_that_fails_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(usd.shutil, "copyfileobj", full)
+    with pytest.raises(OSError, match="No space"):
+        write(tmp_path, make_result(outputs="usd"))
+    assert {path.name for path in tmp_path.iterdir()} == {"shapes.npz"}

@@ -10,13 +10,12 @@ import numpy as np
 from pliant.client.options import Options, Output
 from pliant.solver import InvalidInput
 from pliant.worker import preview
-from pliant.worker.artifacts import usd
+from pliant.worker.artifacts import matlab, usd
 from pliant.worker.artifacts.animation import animate
 from pliant.worker.artifacts.colours import linear
 from pliant.worker.artifacts.frames_zip import OnProgress, write_obj_zip, write_ply_zip
 from pliant.worker.artifacts.geometry import triangles_of, viewer_scale
 from pliant.worker.artifacts.glb import write_glb
-from pliant.worker.artifacts.matlab import write_mat
 from pliant.worker.artifacts.result import Result
 from pliant.worker.artifacts.tables import write_frames_csv, write_points_csv
 
@@ -38,19 +37,31 @@ class Kind:
     """Writes the file; returns what the report should say of it."""
 
 
-def kinds_for(options: Options) -> list[Kind]:
+def kinds_for(options: Options, *, size: tuple[int, int] = (0, 0)) -> list[Kind]:
     """Return what a job's options ask for, in the order of writing.
+
+    Parameters
+    ----------
+    options : Options
+        Of the job.
+    size : tuple of int
+        Frames and points, as far as they are known.
 
     Raises
     ------
     InvalidInput
-        A file is asked for that cannot be written in this installation.
+        A file is asked for that cannot be written in this installation, or not in this size.
     """
     if "usd" in options.outputs and not usd.available():
         raise InvalidInput(
             "output_unavailable", field="options.outputs", expected="outputs that this installation can write",
             got="usd, which needs the package usd-core", hint="Install it beside the worker and the service "
             "(pip install 'pliant[usd]'), or leave usd out.",
+        )  # fmt: skip
+    if "mat" in options.outputs and not matlab.fits(*size):
+        raise InvalidInput(
+            "output_unavailable", field="options.outputs", expected="less than 2 GiB of shapes for mat",
+            got=f"{size[0]} frames of {size[1]} points", hint="Leave mat out; shapes.npz holds the same arrays.",
         )  # fmt: skip
     return [kind for kind in KINDS if kind.output is None or kind.output in options.outputs]
 
@@ -131,7 +142,7 @@ KINDS = (
     Kind("shapes_ply.zip", "ply", "application/zip", "One binary PLY for each frame.", 6, _painted(write_ply_zip)),
     Kind("shapes_obj.zip", "obj", "application/zip", "One OBJ for each frame.", 30, _painted(write_obj_zip)),
     Kind("shapes.usdc", "usd", "application/octet-stream", "The moving mesh as USD, y up.", 3, _painted(usd.write_usd)),
-    Kind("shapes.mat", "mat", "application/x-matlab-data", "The same arrays for MATLAB; faces count from 1.", 2, _at_once(write_mat)),
+    Kind("shapes.mat", "mat", "application/x-matlab-data", "The same arrays for MATLAB; faces from 1.", 2, _at_once(matlab.write_mat)),
     Kind("metrics_frames.csv", "csv", "text/csv", "Metrics of every frame.", 2, _at_once(write_frames_csv)),
     Kind("metrics_points.csv", "csv", "text/csv", "Metrics of every point.", 2, _at_once(write_points_csv)),
     Kind(preview.NAME, None, preview.MEDIA_TYPE, preview.DESCRIPTION, 1, _at_once(_preview)),

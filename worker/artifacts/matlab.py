@@ -13,7 +13,12 @@ TEXT_BYTES = 116
 """Length of the text that a file begins with; what follows it are the version and the byte order."""
 
 MOST_BYTES = 2**31
-"""Above this MATLAB does not read a variable of the format."""
+"""A variable of the format is smaller."""
+
+
+def fits(num_frames: int, num_points: int) -> bool:
+    """Whether the shapes fit into a variable."""
+    return 24 * num_frames * num_points < MOST_BYTES
 
 
 def write_mat(result: Result, file: IO[bytes]) -> None:

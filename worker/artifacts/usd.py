@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import shutil
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
@@ -23,36 +22,43 @@ def available() -> bool:
 def write_usd(result: Result, file: IO[bytes], on_progress: Callable[[float], None]) -> None:
     """Write `/shape` with a time sample a frame; y up, right-handed, as in the glTF file.
 
-    The library wants a path of its own with its own suffix, so it writes beside the file, into a directory that goes.
+    The library wants a path with its own suffix, so it writes beside the file, into one that goes.
     """
-    from pxr import Sdf, Usd, UsdGeom, Vt
-
-    with tempfile.TemporaryDirectory(dir=Path(file.name).parent, prefix=".usd-", suffix=".part") as aside:
-        path = Path(aside) / "shapes.usdc"
-        stage = Usd.Stage.CreateNew(str(path))
-        _describe_stage(stage, result)
-        shape = _define(stage, result)
-        stage.SetDefaultPrim(shape.GetPrim())
-        points, extent = shape.CreatePointsAttr(), shape.CreateExtentAttr()
-        moving = result.options.normals == "animated" and len(result.faces) > 0
-        painted, kind = result.painting, Sdf.ValueTypeNames.Color3fArray
-        painting = UsdGeom.PrimvarsAPI(shape)
-        frames = len(result.solution.shapes)
-        for frame in range(frames):
-            standing = result.standing(frame)
-            points.Set(Vt.Vec3fArray.FromNumpy(standing.astype(np.float32)), frame)
-            corners = np.stack([standing.min(axis=0), standing.max(axis=0)]).astype(np.float32)
-            extent.Set(Vt.Vec3fArray.FromNumpy(corners), frame)
-            if moving:
-                normals = vertex_normals(standing, triangles_of(result.faces))
-                shape.CreateNormalsAttr().Set(Vt.Vec3fArray.FromNumpy(normals), frame)
-            if painted is not None:
-                colours = painting.CreatePrimvar("displayColor", kind, UsdGeom.Tokens.vertex)
-                colours.Set(Vt.Vec3fArray.FromNumpy(linear(painted.frame(frame)).astype(np.float32)), frame)
-            on_progress((frame + 1) / frames)
-        stage.GetRootLayer().Save()
+    path = Path(f"{file.name}.usdc")
+    path.unlink(missing_ok=True)
+    try:
+        _build(path, result, on_progress)
         with path.open("rb") as made:
             shutil.copyfileobj(made, file)
+    finally:
+        path.unlink(missing_ok=True)
+
+
+def _build(path: Path, result: Result, on_progress: Callable[[float], None]) -> None:
+    from pxr import Sdf, Usd, UsdGeom, Vt
+
+    stage = Usd.Stage.CreateNew(str(path))
+    _describe_stage(stage, result)
+    shape = _define(stage, result)
+    stage.SetDefaultPrim(shape.GetPrim())
+    points, extent = shape.CreatePointsAttr(), shape.CreateExtentAttr()
+    moving = result.options.normals == "animated" and len(result.faces) > 0
+    painted, kind = result.painting, Sdf.ValueTypeNames.Color3fArray
+    painting = UsdGeom.PrimvarsAPI(shape)
+    frames = len(result.solution.shapes)
+    for frame in range(frames):
+        standing = result.standing(frame)
+        points.Set(Vt.Vec3fArray.FromNumpy(standing.astype(np.float32)), frame)
+        corners = np.stack([standing.min(axis=0), standing.max(axis=0)]).astype(np.float32)
+        extent.Set(Vt.Vec3fArray.FromNumpy(corners), frame)
+        if moving:
+            normals = vertex_normals(standing, triangles_of(result.faces))
+            shape.CreateNormalsAttr().Set(Vt.Vec3fArray.FromNumpy(normals), frame)
+        if painted is not None:
+            colours = painting.CreatePrimvar("displayColor", kind, UsdGeom.Tokens.vertex)
+            colours.Set(Vt.Vec3fArray.FromNumpy(linear(painted.frame(frame)).astype(np.float32)), frame)
+        on_progress((frame + 1) / frames)
+    stage.GetRootLayer().Save()
 
 
 def _describe_stage(stage: Any, result: Result) -> None:
