@@ -87,7 +87,10 @@ def direct(problem: Problem, shapes: np.ndarray, translations: np.ndarray, *, ta
         fixed: sparse.csr_array, data: sparse.csr_array, right: np.ndarray, _: np.ndarray, run: Run, __: float
     ) -> np.ndarray:
         run.iterations += 1
-        factor = splu((fixed + data).tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+        try:
+            factor = splu((fixed + data).tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+        except SystemError as error:  # what SuperLU says when it cannot have the memory
+            raise MemoryError("the sparse factor does not fit") from error
         return factor.solve(right)
 
     return _reweight(problem, shapes, translations, target=target, cap=cap, inner=inner)

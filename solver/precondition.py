@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from pliant.solver import block_tridiagonal
 from pliant.solver.operator import Operator
 from pliant.solver.parallel import available_cores
 from pliant.solver.records import Floats, Ints
@@ -53,6 +54,8 @@ class Diagonalised:
 
 def build_preconditioner(operator: Operator) -> Callable[[Array], Array]:
     """Return M⁻¹ for this reweighting's operator."""
+    if block_tridiagonal.fits(operator):
+        return block_tridiagonal.build(operator)
     kind = operator.weights.dtype
     temporal = Diagonalised.of(operator, kind)
     laplacian = operator.laplacian

@@ -1,0 +1,128 @@
+"""A preconditioner that takes every observation's own weight: point by point, the path over frames is solved exactly.
+
+Without the coupling of neighbours, what is left of 𝒜 for one point is block-tridiagonal over frames,
+
+    D_f = s²Rᵀ diag(ω_fp) R + (λ1 [HᵀH]_ff + λ2 [AᵀA]_pp) I,        off-diagonal blocks λ1 [HᵀH]_f,f+1 I,
+
+3×3 blocks, the neighbours' own stiffness kept on the diagonal. Block elimination (Golub and Van Loan, Matrix Computations, 4.5.1) costs
+the same for every frame and point: six numbers to keep, no product over frames. IRLS weights of inliers and outliers lie two orders of
+magnitude apart, so that a mean weight for a whole frame, as the cosine preconditioner has to take it, is wrong for both; in return this
+one knows nothing of smoothness along the surface, and is meant for spatial weights that are small beside the temporal one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+from pliant.solver.operator import Operator
+from pliant.solver.parallel import over_ranges
+from pliant.solver.records import Floats
+
+Array = NDArray[np.floating]
+
+BLOCK = 2048
+"""Points worked on at a time: what one frame needs of them stays in the processor's cache."""
+
+RIDGE = 1e-9
+"""Added to every diagonal, as a share of λ1: a point that is never seen, with nothing but its path, has a singular system."""
+
+PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+"""Where the six numbers of a symmetric 3×3 block stand."""
+
+
+def fits(operator: Operator) -> bool:
+    """Return whether paths over frames are all but the whole of this operator."""
+    stiffest = float(operator.bands[0].max())
+    if operator.rank is not None or len(operator.bands) != 2 or stiffest == 0:
+        return False
+    if operator.laplacian is None or operator.spatial_weight == 0:
+        return True
+    return float(stiffness_of_neighbours(operator).mean()) < stiffest
+
+
+def stiffness_of_neighbours(operator: Operator) -> Floats:
+    """Return λ2 [AᵀA]_pp, shape `(P,)`."""
+    points = operator.weights.shape[2]
+    if operator.laplacian is None or operator.spatial_weight == 0:
+        return np.zeros(points)
+    squared = operator.laplacian.matrix.power(2).sum(axis=0)
+    return operator.spatial_weight * np.asarray(squared, dtype=np.float64).ravel()
+
+
+def build(operator: Operator) -> Callable[[Array], Array]:
+    """Factor once a reweighting; returns r ↦ M⁻¹ r."""
+    kind = operator.weights.dtype
+    inverses = np.zeros((len(operator.projections), 6, operator.weights.shape[2]), dtype=kind)
+    shift = (stiffness_of_neighbours(operator) + RIDGE * operator.bands[0].max()).astype(kind)
+    coupling = operator.bands[1].astype(kind)
+
+    def eliminate(start: int, stop: int) -> None:
+        for first, last in _blocks(start, stop):
+            _eliminate(operator, shift[first:last], coupling, inverses[:, :, first:last], slice(first, last))
+
+    over_ranges(eliminate, inverses.shape[2], smallest=BLOCK)
+
+    def apply(r: Array) -> Array:
+        result = np.zeros_like(r)
+
+        def substitute(start: int, stop: int) -> None:
+            for first, last in _blocks(start, stop):
+                _substitute(inverses[:, :, first:last], coupling, r[:, :, first:last], result[:, :, first:last])
+
+        over_ranges(substitute, r.shape[2], smallest=BLOCK)
+        return result
+
+    return apply
+
+
+def _blocks(start: int, stop: int) -> list[tuple[int, int]]:
+    return [(first, min(first + BLOCK, stop)) for first in range(start, stop, BLOCK)]
+
+
+def _eliminate(operator: Operator, shift: Array, coupling: Array, inverses: Array, points: slice) -> None:
+    """Fill in D̃_f⁻¹, with D̃_0 = D_0 and D̃_f = D_f − c² D̃_{f−1}⁻¹."""
+    for frame, camera in enumerate(operator.projections):
+        one, two = operator.weights[frame, :, points]
+        block = np.stack([camera[0, i] * camera[0, j] * one + camera[1, i] * camera[1, j] * two for i, j in PAIRS])
+        block[[0, 3, 5]] += shift + shift.dtype.type(operator.bands[0, frame])
+        if frame > 0:
+            block -= coupling[frame - 1] ** 2 * inverses[frame - 1]
+        _invert(block, inverses[frame])
+
+
+def _invert(block: Array, out: Array) -> None:
+    """Invert symmetric 3×3 blocks by cofactors, shape `(6, P)`."""
+    a, b, c, d, e, f = block
+    out[0], out[1], out[2] = d * f - e * e, c * e - b * f, b * e - c * d
+    scale = a * out[0] + b * out[1] + c * out[2]
+    out[3], out[4], out[5] = a * f - c * c, b * c - a * e, a * d - b * b
+    out /= scale
+
+
+def _substitute(inverses: Array, coupling: Array, r: Array, out: Array) -> None:
+    """Forward z_f = D̃_f⁻¹ (r_f − c z_{f−1}), then back z_f −= c D̃_f⁻¹ z_{f+1}."""
+    right, product, spare = (np.zeros_like(r[0]) for _ in range(3))
+    for frame in range(len(r)):
+        if frame == 0:
+            _product(inverses[0], r[0], out[0], spare)
+            continue
+        np.multiply(out[frame - 1], -coupling[frame - 1], out=right)
+        right += r[frame]
+        _product(inverses[frame], right, out[frame], spare)
+    for frame in range(len(r) - 2, -1, -1):
+        _product(inverses[frame], out[frame + 1], product, spare)
+        product *= coupling[frame]
+        out[frame] -= product
+
+
+def _product(block: Array, x: Array, out: Array, spare: Array) -> None:
+    """Multiply symmetric 3×3 blocks, `(6, P)`, with vectors, `(3, P)`; nothing is allocated."""
+    np.multiply(block[:3], x[0], out=out)  # first column: a, b, c
+    np.multiply(block[1], x[1], out=spare[0])
+    np.multiply(block[3:5], x[1], out=spare[1:])
+    out += spare  # second column: b, d, e
+    np.multiply(block[2], x[2], out=spare[0])
+    np.multiply(block[4:6], x[2], out=spare[1:])
+    out += spare  # third column: c, e, f
