@@ -132,6 +132,17 @@ def test_usd_has_a_time_sample_for_every_frame(tmp_path: Path, mesh: str, y_axis
         np.testing.assert_allclose(normals, vertex_normals(standing[4], triangles_of(inputs.mesh.faces)), atol=1e-6)
 
 
+@pytest.mark.parametrize("mesh", ["grid", "triangles", "none"])
+def test_usd_passes_its_own_validators(tmp_path: Path, mesh: str) -> None:
+    from pxr import Usd, UsdValidation
+
+    files = write(tmp_path, make_result(mesh=mesh, outputs="usd", normals="animated", colours="error"))
+    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    assert len(validators) > 10
+    found = UsdValidation.ValidationContext(validators).Validate(Usd.Stage.Open(str(files["shapes.usdc"])))
+    assert [error.GetMessage() for error in found] == []
+
+
 @pytest.mark.parametrize("mesh", ["grid", "none"])
 def test_mat_holds_the_arrays_of_the_npz(tmp_path: Path, mesh: str) -> None:
     files = write(tmp_path, make_result(mesh=mesh, outputs="mat"))

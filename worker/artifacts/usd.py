@@ -65,6 +65,8 @@ def _describe_stage(stage: Any, result: Result) -> None:
     from pxr import UsdGeom
 
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+    # How large the thing is nobody knows; its scale brings it to a few units, which are taken for metres as in glTF.
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     stage.SetTimeCodesPerSecond(result.options.fps)
     stage.SetFramesPerSecond(result.options.fps)
     stage.SetStartTimeCode(0)
