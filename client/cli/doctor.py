@@ -203,7 +203,7 @@ def check_service(session: Session, url: str) -> Iterator[Finding]:
     from pliant.client.errors import PliantError
 
     try:
-        with session.client(url, as_json=session.json) as client:
+        with session.client(url, as_json=session.json, first_contact=0.5) as client:
             state = client.ready(timeout=3)
     except PliantError as fault:
         yield Finding(

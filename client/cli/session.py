@@ -46,12 +46,14 @@ class Session:
     transport: httpx.BaseTransport | None = None
     """Instead of the network, in tests."""
 
-    def client(self, url: str, *, as_json: bool) -> Client:
+    def client(self, url: str, *, as_json: bool, first_contact: float | None = None) -> Client:
         """Open a client; the token comes from PLIANT_TOKEN, so that it stands in no list of processes."""
+        from pliant.client.policy import Policy
         from pliant.client.sync import Client
 
         self.json = as_json
-        return Client(url, token=os.environ.get("PLIANT_TOKEN") or None, transport=self.transport)
+        policy = Policy() if first_contact is None else Policy(first_contact=first_contact)
+        return Client(url, token=os.environ.get("PLIANT_TOKEN") or None, transport=self.transport, policy=policy)
 
 
 def parse_options(pairs: list[str] | None) -> dict[str, Any]:

@@ -85,14 +85,21 @@ def up(
         err().print("Stopped.")
 
 
-def work(data: Data = None, workers: Workers = None) -> None:
+def work(ctx: typer.Context, data: Data = None, workers: Workers = None, as_json: Json = False) -> None:
     """Run workers alone, for a service that runs elsewhere with the same PLIANT_REDIS_URL and PLIANT_BLOB_URL."""
+    ctx.obj.json = as_json
     from pliant.worker.supervisor import Supervisor, worker_children
 
     settings = chosen(data, workers)
-    Supervisor(worker_children(settings)).run(
-        on_started=lambda: err().print(f"{settings.workers} worker(s) of queue {settings.queue}; Ctrl-C stops them.")
-    )
+
+    def announce() -> None:
+        if as_json:
+            print_json({"workers": settings.workers, "queue": settings.queue})
+            sys.stdout.flush()
+            return
+        err().print(f"{settings.workers} worker(s) of queue {settings.queue}; Ctrl-C stops them.")
+
+    Supervisor(worker_children(settings)).run(on_started=announce)
 
 
 def chosen(data: Path | None, workers: int | None) -> Settings:

@@ -82,9 +82,11 @@ def document(stream: IO[str]) -> dict[str, Any]:
 def test_work_serves_a_queue_until_it_is_told_to_stop(tmp_path: Path) -> None:
     valkey = Valkey.claim(tmp_path)
     server = valkey.start()
-    command = [sys.executable, "-m", "pliant.client.cli", "work", "--data", str(tmp_path), "--workers", "1"]
-    process = subprocess.Popen(command, env=ENVIRONMENT, stderr=subprocess.PIPE, text=True)
+    command = [sys.executable, "-m", "pliant.client.cli", "work", "--data", str(tmp_path), "--workers", "1", "--json"]
+    process = subprocess.Popen(command, env=ENVIRONMENT, stdout=subprocess.PIPE, text=True)
     try:
+        assert process.stdout is not None
+        assert document(process.stdout) == {"workers": 1, "queue": "pliant"}
         jobs = Jobs.open(Settings(data=tmp_path))
         deadline = time.monotonic() + 60
         while jobs.ready()["workers"] != "ok" and time.monotonic() < deadline:
@@ -92,9 +94,7 @@ def test_work_serves_a_queue_until_it_is_told_to_stop(tmp_path: Path) -> None:
         assert jobs.ready()["workers"] == "ok"
         process.send_signal(signal.SIGTERM)
         assert process.wait(60) == 0
-        assert process.stderr is not None
-        assert "1 worker(s) of queue pliant" in process.stderr.read()
-        process.stderr.close()
+        process.stdout.close()
         assert jobs.ready()["workers"] != "ok"
     finally:
         server.terminate()
