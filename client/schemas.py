@@ -112,6 +112,15 @@ class Interpretation(Record):
     )
 
 
+class Inspection(Interpretation):
+    """How inputs would be understood, and a glimpse of them."""
+
+    sample: list[list[int]] = Field(
+        default_factory=list,
+        description="Some frames of some points, for a picture: x and y in turn, 0 to 1000, y down; -1 twice where hidden.",
+    )
+
+
 class Job(Record):
     """One request to reconstruct, and everything known of it."""
 

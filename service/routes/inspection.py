@@ -6,12 +6,14 @@ from pathlib import Path
 
 from anyio import to_thread
 from fastapi import APIRouter, Request
-from pliant.client.schemas import Interpretation
+from pliant.client.schemas import Inspection
 from pliant.service.core import Bound, Core, MyUploads
 from pliant.service.describe import SUBMIT_BODY, problems
 from pliant.service.forms import Form, FormRules, receive_form
+from pliant.service.sample import sample_of
 from pliant.service.submission import FILES, TEXTS, parse_options, read_form, with_uploads
-from pliant.worker.formats import Limits
+from pliant.worker.formats import Limits, load_inputs
+from pliant.worker.formats.apart import LARGE
 from pliant.worker.uploads import Uploads
 
 router = APIRouter(prefix="/v1/inspect", tags=["jobs"])
@@ -23,7 +25,7 @@ router = APIRouter(prefix="/v1/inspect", tags=["jobs"])
     responses=problems(400, 401, 403, 408, 413, 415, 422, 429, 503, 507),
     openapi_extra={"requestBody": SUBMIT_BODY},
 )
-async def inspect(request: Request, core: Core, bounds: Bound, uploads: MyUploads) -> Interpretation:
+async def inspect(request: Request, core: Core, bounds: Bound, uploads: MyUploads) -> Inspection:
     """Read the parts of a job as `POST /v1/jobs` would, and return the interpretation without making a job.
 
     What submitting refuses is refused here in the same words, with the readings to choose from where several fit. Nothing is kept.
@@ -41,7 +43,10 @@ async def inspect(request: Request, core: Core, bounds: Bound, uploads: MyUpload
         return await to_thread.run_sync(lambda: understood(form, room, uploads, core.limits), limiter=core.parsing)
 
 
-def understood(form: Form, room: Path, uploads: Uploads, limits: Limits) -> Interpretation:
+def understood(form: Form, room: Path, uploads: Uploads, limits: Limits) -> Inspection:
     """Read a form as for a job, and forget all but how it was understood. Blocks; call it on a thread."""
-    whole = with_uploads(form, room, uploads)
-    return read_form(whole, parse_options(whole.texts.get("options", "")), limits, target=None)
+    whole, canonical = with_uploads(form, room, uploads), room / "canonical.npz"
+    said = read_form(whole, parse_options(whole.texts.get("options", "")), limits, target=canonical)
+    # What is too large to be read in this process is too large to be looked at in it.
+    sample = sample_of(load_inputs(canonical)) if canonical.stat().st_size <= LARGE else []
+    return Inspection(**said.model_dump(), sample=sample)

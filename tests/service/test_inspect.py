@@ -42,6 +42,35 @@ def test_it_is_the_interpretation_of_the_job_and_makes_none(running: Running, ht
     assert said.mesh_grid == ((3, 4) if case == "a grid" else None)
 
 
+def test_the_sample_is_the_tracks_upright_and_to_scale(http: httpx.Client) -> None:
+    corners = np.array([[0.0, 0.0], [40, 0], [40, 20], [0, 20], [20, 10], [10, 5], [30, 5], [30, 15], [10, 15]])
+    points = corners + 3 * np.arange(4)[:, None, None] * (1, 0)
+    visible = np.ones((4, 9), bool)
+    visible[2, 4] = False
+    for y_axis, sign in (("down", 1), ("up", -1)):
+        parts = form(npz(tracks=points, visibility=visible), mesh="none", options={"y_axis": y_axis})
+        answer = http.post("/v1/inspect", files=parts)
+        assert answer.status_code == 200, answer.text
+        sample = np.array(answer.json()["sample"]).reshape(4, 9, 2)
+        np.testing.assert_array_equal(sample[2, 4], [-1, -1])
+        scale = (sample[0, 1] - sample[0, 0])[0] / 40
+        assert 15 < scale < 25  # 49 units wide, and a tenth of the square to spare
+        np.testing.assert_allclose(sample[0] - sample[0, 0], scale * corners * (1, sign), atol=2)
+        np.testing.assert_allclose(sample[3] - sample[0], np.tile([9 * scale, 0], (9, 1)), atol=2)
+        assert sample[sample >= 0].max() <= 1000
+
+
+@pytest.mark.parametrize("size", [(3, 2000), (500, 9)])
+def test_the_sample_is_small_whatever_is_sent(http: httpx.Client, size: tuple[int, int]) -> None:
+    points = np.random.default_rng(3).normal(size=(*size, 2))
+    points[0, 0] = 1e9  # one outlier does not make the rest a dot
+    sample = http.post("/v1/inspect", files=form(npz(tracks=points), mesh="none")).json()["sample"]
+    assert len(sample) == min(size[0], 16)
+    assert {len(frame) for frame in sample} == {2 * min(size[1], 200)}
+    held = np.array(sample)
+    assert held[held >= 0].std() > 100
+
+
 @pytest.mark.parametrize("case", BAD)
 def test_what_a_job_is_refused_for_is_said_in_the_same_words(running: Running, http: httpx.Client, case: str) -> None:
     parts, status, code = BAD[case]

@@ -1,6 +1,6 @@
 // Every call to the service. Addresses are relative, so the page also works behind a proxy that adds a path.
 
-import type { Interpretation, Job, JobPage, Problem, Schema } from "./types";
+import type { Inspection, Job, JobPage, Problem, Schema } from "./types";
 
 /** The service said no, or did not answer: `problem.detail` is the sentence to show. */
 export class Refusal extends Error {
@@ -78,7 +78,7 @@ export const deleteJob = async (id: string): Promise<void> => {
 };
 
 /** Ask how files would be understood; no job is made of them. */
-export const inspect = (form: FormData, signal: AbortSignal): Promise<Interpretation> =>
+export const inspect = (form: FormData, signal: AbortSignal): Promise<Inspection> =>
   json("v1/inspect", { method: "POST", body: form, signal });
 
 let options: Promise<Schema> | null = null;

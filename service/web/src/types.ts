@@ -48,6 +48,11 @@ export interface Interpretation {
   notes: string[];
 }
 
+export interface Inspection extends Interpretation {
+  /** A list a frame: x and y of each point in turn, 0 … 1000, y down, −1 twice where hidden. */
+  sample?: number[][];
+}
+
 export type Options = Record<string, unknown>;
 
 export interface Job {

@@ -2,6 +2,7 @@
 
 import { Refusal, inspect } from "./api";
 import { button, fill, h } from "./dom";
+import { Glimpse } from "./glimpse";
 import type { Interpretation, Job } from "./types";
 import { bytes, count, percent } from "./words";
 
@@ -59,9 +60,17 @@ const SETTLES = 250;
 /** Asks how the chosen files are understood while the form is being filled in. */
 export class Inspection {
   private readonly facts = new Facts();
+  private readonly glimpse = new Glimpse();
   private readonly words = h("p", { class: "muted", role: "status" });
   private readonly ask = button("See how it is understood", () => void this.send());
-  private readonly found = h("div", { class: "found", hidden: true }, h("h3", { id: "found-title" }, "How your files are understood"), this.facts.list, this.facts.notes);
+  private readonly found = h(
+    "div",
+    { class: "found", hidden: true },
+    h("h3", { id: "found-title" }, "How your files are understood"),
+    this.glimpse.canvas,
+    this.facts.list,
+    this.facts.notes,
+  );
   readonly element = h("section", { class: "inspection", "aria-labelledby": "found-title" }, this.words, this.ask, this.found);
   private asking: AbortController | null = null;
   private timer = 0;
@@ -103,6 +112,7 @@ export class Inspection {
     this.words.textContent = "";
     this.ask.hidden = true;
     this.found.hidden = true;
+    this.glimpse.stop();
   }
 
   private async send(): Promise<void> {
@@ -117,6 +127,7 @@ export class Inspection {
       if (asking.signal.aborted) return;
       this.facts.show(facts(seen), seen.notes);
       this.found.hidden = false;
+      this.glimpse.show(seen.sample ?? []);
       this.words.textContent = "";
     } catch (error) {
       if (asking.signal.aborted) return;
