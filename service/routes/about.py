@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 from typing import Any
 
 from fastapi import APIRouter
@@ -15,6 +16,8 @@ from pliant.service.problems import answer, problem
 from pliant.worker.jobs import LARGEST_PAGE
 
 router = APIRouter(tags=["about"])
+
+_log = logging.getLogger("pliant.service")
 
 
 @router.get("/v1/options", summary="The options of a job", responses=problems(401))
@@ -44,10 +47,16 @@ def healthz() -> dict[str, str]:
 
 @router.get("/readyz", summary="Can it take jobs?", responses=problems(503))
 def readyz(core: Core) -> Response:
-    """Return 200 if the job store, the blob store and at least one worker are there, else 503 and what is missing."""
+    """Return 200 if the job store, the blob store and at least one worker are there, else 503 and what is missing.
+
+    Where tokens are asked for, strangers are told which part is missing and not why; the service's log says that.
+    """
     parts = core.jobs.ready()
     missing = {name: said for name, said in parts.items() if said != "ok"}
     if not missing:
         return JSONResponse(parts)
     said = " ".join(f"{name}: {sentence}" for name, sentence in missing.items())
+    if core.settings.asks_for_tokens:
+        _log.warning("not ready: %s", said)
+        said = f"Not ready: {', '.join(missing)}. The service's log says why."
     return answer(problem(503, "not_ready", detail=said), headers={"Retry-After": "2"})

@@ -225,11 +225,17 @@ def test_the_sdk_and_its_twin_work_with_a_token_and_say_what_is_wrong_without(gu
         stranger.get(job.id)
 
 
-def test_a_store_that_is_away_lets_nobody_in(serve: Serve, tmp_path: Path) -> None:
+def test_a_store_that_is_away_lets_nobody_in(serve: Serve, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     running = serve(redis_url=f"unix://{tmp_path}/nobody.sock", auth="required")
     headers = {"Authorization": f"Bearer pliant_{'0' * 12}_{'a' * 43}"}
     answer = httpx.get(f"{running.url}/v1/limits", headers=headers, timeout=30)
     assert (answer.status_code, answer.json()["code"], answer.headers["retry-after"]) == (503, "store_unavailable", "2")
+    ready = httpx.get(f"{running.url}/readyz", timeout=30)
+    assert (ready.status_code, ready.json()["code"]) == (503, "not_ready")
+    assert ready.json()["detail"] == "Not ready: redis, workers. The service's log says why.", (
+        "reasons are not for strangers"
+    )
+    assert "ConnectionError" in caplog.text
 
 
 def test_a_preflight_needs_no_token_and_a_refusal_can_be_read(serve: Serve) -> None:
