@@ -12,10 +12,9 @@ one knows nothing of smoothness along the surface, and is meant for spatial weig
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from numpy.typing import NDArray
+from pliant.solver.conjugate_gradient import Linear
 from pliant.solver.operator import Operator
 from pliant.solver.parallel import over_ranges
 from pliant.solver.records import Floats
@@ -51,7 +50,7 @@ def stiffness_of_neighbours(operator: Operator) -> Floats:
     return operator.spatial_weight * np.asarray(squared, dtype=np.float64).ravel()
 
 
-def build(operator: Operator) -> Callable[[Array], Array]:
+def build(operator: Operator) -> Linear:
     """Factor once a reweighting; returns r ↦ M⁻¹ r."""
     kind = operator.weights.dtype
     inverses = np.zeros((len(operator.projections), 6, operator.weights.shape[2]), dtype=kind)
@@ -64,8 +63,8 @@ def build(operator: Operator) -> Callable[[Array], Array]:
 
     over_ranges(eliminate, inverses.shape[2], smallest=BLOCK)
 
-    def apply(r: Array) -> Array:
-        result = np.zeros_like(r)
+    def apply(r: Array, /, out: Array | None = None) -> Array:
+        result = np.zeros_like(r) if out is None else out
 
         def substitute(start: int, stop: int) -> None:
             for first, last in _blocks(start, stop):

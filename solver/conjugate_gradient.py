@@ -1,14 +1,26 @@
-"""Preconditioned conjugate gradients on arrays of any layout."""
+"""Preconditioned conjugate gradients on arrays of any layout, first axis the one that threads share."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from pliant.solver.parallel import over_ranges
 
 Array = NDArray[np.floating]
+
+SMALLEST = 200_000
+"""Numbers a thread should have to work on, at least."""
+
+
+class Linear(Protocol):
+    """A linear map of arrays."""
+
+    def __call__(self, x: Array, /, out: Array | None = None) -> Array:
+        """Return the image of x, in `out` if it is given and the map can use it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -22,11 +34,11 @@ class Solved:
 
 
 def conjugate_gradient(
-    apply: Callable[[Array], Array],
+    apply: Linear,
     b: Array,
     x: Array,
     *,
-    precondition: Callable[[Array], Array],
+    precondition: Linear,
     reduction: float,
     max_iterations: int,
     should_stop: Callable[[], bool] | None = None,
@@ -37,32 +49,74 @@ def conjugate_gradient(
     majorise–minimise still descends. Stops when √(rᵀM⁻¹r) has
     fallen to `reduction` times its first value, or to rounding level beside √(bᵀM⁻¹b).
     Saad, Iterative Methods for Sparse Linear Systems (2003), algorithm 9.1.
+
+    Five arrays of the size of x are all that is ever held: fresh ones in every iteration would cost more in page faults than
+    in arithmetic.
     """
-    residual = b - apply(x)
+    image = apply(x)
+    residual = b - image
     z = precondition(residual)
     first = rz = _dot(residual, z)
-    enough = max(reduction**2 * first, (10 * float(np.finfo(b.dtype).eps)) ** 2 * abs(_dot(b, precondition(b))))
-    direction = z
+    direction = precondition(b)
+    enough = max(reduction**2 * first, (10 * float(np.finfo(b.dtype).eps)) ** 2 * abs(_dot(b, direction)))
+    direction[...] = z
     x = x.copy()
     done = 0
     while done < max_iterations and rz > enough:
         if should_stop is not None and should_stop():
             break
-        image = apply(direction)
+        image = apply(direction, out=image)
         curvature = _dot(direction, image)
         if not curvature > 0:  # a null direction: nothing more to gain along it
             break
-        step = rz / curvature
-        x += direction.dtype.type(step) * direction
-        residual -= direction.dtype.type(step) * image
-        z = precondition(residual)
+        _advance(rz / curvature, direction, image, x=x, residual=residual)
+        z = precondition(residual, out=z)
         before, rz = rz, _dot(residual, z)
-        direction = z + direction.dtype.type(rz / before) * direction
+        _turn(rz / before, z, direction)
         done += 1
     return Solved(x, done, float(np.sqrt(max(rz, 0.0) / first)) if first > 0 else 0.0)
 
 
+def _advance(step: float, direction: Array, image: Array, *, x: Array, residual: Array) -> None:
+    """X += step · direction; residual −= step · image."""
+    factor = x.dtype.type(step)
+
+    def work(start: int, stop: int) -> None:
+        spare = np.zeros_like(x[start])
+        for i in range(start, stop):
+            np.multiply(direction[i], factor, out=spare)
+            x[i] += spare
+            np.multiply(image[i], factor, out=spare)
+            residual[i] -= spare
+
+    _over_slices(work, x)
+
+
+def _turn(factor: float, z: Array, direction: Array) -> None:
+    """Direction = z + factor · direction."""
+
+    def work(start: int, stop: int) -> None:
+        for i in range(start, stop):
+            direction[i] *= direction.dtype.type(factor)
+            direction[i] += z[i]
+
+    _over_slices(work, z)
+
+
 def _dot(one: Array, two: Array) -> float:
-    """Inner product, frame by frame and then summed in double precision, which float32 needs."""
-    frames = [float(np.vdot(a, b)) for a, b in zip(one, two, strict=True)]
-    return float(np.sum(frames))
+    """Inner product, slice by slice and then summed in double precision, which float32 needs.
+
+    Not by the linear-algebra library: its threads wait for each other in a loop, which on a busy machine takes longer than the sum.
+    """
+    parts = np.zeros(len(one))
+
+    def work(start: int, stop: int) -> None:
+        for i in range(start, stop):
+            parts[i] = np.einsum("i,i->", one[i].ravel(), two[i].ravel())
+
+    _over_slices(work, one)
+    return float(parts.sum())
+
+
+def _over_slices(work: Callable[[int, int], None], array: Array) -> None:
+    over_ranges(work, len(array), smallest=max(1, SMALLEST // max(array[0].size, 1)))

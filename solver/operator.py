@@ -61,9 +61,9 @@ class Operator:
 
     rank: RankTerm | None = None
 
-    def apply(self, shapes: Array) -> Array:
-        """Return 𝒜 X, shape `(F, 3, P)`."""
-        result = np.zeros_like(shapes)
+    def apply(self, shapes: Array, /, out: Array | None = None) -> Array:
+        """Return 𝒜 X, shape `(F, 3, P)`, in `out` if it is given."""
+        result = np.zeros_like(shapes) if out is None else out
         spatial = shapes.dtype.type(self.spatial_weight)
         smooth = self.laplacian is not None and self.spatial_weight > 0
         if smooth:
@@ -76,12 +76,12 @@ class Operator:
                 camera = self.projections[frame]
                 image = camera @ shapes[frame]
                 image *= self.weights[frame]
-                out = result[frame]
-                np.matmul(camera.T, image, out=out)
-                self._add_temporal(shapes, frame, out)
+                row = result[frame]
+                np.matmul(camera.T, image, out=row)
+                self._add_temporal(shapes, frame, row)
                 if smooth:
                     for axis in range(3):
-                        out[axis] += backward @ (spatial * (forward @ shapes[frame, axis]))
+                        row[axis] += backward @ (spatial * (forward @ shapes[frame, axis]))
 
         over_ranges(work, len(shapes), smallest=max(1, SMALLEST // shapes[0].size))
         if self.rank is not None:

@@ -6,12 +6,12 @@ diagonalised once a reweighting (3F numbers); on a grid K is nearly diagonal in 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver import block_tridiagonal
+from pliant.solver.conjugate_gradient import Linear
 from pliant.solver.operator import Operator
 from pliant.solver.parallel import available_cores
 from pliant.solver.records import Floats, Ints
@@ -52,7 +52,7 @@ class Diagonalised:
         return cls(vectors.astype(kind), np.maximum(values, 1e-10 * values[-1]))
 
 
-def build_preconditioner(operator: Operator) -> Callable[[Array], Array]:
+def build_preconditioner(operator: Operator) -> Linear:
     """Return M⁻¹ for this reweighting's operator."""
     if block_tridiagonal.fits(operator):
         return block_tridiagonal.build(operator)
@@ -60,13 +60,13 @@ def build_preconditioner(operator: Operator) -> Callable[[Array], Array]:
     temporal = Diagonalised.of(operator, kind)
     laplacian = operator.laplacian
     if laplacian is None or operator.spatial_weight == 0:
-        return lambda r: _by_point(r, temporal, None)
+        return lambda r, out=None: _by_point(r, temporal, None)  # noqa: ARG005
     if laplacian.grid is not None:
-        return lambda r: _by_cosines(r, temporal, laplacian.grid, operator.spatial_weight)  # type: ignore[arg-type]
+        return lambda r, out=None: _by_cosines(r, temporal, laplacian.grid, operator.spatial_weight)  # noqa: ARG005
     diagonal: Floats = (
         operator.spatial_weight * np.asarray(laplacian.matrix.power(2).sum(axis=0), dtype=np.float64).ravel()
     )
-    return lambda r: _by_point(r, temporal, diagonal)
+    return lambda r, out=None: _by_point(r, temporal, diagonal)  # noqa: ARG005
 
 
 def _by_point(r: Array, temporal: Diagonalised, shift: Floats | None) -> Array:
