@@ -5,13 +5,14 @@ Pure ASGI. Everything needs a token but what `PUBLIC` lists, so a route that som
 
 from __future__ import annotations
 
+import time
 from datetime import UTC, datetime
 
 from anyio import to_thread
 from fastapi.responses import Response
 from pliant.service.problems import answer, from_error, problem
 from pliant.service.settings import ServiceSettings
-from pliant.worker.errors import StoreUnavailable
+from pliant.worker.errors import StoreUnavailable, UnknownToken
 from pliant.worker.tokens import Scope, Token, Tokens
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Send
@@ -44,6 +45,30 @@ def is_public(path: str) -> bool:
     return path in PUBLIC or path.startswith(PUBLIC_FOLDER)
 
 
+class StillGood:
+    """Tells of a token that was good when the request came whether it still is; for answers that last."""
+
+    def __init__(self, tokens: Tokens, token: Token, *, every: float) -> None:
+        self._tokens = tokens
+        self._token = token
+        self._every = every
+        self._asked = time.monotonic()
+
+    async def __call__(self) -> bool:
+        """Ask the store, at most every so many seconds; a store that is away changes nothing."""
+        now = time.monotonic()
+        if now < self._asked + self._every:
+            return True
+        self._asked = now
+        try:
+            token = await to_thread.run_sync(self._tokens.get, self._token.id)
+        except UnknownToken:
+            return False
+        except StoreUnavailable:
+            return True
+        return not token.expired(datetime.now(UTC))
+
+
 class Authentication:
     """ASGI middleware that asks for a token and hands on whose request it is, as `pliant.token` and `pliant.owner`.
 
@@ -54,6 +79,7 @@ class Authentication:
         self._app = app
         self._on = settings.asks_for_tokens
         self._tokens = tokens
+        self._recheck = settings.heartbeat_seconds
 
     async def __call__(self, scope: AsgiScope, receive: Receive, send: Send) -> None:
         """Pass on a request that may be, refuse the others."""
@@ -69,6 +95,7 @@ class Authentication:
             return
         owner = None if found.sees_all else found.owner
         scope["pliant.token"], scope["pliant.owner"] = found, owner
+        scope["pliant.still_good"] = StillGood(self._tokens, found, every=self._recheck)
         await self._app(scope, receive, send)
 
     async def _judged(self, scope: AsgiScope) -> Token | Response:

@@ -61,21 +61,31 @@ def bounds_of(request: Request) -> Bounds:
     service, token = service_of(request), request.scope.get("pliant.token")
     settings = service.settings
     assert token is None or isinstance(token, Token)
-    own = (None, None, None) if token is None else (token.max_body_bytes, token.max_queued, token.requests_per_minute)
-    most = float("inf") if own[0] is None else own[0]
+    most = float("inf") if token is None or token.max_body_bytes is None else token.max_body_bytes
+
+    def own(name: str, usual: int) -> int:
+        said = getattr(token, name, None)
+        return usual if said is None else int(said)
+
     return Bounds(
         max_body_bytes=int(min(most, settings.max_body_bytes)),
         max_upload_bytes=int(min(most, service.limits.max_bytes)),
-        max_queued=settings.max_queued if own[1] is None else own[1],
-        max_running=service.jobs.settings.max_running,
-        requests_per_minute=settings.rate_of(own[2]),
+        max_queued=own("max_queued", settings.max_queued),
+        max_running=own("max_running", service.jobs.settings.max_running),
+        requests_per_minute=settings.rate_of(None if token is None else token.requests_per_minute),
     )
 
 
 def mine(request: Request) -> Jobs:
     """Return the jobs that the request's token may see: its own, or everybody's where tokens are off."""
     owner = request.scope.get("pliant.owner")
-    return replace(service_of(request).jobs, owner=owner, max_queued=bounds_of(request).max_queued)
+    token = request.scope.get("pliant.token")
+    return replace(
+        service_of(request).jobs,
+        owner=owner,
+        max_queued=bounds_of(request).max_queued,
+        max_running=None if token is None else token.max_running,
+    )
 
 
 def my_uploads(request: Request) -> Uploads:

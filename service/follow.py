@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator
 
 from pliant.client.schemas import Job
 from pliant.worker.jobs import Jobs
@@ -46,7 +46,7 @@ class Followers:
 
     async def follow(
         self, jobs: Jobs, id: str, *, after: str | None = None, heartbeat: float = 15.0
-    ) -> AsyncIterator[Event | None]:
+    ) -> AsyncGenerator[Event | None]:
         """Yield a job's events as they come, None when `heartbeat` seconds passed without one; ends at a final status.
 
         Parameters

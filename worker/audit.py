@@ -96,8 +96,9 @@ def _counts(held: Stored, key: str) -> bool:
 def _held_back(jobs: Jobs, records: list[Stored], waiting: set[str]) -> set[str]:
     """Return the queued jobs whose owner has as many running or about to run as may."""
     taken = Counter(stored.owner for stored in records if stored.job.status in ACTIVE or stored.token in waiting)
-    most = jobs.settings.max_running
-    return {stored.job.id for stored in records if 0 < most <= taken[stored.owner]}
+    usual = jobs.settings.max_running
+    most = {each.job.id: usual if each.max_running is None else each.max_running for each in records}
+    return {each.job.id for each in records if 0 < most[each.job.id] <= taken[each.owner]}
 
 
 def _of_queue(jobs: Jobs, records: list[Stored]) -> Iterator[str]:

@@ -51,6 +51,8 @@ class Jobs:
     """None: everybody's jobs; otherwise those of this owner, and to him there are no others."""
     max_queued: int = 0
     """Jobs of one owner that may wait at once; 0: any number."""
+    max_running: int | None = None
+    """Jobs of one owner that may run at once; 0: any number; None: what the settings say."""
     clock: Callable[[], datetime] = utc_now
 
     @classmethod
@@ -380,6 +382,7 @@ class Jobs:
             key=key,
             fingerprint=fingerprint,
             webhook=webhook,
+            max_running=self.max_running,
         )
         try:
             kept = self.records.create(mine, max_queued=self.max_queued)
@@ -401,7 +404,7 @@ class Jobs:
 
         Counted after the record was written, so two submissions at once cannot both miss each other.
         """
-        most = self.settings.max_running
+        most = self.settings.max_running if self.max_running is None else self.max_running
         unfinished = (Status.QUEUED, Status.RUNNING, Status.CANCELLING)
         return most > 0 and self.records.count(unfinished, owner=owner) > most
 

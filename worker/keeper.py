@@ -169,8 +169,8 @@ class Keeper:
 
         What is in the queue, or on its way from there to a worker, counts as running; the places that are left go to the oldest.
         """
-        most = self.jobs.settings.max_running
-        if most == 0:
+        usual = self.jobs.settings.max_running
+        if usual == 0 and all(beat.max_running is None for beat in absent.values()):
             return set()
         records = self.jobs.records
         active = records.beats([*records.ids(Status.RUNNING), *records.ids(Status.CANCELLING)])
@@ -179,7 +179,8 @@ class Keeper:
         held: set[str] = set()
         for id, beat in absent.items():  # oldest first, as `ids` gives them
             taken[beat.owner] += 1
-            if taken[beat.owner] > most:
+            most = usual if beat.max_running is None else beat.max_running
+            if 0 < most < taken[beat.owner]:
                 held.add(id)
         return held
 

@@ -144,11 +144,8 @@ class MemoryRecords(Records):
     def beats(self, ids: Iterable[str]) -> dict[str, Beat]:
         """See `Records.beats`."""
         with self._changed:
-            return {
-                id: Beat(self._records[id].token, self._beats[id], self._records[id].owner)
-                for id in ids
-                if id in self._records
-            }
+            held = {id: self._records[id] for id in ids if id in self._records}
+            return {id: Beat(each.token, self._beats[id], each.owner, each.max_running) for id, each in held.items()}
 
     def events(self, id: str, *, after: str | None, timeout: float) -> list[Event]:
         """See `Records.events`."""

@@ -72,6 +72,9 @@ class Stored(BaseModel):
     webhook: Webhook | None = None
     """Told once the job has ended."""
 
+    max_running: int | None = None
+    """How many jobs of its owner may run at once, as the owner's token said when it was submitted; None: `Settings.max_running`."""
+
     version: int = 0
     """Counts the changes; the compare-and-set compares it."""
 
@@ -100,6 +103,8 @@ class Beat(NamedTuple):
     token: str
     beats: int
     owner: str
+    max_running: int | None
+    """See `Stored`."""
 
 
 Change = Callable[[Stored], Stored]

@@ -2,7 +2,7 @@
 
 Keys, all under one prefix::
 
-    job:<id>              hash: version, status, token, owner, sort, bytes, key, beat, body (JSON of `Stored`)
+    job:<id>              hash: version, status, token, owner, sort, bytes, key, beat, most, body (JSON of `Stored`)
     index:*:<status>      sorted set of sort keys, all jobs of a status; index:@<owner>:<status> the owner's
     events:<id>, log:<id> stream and list, both capped
     key:<digest>          the job of an idempotency key
@@ -40,7 +40,7 @@ LONGEST_WAIT = 20.0
 """Seconds one blocking read waits at most: below the connection's own timeout."""
 
 # ARGV: 1 prefix, 2 id, 3 version, 4 status, 5 token, 6 owner, 7 sort key, 8 bytes, 9 key digest, 10 body, 11 event, 12 data, 13 cap,
-# 14 most queued jobs of the owner (0: any)
+# 14 most queued jobs of the owner (0: any), 15 most running ones as its token said ('': nothing)
 _CREATE = """
 local at = ARGV[1]
 if ARGV[9] ~= '' then
@@ -52,7 +52,8 @@ local most = tonumber(ARGV[14])
 if most > 0 and redis.call('ZCARD', at .. 'index:@' .. ARGV[6] .. ':queued') >= most then return '!full' end
 if ARGV[9] ~= '' then redis.call('SET', at .. 'key:' .. ARGV[9], ARGV[2]) end
 redis.call('HSET', at .. 'job:' .. ARGV[2], 'version', ARGV[3], 'status', ARGV[4], 'token', ARGV[5], 'owner', ARGV[6],
-  'sort', ARGV[7], 'bytes', ARGV[8], 'key', ARGV[9], 'body', ARGV[10], 'beat', 0)
+  'sort', ARGV[7], 'bytes', ARGV[8], 'key', ARGV[9], 'body', ARGV[10], 'beat', 0,
+  'most', ARGV[15])
 redis.call('ZADD', at .. 'index:*:' .. ARGV[4], 0, ARGV[7])
 redis.call('ZADD', at .. 'index:@' .. ARGV[6] .. ':' .. ARGV[4], 0, ARGV[7])
 redis.call('INCRBY', at .. 'used', ARGV[8])
@@ -137,7 +138,7 @@ class RedisRecords(Records):
                 args=[
                     self._at, job.id, stored.version, job.status.value, stored.token, stored.owner, stored.sort_key,
                     stored.bytes, stored.key or "", stored.model_dump_json(), name, data, events_kept(stored),
-                    max_queued,
+                    max_queued, "" if stored.max_running is None else stored.max_running,
                 ]
             )  # fmt: skip
         if taken == _FULL:
@@ -239,11 +240,11 @@ class RedisRecords(Records):
         with reachable():
             pipe = self._redis.pipeline(transaction=False)
             for id in wanted:
-                pipe.hmget(f"{self._at}job:{id}", "token", "beat", "owner")
+                pipe.hmget(f"{self._at}job:{id}", "token", "beat", "owner", "most")
             answers = pipe.execute()
         return {
-            id: Beat(token, int(beat), owner)
-            for id, (token, beat, owner) in zip(wanted, answers, strict=True)
+            id: Beat(token, int(beat), owner, int(most) if most else None)
+            for id, (token, beat, owner, most) in zip(wanted, answers, strict=True)
             if token is not None
         }
 

@@ -61,6 +61,8 @@ class Token(BaseModel):
     """Largest body of one request; None, here and below: what the service allows everybody."""
     max_queued: int | None = None
     """Jobs that may wait at once."""
+    max_running: int | None = None
+    """Jobs that are worked on at once; the others wait."""
     requests_per_minute: int | None = None
 
     def may(self, scope: Scope) -> bool:
@@ -104,6 +106,7 @@ class Tokens:
         sharing: str | None = None,
         max_body_bytes: int | None = None,
         max_queued: int | None = None,
+        max_running: int | None = None,
         requests_per_minute: int | None = None,
     ) -> tuple[Token, str]:
         """Make a token.
@@ -118,7 +121,7 @@ class Tokens:
             From now; None: never.
         sharing : str, optional
             Id of a token whose jobs the new one shares, e.g. to replace it.
-        max_body_bytes, max_queued, requests_per_minute : int, optional
+        max_body_bytes, max_queued, max_running, requests_per_minute : int, optional
             Limits of its own.
 
         Returns
@@ -151,7 +154,7 @@ class Tokens:
         token = Token(
             id=id, name=label, scopes=tuple(dict.fromkeys(scopes)), owner=owner or id, sha256=_digest(text),
             created_at=now, expires_at=None if expires is None else now + expires, max_body_bytes=max_body_bytes,
-            max_queued=max_queued, requests_per_minute=requests_per_minute,
+            max_queued=max_queued, max_running=max_running, requests_per_minute=requests_per_minute,
         )  # fmt: skip
         with reachable():
             self._redis.hset(self._key, id, token.model_dump_json())

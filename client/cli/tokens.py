@@ -46,6 +46,9 @@ def create(
     max_queued: Annotated[
         int | None, typer.Option(help="Jobs that may wait at once.", min=1, show_default="the service's")
     ] = None,
+    max_running: Annotated[
+        int | None, typer.Option(help="Jobs that are worked on at once.", min=1, show_default="the service's")
+    ] = None,
     requests_per_minute: Annotated[
         int | None, typer.Option(help="Requests in a minute.", min=1, show_default="the service's")
     ] = None,
@@ -65,6 +68,7 @@ def create(
             sharing=sharing,
             max_body_bytes=None if max_body_mb is None else max_body_mb * MB,
             max_queued=max_queued,
+            max_running=max_running,
             requests_per_minute=requests_per_minute,
         )
     if as_json:

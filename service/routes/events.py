@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable
+from contextlib import aclosing
 from functools import partial
 from typing import Annotated
 
 from anyio import to_thread
-from fastapi import APIRouter, Header
+from fastapi import APIRouter, Header, Request
 from fastapi.responses import PlainTextResponse, Response, StreamingResponse
 from pliant.service.core import Core, Mine
 from pliant.service.describe import problems
@@ -46,6 +47,7 @@ _LOG = {"text/plain": {"schema": {"type": "string"}}}
 )
 async def events(
     id: Id,
+    request: Request,
     core: Core,
     jobs: Mine,
     last: Annotated[str | None, Header(alias="Last-Event-ID", description="The last event you have.")] = None,
@@ -53,13 +55,13 @@ async def events(
     """Stream `job` events (the whole job, when its status changed) and `progress` events, and end when the job has.
 
     Begins with the events that are kept, or after `Last-Event-ID`; a browser's EventSource sends that by itself.
-    A comment line every 15 s keeps the connection from being taken for dead.
+    A comment line every 15 s keeps the connection from being taken for dead. Ends, too, when the token was revoked or is over.
     """
     stream = core.followers.follow(jobs, id, after=last or None, heartbeat=core.settings.heartbeat_seconds)
     # What can be refused is refused before the stream begins: afterwards there is no status code to say it with.
     await to_thread.run_sync(partial(jobs.events, id, after=last or None, timeout=0))
     return StreamingResponse(
-        _written(stream),
+        _written(stream, still_good=request.scope.get("pliant.still_good")),
         media_type="text/event-stream",
         headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"},
     )
@@ -76,14 +78,18 @@ def log(id: Id, jobs: Mine) -> Response:
     return PlainTextResponse(jobs.log(id))
 
 
-async def _written(stream: AsyncIterator[Event | None]) -> AsyncIterator[str]:
-    """Yield events as the lines of a text/event-stream."""
+async def _written(
+    stream: AsyncGenerator[Event | None], *, still_good: Callable[[], Awaitable[bool]] | None
+) -> AsyncIterator[str]:
+    """Yield events as the lines of a text/event-stream, as long as whoever listens still may."""
     yield "retry: 2000\n\n"
     try:
-        async for event in stream:
-            yield (
-                ": still here\n\n" if event is None else f"id: {event.id}\nevent: {event.name}\ndata: {event.data}\n\n"
-            )
+        async with aclosing(stream):
+            async for event in stream:
+                if still_good is not None and not await still_good():
+                    return
+                said = "" if event is None else f"id: {event.id}\nevent: {event.name}\ndata: {event.data}\n\n"
+                yield said or ": still here\n\n"
     except WorkerError:
         # The store went away or the job was deleted: the client comes back with Last-Event-ID and is told by a status.
         return

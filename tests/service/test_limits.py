@@ -186,6 +186,14 @@ def test_the_usual_rate_holds_where_strangers_may_come() -> None:
             rate(**{name: "-1"})
 
 
+def test_no_more_of_a_tokens_jobs_are_queued_for_the_workers_than_may_run(serve: Serve) -> None:
+    running = serve(auth="required")
+    with running.client(max_running=1) as one, running.client() as other:
+        assert (one.get("/v1/limits").json()["max_running"], other.get("/v1/limits").json()["max_running"]) == (1, 0)
+        places = [submit(client).place_in_queue for client in (one, one, other, other)]
+        assert places == [0, None, 1, 2], "null: held back"
+
+
 def test_admins_jobs_are_counted_as_nobodys(serve: Serve) -> None:
     running: Running = serve(auth="required", max_queued=1)
     with running.client() as ada, running.client(Scope.ADMIN) as admin:

@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from datetime import timedelta
 from pathlib import Path
 
 import httpx
@@ -44,6 +45,24 @@ def test_a_listener_who_leaves_is_forgotten(restless: Running) -> None:
             next(answer.iter_lines())
             until(lambda: service.followers.watched == 1)
         until(lambda: service.followers.watched == 0)
+
+
+@pytest.mark.parametrize("how", ["revoked", "expired"])
+def test_a_stream_ends_when_its_token_does(serve: Serve, how: str) -> None:
+    running = serve(auth="required", heartbeat_seconds=0.2)
+    token, text = running.tokens.create("listener", expires=timedelta(seconds=2) if how == "expired" else None)
+    with httpx.Client(base_url=running.url, timeout=10, headers={"Authorization": f"Bearer {text}"}) as http:
+        job = submit(http)
+        with http.stream("GET", f"/v1/jobs/{job.id}/events") as answer:
+            lines = answer.iter_lines()
+            assert next(line for line in lines if line.startswith(":"))
+            if how == "revoked":
+                running.tokens.revoke(token.id)
+            begun = time.monotonic()
+            rest = list(lines)
+        assert time.monotonic() - begun < 5
+        assert all(line in ("", ": still here") for line in rest)
+        assert http.get(f"/v1/jobs/{job.id}/events").status_code == 401
 
 
 @pytest.mark.parametrize("verb", ["POST", "PUT"])

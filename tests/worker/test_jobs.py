@@ -375,3 +375,10 @@ def test_a_repeated_key_finds_its_job_though_the_queue_is_full(jobs: Jobs, submi
     job = submit(ada, idempotency_key="k", fingerprint="f")
     ada.check_room(idempotency_key="k")
     assert submit(ada, idempotency_key="k", fingerprint="f").id == job.id
+
+
+def test_what_a_token_says_of_running_jobs_is_kept_with_each(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
+    ids = [submit(dataclasses.replace(jobs.of("ada"), max_running=most)).id for most in (None, 0, 3)]
+    beats = jobs.records.beats(ids)
+    assert [(beats[id].owner, beats[id].max_running) for id in ids] == [("ada", None), ("ada", 0), ("ada", 3)]
+    assert [jobs.records.get(id).max_running for id in ids] == [None, 0, 3]

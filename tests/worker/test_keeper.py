@@ -339,3 +339,21 @@ def test_a_jump_of_the_clock_loses_nothing(
     with pytest.raises(UnknownJob):
         world.jobs.get(done)
     assert world.jobs.get(busy).attempt == 1
+
+
+def test_a_tokens_own_bound_on_running_jobs_goes_before_the_usual_one(
+    tmp_path: Path, inputs_file: Path, interpretation: Interpretation
+) -> None:
+    world = World(tmp_path, max_running=2)
+
+    def made(owner: str, most: int | None) -> str:
+        jobs = dataclasses.replace(world.jobs.of(owner), max_running=most)
+        world.now += timedelta(milliseconds=10)
+        return jobs.submit(inputs_file, options=Options(), interpretation=interpretation).id
+
+    ones, threes, usual, free = ([made(f"{most}", most) for _ in range(4)] for most in (1, 3, None, 0))
+    expected = [*ones[:1], *threes[:3], *usual[:2], *free]
+    for _ in range(2):
+        assert [token.rpartition("-")[0] for token in world.jobs.queue.waiting()] == expected
+        assert findings(world.jobs, settle=0) == []
+        world.pass_seconds(10)
