@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 from pliant.client import Client, Job, Policy
@@ -17,6 +18,7 @@ from pliant.service.incoming import Incoming
 from pliant.worker.audit import findings
 from pliant.worker.errors import StoreUnavailable
 from pliant.worker.jobs import Jobs
+from pliant.worker.processes import die_with_parent
 from pliant.worker.settings import Settings
 
 SOON = {
@@ -78,8 +80,9 @@ class House:
         while time.monotonic() < deadline:
             with (self.folder / "log").open("ab") as log:
                 self._process = subprocess.Popen(
-                    command, env=environment, stdout=subprocess.PIPE, stderr=log, text=True
-                )
+                    command, env=environment, stdout=subprocess.PIPE, stderr=log, text=True,
+                    preexec_fn=partial(die_with_parent, os.getpid(), how=signal.SIGTERM),
+                )  # fmt: skip
             assert self._process.stdout is not None
             text = ""
             for line in self._process.stdout:

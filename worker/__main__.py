@@ -12,7 +12,7 @@ import sys
 from types import FrameType
 
 from pliant.worker.audit import findings
-from pliant.worker.connection import connect
+from pliant.worker.connection import BLOCK_WITHIN, connect
 from pliant.worker.errors import WorkerError
 from pliant.worker.jobs import Jobs
 from pliant.worker.keeper import Keeper
@@ -44,7 +44,7 @@ def work(settings: Settings) -> int:
     gc.freeze()  # or every horse's first collection would copy all the pages it shares with us
     settings.work.mkdir(parents=True, exist_ok=True)
     quick = connect(settings.redis, decode=True, retries=0, answer_within=WATCH_ANSWERS_WITHIN)
-    connection = connect(settings.redis, decode=False)
+    connection = connect(settings.redis, decode=False, answer_within=BLOCK_WITHIN)
     PliantWorker(
         settings=settings,
         connection=connection,

@@ -10,11 +10,14 @@ from pliant.worker.errors import StoreUnavailable
 from redis.backoff import ExponentialWithJitterBackoff
 from redis.retry import Retry
 
-ANSWER_WITHIN = 30.0
-"""Seconds a command may take, blocking reads included."""
+ANSWER_WITHIN = 10.0
+"""Seconds a command may take. Whoever asks the service while Redis hangs waits this long to be told to come back."""
+
+BLOCK_WITHIN = 30.0
+"""The same of those that block on purpose: waiting for events and for deliveries."""
 
 
-def connect(url: str, *, decode: bool, retries: int = 3, answer_within: float = ANSWER_WITHIN) -> redis.Redis:
+def connect(url: str, *, decode: bool, retries: int = 3, answer_within: float | None = None) -> redis.Redis:
     """Return a client, which connects when it is first used.
 
     Parameters
@@ -25,17 +28,19 @@ def connect(url: str, *, decode: bool, retries: int = 3, answer_within: float = 
         Text instead of bytes; RQ needs bytes.
     retries : int
         Attempts after the first when the connection breaks, with growing pauses of up to half a second. Every write
-        of ours is a compare-and-set or may be repeated, so a retry after an unheard answer does no harm.
-    answer_within : float
-        Seconds a command may take.
+        of ours is a compare-and-set or may be repeated, so a retry after an unheard answer does no harm. A server that
+        is there and does not answer is not asked again: that would only multiply the wait.
+    answer_within : float, optional
+        Seconds a command may take; `ANSWER_WITHIN` when not given.
     """
+    seconds = ANSWER_WITHIN if answer_within is None else answer_within
     return redis.Redis.from_url(
         url,
         decode_responses=decode,
-        socket_connect_timeout=min(5.0, answer_within),
-        socket_timeout=answer_within,
+        socket_connect_timeout=min(5.0, seconds),
+        socket_timeout=seconds,
         health_check_interval=15,
-        retry=Retry(ExponentialWithJitterBackoff(base=0.05, cap=0.5), retries),
+        retry=Retry(ExponentialWithJitterBackoff(base=0.05, cap=0.5), retries, (redis.ConnectionError,)),
     )
 
 

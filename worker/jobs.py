@@ -15,7 +15,7 @@ from pliant.worker import lifecycle
 from pliant.worker.blobs import Blob, Blobs
 from pliant.worker.checks import LARGEST_PAGE as LARGEST_PAGE
 from pliant.worker.checks import check_event_id, check_id, check_key, check_page, is_id
-from pliant.worker.connection import connect
+from pliant.worker.connection import BLOCK_WITHIN, connect
 from pliant.worker.errors import (
     Conflict,
     NotAllowedNow,
@@ -59,7 +59,11 @@ class Jobs:
     def open(cls, settings: Settings) -> Jobs:
         """Connect to what the settings name. Nothing is sent before it is needed, so Redis may still be starting."""
         return cls(
-            records=RedisRecords(connect(settings.redis, decode=True), prefix=settings.queue),
+            records=RedisRecords(
+                connect(settings.redis, decode=True),
+                prefix=settings.queue,
+                waiting=connect(settings.redis, decode=True, answer_within=BLOCK_WITHIN),
+            ),
             blobs=Blobs.open(settings.blobs),
             queue=RedisQueue(connect(settings.redis, decode=False), name=settings.queue),
             settings=settings,

@@ -120,8 +120,10 @@ return 1
 class RedisRecords(Records):
     """Records in Redis under one key prefix."""
 
-    def __init__(self, client: redis.Redis, *, prefix: str) -> None:
+    def __init__(self, client: redis.Redis, *, prefix: str, waiting: redis.Redis | None = None) -> None:
         self._redis: Any = client  # redis-py types every answer as a union with its awaitable twin
+        self._waiting: Any = waiting or client
+        """Blocks for up to `LONGEST_WAIT`."""
         self._at = f"{prefix}:"
         self._create = client.register_script(_CREATE)
         self._replace = client.register_script(_REPLACE)
@@ -257,7 +259,7 @@ class RedisRecords(Records):
                 return []
             # BLOCK 0 would wait for ever.
             block = {"block": max(1, int(wait * 1000))} if wait > 0 else {}
-            answer = self._redis.xread({key: after or "0-0"}, **block)
+            answer = self._waiting.xread({key: after or "0-0"}, **block)
         streams = answer.values() if isinstance(answer, dict) else [each[1] for each in answer or []]
         entries = [entry for stream in streams for entry in _flat(stream)]
         return [Event(entry, fields["name"], fields["data"]) for entry, fields in entries]

@@ -40,8 +40,8 @@ def limits(core: Core, bounds: Bound) -> ServiceLimits:
 
 
 @router.get("/healthz", summary="Is the process alive?")
-def healthz() -> dict[str, str]:
-    """Return 200 while the process answers at all; nothing else is looked at."""
+async def healthz() -> dict[str, str]:
+    """Return 200 while the process answers at all; nothing else is looked at, and no thread is waited for."""
     return {"status": "ok"}
 
 

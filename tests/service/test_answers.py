@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import os
+import socket
 import threading
 import time
 from pathlib import Path
@@ -143,6 +144,33 @@ def test_every_error_of_the_worker_has_a_status() -> None:
     kinds = [each for each in vars(errors).values() if isinstance(each, type) and issubclass(each, Exception)]
     assert len(kinds) > 8
     assert all(any(base in STATUS_OF for base in kind.__mro__) for kind in kinds)
+
+
+def test_while_the_store_hangs_everybody_is_told_soon_and_the_process_counts_as_alive(
+    serve: Serve, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pliant.worker.connection.ANSWER_WITHIN", 1.0)
+    with socket.create_server(("127.0.0.1", 0), backlog=200) as deaf:  # the kernel accepts for it
+        running = serve(redis_url=f"redis://127.0.0.1:{deaf.getsockname()[1]}")
+        answers: list[int] = []
+        http = httpx.Client(base_url=running.url, timeout=30)
+
+        def ask() -> None:
+            answers.append(http.get("/v1/jobs/some-job").status_code)
+
+        threads = [threading.Thread(target=ask) for _ in range(60)]  # more than there are threads for them
+        began = time.monotonic()
+        for thread in threads:
+            thread.start()
+        time.sleep(0.3)
+        healthy = time.monotonic()
+        assert http.get("/healthz").status_code == 200
+        assert time.monotonic() - healthy < 0.9, "it did not wait for a thread"
+        for thread in threads:
+            thread.join()
+        http.close()
+        assert answers == [503] * 60
+        assert time.monotonic() - began < 10
 
 
 def test_a_killed_process_folder_is_swept_and_a_living_ones_is_not(tmp_path: Path) -> None:

@@ -274,6 +274,16 @@ def test_without_a_binary_it_says_what_to_install(monkeypatch: pytest.MonkeyPatc
     assert find_binary() == Path("/somewhere/redis-server")
 
 
+def test_a_store_that_hangs_is_asked_once() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as deaf:  # the kernel accepts for it
+        client = connect(f"redis://127.0.0.1:{deaf.getsockname()[1]}", decode=True, retries=5, answer_within=0.3)
+        began = time.monotonic()
+        with pytest.raises(StoreUnavailable, match="TimeoutError"), reachable():
+            client.ping()
+        assert time.monotonic() - began < 1.0
+        client.close()
+
+
 def test_a_store_that_does_not_answer_is_said_so() -> None:
     with socket.socket() as unused:
         unused.bind(("127.0.0.1", 0))
