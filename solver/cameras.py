@@ -7,10 +7,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from pliant.solver.completion import Completed, complete
-from pliant.solver.likelihood import Scene, cameras_of, fit, start
-from pliant.solver.metric_upgrade import upgrade
+from pliant.solver.metric_upgrade import Upgrade, upgrade
 from pliant.solver.normalise import Normalised
-from pliant.solver.rank import CANDIDATES, FIT_ITERATIONS, Scored, roughness, score
+from pliant.solver.race import CANDIDATES, Candidate, carried, frames_used, gram_of, held, race
 from pliant.solver.records import Floats, Step, read_only
 from pliant.solver.rotation import angles_between, start_at_identity
 from pliant.solver.settings import Settings
@@ -28,12 +27,6 @@ RIGID_ENOUGH = 0.01
 
 WIDEST = 0.3
 """And where the standard deviation of their logarithm is below this: no camera zooms more by accident."""
-
-REFINED_FRAMES = 240
-"""Longer sequences keep the factorization's rotations: the refinement grows with F³."""
-
-REFINEMENTS = 100
-"""L-BFGS iterations of the refinement."""
 
 HARDLY = np.radians(10.0)
 """Largest turn between any frame and the first below which the user is warned."""
@@ -87,43 +80,44 @@ def estimate_cameras(
     tell(Step("cameras", 0.4 * SHARE))
     scales, scale_reason = _adopted_scales(completed.gram, settings)
     gram = completed.gram / np.outer(np.repeat(scales, 2), np.repeat(scales, 2))
-    scored: list[Scored] = []
+    used = frames_used(len(scales))
+    part = gram_of(gram, used)
+    upgrades: list[Upgrade] = []
+    entries: list[Candidate] = []
     for size in _sizes(completed, settings):
-        if scored and should_stop is not None and should_stop():
+        if entries and should_stop is not None and should_stop():
             break
-        scored.append(score(gram, upgrade(gram, size), np.ones(len(scales)), with_scales=False))
-        tell(Step("cameras", (0.4 + 0.04 * len(scored)) * SHARE))
-    best = min(scored, key=lambda candidate: candidate.score)
-    rotations, refined = best.upgrade.rotations, "Rotations are those of the factorization."
-    if settings.refine_rotations and not (should_stop is not None and should_stop()):
-        rotations, refined = refine(gram, best)
+        upgrades.append(upgrade(gram, size))
+        entries.append(held(part, _thinned(upgrades[-1], used), np.ones(len(part) // 2), with_scales=False))
+        tell(Step("cameras", (0.4 + 0.04 * len(entries)) * SHARE))
+    best, ran = min(entries, key=lambda candidate: candidate.energy), entries
+    if settings.refine_rotations:
+        best, ran = race(part, entries, should_stop=should_stop)
+    own = next(each for each in upgrades if each.basis_size == best.basis_size)
+    tell(Step("cameras", 0.8 * SHARE))
+    rotations, refined = _everywhere(own.rotations, best, used, settings)
     read_only(rotations)
     read_only(scales)
     tell(Step("cameras", SHARE))
-    reasons = {"basis_size": _why(scored, best, settings), "scales": scale_reason, "rotations": refined}
-    size = best.upgrade.basis_size
-    return CameraEstimate(rotations, scales, completed.translations, size, reasons, _warnings(rotations))
+    reasons = {"basis_size": _why(ran, best, settings), "scales": scale_reason, "rotations": refined}
+    return CameraEstimate(rotations, scales, completed.translations, best.basis_size, reasons, _warnings(rotations))
 
 
-def refine(gram: Floats, best: Scored) -> tuple[Floats, str]:
-    """Return rotations that make the tracks more probable, or the candidate's own, and a sentence.
-
-    Variable projection with the log-determinant against flattening (`pliant.solver.likelihood`), kept only if the sum of energy and
-    scale-free roughness falls. The energy's modes are smooth and more than in the choice of K.
-    """
-    before = best.upgrade.rotations
-    if len(before) > REFINED_FRAMES:
-        return before, f"More than {REFINED_FRAMES} frames: rotations are those of the factorization."
-    ones = np.ones(len(before))
-    scene = Scene.of(gram, before, with_scales=False, smoothness=1000.0)
-    held, start_energy = fit(scene, start(scene, ones, num_modes=16), iterations=FIT_ITERATIONS, turning=False)
-    moved, energy = fit(scene, held, iterations=REFINEMENTS, turning=True)
-    after = start_at_identity(cameras_of(scene, moved)[0])
-    gained = start_energy - energy + 0.5 * (roughness(gram, before, ones) - roughness(gram, after, ones))
-    if not (np.isfinite(after).all() and gained > 0):
-        return before, "A refinement was tried and refused: it did not lower energy and roughness together."
+def _everywhere(before: Floats, best: Candidate, used: slice, settings: Settings) -> tuple[Floats, str]:
+    """Return the rotations of all frames, given those of the frames that raced, and a sentence."""
+    if not settings.refine_rotations:
+        return before, "Rotations are those of the factorization."
+    after = carried(before, best.cameras[0], used)
+    if not np.isfinite(after).all():
+        return before, "A refinement was tried and refused: it left the finite numbers."
+    after = start_at_identity(after)
     turn = float(np.degrees(angles_between(after, before).mean()))
-    return after, f"Refined by variable projection; rotations moved by {turn:.2f}° on average."
+    how = ", from a steadied start" if best.steadied else ""
+    return after, f"Refined by variable projection{how}; rotations moved by {turn:.2f}° on average."
+
+
+def _thinned(full: Upgrade, used: slice) -> Upgrade:
+    return Upgrade(full.basis_size, full.rotations[used], full.scales[used], full.residual)
 
 
 def estimate_scales(normalised: Normalised, rotations: Floats) -> Floats:
@@ -142,14 +136,12 @@ def _sizes(completed: Completed, settings: Settings) -> list[int]:
     return [size for size in CANDIDATES if size <= limit]
 
 
-def _why(scored: list[Scored], best: Scored, settings: Settings) -> str:
-    size = best.upgrade.basis_size
+def _why(ran: list[Candidate], best: Candidate, settings: Settings) -> str:
+    size = best.basis_size
     if settings.basis_size is not None:
         return f"K = {size} as set."
-    tried = ", ".join(f"{each.upgrade.basis_size}: {each.score:.3f}" for each in scored)
-    return (
-        f"K = {size} leaves the most probable and smoothest motion (negative log-likelihood plus roughness: {tried})."
-    )
+    tried = ", ".join(f"{each.basis_size}{' steadied' if each.steadied else ''}: {each.energy:.3f}" for each in ran)
+    return f"K = {size} leads to the most probable motion under the steadiest camera (negative log-likelihood: {tried})."
 
 
 def _warnings(rotations: Floats) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ The trace is variable projection: tr M⁻¹ G is what min_S ‖W − Π S‖²/�
 traded for rotation (a flat shape that turns faster moves the same in the image). The log-determinant is what a smoothness
 energy lacks: a prior that expects less depth explains less and must pay. T is the covariance of a random walk, the modes
 L (F×q) are the low-rank part, and κ‖H L‖²/2F keeps them smooth: without it every frame is turned to fit the mean shape best,
-and a talking face nods with its jaw. Everything lives in 2F dimensions; P does not matter.
+and a talking face nods with its jaw. What binds the cameras themselves is in `pliant.solver.steadiness`. Everything lives in 2F dimensions; P does not matter.
 """
 
 from __future__ import annotations
@@ -23,14 +23,23 @@ from dataclasses import dataclass
 import numpy as np
 from pliant.solver.records import Floats
 from pliant.solver.rotation import exponential, left_jacobian, vee
+from pliant.solver.steadiness import unevenness, unsteadiness
 from scipy.linalg import lapack
 from scipy.optimize import minimize
 
-SCALE_SMOOTHNESS = 10.0
-"""Of ½‖H log s‖²/F times this: a camera's distance changes steadily."""
+NOISE_FLOOR = 3e-3
+"""Normalised units. No tracks of real video are better, and a finer one spends the model's modes on what no camera explains:
+measured, 1e-4 leaves L-BFGS unconverged after 200 iterations, with 3e-3 different starts reach the same cameras."""
 
-NOISE_FLOOR = 1e-4
-"""Normalised units; keeps M well conditioned on tracks without noise."""
+STEADINESS = 0.03
+"""Weight of `pliant.solver.steadiness`, whose terms are those of one camera, against E, which is that of one point: the points
+of a surface move together and are worth about 1/0.03 independent ones."""
+
+SMOOTHNESS = 1000.0
+"""κ."""
+
+NUM_MODES = 16
+"""q."""
 
 UNLIKELY = 1e6
 """Energy reported where M is not positive definite to rounding; the line search steps back from it."""
@@ -89,22 +98,33 @@ class Scene:
     with_scales: bool
     """False: every s_f is 1."""
 
-    smoothness: float
-    """κ. Measured on faces, mocap and animals: 100 tells candidates apart best, 1000 keeps a refinement from jitter."""
-
     walk: Floats
     """T, shape `(F, F)`, mean of the diagonal 1."""
 
+    steadiness: float
+    """Weight of the camera's unsteadiness."""
+
+    noise_floor: float
+    """Normalised units; added to σ in quadrature."""
+
     @classmethod
-    def of(cls, gram: Floats, rotations: Floats, *, with_scales: bool, smoothness: float = 100.0) -> Scene:
+    def of(
+        cls,
+        gram: Floats,
+        rotations: Floats,
+        *,
+        with_scales: bool,
+        steadiness: float = STEADINESS,
+        noise_floor: float = NOISE_FLOOR,
+    ) -> Scene:
         """Return the scene for a Gram matrix and starting cameras."""
         frames = len(rotations)
         steps = np.diff(np.eye(frames), axis=0)
         walk = np.linalg.inv(steps.T @ steps + np.eye(frames) * 10.0 / frames**2)
-        return cls(gram, rotations, with_scales, smoothness, walk / (np.trace(walk) / frames))
+        return cls(gram, rotations, with_scales, walk / (np.trace(walk) / frames), steadiness, noise_floor)
 
 
-def start(scene: Scene, scales: Floats, *, num_modes: int = 8) -> Motion:
+def start(scene: Scene, scales: Floats, *, num_modes: int = NUM_MODES) -> Motion:
     """Return a rigid explanation and, from what it leaves, the leading modes in time."""
     frames = len(scene.rotations)
     rows = (scene.rotations[:, :2] * scales[:, None, None]).reshape(2 * frames, 3)
@@ -113,7 +133,7 @@ def start(scene: Scene, scales: Floats, *, num_modes: int = 8) -> Motion:
     extent = extent + 1e-3 * np.trace(extent) / 3 * np.eye(3)
     rest = np.eye(2 * frames) - rows @ inverse
     left = rest @ scene.gram @ rest.T
-    variance = max(float(np.trace(left)) / (2 * frames), NOISE_FLOOR**2)
+    variance = max(float(np.trace(left)) / (2 * frames), scene.noise_floor**2)
     values, vectors = np.linalg.eigh((left[0::2, 0::2] + left[1::2, 1::2]) / 2)
     count = min(num_modes, frames // 2)
     modes = vectors[:, ::-1][:, :count] * np.sqrt(np.maximum(values[::-1][:count], 1e-12))
@@ -131,7 +151,7 @@ def cameras_of(scene: Scene, motion: Motion) -> tuple[Floats, Floats]:
 
 
 def energy(scene: Scene, motion: Motion) -> tuple[float, Motion]:
-    """Return E with the penalties on modes and scales, and its gradient, analytic in every parameter.
+    """Return E with the penalties on modes, turns and scales, and its gradient, analytic in every parameter.
 
     With D = ∂E/∂M = (M⁻¹ − M⁻¹ G M⁻¹)/2F, everything follows from D and the blocks of M. Turns move on SO(3)^F by the
     exponential map, whose left Jacobian carries the gradient from the rotation to its vector.
@@ -146,7 +166,7 @@ def energy(scene: Scene, motion: Motion) -> tuple[float, Motion]:
     wide = np.repeat(np.repeat(motion.modes @ motion.modes.T + drift * scene.walk, 2, axis=0), 2, axis=1)
     deform = rows1 @ rows.T
     covariance = rows0 @ rows.T + deform * wide
-    covariance[np.diag_indices(2 * frames)] += noise + NOISE_FLOOR**2
+    covariance[np.diag_indices(2 * frames)] += noise + scene.noise_floor**2
     inverse, log_det = _invert(covariance)
     if inverse is None:
         return UNLIKELY, Motion.unflat(np.zeros_like(motion.flat()), frames)
@@ -157,11 +177,12 @@ def energy(scene: Scene, motion: Motion) -> tuple[float, Motion]:
     widened = slope * wide
     by_pairs = 2 * (slope @ rows0 + widened @ rows1).reshape(frames, 2, 3)
     by_frames = (slope * deform).reshape(frames, 2, frames, 2).sum(axis=(1, 3))
-    rough, by_modes = _roughness(motion.modes, scene.smoothness / frames)
-    uneven, by_logs = _roughness(np.log(scales), SCALE_SMOOTHNESS / frames)
-    by_logs = by_logs + np.einsum("fij,fij->f", by_pairs, pairs)
-    by_rotations = np.zeros((frames, 3, 3))
-    by_rotations[:, :2] = by_pairs * scales[:, None, None]
+    rough, by_modes = _roughness(motion.modes, SMOOTHNESS / frames)
+    uneven, by_logs = unevenness(np.log(scales))
+    by_logs = scene.steadiness * by_logs + np.einsum("fij,fij->f", by_pairs, pairs)
+    unsteady, by_rotations = unsteadiness(rotations)
+    by_rotations *= scene.steadiness
+    by_rotations[:, :2] += by_pairs * scales[:, None, None]
     turned = vee(by_rotations @ np.swapaxes(rotations, 1, 2))
     gradient = Motion(
         np.einsum("fji,fj->fi", left_jacobian(motion.turns), turned),
@@ -171,7 +192,7 @@ def energy(scene: Scene, motion: Motion) -> tuple[float, Motion]:
         2 * (rows.T @ widened @ rows @ root1)[LOWER],
         2 * np.array([np.trace(slope) * noise, (by_frames * scene.walk).sum() * drift]),
     )
-    return value + rough + uneven, gradient
+    return value + rough + scene.steadiness * (uneven + unsteady), gradient
 
 
 def fit(scene: Scene, motion: Motion, *, iterations: int, turning: bool) -> tuple[Motion, float]:

@@ -44,6 +44,21 @@ def exponential(vectors: Floats) -> Floats:
     return np.eye(3) + first * skew + second * (skew @ skew)
 
 
+def logarithm(rotations: Floats) -> Floats:
+    """Return the vectors v, ‖v‖ ≤ π, of which the rotations are the exponentials, shapes `(..., 3, 3)` to `(..., 3)`."""
+    sine = 0.5 * vee(rotations)
+    length = np.linalg.norm(sine, axis=-1)
+    angle = np.arctan2(length, 0.5 * (np.trace(rotations, axis1=-2, axis2=-1) - 1.0))
+    axis = sine / np.maximum(length, np.finfo(float).tiny)[..., None]
+    # near half a turn the sine vanishes: the axis is then the leading eigenvector of R + Rᵀ, its sign that of the sine
+    opposite = angle > np.pi - 1e-3
+    if np.any(opposite):
+        leading = np.linalg.eigh(rotations[opposite] + np.swapaxes(rotations[opposite], -1, -2))[1][..., -1]
+        sign = np.where((leading * sine[opposite]).sum(axis=-1) < 0, -1.0, 1.0)
+        axis[opposite] = leading * sign[..., None]
+    return np.asarray(axis * angle[..., None])
+
+
 def left_jacobian(vectors: Floats) -> Floats:
     """Return J with exp(v + dv) = exp(J dv) exp(v) to first order, shape `(..., 3, 3)`."""
     _, second, third = _coefficients(vectors)
