@@ -141,7 +141,9 @@ def _why(ran: list[Candidate], best: Candidate, settings: Settings) -> str:
     if settings.basis_size is not None:
         return f"K = {size} as set."
     tried = ", ".join(f"{each.basis_size}{' steadied' if each.steadied else ''}: {each.energy:.3f}" for each in ran)
-    return f"K = {size} leads to the most probable motion under the steadiest camera (negative log-likelihood: {tried})."
+    return (
+        f"K = {size} leads to the most probable motion under the steadiest camera (negative log-likelihood: {tried})."
+    )
 
 
 def _warnings(rotations: Floats) -> tuple[str, ...]:

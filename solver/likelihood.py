@@ -13,7 +13,8 @@ The trace is variable projection: tr M⁻¹ G is what min_S ‖W − Π S‖²/�
 traded for rotation (a flat shape that turns faster moves the same in the image). The log-determinant is what a smoothness
 energy lacks: a prior that expects less depth explains less and must pay. T is the covariance of a random walk, the modes
 L (F×q) are the low-rank part, and κ‖H L‖²/2F keeps them smooth: without it every frame is turned to fit the mean shape best,
-and a talking face nods with its jaw. What binds the cameras themselves is in `pliant.solver.steadiness`. Everything lives in 2F dimensions; P does not matter.
+and a talking face nods with its jaw. What binds the cameras is in
+`pliant.solver.steadiness`. Everything lives in 2F dimensions; P does not matter.
 """
 
 from __future__ import annotations

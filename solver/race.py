@@ -18,6 +18,7 @@ from pliant.solver.likelihood import Motion, Scene, cameras_of, fit, start
 from pliant.solver.metric_upgrade import Upgrade
 from pliant.solver.records import Floats
 from pliant.solver.rotation import exponential, logarithm, nearest
+from scipy.linalg import solveh_banded
 
 CANDIDATES = (1, 2, 3, 5, 8, 12)
 """K tried."""
@@ -36,6 +37,13 @@ STEADIED = 2
 
 STEADIED_ITERATIONS, STEADIED_NOISE, STEADIED_WEIGHT = 100, 3e-2, 10.0
 """A steadied start: so much noise and so heavy a camera that only what a steady camera explains is explained."""
+
+
+CLOSED_FORM_WEIGHT = 1e-3
+"""λ1 of the temporal closed form."""
+
+DEEPEST = 1.0
+"""Root mean square depth, normalised units, from which more depth counts against a candidate."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,7 +94,11 @@ def race(
     should_stop : callable, optional
         Asked before every refinement; once it says True, the best so far wins.
     """
-    ordered = sorted(entries, key=_energy)
+
+    def rating(candidate: Candidate) -> float:
+        return _rating(gram, candidate)
+
+    ordered = sorted(entries, key=rating)
     running = ordered + [steadied(gram, candidate) for candidate in ordered[:STEADIED]]
     first: list[Candidate] = []
     for iterations, left in HEATS:
@@ -95,7 +107,7 @@ def race(
             stopped = should_stop is not None and should_stop()
             finished.append(candidate if stopped else refined(candidate, iterations))
         first = first or finished
-        running = sorted(finished, key=_energy)[:left]
+        running = sorted(finished, key=rating)[:left]
     return running[0], first
 
 
@@ -113,9 +125,7 @@ def steadied(gram: Floats, candidate: Candidate) -> Candidate:
     """
     rotations, scales = candidate.cameras
     with_scales = candidate.scene.with_scales
-    calm = Scene.of(
-        gram, rotations, with_scales=with_scales, steadiness=STEADIED_WEIGHT, noise_floor=STEADIED_NOISE
-    )
+    calm = Scene.of(gram, rotations, with_scales=with_scales, steadiness=STEADIED_WEIGHT, noise_floor=STEADIED_NOISE)
     motion, _ = fit(calm, start(calm, scales), iterations=STEADIED_ITERATIONS, turning=True)
     return _entered(gram, *cameras_of(calm, motion), candidate.basis_size, with_scales=with_scales, steadied=True)
 
@@ -150,5 +160,36 @@ def _entered(
     return Candidate(basis_size, steadied, scene, motion, energy)
 
 
-def _energy(candidate: Candidate) -> float:
-    return candidate.energy
+def _rating(gram: Floats, candidate: Candidate) -> float:
+    """Return the energy, raised where the closed form comes out deeper than the image is wide: turns that are far too small."""
+    return candidate.energy + max(0.0, float(np.log(max(depth(gram, candidate.cameras[0]), 1e-12) / DEEPEST**2)))
+
+
+def depth(gram: Floats, rotations: Floats) -> float:
+    """Return the mean squared depth of the temporal closed form (Dai, Deng, He 2017, eq. 5), normalised units.
+
+    S = (ΠᵀΠ + λ1 HᵀH)⁻¹ Πᵀ W, so that S Sᵀ / P follows from the Gram matrix; a block-tridiagonal solve, no shapes.
+    """
+    frames = len(rotations)
+    pairs = rotations[:, :2]
+    right = np.zeros((frames, 3, frames, 2))
+    each = np.arange(frames)
+    right[each, :, each] = np.swapaxes(pairs, 1, 2)
+    solved = solveh_banded(_normal_bands(pairs), right.reshape(3 * frames, 2 * frames), lower=True)
+    along = np.einsum("fi,fim->fm", rotations[:, 2], solved.reshape(frames, 3, -1))
+    return float(((along @ gram) * along).sum()) / frames
+
+
+def _normal_bands(pairs: Floats) -> Floats:
+    """Return ΠᵀΠ + λ1 HᵀH in LAPACK's lower banded form, shape `(4, 3F)`."""
+    frames = len(pairs)
+    bands = np.zeros((4, 3 * frames))
+    ends = np.full(frames, 2.0)
+    ends[[0, -1]] = 1.0
+    blocks = np.einsum("fci,fcj->fij", pairs, pairs)
+    blocks += (CLOSED_FORM_WEIGHT * ends + 1e-9)[:, None, None] * np.eye(3)
+    for below in range(3):
+        for column in range(3 - below):
+            bands[below, column::3] = blocks[:, column + below, column]
+    bands[3, :-3] = -CLOSED_FORM_WEIGHT
+    return bands

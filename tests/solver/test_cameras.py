@@ -9,7 +9,17 @@ from pliant.solver.cameras import estimate_cameras, estimate_scales
 from pliant.solver.likelihood import Motion, Scene, energy, start
 from pliant.solver.metric_upgrade import upgrade
 from pliant.solver.normalise import normalise
-from pliant.solver.rotation import MIRROR, angles_between, exponential, left_jacobian, nearest, start_at_identity
+from pliant.solver.race import carried
+from pliant.solver.rotation import (
+    MIRROR,
+    angles_between,
+    exponential,
+    left_jacobian,
+    logarithm,
+    nearest,
+    start_at_identity,
+)
+from pliant.solver.steadiness import SCALE_FLOOR, TURN_FLOOR, unevenness, unsteadiness
 
 
 def turning(frames: int, degrees: float) -> np.ndarray:
@@ -127,3 +137,50 @@ def test_the_exponential_map_and_its_jacobian() -> None:
     np.testing.assert_allclose(exponential(vector) @ exponential(-vector), np.eye(3), atol=1e-14)
     moved = exponential(left_jacobian(vector) @ small) @ exponential(vector)
     np.testing.assert_allclose(exponential(vector + small), moved, atol=1e-11)
+
+
+def test_logarithms_are_those_of_the_exponentials() -> None:
+    random = np.random.default_rng(0)
+    axes = random.normal(size=(40, 3))
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    vectors = axes * np.concatenate([np.geomspace(1e-9, 3.1, 30), np.pi - np.geomspace(1e-2, 1e-9, 10)])[:, None]
+    np.testing.assert_allclose(logarithm(exponential(vectors)), vectors, atol=1e-7)
+    assert (logarithm(np.eye(3)[None]) == 0).all()
+
+
+def test_steadiness_pays_for_changes_of_speed_alone() -> None:
+    spin = exponential(np.arange(30)[:, None] * np.array([0.0, 0.05, 0.0]))
+    random = np.random.default_rng(0)
+    floor, slope = unsteadiness(spin)
+    assert floor == pytest.approx(3 * np.log(TURN_FLOOR), abs=1e-9)
+    np.testing.assert_allclose(slope, 0, atol=1e-6)
+    jitter = unsteadiness(exponential(random.normal(0, 0.01, (30, 3))) @ spin)[0]
+    jolts = unsteadiness(exponential(random.normal(0, 0.1, (30, 3))) @ spin)[0]
+    assert floor + 2 < jitter < jolts - 5
+    assert unevenness(np.linspace(0, 0, 9))[0] == pytest.approx(np.log(SCALE_FLOOR))
+
+
+def test_corrections_are_carried_to_the_frames_between() -> None:
+    truth, used = turning(41, 60), slice(None, None, 4)
+    world = exponential(np.array([0.3, -2.0, 0.4]))
+    drift = np.linspace(0, 0.3, 41)[:, None] * np.array([0.0, 1.0, 0.0])
+    found = carried(truth @ exponential(-drift), (truth @ world)[used], used)
+    assert error(found[used], truth[used]) < 1e-6
+    assert error(found, truth) < 0.01
+    assert error(truth @ exponential(-drift), truth) > 3
+
+
+def test_a_dancer_does_not_make_the_camera_dance() -> None:
+    # limbs that swing as fast as the camera turns: every K gives cameras that jitter with them
+    random = np.random.default_rng(2)
+    time = np.linspace(0, 1, 40)
+    camera = start_at_identity(exponential(np.stack([0 * time, 2.0 * time, 0 * time], axis=1)))
+    body = random.normal(size=(80, 3)) * [0.5, 1.0, 0.4]
+    swings = [np.sin(2 * np.pi * (rate * time + phase)) for rate, phase in random.uniform(0.5, 2.5, (8, 2))]
+    shapes = body + sum(0.12 * swing[:, None, None] * random.normal(size=body.shape) for swing in swings)
+    normalised = normalise(Tracks.from_arrays(view(shapes, camera)))
+    rough = estimate_cameras(normalised, Settings(refine_rotations=False)).rotations
+    refined = estimate_cameras(normalised, Settings())
+    assert error(refined.rotations, camera) < 0.5 * error(rough, camera)
+    assert unsteadiness(refined.rotations)[0] < unsteadiness(rough)[0]
+    assert refined.reasons["rotations"].startswith("Refined by variable projection")
