@@ -30,7 +30,7 @@ sys.path.insert(0, str(ROOT / "tests" / "support"))
 
 from browsing import Browsing  # noqa: E402
 
-MOST_BYTES = 200_000
+MOST_BYTES = 320_000
 
 
 @contextmanager

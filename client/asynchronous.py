@@ -39,7 +39,7 @@ class AsyncClient:
 
     Examples
     --------
-    ``Client().submit(points).wait(timeout=600).shapes`` is an array (F, P, 3).
+    ``(await (await AsyncClient().submit(points)).wait(timeout=600)).shapes`` is an array (F, P, 3).
     """
 
     def __init__(

@@ -107,6 +107,13 @@ def test_python_runs(document: Path, service_url: str, folder: Path) -> None:
     assert ran.returncode == 0, f"{document.name}:\n{ran.stderr}"
 
 
+def test_the_readmes_first_program_is_five_lines() -> None:
+    first = next(block for block in BLOCKS if block.document.name == "README.md" and block.language == "python")
+    assert not first.note
+    assert len([line for line in first.text.splitlines() if line.strip()]) == 5
+    assert "pliant.client" in first.text
+
+
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
 def test_shell_runs(document: Path, service_url: str, folder: Path) -> None:
     (folder / "examples").symlink_to(ROOT / "examples")

@@ -29,7 +29,7 @@ pytestmark = [
 ]
 
 TRACKS = "tracks.npz"
-DONE = 90_000
+DONE = 180_000
 
 
 @pytest.fixture(scope="module")

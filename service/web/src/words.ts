@@ -44,7 +44,7 @@ export function seconds(value: number): string {
 /** The same in few letters, for a heading. */
 export function duration(value: number): string {
   if (value < 60) return `${value < 9.95 ? value.toFixed(1) : Math.round(value)} s`;
-  if (value < 5400) return `${Math.floor(value / 60)} min ${Math.round(value % 60)} s`;
+  if (value < 5400) return `${Math.floor(value / 60)}:${String(Math.floor(value % 60)).padStart(2, "0")} min`;
   return `${(value / 3600).toFixed(1)} h`;
 }
 
