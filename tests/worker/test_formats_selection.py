@@ -218,6 +218,9 @@ def test_points_seen_too_seldom_are_left_out_and_said(folder: Path) -> None:
     assert "1 of them belong to no face" in notes
     assert read(folder, folder / "most.npz", min_seen=4).interpretation.left_out_points == [4, 7, 9]
     assert read(folder, folder / "most.npz", min_seen=1).interpretation.num_left_out == 0
+    with pytest.raises(InvalidInput, match="seen in 11 frames or more") as caught:
+        read(folder, folder / "most.npz", min_seen=11)
+    assert (caught.value.code, caught.value.field) == ("nothing_visible", "options.min_seen")
 
 
 def test_a_mask_picks_points_of_whole_pictures(tmp_path: Path) -> None:

@@ -8,37 +8,49 @@ as that takes, under limits of its own; the server gets the interpretation, or t
 from __future__ import annotations
 
 import json
+import math
 import os
 import resource
 import signal
 import subprocess
 import sys
 import zipfile
+import zlib
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from pliant.client.options import Options
 from pliant.client.schemas import Interpretation
 from pliant.solver import InvalidInput
-from pliant.worker.formats.arrays import NPY_MAGIC, check_directory
+from pliant.worker.formats.arrays import NPY_MAGIC, check_directory, read_header
 from pliant.worker.formats.canonical import save_inputs
 from pliant.worker.formats.child import die_with
 from pliant.worker.formats.errors import AmbiguousInput, too_large
+from pliant.worker.formats.hdf5 import SIGNATURE
 from pliant.worker.formats.read import read_inputs
 from pliant.worker.formats.records import Limits
 
-LARGE = 64 << 20
+LARGE = 16 << 20
 """Bytes of arrays, by what the files announce, above which they are read apart."""
 
-INFLATED = 1032
-"""Deflate makes at most this of a byte; MATLAB files and pictures do not say beforehand how large they become."""
+GROWTH = {b"MATLAB": 1032, b"\x89PNG": 8 * 1032}
+"""What a byte may become: deflate makes at most 1032 of it, and a pixel's point number has 8."""
 
 TEXT = 8
 """A byte of text or of a mesh file becomes at most this many."""
 
-REFUSED, UNREADABLE = 3, 1
+NUMBER = 8
+"""Bytes of a number while it is worked on, however it is stored."""
+
+WITHOUT_BOUND = 1 << 62
+"""HDF5 says in a kilobyte that there are gigabytes of zeros."""
+
+MEMBERS = 256
+"""Members of a zip file that are looked at; more are refused."""
+
+REFUSED = 3
 OWN_ERRORS = 4096
 KEPT = ("code", "field", "expected", "got", "hint")
 
@@ -89,15 +101,33 @@ def announced(path: Path, *, field: str) -> int:
     """
     size = path.stat().st_size
     with path.open("rb") as file:
-        head = file.read(8)
+        head = file.read(1024)
+        if head.startswith(NPY_MAGIC):
+            file.seek(0)
+            return _numbers(file, size, field)
+    if SIGNATURE in head:
+        return WITHOUT_BOUND
     if head.startswith(b"PK"):
         check_directory(path, field=field)
         with suppress(zipfile.BadZipFile, OSError, ValueError, NotImplementedError), zipfile.ZipFile(path) as archive:
-            return sum(info.file_size for info in archive.infolist())
+            return sum(_member(archive, info, field) for info in archive.infolist()[:MEMBERS])
         return size
-    if head.startswith(NPY_MAGIC):
+    return size * next((growth for start, growth in GROWTH.items() if head.startswith(start)), TEXT)
+
+
+def _member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, field: str) -> int:
+    with suppress(zipfile.BadZipFile, RuntimeError, OSError, zlib.error, EOFError), archive.open(info) as member:
+        return _numbers(member, info.file_size, field)
+    return info.file_size
+
+
+def _numbers(file: IO[bytes], size: int, field: str) -> int:
+    """Bytes of an array as numbers of 8 bytes; of what is no orderly array, as many as there are."""
+    try:
+        header, _ = read_header(file, field=field, limits=Limits())
+    except InvalidInput:
         return size
-    return size * (INFLATED if head.startswith((b"MATLAB", b"\x89HDF", b"\x89PNG")) else TEXT)
+    return max(size, math.prod(header.shape) * NUMBER)
 
 
 def _in_process(parts: dict[str, Any], options: Options, limits: Limits, target: Path | None) -> Interpretation:

@@ -95,18 +95,24 @@ def _accessor(document: dict[str, Any], binary: bytes, index: int, field: str, l
     dtype, width, count = (
         np.dtype(TYPES[described["componentType"]]),
         WIDTHS[described["type"]],
-        int(described["count"]),
+        _whole(described["count"]),
     )
     size = dtype.itemsize * width
-    stride = int(view.get("byteStride", size))
-    start = int(view.get("byteOffset", 0)) + int(described.get("byteOffset", 0))
+    stride = _whole(view.get("byteStride", size))
+    start = _whole(view.get("byteOffset", 0)) + _whole(described.get("byteOffset", 0))
     if not (0 < count <= 3 * limits.max_faces and size <= stride <= 252 + size and start >= 0):
         raise too_large(field, expected="counts within the limits", got=f"{count} rows of {stride} bytes")
-    raw = np.frombuffer(_buffer(document, binary, int(view["buffer"])), np.uint8)
+    raw = np.frombuffer(_buffer(document, binary, _whole(view["buffer"])), np.uint8)
     if start + (count - 1) * stride + size > len(raw):
         raise ValueError("an accessor beyond its buffer")
     rows = np.lib.stride_tricks.as_strided(raw[start:], (count, size), (stride, 1), writeable=False)
     return np.ascontiguousarray(rows).view(dtype)
+
+
+def _whole(value: object) -> int:
+    if type(value) is not int:
+        raise ValueError(f"{str(value)[:20]!r} is not a whole number")
+    return value
 
 
 def _buffer(document: dict[str, Any], binary: bytes, index: int) -> bytes:

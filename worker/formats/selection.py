@@ -61,12 +61,22 @@ def hide_seldom_seen(
         Their indices.
     notes : list of str
         How many, which, and what the result holds for them.
+
+    Raises
+    ------
+    InvalidInput
+        Code nothing_visible, when that leaves no point.
     """
     confidence = np.ones(points.shape[:2]) if visible is None else np.array(visible, dtype=np.float64)
     confidence[~np.isfinite(points).all(axis=2)] = 0.0
     dropped = np.flatnonzero((confidence > 0).sum(axis=0) < options.min_seen)
     if len(dropped) == 0:
         return confidence, dropped, []
+    if len(dropped) == points.shape[1] and confidence.any():
+        raise refusal(
+            "nothing_visible", "options.min_seen", expected=f"points that are seen in {options.min_seen} frames or more",
+            got=f"none of {len(dropped)}", hint="Set min_seen lower.",
+        )  # fmt: skip
     confidence[:, dropped] = 0.0
     shown = ", ".join(str(index) for index in dropped[:SHOWN]) + (" …" if len(dropped) > SHOWN else "")
     notes = [

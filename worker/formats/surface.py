@@ -103,6 +103,8 @@ def _mesh_of(arrays: Arrays, num_points: int) -> Mesh:
     if "faces" in arrays or "array" in arrays:
         return Mesh.from_faces(arrays.get("faces", arrays.get("array")), num_points)  # type: ignore[arg-type]
     if "mask" in arrays or "grid" in arrays:
+        if "grid" not in arrays and np.count_nonzero(arrays["mask"]) != num_points:
+            raise mismatch("mesh", num_points, int(np.count_nonzero(arrays["mask"])))
         grid = arrays["grid"] if "grid" in arrays else number_cells(arrays["mask"])
         surface = Mesh.from_grid(grid)
         if surface.num_points != num_points:
