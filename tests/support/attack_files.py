@@ -7,6 +7,7 @@ that count as a defence; which of several comes depends on the library that meet
 # ruff: noqa: E501
 from __future__ import annotations
 
+import base64
 import io
 import json
 import pickle
@@ -264,6 +265,9 @@ def accessors(**first: object) -> list[dict[str, object]]:
 
 
 BINARY = np.zeros((20, 3), "<f4").tobytes() + np.array([0, 1, 2, 3, 4, 5], "<u4").tobytes()
+
+
+GFACES = base64.b64encode(BINARY).decode()
 
 
 def png(width: int, height: int, *chunks: tuple[bytes, bytes], data: bytes = b"") -> bytes:

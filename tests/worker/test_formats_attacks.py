@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import struct
 import warnings
@@ -114,3 +115,22 @@ def test_no_bytes_make_the_reader_fail_otherwise(junk: bytes, at: int) -> None:
         read_npy(io.BytesIO(content), len(content), field="tracks", limits=SMALL)
     except InvalidInput as error:
         assert error.code in ("damaged_file", "wrong_type", "too_large", "object_array")  # noqa: PT017
+
+
+def test_a_directory_that_points_before_the_file_is_refused(tmp_path: Path) -> None:
+    path = archive(tmp_path / "x.npz", [("tracks.npy", GOOD)])
+    path.write_bytes(path.read_bytes()[1:])
+    with pytest.raises(InvalidInput) as caught:
+        read_npz(path, field="tracks", limits=SMALL)
+    assert caught.value.code == "damaged_file"
+
+
+def test_a_disk_that_fails_is_not_the_files_fault(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = archive(tmp_path / "x.npz", [("tracks.npy", GOOD)])
+
+    def fails(*_: object, **__: object) -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(zipfile.ZipFile, "open", fails)
+    with pytest.raises(OSError, match="Input/output error"):
+        read_npz(path, field="tracks", limits=SMALL)

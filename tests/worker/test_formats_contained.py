@@ -54,6 +54,8 @@ def test_csv_lines_may_come_in_any_order_and_missing_ones_are_hidden(tmp_path: P
     assert code_of(tmp_path / "t.csv") == "duplicate_observation"
     (tmp_path / "t.csv").write_text("frame,point,x,y\n0,0,1,2\n99999999,0,1,3\n")
     assert code_of(tmp_path / "t.csv") == "too_large"
+    (tmp_path / "t.csv").write_text("1\n" + "1,2,3,4\n")
+    assert code_of(tmp_path / "t.csv") == "unknown_format"
     (tmp_path / "t.csv").write_text("frame,point,x,y\n0,zero,1,2\n")
     assert code_of(tmp_path / "t.csv") == "damaged_file"
 

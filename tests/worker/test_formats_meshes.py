@@ -201,3 +201,14 @@ def test_points_on_a_line_get_no_mesh(tmp_path: Path) -> None:
     mesh, notes = triangulate(Tracks.from_arrays(line), y_axis="down")
     assert mesh is None
     assert "too few points" in notes[0]
+
+
+def test_vertices_that_are_no_list_are_refused(tmp_path: Path, tracks: Path) -> None:
+    np.savez(tmp_path / "m.npz", vertices=np.float64(3), faces=FACES)
+    assert code_of(tracks, tmp_path / "m.npz") == "vertex_count_mismatch"
+
+
+def test_indices_beyond_64_bits_are_refused(tmp_path: Path, tracks: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(contain, "parse_in_child", parse_here)
+    (tmp_path / "m.obj").write_text(obj(FACES) + f"f 1 2 3 {10**30}\n")
+    assert code_of(tracks, tmp_path / "m.obj") == "damaged_file"

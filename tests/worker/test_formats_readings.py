@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import scipy.io
 from pliant.client.options import Options
-from pliant.solver import InvalidInput
+from pliant.solver import InvalidInput, Tracks
 from pliant.worker.formats import AmbiguousInput, Inputs, Limits, read_inputs
 from pliant.worker.formats.hdf5 import read_matlab73
 from pliant.worker.formats.interpret import understand
@@ -217,3 +217,27 @@ def test_whole_pictures_give_their_grid(tmp_path: Path) -> None:
     assert got.interpretation.mesh_source == "grid"
     assert got.interpretation.mesh_grid == (ROWS, COLUMNS)
     np.testing.assert_array_equal(got.tracks.visible > 0, SEEN)
+
+
+def test_numbers_beyond_measure_are_refused_where_they_count(tmp_path: Path) -> None:
+    far = POINTS.copy()
+    far[2, 3] = 1e13
+    with pytest.raises(InvalidInput, match="1 points beyond") as caught:
+        read(tmp_path, {"tracks": far})
+    assert (caught.value.code, caught.value.field) == ("out_of_range", "tracks")
+    seen = np.ones((F, P), dtype=bool)
+    seen[2, 3] = False
+    assert read(tmp_path, {"tracks": far, "visibility": seen}).tracks.visible[2, 3] == 0
+    got = read(tmp_path, {"tracks": POINTS, "shapes": SHAPES * 1e13})
+    assert any("within ±1e+12" in note for note in got.interpretation.notes)
+
+
+def test_empty_arrays_are_refused() -> None:
+    for shape in ((0, 4), (4, 0), (0, 5, 9, 2), (4, 0, 0, 2), (0, 0, 0)):
+        with pytest.raises(InvalidInput):
+            read_whole(np.zeros(shape))
+
+
+def read_whole(array: np.ndarray) -> None:
+    got = understand({"W" if array.ndim == 2 else "tracks": array}, Options())
+    Tracks.from_arrays(got.points)

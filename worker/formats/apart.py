@@ -15,7 +15,6 @@ import signal
 import subprocess
 import sys
 import zipfile
-import zlib
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -24,11 +23,11 @@ from typing import IO, Any
 from pliant.client.options import Options
 from pliant.client.schemas import Interpretation
 from pliant.solver import InvalidInput
-from pliant.worker.formats.arrays import NPY_MAGIC, check_directory, read_header
+from pliant.worker.formats.arrays import NPY_MAGIC, UNREADABLE_ZIP, check_directory, read_header
 from pliant.worker.formats.canonical import save_inputs
 from pliant.worker.formats.child import die_with
 from pliant.worker.formats.errors import AmbiguousInput, too_large
-from pliant.worker.formats.hdf5 import SIGNATURE
+from pliant.worker.formats.parsers import HDF5
 from pliant.worker.formats.read import read_inputs
 from pliant.worker.formats.records import Limits
 
@@ -105,18 +104,18 @@ def announced(path: Path, *, field: str) -> int:
         if head.startswith(NPY_MAGIC):
             file.seek(0)
             return _numbers(file, size, field)
-    if SIGNATURE in head:
+    if HDF5 in head:
         return WITHOUT_BOUND
     if head.startswith(b"PK"):
         check_directory(path, field=field)
-        with suppress(zipfile.BadZipFile, OSError, ValueError, NotImplementedError), zipfile.ZipFile(path) as archive:
+        with suppress(*UNREADABLE_ZIP), zipfile.ZipFile(path) as archive:
             return sum(_member(archive, info, field) for info in archive.infolist()[:MEMBERS])
         return size
     return size * next((growth for start, growth in GROWTH.items() if head.startswith(start)), TEXT)
 
 
 def _member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, field: str) -> int:
-    with suppress(zipfile.BadZipFile, RuntimeError, OSError, zlib.error, EOFError), archive.open(info) as member:
+    with suppress(RuntimeError, *UNREADABLE_ZIP), archive.open(info) as member:  # RuntimeError: encrypted
         return _numbers(member, info.file_size, field)
     return info.file_size
 

@@ -8,6 +8,7 @@ bytes as the header announces are read into memory that the system hands out onl
 from __future__ import annotations
 
 import ast
+import errno
 import math
 import os
 import re
@@ -31,6 +32,11 @@ MAX_DIMENSIONS = 8
 MAX_DIRECTORY = 1 << 20
 CHUNK = 1 << 20
 MEMBER = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_. -]{0,120}\.npy")
+UNREADABLE_ZIP = (
+    zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, OSError, OverflowError, struct.error, UnicodeDecodeError,
+)  # fmt: skip
+"""What Python's reader raises at files that are none of its making."""
+
 END_OF_DIRECTORY = b"PK\x05\x06"
 ZIP64_LOCATOR = b"PK\x06\x07"
 
@@ -116,7 +122,11 @@ def read_npz(
                     continue
                 with archive.open(member) as stream:
                     arrays[name] = read_npy(stream, member.file_size, field=f"{field}.{name}", limits=limits)
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, struct.error, UnicodeDecodeError) as error:
+    except UNREADABLE_ZIP as error:
+        if (
+            isinstance(error, OSError) and error.errno != errno.EINVAL
+        ):  # a directory may point before the file; a disk may fail
+            raise
         raise damaged(field, f"a zip file that cannot be read ({error})") from error
     return arrays, passed_over
 

@@ -87,6 +87,8 @@ def _columns(stream: IO[bytes], *, field: str, limits: Limits) -> tuple[list[str
                 columns = cells if named else [*COLUMNS, "visible", *map(str, range(len(cells)))][: len(cells)]
                 if named:
                     continue
+                if len(cells) < len(COLUMNS):
+                    raise damaged(field, f"{len(cells)} columns where frame, point, x and y are expected")
             if len(cells) != len(columns):
                 raise damaged(field, f"a line of {len(cells)} cells where {len(columns)} are expected")
             rows.append([_number(cell) for cell in cells])

@@ -54,9 +54,9 @@ def flatten_like(array: NDArray[np.generic], grid: tuple[int, int] | None) -> ND
     """Lay pixels in a row in an array that goes with tracks, and remove axes of length 1 around what is left."""
     if grid is not None and array.ndim >= 3:
         if array.shape[-2:] == grid:
-            array = array.reshape(*array.shape[:-2], -1)
+            array = array.reshape(*array.shape[:-2], grid[0] * grid[1])
         elif array.ndim >= 4 and array.shape[-3:-1] == grid:
-            array = array.reshape(*array.shape[:-3], -1, array.shape[-1])
+            array = array.reshape(*array.shape[:-3], grid[0] * grid[1], array.shape[-1])
     while array.ndim > 2 and 1 in (array.shape[0], array.shape[-1]):
         array = array[0] if array.shape[0] == 1 else array[..., 0]
     return array
@@ -80,6 +80,8 @@ def _pictures(array: NDArray[np.generic]) -> Flat:
 
 
 def _is_picture(array: NDArray[np.generic]) -> bool:
+    if array.shape[0] == 0:
+        return False
     first = array[0]
     if array.shape[-1] not in (2, 3):
         if array.shape[1] != 2:

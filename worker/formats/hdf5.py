@@ -14,6 +14,9 @@ import numpy as np
 from pliant.worker.formats.errors import damaged, refusal, too_large
 from pliant.worker.formats.records import Arrays, Limits
 
+UNREADABLE = (OSError, ValueError, KeyError, RuntimeError, TypeError, AttributeError, OverflowError, IndexError)
+"""What h5py raises at damaged files."""
+
 MAX_OBJECTS = 512
 MAX_DEPTH = 4
 MAX_CELLS = 20_000
@@ -31,7 +34,7 @@ def read_matlab73(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
     try:
         with h5py.File(stream, "r") as file:
             _collect(file, "", found, field=field, limits=limits, depth=0)
-    except (OSError, ValueError, KeyError, RuntimeError, TypeError, AttributeError) as error:
+    except UNREADABLE as error:
         raise damaged(field, f"an HDF5 file that cannot be read ({str(error)[:120]})") from error
     if not found:
         raise refusal(

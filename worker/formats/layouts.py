@@ -16,6 +16,7 @@ from pliant.client.options import Options
 from pliant.solver.records import MIN_FRAMES, MIN_POINTS
 from pliant.worker.formats.dialects import Dialect
 from pliant.worker.formats.errors import AmbiguousInput, refusal
+from pliant.worker.formats.records import FARTHEST
 
 CONTRADICTED = 5.0
 """The documented order is doubted when another reading is this many times smoother in time."""
@@ -75,8 +76,8 @@ def readings(name: str, array: NDArray[np.generic]) -> list[Reading]:
         ):
             if matrix.shape[0] % 2:
                 continue
-            pairs = matrix.reshape(-1, 2, matrix.shape[1]).transpose(0, 2, 1)
-            halves = matrix.reshape(2, -1, matrix.shape[1]).transpose(1, 2, 0)
+            pairs = matrix.reshape(matrix.shape[0] // 2, 2, matrix.shape[1]).transpose(0, 2, 1)
+            halves = matrix.reshape(2, matrix.shape[0] // 2, matrix.shape[1]).transpose(1, 2, 0)
             word = "rows" if order == "frames_points" else "columns"
             found.append(Reading(f"{name} {spelled_matrix}, {word} interleaved", order, "interleaved", pairs))
             found.append(Reading(f"{name} {spelled_matrix}, {word} stacked", order, "stacked", halves))
@@ -89,7 +90,7 @@ def roughness(points: NDArray[np.generic]) -> float:
     count = points.shape[1]
     chosen = np.unique(np.linspace(0, count - 1, SAMPLE).round().astype(int))
     sample = np.asarray(points[: 4 * SAMPLE][:, chosen], dtype=np.float64)
-    sample = np.where(np.isfinite(sample), sample, np.nan)
+    sample = np.where(np.isfinite(sample) & (np.abs(sample) <= FARTHEST), sample, np.nan)
     if np.isfinite(sample).all(axis=2).mean() < 0.01:
         return float("inf")
     with np.errstate(invalid="ignore", divide="ignore"):

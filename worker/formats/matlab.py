@@ -16,6 +16,12 @@ from numpy.typing import NDArray
 from pliant.worker.formats.errors import damaged, refusal, too_large
 from pliant.worker.formats.records import Arrays, Limits
 
+UNREADABLE = (
+    ValueError, TypeError, KeyError, IndexError, OSError, NotImplementedError, zlib.error, struct.error, NameError, ArithmeticError,
+    EOFError, AttributeError, RecursionError,
+)  # fmt: skip
+"""What SciPy raises at damaged files; NameError where it does not expect a class."""
+
 MAX_DEPTH = 4
 MAX_ARRAYS = 256
 
@@ -42,16 +48,7 @@ def read_matlab5(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
                 squeeze_me=False,
                 chars_as_strings=True,
             )
-    except (
-        ValueError,
-        TypeError,
-        KeyError,
-        IndexError,
-        OSError,
-        NotImplementedError,
-        zlib.error,
-        struct.error,
-    ) as error:
+    except UNREADABLE as error:
         raise damaged(field, f"a .mat file that cannot be read ({str(error)[:120]})") from error
     found: Arrays = {}
     for name, value in content.items():

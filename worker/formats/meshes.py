@@ -98,10 +98,12 @@ def join_polygons(polygons: list[list[int]], *, field: str) -> NDArray[np.int64]
             "wrong_shape", f"{field}.faces", expected="faces of three vertices or more", got=f"a face of {min(sizes)}",
             hint="Remove points and lines from the faces.",
         )  # fmt: skip
-    if sizes in ({3}, {4}):
-        return np.array(polygons, dtype=np.int64)
-    fans = [[face[0], face[i], face[i + 1]] for face in polygons for i in range(1, len(face) - 1)]
-    return np.array(fans, dtype=np.int64).reshape(-1, 3)
+    if sizes not in ({3}, {4}):
+        polygons = [[face[0], face[i], face[i + 1]] for face in polygons for i in range(1, len(face) - 1)]
+    try:
+        return np.array(polygons, dtype=np.int64).reshape(-1, 4 if sizes == {4} else 3)
+    except OverflowError as error:
+        raise damaged(f"{field}.faces", "an index beyond 64 bits") from error
 
 
 def given_vertices(arrays: Arrays, *, num_points: int, field: str) -> None:
@@ -112,8 +114,10 @@ def given_vertices(arrays: Arrays, *, num_points: int, field: str) -> None:
     InvalidInput
         Code vertex_count_mismatch.
     """
-    if "vertices" in arrays and len(arrays["vertices"]) != num_points:
-        raise mismatch(field, num_points, len(arrays["vertices"]))
+    if "vertices" in arrays:
+        count = arrays["vertices"].shape[0] if arrays["vertices"].ndim else 0
+        if count != num_points:
+            raise mismatch(field, num_points, count)
 
 
 def mismatch(field: str, num_points: int, num_vertices: int) -> InvalidInput:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.client.options import Options
 from pliant.worker.formats.errors import AmbiguousInput, refusal
+from pliant.worker.formats.records import FARTHEST
 
 SAMPLE = 100_000
 SLACK = 0.02
@@ -62,7 +63,8 @@ def place(points: NDArray[np.generic], options: Options, *, picture: tuple[int, 
         )  # fmt: skip
     last = np.array([size[0] - 1, size[1] - 1], dtype=np.float64)
     wide = np.asarray(points, dtype=np.float64)
-    placed = wide * last if kind == "unit" else (wide + 1.0) * (last / 2.0)
+    with np.errstate(over="ignore", invalid="ignore"):
+        placed = wide * last if kind == "unit" else (wide + 1.0) * (last / 2.0)
     return Placed(placed, kind, [*notes, *why, f"Brought to pixels of a picture of {size[0]} × {size[1]}."])
 
 
@@ -104,7 +106,8 @@ def project(
     fx, fy, cx, cy = (float(value) for value in matrix.reshape(-1))
     wide = np.asarray(points, dtype=np.float64)
     depth = np.where(wide[..., 2] > 0, wide[..., 2], np.nan)
-    seen = np.stack([fx * wide[..., 0] / depth + cx, fy * wide[..., 1] / depth + cy], axis=-1)
+    with np.errstate(over="ignore", invalid="ignore"):
+        seen = np.stack([fx * wide[..., 0] / depth + cx, fy * wide[..., 1] / depth + cy], axis=-1)
     note = f"Points in space, projected with fx = {fx:g}, fy = {fy:g}, cx = {cx:g}, cy = {cy:g}; the points themselves serve as truth."
     return seen, "projected", [note]
 
@@ -118,7 +121,7 @@ def _size(text: str | None) -> tuple[int, int] | None:
 
 def _sampled(points: NDArray[np.generic]) -> NDArray[np.float64]:
     flat = points.reshape(-1, 2)[:: max(1, points.shape[0] * points.shape[1] // SAMPLE)].astype(np.float64)
-    return flat[np.isfinite(flat).all(axis=1)]
+    return flat[(np.abs(flat) <= FARTHEST).all(axis=1)]
 
 
 def _ordered(

@@ -12,9 +12,9 @@ from pliant.client.schemas import Interpretation
 from pliant.solver import InvalidInput, Mesh, Tracks
 from pliant.worker.formats.contain import read_arrays
 from pliant.worker.formats.dialects import KNOWN
-from pliant.worker.formats.errors import too_large
+from pliant.worker.formats.errors import refusal, too_large
 from pliant.worker.formats.interpret import Understood, understand
-from pliant.worker.formats.records import GroundTruth, Inputs, Limits, Selection
+from pliant.worker.formats.records import FARTHEST, GroundTruth, Inputs, Limits, Selection
 from pliant.worker.formats.selection import chosen_frames, hide_seldom_seen
 from pliant.worker.formats.surface import read_surface, whole_grid
 from pliant.worker.formats.thinning import thin
@@ -102,6 +102,7 @@ def _choose(understood: Understood, mesh: Path | str | None, options: Options, l
         points, visible = points[frames], None if visible is None else visible[frames]
     if len(picked) < whole[1]:
         points, visible = points[:, picked], None if visible is None else visible[:, picked]
+    _check_range(points, visible)
     kept, made, how = thin(points, visible, surface.mesh, options)
     if len(kept) < len(picked):
         points, visible = points[:, kept], None if visible is None else visible[:, kept]
@@ -126,6 +127,19 @@ def _check_size(points: NDArray[np.generic], limits: Limits) -> None:
             expected=f"at most {limits.max_frames} frames, {limits.max_points} points and {limits.max_observations} observations",
             got=f"{frames} frames × {count} points",
         )
+
+
+def _check_range(points: NDArray[np.generic], visible: NDArray[np.float64] | None) -> None:
+    if points.dtype.itemsize <= 2:
+        return  # such numbers end at 65,504
+    far = ((points > FARTHEST) | (points < -FARTHEST)).any(axis=2) & np.isfinite(points).all(axis=2)  # type: ignore[operator]
+    if visible is not None:
+        far &= visible > 0
+    if far.any():
+        raise refusal(
+            "out_of_range", "tracks", expected=f"visible coordinates within ±{FARTHEST:g}", got=f"{int(far.sum())} points beyond",
+            hint="Mark them as hidden, or set them to NaN.",
+        )  # fmt: skip
 
 
 def _read_truth(

@@ -17,6 +17,10 @@ Arrays = dict[str, NDArray[np.generic]]
 """Named arrays as a file holds them, not yet interpreted; members of nested structures have dotted names."""
 
 
+FARTHEST = 1e12
+"""Coordinates beyond this are no measurement, and squares of them leave the range of numbers."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Limits:
     """How much one job may bring. Beyond them a reader refuses before it allocates."""
@@ -97,6 +101,11 @@ class GroundTruth:
             raise refusal(
                 "not_finite", "ground_truth.shapes", expected="finite coordinates", got=f"{int((~np.isfinite(points)).sum())} that are not",
                 hint="Give truth for every point and frame, or leave it out.",
+            )  # fmt: skip
+        if np.abs(points).max() > FARTHEST:
+            raise refusal(
+                "out_of_range", "ground_truth.shapes", expected=f"coordinates within ±{FARTHEST:g}", got=f"{np.abs(points).max():.3g}",
+                hint="Check the file, or choose a larger unit.",
             )  # fmt: skip
         if not (np.ptp(points, axis=1) > 0).any(axis=1).all():
             raise refusal(

@@ -19,7 +19,7 @@ from pliant.worker.formats.contain import read_arrays
 from pliant.worker.formats.dialects import TRUE_ROTATIONS, TRUE_SHAPES, short_names
 from pliant.worker.formats.errors import refusal
 from pliant.worker.formats.interpret import Understood
-from pliant.worker.formats.records import Arrays, Limits
+from pliant.worker.formats.records import FARTHEST, Arrays, Limits
 
 TRUTH_NAMES = frozenset([*TRUE_SHAPES, *TRUE_ROTATIONS])
 CAMERA_NAMES = frozenset([*TRUE_ROTATIONS, "scales"])
@@ -143,7 +143,7 @@ def unexplained(shapes: NDArray[np.generic], points: NDArray[np.generic]) -> flo
     shares = []
     for frame in chosen:
         true, seen = np.asarray(shapes[frame], np.float64), np.asarray(points[frame], np.float64)
-        usable = np.isfinite(true).all(axis=1) & np.isfinite(seen).all(axis=1)
+        usable = (np.abs(true) <= FARTHEST).all(axis=1) & (np.abs(seen) <= FARTHEST).all(axis=1)
         if usable.sum() < 6:
             continue
         true, seen = true[usable] - true[usable].mean(axis=0), seen[usable] - seen[usable].mean(axis=0)
@@ -166,7 +166,8 @@ def _matrix_readings(
 
 def _askew(rotations: NDArray[np.generic]) -> float:
     rows = np.asarray(rotations[:, :2], dtype=np.float64)
-    deviation = np.abs(rows @ rows.transpose(0, 2, 1) - np.eye(2)).max(axis=(1, 2))
+    with np.errstate(over="ignore", invalid="ignore"):
+        deviation = np.abs(rows @ rows.transpose(0, 2, 1) - np.eye(2)).max(axis=(1, 2))
     return float(np.median(deviation)) if np.isfinite(deviation).all() else float("inf")
 
 

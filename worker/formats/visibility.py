@@ -131,9 +131,9 @@ def _arranged(flat: NDArray[np.float64], reading: Reading, name: str) -> NDArray
         return flat
     if flat.shape == (2 * like[0], like[1]) and reading.rows is not None:  # one row for x and one for y, as in W
         pairs = (
-            flat.reshape(-1, 2, like[1])
+            flat.reshape(like[0], 2, like[1])
             if reading.rows == "interleaved"
-            else flat.reshape(2, -1, like[1]).swapaxes(0, 1)
+            else flat.reshape(2, like[0], like[1]).swapaxes(0, 1)
         )
         return np.ascontiguousarray(pairs.min(axis=1))
     raise refusal(
