@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import json
 import os
 from pathlib import Path
 
@@ -9,6 +11,7 @@ import h5py
 import numpy as np
 import pytest
 import scipy.io
+from attack_files import GFACES, accessors, gltf
 from PIL import Image
 from pliant.client.options import Options
 from pliant.solver import InvalidInput
@@ -16,6 +19,8 @@ from pliant.worker.artifacts.animation import animate
 from pliant.worker.artifacts.glb import write_glb
 from pliant.worker.formats import Inputs, Limits, read_inputs
 from pliant.worker.formats.child import parse_in_child
+from pliant.worker.formats.csv_tracks import read_csv
+from pliant.worker.formats.gltf_mesh import read_gltf
 from results import moving_sheet
 
 F, ROWS, COLUMNS = 6, 4, 5
@@ -54,8 +59,8 @@ def test_csv_lines_may_come_in_any_order_and_missing_ones_are_hidden(tmp_path: P
     assert code_of(tmp_path / "t.csv") == "duplicate_observation"
     (tmp_path / "t.csv").write_text("frame,point,x,y\n0,0,1,2\n99999999,0,1,3\n")
     assert code_of(tmp_path / "t.csv") == "too_large"
-    (tmp_path / "t.csv").write_text("1\n" + "1,2,3,4\n")
-    assert code_of(tmp_path / "t.csv") == "unknown_format"
+    with pytest.raises(InvalidInput, match="2 columns where frame, point, x and y"):
+        read_csv(io.BytesIO(b"1,2\n3,4\n"), field="tracks", limits=Limits())
     (tmp_path / "t.csv").write_text("frame,point,x,y\n0,zero,1,2\n")
     assert code_of(tmp_path / "t.csv") == "damaged_file"
 
@@ -113,3 +118,18 @@ def test_damaged_matlab_files_are_refused(tmp_path: Path) -> None:
 def test_pickles_are_never_opened(tmp_path: Path) -> None:
     (tmp_path / "t.pkl").write_bytes(b"\x80\x04cos\nsystem\n.")
     assert code_of(tmp_path / "t.pkl") == "pickle_refused"
+
+
+def test_gltf_of_text_gives_its_faces_and_whole_numbers_only(tmp_path: Path) -> None:
+    np.savez(tmp_path / "t.npz", tracks=POINTS)
+    document = gltf(buffers=[{"uri": "data:application/octet-stream;base64," + GFACES}])
+    (tmp_path / "m.gltf").write_text(json.dumps(document))
+    got = read_inputs(tracks=tmp_path / "t.npz", mesh=tmp_path / "m.gltf", options=Options())
+    assert got.mesh is not None
+    np.testing.assert_array_equal(got.mesh.faces, [[0, 1, 2], [3, 4, 5]])
+    with pytest.raises(InvalidInput, match="not a whole number"):
+        read_gltf(
+            io.BytesIO(json.dumps({**document, "accessors": accessors(count="20")}).encode()),
+            field="mesh",
+            limits=Limits(),
+        )
