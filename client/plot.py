@@ -10,18 +10,26 @@ from pliant.client.errors import PliantError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+    from mpl_toolkits.mplot3d import Axes3D
 
 MOST_POINTS = 5000
-"""Points drawn in one picture at most; more only make it slower."""
+MOST_TRIANGLES = 30_000
+"""Drawn in one picture at most: further points are left out, larger meshes are drawn as points."""
+
+CLAY = np.array([0.85, 0.79, 0.71])
+LIGHT = np.array([-0.5, -0.6, 0.62])
+"""Towards the light, in the picture's axes: right, away from the viewer, up. Both sides of a surface are lit."""
 
 
-def draw(shapes: NDArray[np.float64], frames: int, *, title: str) -> Figure:
-    """Draw evenly spread frames side by side, all to one scale, depth as colour.
+def draw(shapes: NDArray[np.float64], faces: NDArray[np.int32], frames: int, *, title: str) -> Figure:
+    """Draw evenly spread frames side by side, all to one scale: the lit surface, or points with depth as colour.
 
     Parameters
     ----------
     shapes : ndarray, shape (F, P, 3)
         World axes, y down as in images; drawn with y up.
+    faces : ndarray, shape (T, 3) or (T, 4)
+        Points alone are drawn where there are none, or too many.
     frames : int
         How many pictures; at most F.
 
@@ -35,15 +43,43 @@ def draw(shapes: NDArray[np.float64], frames: int, *, title: str) -> Figure:
     except ImportError as fault:
         raise PliantError("Plots need matplotlib: pip install matplotlib") from fault
     shown = np.unique(np.linspace(0, len(shapes) - 1, max(1, frames)).round().astype(int))
-    points = shapes[:, :: max(1, shapes.shape[1] // MOST_POINTS)]
-    reach = np.abs(points).max()
+    triangles = split(faces)
+    reach = 0.8 * np.abs(shapes).max()
     figure = Figure(figsize=(3.2 * len(shown), 3.4), layout="constrained")
     figure.suptitle(title)
     for place, frame in enumerate(shown, start=1):
-        axes = figure.add_subplot(1, len(shown), place, projection="3d")
-        x, y, z = points[frame].T
-        axes.scatter(x, z, -y, c=z, s=2, cmap="viridis", vmin=-reach, vmax=reach)
+        axes: Axes3D = figure.add_subplot(1, len(shown), place, projection="3d", proj_type="ortho")
+        x, y, z = shapes[frame].T
+        upright = np.stack([x, z, -y], axis=1)  # matplotlib's third axis points up
+        if 0 < len(triangles) <= MOST_TRIANGLES:
+            _surface(axes, upright, triangles)
+        else:
+            _points(axes, upright, reach)
         axes.set(xlim=(-reach, reach), ylim=(-reach, reach), zlim=(-reach, reach), title=f"frame {frame}")
-        axes.set_box_aspect((1, 1, 1))
-        axes.view_init(elev=10, azim=-75)
+        axes.set_box_aspect((1, 1, 1), zoom=1.45)
+        axes.view_init(elev=8, azim=-72)
+        axes.set_axis_off()
     return figure
+
+
+def split(faces: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Return triangles (T, 3): those given, or each quad cut in two."""
+    if faces.shape[1] == 3:
+        return faces
+    return np.concatenate([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]])
+
+
+def _surface(axes: Axes3D, points: NDArray[np.float64], triangles: NDArray[np.int32]) -> None:
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+    corners = points[triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    lengths = np.maximum(np.linalg.norm(normals, axis=1), np.finfo(float).tiny)
+    lit = np.abs(normals @ LIGHT) / (lengths * np.linalg.norm(LIGHT))
+    colours = np.clip(CLAY * (0.35 + 0.7 * lit[:, None]), 0, 1)
+    axes.add_collection3d(Poly3DCollection(corners, facecolors=colours, edgecolors=colours, linewidths=0.2))
+
+
+def _points(axes: Axes3D, points: NDArray[np.float64], reach: float) -> None:
+    x, y, z = points[:: max(1, len(points) // MOST_POINTS)].T
+    axes.scatter(x, y, z, c=y, s=2, cmap="viridis", vmin=-reach, vmax=reach)

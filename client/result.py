@@ -78,7 +78,7 @@ class Reconstruction:
         return self.job.metrics if self.job.metrics is not None else {}
 
     def plot(self, frames: int = 4) -> Figure:
-        """Draw some frames of the shape in 3-D; needs matplotlib.
+        """Draw some frames of the shape in 3-D, as a lit surface where there is a mesh; needs matplotlib.
 
         Parameters
         ----------
@@ -92,7 +92,7 @@ class Reconstruction:
         """
         from pliant.client.plot import draw
 
-        return draw(self.shapes, frames, title=self.job.name if self.job.name != "" else self.job.id)
+        return draw(self.shapes, self.faces, frames, title=self.job.name if self.job.name != "" else self.job.id)
 
     def _local(self, name: str) -> Path:
         path = self.folder / name

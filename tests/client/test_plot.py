@@ -1,0 +1,45 @@
+"""Pictures: a lit surface where there is a mesh, points where there is none or too large a one."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import pytest
+from pliant.client import plot
+from pliant.solver.gallery import flag
+
+art3d = pytest.importorskip("mpl_toolkits.mplot3d.art3d")
+SEQUENCE = flag(6, 60)
+SHAPES = SEQUENCE.shapes - SEQUENCE.shapes.mean(axis=1, keepdims=True)
+
+
+def test_a_quad_is_two_triangles_and_a_triangle_itself() -> None:
+    np.testing.assert_array_equal(plot.split(np.array([[0, 1, 2, 3]], np.int32)), [[0, 1, 2], [0, 2, 3]])
+    np.testing.assert_array_equal(plot.split(np.array([[4, 5, 6]], np.int32)), [[4, 5, 6]])
+    assert plot.split(np.zeros((0, 3), np.int32)).shape == (0, 3)
+
+
+def test_a_mesh_is_drawn_as_a_surface_upright_and_lit() -> None:
+    faces = SEQUENCE.mesh.faces
+    figure = plot.draw(SHAPES, faces, 3, title="flag")
+    assert [axes.get_title() for axes in figure.axes] == ["frame 0", "frame 2", "frame 5"]
+    (surface,) = [each for each in figure.axes[1].collections if isinstance(each, art3d.Poly3DCollection)]
+    assert len(surface.get_facecolor()) == 2 * len(faces)
+    brightness = surface.get_facecolor()[:, :3].mean(axis=1)
+    assert 0.2 < brightness.min() < brightness.max() - 0.02 <= 1.0
+    written = io.BytesIO()
+    figure.savefig(written, dpi=40)
+    assert written.getvalue().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("most", [0, None])
+def test_points_are_drawn_where_there_is_no_surface(monkeypatch: pytest.MonkeyPatch, most: int | None) -> None:
+    faces = SEQUENCE.mesh.faces if most is not None else np.zeros((0, 3), np.int32)
+    if most is not None:
+        monkeypatch.setattr(plot, "MOST_TRIANGLES", most)
+    figure = plot.draw(SHAPES, faces, 2, title="flag")
+    assert [isinstance(each, art3d.Path3DCollection) for axes in figure.axes for each in axes.collections] == [
+        True,
+        True,
+    ]
