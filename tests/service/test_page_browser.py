@@ -274,6 +274,35 @@ def test_every_view_of_a_result_shows_something_else(page: Page, url: str, finis
     assert differing_pixels(page, plain, canvas.screenshot()) == 0
 
 
+def test_the_animation_stops_loops_or_turns_back_at_the_speed_asked_for(page: Page, url: str, finished: str) -> None:
+    page.goto(f"{url}/#job={finished}")
+    page.locator(".view canvas").wait_for(timeout=DONE)
+    slider = page.get_by_role("slider", name="Frame")
+
+    def watched(seconds: float) -> list[float]:
+        end, seen = time.monotonic() + seconds, [0.0]
+        while time.monotonic() < end:
+            seen.append(float(slider.input_value()))
+        return seen
+
+    page.get_by_label("Speed").select_option(label="4 ×")
+    page.get_by_label("At the end").select_option(label="stop")
+    page.get_by_role("button", name="Play").click()
+    expect(page.get_by_role("button", name="Play")).to_be_visible(timeout=20_000)
+    expect(slider).to_have_value("9")
+
+    seek(page, 0)
+    page.get_by_label("Speed").select_option(label="¼ ×")
+    page.get_by_label("At the end").select_option(label="loop")
+    page.get_by_role("button", name="Play").click()
+    steps = np.diff(watched(4))
+    assert steps.min() < -5  # from the last frame to the first
+
+    page.get_by_label("At the end").select_option(label="back and forth")
+    steps = np.diff(watched(4))
+    assert -5 < steps.min() < 0 < steps.max()
+
+
 def test_a_refusal_is_shown_as_the_services_own_sentence(page: Page, url: str) -> None:
     said = httpx.post(f"{url}/v1/jobs", files={"tracks": ("tracks.npz", b"hello, I am not tracks")}).json()
     choose(page, {TRACKS: b"hello, I am not tracks"})
