@@ -2,7 +2,8 @@
 
 The cameras are computed from the Gram matrix W Wᵀ, which one gross outlier spoils and which hidden entries leave undefined.
 Tracks of a moving thing are nearly of low rank, so W ≈ M B + t 1ᵀ is fitted to the entries that were seen, by alternating
-least squares whose weights fall with the residual. The basis M (2F×r) and the translations t come from a sample of points:
+least squares whose weights fall with the residual and whose coefficients B have a Gaussian prior, its covariance fitted too.
+The basis M (2F×r) and the translations t come from a sample of points:
 the cost does not depend on P; one pass then carries every point onto the basis.
 """
 
@@ -37,7 +38,11 @@ CHUNK = 4096
 """Points carried onto the basis at once; bounds the memory at CHUNK·(6F + r²) numbers."""
 
 FINE = 0.01
-"""Normalised units: smallest residual scale of the weights, so that clean tracks are fitted by plain least squares."""
+"""Normalised units: smallest residual scale of the weights, so that clean tracks are fitted by plain least squares, and of the
+prior on coefficients: measured on turning bodies, of which no point is always seen, a finer one extrapolates, a coarser one blurs."""
+
+DAMPING = 1e-2
+"""The same, before the spread of the coefficients is known."""
 
 RIDGE = 1e-6
 """Regularises coefficients of points that were seen too seldom."""
@@ -76,10 +81,10 @@ def complete(normalised: Normalised, *, seed: int = 0) -> Completed:
     random = np.random.default_rng(seed)
     chosen = choose_points(normalised.visible, random)
     points, weight = normalised.points[:, chosen], normalised.visible[:, chosen]
-    basis, scale = fit_basis(points, weight, random)
-    outliers = fill(points, weight, basis, scale)[1]
+    basis, spread, scale = fit_basis(points, weight, random)
+    outliers = fill(points, weight, basis, spread, scale)[1]
     clean = outliers == 0.0 and bool((normalised.visible > 0).all())
-    gram, translations, sample = _carry(normalised, None if clean else basis, scale, chosen)
+    gram, translations, sample = _carry(normalised, None if clean else basis, spread, scale, chosen)
     return Completed(gram, sample, translations, 0 if clean else basis.shape[2], outliers)
 
 
@@ -95,8 +100,8 @@ def choose_points(visible: Floats, random: np.random.Generator) -> NDArray[np.in
     return np.sort(np.concatenate([half, rest]))
 
 
-def fit_basis(points: Floats, weight: Floats, random: np.random.Generator) -> tuple[Floats, float]:
-    """Return the basis (F, 2, r), last column the translation, and the robust standard deviation of the residuals.
+def fit_basis(points: Floats, weight: Floats, random: np.random.Generator) -> tuple[Floats, Floats, float]:
+    """Return the basis (F, 2, r), last column the translation, the spread of its coefficients, and that of the residuals.
 
     The rank is the one that predicts held-out entries best; a larger one must do so by more than 2 %.
     """
@@ -110,9 +115,9 @@ def fit_basis(points: Floats, weight: Floats, random: np.random.Generator) -> tu
         if rank > min(2 * frames, count) - 1 or rank * (2 * frames + count) > 0.7 * 2 * (kept > 0).sum():
             break
         basis = _widen(basis, points, kept, start, rank)
-        basis, coefficients, scale = alternate(points, kept, basis, sweeps=SWEEPS)
+        basis, coefficients, spread, scale = alternate(points, kept, basis, sweeps=SWEEPS)
         if not hidden and not gross(points, weight, predict(basis, coefficients), scale).any():
-            return basis, scale
+            return basis, spread, scale
         error = _typical(_lengths(points - predict(basis, coefficients)), held & (weight > 0))
         if error < 0.98 * best_error:
             best_error, best_rank, best = error, rank, basis
@@ -120,16 +125,17 @@ def fit_basis(points: Floats, weight: Floats, random: np.random.Generator) -> tu
             break
     if not np.isfinite(best_error):
         best = _widen(np.zeros((frames, 2, 0)), points, weight, start, min(3, min(2 * frames, count) - 1))
-    basis, _, scale = alternate(points, weight, best, sweeps=2 * SWEEPS)
-    return basis, scale
+    basis, _, spread, scale = alternate(points, weight, best, sweeps=2 * SWEEPS)
+    return basis, spread, scale
 
 
-def alternate(points: Floats, weight: Floats, basis: Floats, *, sweeps: int) -> tuple[Floats, Floats, float]:
-    """Return basis, coefficients (S, r−1) and residual scale after `sweeps` robust alternations.
+def alternate(points: Floats, weight: Floats, basis: Floats, *, sweeps: int) -> tuple[Floats, Floats, Floats, float]:
+    """Return basis, coefficients (S, r−1), their spread and the residual scale after `sweeps` robust alternations.
 
     Weights are those of the Cauchy loss, whose scale follows three times the median residual.
     """
-    coefficients, scale = coefficients_of(points, weight, basis, sweeps=3)
+    coefficients, spread = coefficients_of(points, weight, basis, None, 1.0, sweeps=3)
+    scale = FINE
     for _ in range(sweeps):
         lengths = _lengths(points - predict(basis, coefficients))
         scale = max(_typical(lengths, weight > 0), FINE)
@@ -139,27 +145,38 @@ def alternate(points: Floats, weight: Floats, basis: Floats, *, sweeps: int) -> 
         normal += _ridge(normal)
         right = np.einsum("fp,fpc,pi->fic", robust, points, extended, optimize=True)
         basis = np.linalg.solve(normal, right).transpose(0, 2, 1)
-        basis = _orthonormal(basis)
-        coefficients, _ = coefficients_of(points, robust, basis, sweeps=1)
-    return basis, coefficients, scale
+        basis, change = _orthonormal(basis)
+        coefficients, spread = coefficients_of(points, robust, basis, change @ spread @ change.T, scale, sweeps=1)
+    return basis, coefficients, spread, scale
 
 
-def coefficients_of(points: Floats, weight: Floats, basis: Floats, *, sweeps: int) -> tuple[Floats, float]:
-    """Return each point's coefficients on the basis, shape (S, r−1), by `sweeps` reweighted least squares."""
+def coefficients_of(
+    points: Floats, weight: Floats, basis: Floats, spread: Floats | None, scale: float, *, sweeps: int
+) -> tuple[Floats, Floats]:
+    """Return each point's coefficients on the basis, shape (S, r−1), and their spread, shape (r−1, r−1).
+
+    Reweighted least squares with a Gaussian prior: a point that was seen in few frames shows few of its coefficients, and least
+    squares alone sends the others, and with them the hidden positions, anywhere. The spread is the points' second moment,
+    posterior variance included (one EM step); without one, a first spread comes from strongly damped least squares.
+    """
     columns, shift = basis[:, :, :-1], basis[:, :, -1]
     products = np.einsum("fci,fcj->fij", columns, columns).reshape(len(basis), -1)
-    robust, scale = weight, 1.0
-    coefficients = np.zeros((points.shape[1], columns.shape[2]))
+    robust, size = weight, columns.shape[2]
+    coefficients, moment = np.zeros((points.shape[1], size)), np.eye(size)
     for sweep in range(sweeps):
-        normal = (robust.T @ products).reshape(-1, columns.shape[2], columns.shape[2])
-        normal += _ridge(normal)
+        normal = (robust.T @ products).reshape(-1, size, size)
+        normal += _ridge(normal, DAMPING) if spread is None else _prior(spread, scale) + _ridge(normal)
         right = np.einsum("fp,fpc,fci->pi", robust, points - shift[:, None], columns, optimize=True)
-        coefficients = np.linalg.solve(normal, right[..., None])[..., 0]
+        inverse = np.linalg.inv(normal)
+        coefficients = np.einsum("pij,pj->pi", inverse, right)
+        moment = coefficients.T @ coefficients / len(coefficients)
+        if spread is not None:
+            moment = moment + scale**2 * inverse.mean(axis=0)
         if sweep + 1 < sweeps:
             lengths = _lengths(points - predict(basis, coefficients))
-            scale = max(_typical(lengths, weight > 0), FINE)
-            robust = weight / (1 + (lengths / (3 * scale)) ** 2)
-    return coefficients, scale
+            typical = max(_typical(lengths, weight > 0), FINE)
+            robust = weight / (1 + (lengths / (3 * typical)) ** 2)
+    return coefficients, moment
 
 
 def predict(basis: Floats, coefficients: Floats) -> Floats:
@@ -167,9 +184,9 @@ def predict(basis: Floats, coefficients: Floats) -> Floats:
     return np.asarray(np.einsum("fci,pi->fpc", basis[:, :, :-1], coefficients, optimize=True) + basis[:, None, :, -1])
 
 
-def fill(points: Floats, weight: Floats, basis: Floats, scale: float) -> tuple[Floats, float]:
+def fill(points: Floats, weight: Floats, basis: Floats, spread: Floats, scale: float) -> tuple[Floats, float]:
     """Return points with hidden entries predicted and outliers replaced, and the share of seen entries replaced."""
-    coefficients, _ = coefficients_of(points, weight, basis, sweeps=4)
+    coefficients, _ = coefficients_of(points, weight, basis, spread, scale, sweeps=4)
     predicted = predict(basis, coefficients)
     wrong = gross(points, weight, predicted, scale)
     keep = (weight > 0) & ~wrong
@@ -182,7 +199,7 @@ def gross(points: Floats, weight: Floats, predicted: Floats, scale: float) -> ND
 
 
 def _carry(
-    normalised: Normalised, basis: Floats | None, scale: float, chosen: NDArray[np.intp]
+    normalised: Normalised, basis: Floats | None, spread: Floats, scale: float, chosen: NDArray[np.intp]
 ) -> tuple[Floats, Floats, Floats]:
     """Return Gram matrix, translations and centred sample, filling all points chunk by chunk."""
     frames, count = normalised.visible.shape
@@ -195,7 +212,7 @@ def _carry(
         shown = (weight > 0).any(axis=0)
         points, weight = points[:, shown], weight[:, shown]
         if basis is not None:
-            points, _ = fill(points, weight, basis, scale)
+            points, _ = fill(points, weight, basis, spread, scale)
         stacked = points.transpose(0, 2, 1).reshape(2 * frames, -1)
         gram += stacked @ stacked.T
         total += points.sum(axis=1)
@@ -226,8 +243,9 @@ def _widen(basis: Floats, points: Floats, weight: Floats, start: Floats, rank: i
         left, shift = start, start.mean(axis=1)
         old = np.zeros((frames, 2, 0))
     else:
-        coefficients, scale = coefficients_of(points, weight, basis, sweeps=2)
+        coefficients, _ = coefficients_of(points, weight, basis, None, 1.0, sweeps=2)
         left = points - predict(basis, coefficients)
+        scale = max(_typical(_lengths(left), weight > 0), FINE)
         left *= (weight / (1 + (_lengths(left) / (3 * scale)) ** 2))[..., None]
         old, shift = basis[:, :, :-1], basis[:, :, -1]
     stacked = (left - left.mean(axis=1, keepdims=True)).transpose(0, 2, 1).reshape(2 * frames, -1)
@@ -236,17 +254,25 @@ def _widen(basis: Floats, points: Floats, weight: Floats, start: Floats, rank: i
     return np.concatenate([old, new, shift[..., None]], axis=2)
 
 
-def _orthonormal(basis: Floats) -> Floats:
+def _orthonormal(basis: Floats) -> tuple[Floats, Floats]:
+    """Return the basis with orthonormal columns, and the matrix that takes the old coefficients to the new."""
     columns = basis[:, :, :-1]
     frames, _, rank = columns.shape
-    unit = np.linalg.qr(columns.reshape(2 * frames, rank))[0]
-    return np.concatenate([unit.reshape(frames, 2, rank), basis[:, :, -1:]], axis=2)
+    unit, change = np.linalg.qr(columns.reshape(2 * frames, rank))
+    return np.concatenate([unit.reshape(frames, 2, rank), basis[:, :, -1:]], axis=2), np.asarray(change)
 
 
-def _ridge(normal: Floats) -> Floats:
+def _prior(spread: Floats, scale: float) -> Floats:
+    """Return σ² Σ⁻¹, Σ the spread; directions in which no point was seen to move stay nearly still."""
+    size = len(spread)
+    floor = 1e-8 * max(float(np.trace(spread)), 1e-12) / max(size, 1)
+    return np.asarray(scale**2 * np.linalg.inv(spread + floor * np.eye(size)))
+
+
+def _ridge(normal: Floats, share: float = RIDGE) -> Floats:
     size = normal.shape[-1]
     mean = float(np.trace(normal.mean(axis=0))) / size
-    return np.asarray(RIDGE * max(mean, 1e-12) * np.eye(size))
+    return np.asarray(share * max(mean, 1e-12) * np.eye(size))
 
 
 def _lengths(difference: Floats) -> Floats:
