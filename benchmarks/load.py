@@ -12,7 +12,7 @@ import asyncio
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from threading import Event, Thread
@@ -103,37 +103,63 @@ def jobs(house: House, *, number: int, clients: int) -> int:
     return lost
 
 
+class Poller:
+    """One connection that is kept, and nothing else: a thousand in one pool of httpx cost more than the service does."""
+
+    def __init__(self, url: str) -> None:
+        self._host, port = url.removeprefix("http://").split(":")
+        self._port = int(port)
+        self._streams: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
+
+    async def get(self, path: str, headers: dict[str, str]) -> int:
+        """Send a GET, read the answer, return its status."""
+        if self._streams is None:
+            self._streams = await asyncio.open_connection(self._host, self._port)
+        reader, writer = self._streams
+        lines = [f"GET {path} HTTP/1.1", f"Host: {self._host}:{self._port}", *(f"{k}: {v}" for k, v in headers.items())]
+        writer.write("\r\n".join([*lines, "", ""]).encode())
+        head = (await reader.readuntil(b"\r\n\r\n")).decode().lower()
+        await reader.readexactly(int(head.split("content-length: ")[1].split("\r\n")[0]))
+        return int(head.split()[1])
+
+    def close(self) -> None:
+        """Give the connection up."""
+        if self._streams is not None:
+            self._streams[1].close()
+
+
 def pollers(house: House, *, number: int, seconds: float, every: float) -> int:
     """Let many clients look at jobs at their own pace, and then all wait for one job at once (`Prefer: wait`)."""
     ids = house.acknowledged or [_one(house)]
     reads: list[float] = []
     lost: list[str] = []
 
-    async def ask(http: httpx.AsyncClient, path: str, wait: int | None = None) -> None:
+    async def ask(poller: Poller, path: str, wait: int | None = None) -> None:
         began = time.monotonic()
         try:
-            answer = await http.get(path, headers={} if wait is None else {"Prefer": f"wait={wait}"})
-            if answer.status_code != 200:
-                lost.append(str(answer.status_code))
-        except httpx.HTTPError as fault:
+            status = await poller.get(path, {} if wait is None else {"Prefer": f"wait={wait}"})
+            if status != 200:
+                lost.append(str(status))
+        except (OSError, EOFError) as fault:
             lost.append(type(fault).__name__)
         reads.append(time.monotonic() - began)
 
-    async def poll(http: httpx.AsyncClient, index: int, until: float) -> None:
+    async def poll(poller: Poller, index: int, until: float) -> None:
         await asyncio.sleep(every * index / number)
         while time.monotonic() < until:
-            await ask(http, f"/v1/jobs/{ids[index % len(ids)]}")
+            await ask(poller, f"/v1/jobs/{ids[index % len(ids)]}")
             await asyncio.sleep(every)
 
-    async def all_of_them(one: Callable[[httpx.AsyncClient, int], object]) -> None:
-        limits = httpx.Limits(max_connections=None, max_keepalive_connections=None)
-        async with httpx.AsyncClient(base_url=house.url, timeout=120, limits=limits) as http:
-            await asyncio.gather(*(one(http, index) for index in range(number)))  # type: ignore[call-overload]
+    async def all_of_them(one: Callable[[Poller, int], Awaitable[None]]) -> None:
+        each = [Poller(house.url) for _ in range(number)]
+        await asyncio.gather(*(one(poller, index) for index, poller in enumerate(each)))
+        for poller in each:
+            poller.close()
 
     (service,) = house.look()["service"]
     with watched(service) as largest:
         until = time.monotonic() + seconds
-        asyncio.run(all_of_them(lambda http, index: poll(http, index, until)))
+        asyncio.run(all_of_them(lambda poller, index: poll(poller, index, until)))
         print(f"| {number} pollers | |\n|---|---|")
         print(
             f"| each every {every:g} s for {seconds:g} s: reads, a second | {len(reads)}, {len(reads) / seconds:.0f} |"
@@ -142,7 +168,7 @@ def pollers(house: House, *, number: int, seconds: float, every: float) -> int:
         reads.clear()
         long = _one(house, options={"max_reweightings": 1000, "tolerance": 1e-15}, frames=40, points=1200)
         began = time.monotonic()
-        asyncio.run(all_of_them(lambda http, _: ask(http, f"/v1/jobs/{long}", wait=15)))
+        asyncio.run(all_of_them(lambda poller, _: ask(poller, f"/v1/jobs/{long}", wait=15)))
         print(f"| all waiting for one job, `Prefer: wait=15`: all answered after | {time.monotonic() - began:.1f} s |")
         with suppress(NotAllowedNow):
             house.jobs.cancel(long)

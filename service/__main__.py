@@ -20,6 +20,10 @@ from pliant.worker.tokens import Tokens
 
 _log = logging.getLogger("pliant.service")
 
+KEEP_ALIVE = 75
+"""Seconds that an idle connection is kept: longer than a proxy keeps its own (60 s as a rule) and than clients pause between two looks,
+or now and then a request would meet a connection that is just being closed."""
+
 STOP_WITHIN = 10
 """Seconds that running requests get after SIGTERM."""
 
@@ -91,6 +95,7 @@ def main() -> int:
         log_config=None,
         access_log=False,
         server_header=False,
+        timeout_keep_alive=KEEP_ALIVE,
         timeout_graceful_shutdown=STOP_WITHIN,
     )
     server = Server(config, on_stop=lambda: stop_streams(app))
