@@ -42,7 +42,7 @@ def fuzzed(parser: str, examples: int, number: int) -> dict[str, int]:
 
 @pytest.mark.parametrize("parser", READERS)
 def test_a_bent_file_is_read_or_refused(parser: str) -> None:
-    examples = 60 if parser in NATIVE else 300
+    examples = 120 if parser in NATIVE else 300
     answers = fuzzed(parser, examples, number=7)
     assert sum(answers.values()) >= examples
     assert "a refusal without a hint" not in answers

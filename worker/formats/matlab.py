@@ -18,7 +18,7 @@ from pliant.worker.formats.records import Arrays, Limits
 
 UNREADABLE = (
     ValueError, TypeError, KeyError, IndexError, OSError, NotImplementedError, zlib.error, struct.error, NameError, ArithmeticError,
-    EOFError, AttributeError, RecursionError,
+    EOFError, AttributeError, RecursionError, scipy.io.matlab.MatReadError,
 )  # fmt: skip
 """What SciPy raises at damaged files; NameError where it does not expect a class."""
 
