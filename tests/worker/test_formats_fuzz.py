@@ -166,8 +166,8 @@ FUZZED = """
 
 Honest files of every format, and the attacks above, bent by hypothesis (bytes set, inserted, cut, repeated, numbers exchanged) and given to
 each reader. Arrays or a refusal must come back; `test_formats_fuzz.py` does less of the same at every run of the tests, and reads arrays
-of any name, shape, type and content through the whole interpretation besides. SciPy's reader of MATLAB v5 files has crashed on some such files, which
-is why it runs in a process that may be lost: the answer is then 422 `damaged_file`.
+of any name, shape, type and content through the whole interpretation besides. SciPy's reader of MATLAB v5 files has crashed on
+some such files, which is why it runs in a process that may be lost: the answer is then 422 `damaged_file`.
 
 ```bash not-run: takes minutes, and rewrites the table
 python tests/worker/test_formats_fuzz.py
