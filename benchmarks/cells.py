@@ -22,7 +22,9 @@ METHODS: dict[str, dict[str, str]] = {
     "spatio_temporal": {"method": "spatio_temporal", "prior": "smooth"},
     "robust": {"method": "robust", "prior": "smooth"},
     "robust+low_rank": {"method": "robust", "prior": "smooth+low_rank"},
+    "default": {},
 }
+"""`default`: the settings as they are when nothing is said, whatever prior that is (`chosen` of a cell names it)."""
 
 CORRUPTIONS: dict[str, dict[str, float]] = {
     "clean": {},
@@ -79,6 +81,7 @@ def measure(case: Case, key: Key) -> dict[str, Any]:
             "low_rank_weight",
         )
     }
+    chosen["prior"] = settings.prior
     return {
         **asdict(key),
         "frames": tracks.num_frames,

@@ -51,7 +51,7 @@ def measure_all() -> dict[str, float]:
         case = from_gallery(make(), name)
         for cameras in ("true", "estimated"):
             for method in METHODS:
-                for corruption in ("clean", "both") if method.startswith("robust") else ("clean",):
+                for corruption in ("clean", "both") if method in ("robust", "default") else ("clean",):
                     row = measure(case, Key(name, case.tracks.num_points, "file", cameras, method, corruption, 0))
                     for metric in METRICS:
                         numbers[f"{name} / {corruption} / {cameras} / {method} / {metric}"] = round(

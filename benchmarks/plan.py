@@ -30,8 +30,8 @@ class Part:
 
 PARTS = (
     Part(points=THINNED),
-    Part(methods=("robust+low_rank",)),
-    Part(only=FACES, corruptions=("outliers 10",), cameras=("estimated",), methods=("robust+low_rank",), trials=1),
+    Part(methods=("default",)),
+    Part(only=FACES, corruptions=("outliers 10",), cameras=("estimated",), methods=("default",), trials=1),
     Part(only=CORRUPTED, points=THINNED, corruptions=("all",)),
 )
 """In the order of what is wanted first; a later part skips what an earlier one has measured."""
