@@ -12,6 +12,7 @@ export class Glimpse {
   readonly canvas = h("canvas", { class: "glimpse", role: "img", "aria-label": "Some of the tracks, as they were read", width: 640, height: 400 });
   private sample: number[][] = [];
   private running = 0;
+  private waiting = 0;
 
   /** Play a sample; an empty one hides the picture. */
   show(sample: number[][]): void {
@@ -25,12 +26,13 @@ export class Glimpse {
 
   stop(): void {
     cancelAnimationFrame(this.running);
+    clearTimeout(this.waiting);
     this.running = 0;
   }
 
   private readonly tick = (now: number): void => {
-    if (!this.canvas.isConnected || this.canvas.offsetParent === null) {
-      this.running = requestAnimationFrame(this.tick); // folded away for the moment
+    if (!this.canvas.checkVisibility()) {
+      this.waiting = setTimeout(() => (this.running = requestAnimationFrame(this.tick)), 500); // folded away for the moment
       return;
     }
     // There and back: a sequence seldom ends where it began.
