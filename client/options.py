@@ -75,10 +75,11 @@ class Options(BaseModel):
         "auto",
         description="Spatial smoothness: 8-direction stencil on a pixel grid, or mesh Laplacian; auto: by the mesh given.",
     )
-    prior: Literal["smooth", "smooth+low_rank"] = Field(
-        "smooth+low_rank",
-        description="smooth: the published method; smooth+low_rank also favours shapes that few basis shapes explain (with preset "
-        "paper only if low_rank_weight is given).",
+    prior: Literal["gaussian", "smooth+low_rank", "smooth"] = Field(
+        "gaussian",
+        description="gaussian: one Gaussian over the frames for the positions of a point, learned from the tracks (method robust with "
+        "preset auto; else smooth); smooth: the published method; smooth+low_rank also favours shapes that few basis shapes "
+        "explain (with preset paper only if low_rank_weight is given).",
     )
     low_rank_weight: Weight | None = Field(
         None, description="λ3, strength of the low-rank prior, dimensionless; null: from the data."

@@ -10,7 +10,7 @@ from pliant.solver.completion import Completed, complete
 from pliant.solver.metric_upgrade import Upgrade, upgrade
 from pliant.solver.normalise import Normalised
 from pliant.solver.race import CANDIDATES, Candidate, carried, frames_used, gram_of, held, race
-from pliant.solver.records import Floats, Step, read_only
+from pliant.solver.records import Floats, KnownCamera, Step, read_only
 from pliant.solver.rotation import angles_between, start_at_identity
 from pliant.solver.settings import Settings
 
@@ -47,6 +47,12 @@ class CameraEstimate:
 
     basis_size: int
     """K of the factorization; 0 for given cameras."""
+
+    gram: Floats
+    """W Wᵀ / P of the completed tracks, shape `(2F, 2F)`, normalised units."""
+
+    outliers: float = 0.0
+    """Share of the seen entries that completion replaced as gross outliers."""
 
     reasons: dict[str, str] = field(default_factory=dict)
     """One sentence for each choice."""
@@ -100,7 +106,10 @@ def estimate_cameras(
     read_only(scales)
     tell(Step("cameras", SHARE))
     reasons = {"basis_size": _why(ran, best, settings), "scales": scale_reason, "rotations": refined}
-    return CameraEstimate(rotations, scales, completed.translations, best.basis_size, reasons, _warnings(rotations))
+    return CameraEstimate(
+        rotations, scales, completed.translations, best.basis_size, completed.gram, completed.outliers, reasons,
+        _warnings(rotations),
+    )  # fmt: skip
 
 
 def _everywhere(before: Floats, best: Candidate, used: slice, settings: Settings) -> tuple[Floats, str]:
@@ -120,13 +129,23 @@ def _thinned(full: Upgrade, used: slice) -> Upgrade:
     return Upgrade(full.basis_size, full.rotations[used], full.scales[used], full.residual)
 
 
-def estimate_scales(normalised: Normalised, rotations: Floats) -> Floats:
-    """Return the scale of every frame for given rotations, shape `(F,)`, mean of the logarithm 0.
+def given_cameras(normalised: Normalised, known: KnownCamera, settings: Settings) -> CameraEstimate:
+    """Return given cameras as an estimate; scales that are not given are estimated if the camera model has them.
 
-    The scales are those with which one rigid shape explains the tracks best: Σ_f ‖W_f − s_f R_f S‖². Shrinking them all
-    gains nothing, for S grows in return.
+    They are then those with which one rigid shape explains the tracks best: Σ_f ‖W_f − s_f R_f S‖². Shrinking them all gains
+    nothing, for S grows in return.
     """
-    return _rigid_scales(complete(normalised).gram, rotations)
+    completed = complete(normalised, seed=settings.seed)
+    if known.scales is not None:
+        scales, reason = np.array(known.scales), "Rotations and scales were given."
+    elif settings.camera == "scaled_orthographic":
+        scales = _rigid_scales(completed.gram, known.rotations)
+        reason = "Rotations were given; scales were estimated."
+    else:
+        scales, reason = np.ones(len(known.rotations)), "Rotations were given; orthography has no scales."
+    return CameraEstimate(
+        known.rotations, scales, completed.translations, 0, completed.gram, completed.outliers, {"camera": reason}
+    )
 
 
 def _sizes(completed: Completed, settings: Settings) -> list[int]:

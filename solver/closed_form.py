@@ -8,6 +8,9 @@ from pliant.solver.precondition import build_preconditioner
 from pliant.solver.records import Floats
 from pliant.solver.state import Array, Problem
 
+DOUBT = 0.1
+"""Standard deviation of an image coordinate, normalised units, that the start assumes with a Gaussian prior."""
+
 
 def pseudo_inverse(problem: Problem, translations: Floats) -> Array:
     """Return R†(W − t), frame by frame: flat shapes, each in its own image plane; hidden points at the centre.
@@ -24,9 +27,14 @@ def uniform_solution(problem: Problem, translations: Floats) -> Array:
     """Return the least-squares shapes if every observation weighed the same (eq. 5 when λ2 is 0).
 
     min_S ‖W − R S‖² + λ1 ‖H S‖² + λ2 ‖A S‖²: exact where all is visible and space is a whole grid or has no weight,
-    a good start for the iteration elsewhere.
+    a good start for the iteration elsewhere. With a Gaussian prior the tracks are doubted first: shapes that followed an outlier
+    would give it full weight, and the reweighting would take long to leave it.
     """
     weights = np.array(np.broadcast_to(problem.confidence[:, None, :], problem.points.shape))
-    operator = Operator(problem.projections, weights, problem.bands, problem.laplacian, problem.weights.spatial)
+    if problem.quadratic is not None:
+        weights *= weights.dtype.type(problem.weights.temporal / DOUBT**2)
+    operator = Operator(
+        problem.projections, weights, problem.bands, problem.laplacian, problem.weights.spatial, None, problem.quadratic
+    )
     target = problem.points - translations[:, :, None].astype(problem.points.dtype)
     return build_preconditioner(operator)(operator.right_hand_side(target))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from pliant.solver.loss import loss_value
 from pliant.solver.low_rank import rank_penalty
+from pliant.solver.operator import add_product
 from pliant.solver.records import Floats
 from pliant.solver.state import Array, Problem
 
@@ -24,10 +25,14 @@ def objective(problem: Problem, shapes: Array, residual: Array) -> float:
 
 
 def smoothness(problem: Problem, shapes: Array) -> float:
-    """Return λ1 ‖HX‖² + λ2 ‖AX‖²."""
+    """Return λ1 ‖HX‖² + λ2 ‖AX‖², the first replaced by λ1 tr XᵀQX with a Gaussian prior."""
     weights = problem.weights
     total = 0.0
-    if weights.temporal > 0:
+    if problem.quadratic is not None:
+        image = np.zeros_like(shapes)
+        add_product(problem.quadratic, shapes, image)
+        total += float(np.einsum("fcp,fcp->", image, shapes, dtype=np.float64))
+    elif weights.temporal > 0:
         order = len(problem.bands) - 1
         for frame in range(len(shapes) - order):
             step = np.diff(shapes[frame : frame + order + 1], n=order, axis=0)

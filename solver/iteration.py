@@ -59,7 +59,13 @@ def step(
 def operator_at(problem: Problem, state: State) -> Operator:
     """Return the normal equations that majorise the energy at this state."""
     return Operator(
-        problem.projections, state.omega, problem.bands, problem.laplacian, problem.weights.spatial, state.rank
+        problem.projections,
+        state.omega,
+        problem.bands,
+        problem.laplacian,
+        problem.weights.spatial,
+        state.rank,
+        problem.quadratic,
     )
 
 

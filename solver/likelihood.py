@@ -108,6 +108,9 @@ class Scene:
     noise_floor: float
     """Normalised units; added to σ in quadrature."""
 
+    smoothness: float = SMOOTHNESS
+    """κ."""
+
     @classmethod
     def of(
         cls,
@@ -151,6 +154,13 @@ def cameras_of(scene: Scene, motion: Motion) -> tuple[Floats, Floats]:
     return rotations, np.exp(logs)
 
 
+def covariances_of(motion: Motion) -> tuple[Floats, Floats, float, float]:
+    """Return A₀, A₁, σ² and τ."""
+    root0, root1 = _root(motion.extent), _root(motion.play)
+    noise, drift = np.exp(2 * motion.logs)
+    return root0 @ root0.T, root1 @ root1.T, float(noise) + NOISE_FLOOR**2, float(drift)
+
+
 def energy(scene: Scene, motion: Motion) -> tuple[float, Motion]:
     """Return E with the penalties on modes, turns and scales, and its gradient, analytic in every parameter.
 
@@ -178,7 +188,7 @@ def energy(scene: Scene, motion: Motion) -> tuple[float, Motion]:
     widened = slope * wide
     by_pairs = 2 * (slope @ rows0 + widened @ rows1).reshape(frames, 2, 3)
     by_frames = (slope * deform).reshape(frames, 2, frames, 2).sum(axis=(1, 3))
-    rough, by_modes = _roughness(motion.modes, SMOOTHNESS / frames)
+    rough, by_modes = _roughness(motion.modes, scene.smoothness / frames)
     uneven, by_logs = unevenness(np.log(scales))
     by_logs = scene.steadiness * by_logs + np.einsum("fij,fij->f", by_pairs, pairs)
     unsteady, by_rotations = unsteadiness(rotations)

@@ -61,6 +61,9 @@ class Operator:
 
     rank: RankTerm | None = None
 
+    quadratic: Array | None = None
+    """The Gaussian prior over frames of each coordinate, shape `(3, F, F)`."""
+
     def apply(self, shapes: Array, /, out: Array | None = None) -> Array:
         """Return 𝒜 X, shape `(F, 3, P)`, in `out` if it is given."""
         result = np.zeros_like(shapes) if out is None else out
@@ -78,7 +81,8 @@ class Operator:
                 image *= self.weights[frame]
                 row = result[frame]
                 np.matmul(camera.T, image, out=row)
-                self._add_temporal(shapes, frame, row)
+                if self.quadratic is None:
+                    self._add_temporal(shapes, frame, row)
                 if smooth:
                     for axis in range(3):
                         row[axis] += backward @ (spatial * (forward @ shapes[frame, axis]))
@@ -86,6 +90,8 @@ class Operator:
         over_ranges(work, len(shapes), smallest=max(1, SMALLEST // shapes[0].size))
         if self.rank is not None:
             self._add_rank(shapes, result)
+        if self.quadratic is not None:
+            add_product(self.quadratic, shapes, result)
         return result
 
     def _add_temporal(self, shapes: Array, frame: int, out: Array) -> None:
@@ -112,6 +118,16 @@ class Operator:
         """Return s Rᵀ (ω ∘ W) for centred tracks W of shape `(F, 2, P)`."""
         back: Array = np.matmul(self.projections.transpose(0, 2, 1), self.weights * target)
         return back
+
+
+def add_product(quadratic: Array, shapes: Array, result: Array) -> None:
+    """Add Q_c X_c to every coordinate c of the result, blocks of points in parallel."""
+
+    def work(start: int, stop: int) -> None:
+        for axis, over_frames in enumerate(quadratic):
+            result[:, axis, start:stop] += over_frames @ shapes[:, axis, start:stop]
+
+    over_ranges(work, shapes.shape[2], smallest=max(1, SMALLEST // (3 * len(shapes))))
 
 
 def _as_type(matrix: Matrix, kind: np.dtype[np.floating]) -> Matrix:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver import block_tridiagonal
+from pliant.solver.coarse import build_coarse
 from pliant.solver.conjugate_gradient import Linear
 from pliant.solver.operator import Operator
 from pliant.solver.parallel import available_cores
@@ -35,6 +36,9 @@ def temporal_matrix(operator: Operator) -> Floats:
     whole = np.kron(over_frames, np.eye(3)).reshape(frames, 3, frames, 3)
     index = np.arange(frames)
     whole[index, :, index, :] += blocks
+    if operator.quadratic is not None:
+        for axis, matrix in enumerate(operator.quadratic):
+            whole[:, axis, :, axis] += matrix
     return np.asarray(whole.reshape(3 * frames, 3 * frames), dtype=np.float64)
 
 
@@ -56,11 +60,25 @@ def build_preconditioner(operator: Operator) -> Linear:
     """Return M⁻¹ for this reweighting's operator."""
     if block_tridiagonal.fits(operator):
         return block_tridiagonal.build(operator)
+    alike, coarse = _alike(operator), build_coarse(operator)
+    if coarse is None:
+        return alike
+
+    def both(x: Array, /, out: Array | None = None) -> Array:
+        result = alike(x, out=out)
+        coarse.add(x, result)
+        return result
+
+    return both
+
+
+def _alike(operator: Operator) -> Linear:
+    """Return the inverse for one weight a frame."""
     kind = operator.weights.dtype
-    temporal = Diagonalised.of(operator, kind)
     laplacian = operator.laplacian
     if laplacian is None or operator.spatial_weight == 0:
-        return lambda r, out=None: _by_point(r, temporal, None)  # noqa: ARG005
+        return _by_inverse(temporal_matrix(operator), kind)
+    temporal = Diagonalised.of(operator, kind)
     if laplacian.grid is not None:
         return lambda r, out=None: _by_cosines(r, temporal, laplacian.grid, operator.spatial_weight)  # noqa: ARG005
     diagonal: Floats = (
@@ -69,12 +87,20 @@ def build_preconditioner(operator: Operator) -> Linear:
     return lambda r, out=None: _by_point(r, temporal, diagonal)  # noqa: ARG005
 
 
-def _by_point(r: Array, temporal: Diagonalised, shift: Floats | None) -> Array:
+def _by_inverse(temporal: Floats, kind: np.dtype[np.floating]) -> Linear:
+    """Return the solution of T x_p = r_p for every point p: one product where a diagonalisation would need two."""
+    size = len(temporal)
+    temporal[np.diag_indices(size)] += 1e-12 * temporal.diagonal().max()
+    inverse = linalg.cho_solve(linalg.cho_factor(temporal, lower=True), np.eye(size))
+    symmetric = ((inverse + inverse.T) / 2).astype(kind)
+    return lambda r, out=None: (symmetric @ r.reshape(size, -1)).reshape(r.shape)  # noqa: ARG005
+
+
+def _by_point(r: Array, temporal: Diagonalised, shift: Floats) -> Array:
     """Solve (T + shift_p I) x_p = r_p for every point p."""
     flat = r.reshape(len(temporal.values), -1)
     inner = temporal.vectors.T @ flat
-    added = 0.0 if shift is None else shift
-    inner /= (temporal.values[:, None] + added).astype(r.dtype)
+    inner /= (temporal.values[:, None] + shift).astype(r.dtype)
     return (temporal.vectors @ inner).reshape(r.shape)
 
 

@@ -2,34 +2,49 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from pliant.solver.cameras import CameraEstimate
+from pliant.solver.covariance import ShapeCovariance
+from pliant.solver.iteration import init
 from pliant.solver.laplacian import Laplacian, build_laplacian
 from pliant.solver.normalise import Normalised
 from pliant.solver.records import Choices, Mesh
 from pliant.solver.settings import Settings
-from pliant.solver.state import Problem
+from pliant.solver.state import Problem, State
 from pliant.solver.temporal import difference_bands
-from pliant.solver.weights import choose_weights
+from pliant.solver.weights import bending_weight, choose_weights
 
 
 def build_problem(
-    normalised: Normalised, estimate: CameraEstimate, mesh: Mesh | None, settings: Settings
+    normalised: Normalised,
+    estimate: CameraEstimate,
+    mesh: Mesh | None,
+    settings: Settings,
+    covariance: ShapeCovariance | None = None,
 ) -> tuple[Problem, Choices]:
-    """Choose what the settings leave open, and put the energy together."""
+    """Choose what the settings leave open, and put the energy together; a covariance makes the prior Gaussian."""
     kind = np.dtype(settings.precision)
     laplacian = _laplacian(normalised, mesh, settings)
-    weights, noise, reasons = choose_weights(normalised, estimate, laplacian, settings)
+    weights, noise, reasons = choose_weights(normalised, covariance, laplacian, settings)
     frames = len(normalised.points)
-    projections = np.asarray(estimate.scales)[:, None, None] * np.asarray(estimate.rotations)[:, :2]
+    bands = weights.temporal * difference_bands(frames, weights.order)
+    axes, quadratic = np.eye(3), None
+    if covariance is not None:
+        axes, precisions = covariance.precisions()
+        bands, quadratic = np.zeros_like(bands), (weights.temporal * precisions).astype(kind)
+    projections = np.asarray(estimate.scales)[:, None, None] * np.asarray(estimate.rotations)[:, :2] @ axes
     problem = Problem(
         points=np.ascontiguousarray(normalised.points.transpose(0, 2, 1), dtype=kind),
         confidence=normalised.visible.astype(kind),
         projections=np.ascontiguousarray(projections, dtype=kind),
         loss=settings.loss if settings.method == "robust" else "l2",
         weights=weights,
-        bands=weights.temporal * difference_bands(frames, weights.order),
-        laplacian=laplacian if weights.spatial > 0 else None,
+        bands=bands,
+        laplacian=laplacian if weights.spatial > 0 or covariance is not None else None,
+        axes=axes,
+        quadratic=quadratic,
     )
     choices = Choices(
         basis_size=estimate.basis_size,
@@ -45,6 +60,19 @@ def build_problem(
         warnings=tuple(estimate.warnings),
     )
     return problem, choices
+
+
+def with_bending(
+    problem: Problem, choices: Choices, state: State, settings: Settings
+) -> tuple[Problem, Choices, State]:
+    """Return the same with λ2 from the shapes so far, if the prior is Gaussian and nobody set it."""
+    if problem.quadratic is None or problem.laplacian is None or settings.spatial_weight is not None:
+        return problem, choices, state
+    weight = bending_weight(problem.weights.temporal, problem.laplacian, state.shapes)
+    problem = replace(problem, weights=replace(problem.weights, spatial=weight))
+    reason = f"{choices.reasons['weights']} λ2 = {weight:.2g} as the surface bends."
+    choices = replace(choices, spatial_weight=weight, reasons={**choices.reasons, "weights": reason})
+    return problem, choices, init(problem, state.shapes, state.translations)
 
 
 def _laplacian(normalised: Normalised, mesh: Mesh | None, settings: Settings) -> Laplacian | None:

@@ -6,14 +6,15 @@ import time
 from collections.abc import Callable
 
 import numpy as np
-from pliant.solver.cameras import CameraEstimate, estimate_cameras, estimate_scales
+from pliant.solver.cameras import CameraEstimate, estimate_cameras, given_cameras
 from pliant.solver.closed_form import pseudo_inverse, uniform_solution
 from pliant.solver.energy import residuals
 from pliant.solver.errors import InvalidInput
 from pliant.solver.iteration import init, no_higher, step, terminate
+from pliant.solver.joint import learn, telling_frames
 from pliant.solver.loss import largest_weight
 from pliant.solver.normalise import Normalised, normalise
-from pliant.solver.problem import build_problem
+from pliant.solver.problem import build_problem, with_bending
 from pliant.solver.records import (
     Camera,
     Choices,
@@ -29,6 +30,7 @@ from pliant.solver.records import (
 )  # fmt: skip
 from pliant.solver.settings import Settings
 from pliant.solver.state import Problem, State
+from pliant.solver.trim import SPOILED, without_outliers
 
 CAMERA_SHARE = 0.3
 """Share of the whole that progress gives to the cameras."""
@@ -75,12 +77,20 @@ def solve(
     began = time.perf_counter()
     normalised = normalise(tracks)
     estimate = _cameras(normalised, cameras, settings, on_step=on_step, should_stop=should_stop)
+    covariance = None
+    if settings.gaussian:
+        turning = cameras is None and settings.refine_rotations
+        estimate, covariance = learn(
+            estimate.gram, estimate, telling_frames(normalised.visible), turning=turning, should_stop=should_stop
+        )
     tell(Step("cameras", CAMERA_SHARE, max_reweightings=settings.max_reweightings))
     seconds = {"cameras": time.perf_counter() - began}
 
     began = time.perf_counter()
-    problem, choices = build_problem(normalised, estimate, mesh, settings)
-    state = _start(problem, estimate, settings)
+    problem, choices = build_problem(normalised, estimate, mesh, settings, covariance)
+    problem, choices, state = with_bending(problem, choices, _start(problem, estimate, settings), settings)
+    if covariance is not None and estimate.outliers > SPOILED:
+        problem, state = without_outliers(problem, state, estimate.outliers)
     tell(_told("initialise", state, settings, normalised.unit))
     seconds["initialise"] = time.perf_counter() - began
 
@@ -135,11 +145,11 @@ def finish(
     """Turn the last state into a Solution in the tracks' unit."""
     state, unit = history[-1], normalised.unit
     left = residuals(problem, state.shapes, state.translations).astype(np.float64)
-    seen = problem.confidence > 0
+    seen = normalised.visible > 0
     length = np.where(seen, np.hypot(left[:, 0], left[:, 1]), 0.0)
     top = largest_weight(problem.loss, problem.weights.robust_scale)
     trust = np.where(seen, state.omega.mean(axis=1, dtype=np.float64) / top, 0.0)
-    shapes = np.ascontiguousarray(state.shapes.transpose(0, 2, 1), dtype=np.float64) * unit
+    shapes = (state.shapes.transpose(0, 2, 1).astype(np.float64) @ problem.axes.T) * unit
     camera = Camera(
         np.array(estimate.rotations, dtype=np.float64),
         np.array(estimate.scales, dtype=np.float64),
@@ -174,17 +184,7 @@ def _cameras(
 ) -> CameraEstimate:
     if known is None:
         return estimate_cameras(normalised, settings, on_step=on_step, should_stop=should_stop)
-    if known.scales is not None:
-        scales = np.array(known.scales)
-        reasons = {"camera": "Rotations and scales were given."}
-    elif settings.camera == "scaled_orthographic":
-        scales = np.array(estimate_scales(normalised, known.rotations))
-        reasons = {"camera": "Rotations were given; scales were estimated."}
-    else:
-        scales = np.ones(len(known.rotations))
-        reasons = {"camera": "Rotations were given; orthography has no scales."}
-    still = np.zeros((len(scales), 2))
-    return CameraEstimate(known.rotations, scales, still, 0, reasons, ())
+    return given_cameras(normalised, known, settings)
 
 
 def _check_fit(tracks: Tracks, mesh: Mesh | None, cameras: KnownCamera | None) -> None:

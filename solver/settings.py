@@ -19,7 +19,7 @@ Method = Literal["pseudo_inverse", "temporal", "spatio_temporal", "robust"]
 CameraModel = Literal["scaled_orthographic", "orthographic"]
 Preset = Literal["auto", "paper"]
 Loss = Literal["l1", "l2", "huber"]
-Prior = Literal["smooth", "smooth+low_rank"]
+Prior = Literal["gaussian", "smooth+low_rank", "smooth"]
 Laplacian = Literal["auto", "grid8", "uniform", "cotangent"]
 
 
@@ -61,9 +61,11 @@ class Settings:
     """`grid8`: the paper's 8-direction stencil (needs a grid); `uniform` or `cotangent` on a mesh; `auto`: grid8 on a grid,
     else uniform."""
 
-    prior: Prior = "smooth+low_rank"
-    """`smooth`: the paper's method exactly; `smooth+low_rank` adds a reweighted nuclear norm on the F×3P shape matrix
-    (under preset `paper` only if `low_rank_weight` is given)."""
+    prior: Prior = "gaussian"
+    """Of method `robust` with preset `auto`. `gaussian`: one Gaussian over all frames for the positions of a point, its covariance
+    learned from the tracks (modes and a random walk, by expectation maximisation), estimated cameras refined with it; λ1 weighs
+    it. `smooth`: the paper's method exactly; `smooth+low_rank` adds a reweighted nuclear norm on the F×3P shape matrix. Other
+    methods and preset `paper` are smooth (with a low-rank term only if `low_rank_weight` is given)."""
 
     low_rank_weight: float | None = None
     """λ3, dimensionless, strength of the low-rank prior; None takes it from the data."""
@@ -79,6 +81,11 @@ class Settings:
 
     seed: int = 0
     """Seed of every random choice (restarts, sampled points). The same seed and thread count give the same bits."""
+
+    @property
+    def gaussian(self) -> bool:
+        """True if the shapes get the Gaussian prior."""
+        return self.prior == "gaussian" and self.method == "robust" and self.preset == "auto"
 
     def __post_init__(self) -> None:
         _check_choice("method", self.method, Method)

@@ -44,8 +44,12 @@ class Problem:
     loss: str
     weights: Weights
     bands: Floats
-    """λ1 times the bands of HᵀH, shape `(order + 1, F)`."""
+    """λ1 times the bands of HᵀH, shape `(order + 1, F)`; 0 with a Gaussian prior, which has its own."""
     laplacian: Laplacian | None
+    axes: Floats
+    """B (3×3): shapes are B X in the world. The identity but for the Gaussian prior, which has axes of its own."""
+    quadratic: Array | None = None
+    """λ1 times the inverse covariance over frames of each coordinate, shape `(3, F, F)`: the Gaussian prior."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

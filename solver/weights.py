@@ -13,7 +13,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from pliant.solver.cameras import CameraEstimate
+from numpy.typing import NDArray
+from pliant.solver.covariance import ShapeCovariance
 from pliant.solver.laplacian import Laplacian
 from pliant.solver.normalise import Normalised
 from pliant.solver.settings import Settings
@@ -44,19 +45,30 @@ LEAST_SQUARES_SHARE = 1e-2
 LOW_RANK_SHARE = 3e-4
 """λ3/λ1 of `auto` with the low-rank prior."""
 
+FINEST = 1e-4
+"""Smallest noise that the Gaussian prior is weighed against, normalised units."""
+
+BENDING_SHARE = 0.3
+"""λ2/λ1 of `auto` with the Gaussian prior, times the mean square of AX: below 1, for the covariance has seen the bending, too."""
+
 SCALES = (1e-3, 1e-2)
 """Range of the robust scale that follows the noise."""
 
 
 def choose_weights(
     normalised: Normalised,
-    estimate: CameraEstimate,  # noqa: ARG001
+    covariance: ShapeCovariance | None,
     laplacian: Laplacian | None,
     settings: Settings,
 ) -> tuple[Weights, float, dict[str, str]]:
     """Return the weights, the estimated noise (normalised units) and one sentence for each choice."""
     rough = roughness_of(normalised)
-    chosen, reason = (PAPER, "The paper's values.") if settings.preset == "paper" else _from_data(rough, settings)
+    if settings.preset == "paper":
+        chosen, reason = PAPER, "The paper's values."
+    elif covariance is not None:
+        chosen, reason = _from_covariance(covariance, settings)
+    else:
+        chosen, reason = _from_data(rough, settings)
     given = replace(
         chosen,
         temporal=chosen.temporal if settings.temporal_weight is None else settings.temporal_weight,
@@ -67,7 +79,7 @@ def choose_weights(
     )
     if laplacian is None:
         given = replace(given, spatial=0.0)
-    if settings.prior == "smooth":
+    if settings.prior != "smooth+low_rank":
         given = replace(given, low_rank=0.0)
     return given, rough.noise, {"weights": reason}
 
@@ -101,6 +113,30 @@ def roughness_of(normalised: Normalised) -> Roughness:
     typical = 1.4826 * float(np.median(seen))
     norm = {1: 2.0, 2: 6.0, 3: 20.0}[order] ** 0.5
     return Roughness(typical / norm, float((seen.max(axis=1) > max(FAR * typical, FAR_AT_LEAST)).mean()))
+
+
+def _from_covariance(covariance: ShapeCovariance, settings: Settings) -> tuple[Weights, str]:
+    """Return the weights with which the energy is the negative logarithm of a probability, times a constant.
+
+    Residuals of Laplace's distribution with standard deviation σ have the density exp(−√2 |r| / σ), so that
+    |r| + (σ / 2√2) xᵀQx is what to minimise; Gaussian ones make it r² + σ² xᵀQx.
+    """
+    sigma = max(covariance.noise**0.5, FINEST)
+    scale = float(np.clip(sigma, *SCALES))
+    strength = sigma / 8**0.5 if settings.loss == "l1" else sigma**2
+    chosen = replace(PAPER, temporal=strength, spatial=0.0, robust_scale=scale)
+    return chosen, (
+        f"λ1 = {strength:.2g} weighs the Gaussian prior against noise of {sigma:.2g} RMS radii; the loss turns linear at "
+        f"{scale:.2g} RMS radii."
+    )
+
+
+def bending_weight(temporal: float, laplacian: Laplacian, shapes: NDArray[np.floating]) -> float:
+    """Return λ2 for which the surface bends about as much as it does in shapes `(F, 3, P)` found without it."""
+    flat = shapes.reshape(-1, shapes.shape[2])
+    bends = np.asarray(laplacian.matrix @ flat.T, dtype=np.float64)
+    rows = float((np.diff(laplacian.matrix.indptr) > 0).mean())
+    return BENDING_SHARE * temporal * rows / max(float(np.mean(bends**2)), np.finfo(float).tiny)
 
 
 def _from_data(rough: Roughness, settings: Settings) -> tuple[Weights, str]:

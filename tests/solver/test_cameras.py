@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from pliant.solver import Settings, Tracks, gallery
-from pliant.solver.cameras import estimate_cameras, estimate_scales
+from pliant.solver import KnownCamera, Settings, Tracks, gallery
+from pliant.solver.cameras import estimate_cameras, given_cameras
 from pliant.solver.completion import complete
 from pliant.solver.likelihood import Motion, Scene, energy, start
 from pliant.solver.metric_upgrade import upgrade
@@ -78,7 +78,8 @@ def test_scales_are_found_where_the_camera_has_them() -> None:
     found = estimate_cameras(normalised, Settings())
     np.testing.assert_allclose(found.scales, scales, rtol=5e-3)
     assert np.log(found.scales).mean() == pytest.approx(0, abs=1e-12)
-    np.testing.assert_allclose(estimate_scales(normalised, CAMERA), scales, rtol=5e-3)
+    given = given_cameras(normalised, KnownCamera.from_arrays(CAMERA), Settings())
+    np.testing.assert_allclose(given.scales, scales, rtol=5e-3)
     plain = estimate_cameras(normalised, Settings(camera="orthographic"))
     assert (plain.scales == 1).all()
 

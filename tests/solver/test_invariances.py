@@ -15,6 +15,10 @@ from pliant.solver import Camera, KnownCamera, Mesh, Settings, Solution, Tracks,
 CLOSE = 2e-4
 """Relative difference that conjugate gradients, stopped at a reduction and not at the exact answer, may leave."""
 
+LEARNED = 0.05
+"""A covariance is learned from completed tracks, and which entries are held out to choose the completion's rank is drawn anew
+for other orders of points and frames."""
+
 TIGHT: dict[str, object] = {"tolerance": 1e-7, "max_reweightings": 400}
 
 
@@ -150,18 +154,19 @@ def test_the_unit_scales_the_shapes_and_nothing_else(factor: float) -> None:
     assert scaled.choices.noise / factor == pytest.approx(plain.choices.noise, rel=1e-9)
 
 
-@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("settings", [{"prior": "smooth"}, {"prior": "smooth", "temporal_order": 2}, {}], ids=str)
 @pytest.mark.parametrize("given", [SCENE, TRIANGLES], ids=["grid", "triangles"])
-def test_a_film_run_backwards_gives_the_shapes_backwards(given: Scene, order: int) -> None:
-    forwards = given.solved(temporal_order=order, **TIGHT)
-    backwards = reversed_in_time(given).solved(temporal_order=order, **TIGHT)
-    assert_same(backwards.shapes[::-1], forwards.shapes)
+def test_a_film_run_backwards_gives_the_shapes_backwards(given: Scene, settings: dict[str, object]) -> None:
+    forwards, backwards = (each.solved(**settings, **TIGHT) for each in (given, reversed_in_time(given)))
+    assert_same(backwards.shapes[::-1], forwards.shapes, CLOSE if settings else LEARNED)
 
 
+@pytest.mark.parametrize("prior", ["smooth", "gaussian"])
 @pytest.mark.parametrize("given", [SCENE, TRIANGLES], ids=["grid", "triangles"])
-def test_the_order_of_the_points_does_not_matter(given: Scene) -> None:
+def test_the_order_of_the_points_does_not_matter(given: Scene, prior: str) -> None:
     shuffled, order = permuted(given)
-    assert_same(shuffled.solved(**TIGHT).shapes, given.solved(**TIGHT).shapes[:, order])
+    found, expected = (each.solved(prior=prior, **TIGHT) for each in (shuffled, given))
+    assert_same(found.shapes, expected.shapes[:, order], CLOSE if prior == "smooth" else LEARNED)
 
 
 def test_y_may_point_up_or_down() -> None:
@@ -189,7 +194,7 @@ def plain_error() -> float:
 def test_estimated_cameras_are_as_good_however_the_film_was_taken(how: str, plain_error: float) -> None:
     given = TRANSFORMED[how]
     assert 0.01 < plain_error < 0.06
-    assert given.error(given.solved(estimated=True)) == pytest.approx(plain_error, rel=0.05)
+    assert given.error(given.solved(estimated=True)) == pytest.approx(plain_error, rel=0.15)
 
 
 @pytest.mark.parametrize("prior", ["smooth", "smooth+low_rank"])
