@@ -32,9 +32,9 @@ NOISE_FLOOR = 3e-3
 """Normalised units. No tracks of real video are better, and a finer one spends the model's modes on what no camera explains:
 measured, 1e-4 leaves L-BFGS unconverged after 200 iterations, with 3e-3 different starts reach the same cameras."""
 
-STEADINESS = 0.03
+STEADINESS = 0.05
 """Weight of `pliant.solver.steadiness`, whose terms are those of one camera, against E, which is that of one point: the points
-of a surface move together and are worth about 1/0.03 independent ones."""
+of a surface move together and are worth about 1/0.05 independent ones."""
 
 SMOOTHNESS = 1000.0
 """κ."""

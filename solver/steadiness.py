@@ -5,7 +5,7 @@ little is a cheap way to explain deformation. What tells them apart is that came
 the turn from frame f to the next, T_f − T_{f−1} is the change of angular velocity; its components are taken as Gaussian of
 unknown variance, and the negative log-likelihood with the variance at its most likely value is
 
-    3/2 log(floor² + mean_f ½‖T_f − T_{f−1}‖_F²)      per frame,
+    3/2 log(floor² + mean_f ½‖T_f − T_{f−1}‖_F²)      for each of the F − 2 changes, divided by F as the energy is,
 
 and ½ log(floor² + mean_f (log s_{f+1} − log s_f)²) for the scales. No strength has to be set: a camera with jumps has a large
 variance and is hardly bound, a steady one is held; the floors say from where on more steadiness is worth nothing.
@@ -32,11 +32,11 @@ def unsteadiness(rotations: Floats) -> tuple[float, Floats]:
     by_turns = np.zeros_like(turns)
     by_turns[1:] += changes
     by_turns[:-1] -= changes
-    by_turns *= 1.5 / (variance * count)
+    by_turns *= 1.5 / (variance * len(rotations))
     gradient = np.zeros_like(rotations)
     gradient[1:] += by_turns @ rotations[:-1]
     gradient[:-1] += np.swapaxes(by_turns, 1, 2) @ rotations[1:]
-    return 1.5 * float(np.log(variance)), gradient
+    return 1.5 * count / len(rotations) * float(np.log(variance)), gradient
 
 
 def unevenness(logs: Floats) -> tuple[float, Floats]:

@@ -154,7 +154,7 @@ def test_steadiness_pays_for_changes_of_speed_alone() -> None:
     spin = exponential(np.arange(30)[:, None] * np.array([0.0, 0.05, 0.0]))
     random = np.random.default_rng(0)
     floor, slope = unsteadiness(spin)
-    assert floor == pytest.approx(3 * np.log(TURN_FLOOR), abs=1e-9)
+    assert floor == pytest.approx(3 * 28 / 30 * np.log(TURN_FLOOR), abs=1e-9)
     np.testing.assert_allclose(slope, 0, atol=1e-6)
     jitter = unsteadiness(exponential(random.normal(0, 0.01, (30, 3))) @ spin)[0]
     jolts = unsteadiness(exponential(random.normal(0, 0.1, (30, 3))) @ spin)[0]
