@@ -74,9 +74,9 @@ def cost_table(rows: Rows, metric: str) -> str:
 
 
 def number(value: float) -> str:
-    """Three significant digits in the field's manner: .0341, 1.25, 12.5."""
-    if value == 0:
-        return "0"
+    """Three significant digits in the field's manner: .0341, 1.25, 12.5; a dash where there is no truth to compare with."""
+    if value == 0 or not np.isfinite(value):
+        return "0" if value == 0 else "–"
     digits = max(0, 2 - int(np.floor(np.log10(abs(value)))))
     text = f"{value:.{min(digits, 5)}f}"
     return text.replace("0.", ".", 1) if text.startswith(("0.", "-0.")) else text

@@ -250,3 +250,10 @@ def test_pictures_are_drawn_of_anything(tmp_path: Path, given: str) -> None:
     assert ("e3d_frame" in ran.stdout) == (given == "mesh and truth")
     image = np.asarray(Image.open(tmp_path / "out" / "some.png").convert("L"))
     assert (image < 250).mean() > 0.01
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(0.03412, ".0341"), (1.254, "1.25"), (-0.5, "-.500"), (0.0, "0"), (float("nan"), "–")]
+)
+def test_numbers_are_written_in_the_field_s_manner(bench, value, text):
+    assert bench("tables").number(value) == text
