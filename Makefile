@@ -35,7 +35,7 @@ demo: $(STAMP) $(PAGE)
 	$(BIN)/pliant demo $(DEMO)
 
 test: $(STAMP) $(PAGE)
-	$(BIN)/python -m pytest $(TESTS)
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest $(TESTS)
 
 # mypy reads the folders under their import names, so it gets a tree of links that has them.
 build/typed/pliant:

@@ -52,7 +52,9 @@ class Options(BaseModel):
         None,
         description="Number K of basis shapes in the factorization that gives the rotations; null: chosen from the data.",
     )
-    refine_rotations: bool = Field(True, description="Refine the cameras against the smoothness of the shapes.")
+    refine_rotations: bool = Field(
+        True, description="Refine the cameras: those under which the tracks are most probable."
+    )
     preset: Literal["auto", "paper"] = Field(
         "auto",
         description="Where weights that are not given come from. auto: measured from noise and motion. paper: the published setting.",

@@ -14,11 +14,13 @@ from pliant.solver import block_tridiagonal
 from pliant.solver.coarse import build_coarse
 from pliant.solver.conjugate_gradient import Linear
 from pliant.solver.operator import Operator
-from pliant.solver.parallel import available_cores
+from pliant.solver.parallel import available_cores, over_ranges
 from pliant.solver.records import Floats, Ints
 from scipy import fft, linalg
 
 Array = NDArray[np.floating]
+BLOCK = 1024
+"""Points a thread should have to work on, at least."""
 
 
 def temporal_matrix(operator: Operator) -> Floats:
@@ -93,15 +95,33 @@ def _by_inverse(temporal: Floats, kind: np.dtype[np.floating]) -> Linear:
     temporal[np.diag_indices(size)] += 1e-12 * temporal.diagonal().max()
     inverse = linalg.cho_solve(linalg.cho_factor(temporal, lower=True), np.eye(size))
     symmetric = ((inverse + inverse.T) / 2).astype(kind)
-    return lambda r, out=None: (symmetric @ r.reshape(size, -1)).reshape(r.shape)  # noqa: ARG005
+
+    def apply(x: Array, /, out: Array | None = None) -> Array:
+        result = np.zeros_like(x) if out is None else out
+        flat, into = x.reshape(size, -1), result.reshape(size, -1)
+
+        def work(start: int, stop: int) -> None:
+            into[:, start:stop] = symmetric @ flat[:, start:stop]
+
+        over_ranges(work, flat.shape[1], smallest=BLOCK)
+        return result
+
+    return apply
 
 
 def _by_point(r: Array, temporal: Diagonalised, shift: Floats) -> Array:
     """Solve (T + shift_p I) x_p = r_p for every point p."""
     flat = r.reshape(len(temporal.values), -1)
-    inner = temporal.vectors.T @ flat
-    inner /= (temporal.values[:, None] + shift).astype(r.dtype)
-    return (temporal.vectors @ inner).reshape(r.shape)
+    result = np.zeros_like(flat)
+    shifts = np.broadcast_to(shift, flat.shape[1])
+
+    def work(start: int, stop: int) -> None:
+        inner = temporal.vectors.T @ flat[:, start:stop]
+        inner /= (temporal.values[:, None] + shifts[start:stop]).astype(r.dtype)
+        result[:, start:stop] = temporal.vectors @ inner
+
+    over_ranges(work, flat.shape[1], smallest=BLOCK)
+    return result.reshape(r.shape)
 
 
 def _by_cosines(r: Array, temporal: Diagonalised, grid: Ints, weight: float) -> Array:

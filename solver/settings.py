@@ -37,7 +37,7 @@ class Settings:
     """K of the rank-3K factorization; None chooses it from the data and reports why."""
 
     refine_rotations: bool = True
-    """Refine the cameras against the smoothness energy by variable projection, kept only if an acceptance test passes."""
+    """Refine the cameras by variable projection on the likelihood of the tracks; with the Gaussian prior, together with it."""
 
     preset: Preset = "auto"
     """`paper`: λ1 = 1e-3, λ2 = 1, L1 with ε = 1e-3, first order; `auto`: weights from the noise and motion measured in the data."""

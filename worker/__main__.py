@@ -37,7 +37,7 @@ def work(settings: Settings) -> int:
     computes nothing: the numerical library shuts its threads down in the fork and starts them anew in the horse.
     """
     for variable in NUMERICAL_THREADS:
-        os.environ.setdefault(variable, str(settings.threads_per_job))
+        os.environ.setdefault(variable, "1")
     for module in PRELOADED:
         importlib.import_module(module)
     gc.collect()

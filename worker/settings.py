@@ -15,7 +15,8 @@ from pliant.worker.errors import InvalidSetting
 from pliant.worker.paths import socket_path
 
 NUMERICAL_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
-"""What the numerical libraries read when they are loaded."""
+"""What the numerical libraries read when they are loaded. Jobs set them to 1: the solver shares work among threads of its own, and
+those of a linear-algebra library wait spinning, which ruins everybody on a busy machine (`benchmarks/README.md`)."""
 
 
 CPU_QUOTA = Path("/sys/fs/cgroup/cpu.max")

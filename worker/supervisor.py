@@ -171,7 +171,7 @@ def valkey_child(valkey: Valkey) -> Child:
 
 def worker_children(settings: Settings) -> list[Child]:
     """Return the workers and the keeper as children."""
-    threads = dict.fromkeys(NUMERICAL_THREADS, str(settings.threads_per_job))
+    threads = dict.fromkeys(NUMERICAL_THREADS, "1")
     env = {**settings.to_environment(), **threads}
     command = [sys.executable, "-m", "pliant.worker"]
     grace = settings.stop_grace + 5

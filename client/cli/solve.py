@@ -36,8 +36,7 @@ def solve(
 ) -> None:
     """Reconstruct without a service: the same code, the same files."""
     ctx.obj.json = as_json
-    if threads is not None:
-        os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(threads)))
+    os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))  # the solver has threads of its own
     from pliant.client.parts import checked_options
     from pliant.client.progress import progress_bar
     from pliant.solver import threads_limited
