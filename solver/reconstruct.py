@@ -31,6 +31,7 @@ from pliant.solver.records import (
 from pliant.solver.settings import Settings
 from pliant.solver.state import Problem, State
 from pliant.solver.trim import SPOILED, without_outliers
+from pliant.solver.unseen import close_surface
 
 CAMERA_SHARE = 0.3
 """Share of the whole that progress gives to the cameras."""
@@ -96,6 +97,7 @@ def solve(
 
     began = time.perf_counter()
     history, outcome = _loop(problem, state, settings, normalised.unit, tell, should_stop)
+    history[-1] = close_surface(problem, history[-1])
     seconds["shapes"] = time.perf_counter() - began
 
     began = time.perf_counter()
