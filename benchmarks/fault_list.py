@@ -11,7 +11,7 @@ from pliant.solver.gallery import face
 
 from benchmarks.house import House
 
-LONG = {"max_reweightings": 1000, "tolerance": 1e-15}
+LONG = {"max_reweightings": 1000, "tolerance": 1e-15, "prior": "smooth+low_rank"}
 SHORT = {"max_reweightings": 3}
 LARGE = {"method": "pseudo_inverse"}
 

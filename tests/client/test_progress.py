@@ -68,7 +68,7 @@ def test_progress_in_words() -> None:
 def test_a_plot_without_matplotlib_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(PliantError, match="pip install matplotlib"):
-        draw(np.zeros((4, 9, 3)), 2, title="")
+        draw(np.zeros((4, 9, 3)), np.zeros((0, 3), dtype=np.int32), 2, title="")
 
 
 def test_a_wire_knows_its_wishes_alone() -> None:

@@ -109,8 +109,8 @@ def test_kill_9_in_mid_wait_and_mid_download(
     installation: Installation, killing: Callable[[str], None], tmp_path: Path, what: str
 ) -> None:
     sequence = face(60, 8000)
-    # Known cameras and a closed form: a large result soon. What is tried here are the connections.
-    options = {"method": "temporal", "refine_rotations": False}
+    # Known cameras and few reweightings: a large result soon, but not before anything can be killed.
+    options = {"prior": "smooth+low_rank", "max_reweightings": 8, "tolerance": 1e-12}
     with Client(installation.url, policy=PATIENT) as client:
         job = client.submit(sequence.tracks.points, mesh="none", rotations=sequence.rotations, options=options)
         seen: list[Status] = []
@@ -123,7 +123,8 @@ def test_kill_9_in_mid_wait_and_mid_download(
         result = job.wait(on_progress=kill_in_mid_wait, load=False, timeout=120)
         assert result.job.status is Status.SUCCEEDED
         assert Status.RUNNING in seen
-        assert (result.job.attempt > 1) == (what == "everything")
+        # A worker whose supervisor was killed may still finish what it had begun; if it could not, the job is begun again.
+        assert result.job.attempt == 1 or what == "everything"
 
         size = next(artifact.bytes for artifact in result.job.artifacts if artifact.name == "shapes.npz")
         assert size > 10_000_000  # more than the sockets' buffers hold, so that the connection breaks in mid file

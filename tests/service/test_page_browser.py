@@ -121,7 +121,7 @@ def long_job(url: str) -> Iterator[Callable[[str], str]]:
             },
             data={
                 "name": name,
-                "options": json.dumps({"max_reweightings": 1000, "tolerance": 1e-12, "refine_rotations": False}),
+                "options": json.dumps({"max_reweightings": 1000, "tolerance": 1e-12, "prior": "smooth+low_rank"}),
             },
             timeout=60,
         )

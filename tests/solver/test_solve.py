@@ -57,8 +57,7 @@ def test_smoothness_gives_depth_that_the_pseudo_inverse_does_not() -> None:
 def test_estimated_cameras_and_a_mesh_run_end_to_end() -> None:
     _, _, tracks, _ = scene()
     told: list[Step] = []
-    # with cameras refined this way the reweighting is slow here: 111 steps, 25 with the factorization's cameras
-    found = solve(tracks, triangulated(sheet()[1]), settings=Settings(max_reweightings=200), on_step=told.append)
+    found = solve(tracks, triangulated(sheet()[1]), on_step=told.append)
     assert found.outcome is Outcome.CONVERGED
     assert np.isfinite(found.shapes).all()
     fractions = [s.fraction for s in told]
