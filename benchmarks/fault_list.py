@@ -41,9 +41,9 @@ def fault(when: str) -> Callable[[Fault], Fault]:
     return listed
 
 
-def submitted(house: House, *, frames: int = 40, points: int = 1200, options: dict[str, object]) -> str:
+def submitted(house: House, *, frames: int = 40, points: int = 0, options: dict[str, object]) -> str:
     """Submit a made-up sequence over HTTP; true cameras, so that the solver is soon at its loop."""
-    sequence = face(frames, points)
+    sequence = face(frames, points or (6000 if options is LONG else 1200))
     with house.client() as client:
         job = client.submit(
             sequence.tracks.points, mesh="none", rotations=sequence.rotations, options=options, timeout=120

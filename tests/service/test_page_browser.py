@@ -111,7 +111,7 @@ def long_job(url: str) -> Iterator[Callable[[str], str]]:
     queued: list[str] = []
 
     def submit(name: str) -> str:
-        sequence = corrupt(face(40, 1500), outliers=0.05)
+        sequence = corrupt(face(40, 6000), outliers=0.05)
         answer = httpx.post(
             f"{url}/v1/jobs",
             files={
