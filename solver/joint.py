@@ -109,7 +109,7 @@ def _turn(gram: Floats, rotations: Floats, covariance: ShapeCovariance) -> tuple
         0.5 * np.log([covariance.noise, covariance.drift]),
     )  # fmt: skip
     moved, _ = fit(scene, started, iterations=TURNS, turning=True)
-    extent, play, noise, drift = covariances_of(moved)
+    extent, play, noise, drift = covariances_of(scene, moved)
     play = play + FLATTEST * np.trace(play) / 3 * np.eye(3)
     size = np.trace(play) / 3
     found = replace(

@@ -154,11 +154,11 @@ def cameras_of(scene: Scene, motion: Motion) -> tuple[Floats, Floats]:
     return rotations, np.exp(logs)
 
 
-def covariances_of(motion: Motion) -> tuple[Floats, Floats, float, float]:
-    """Return A₀, A₁, σ² and τ."""
+def covariances_of(scene: Scene, motion: Motion) -> tuple[Floats, Floats, float, float]:
+    """Return A₀, A₁, σ², the scene's floor included, and τ."""
     root0, root1 = _root(motion.extent), _root(motion.play)
     noise, drift = np.exp(2 * motion.logs)
-    return root0 @ root0.T, root1 @ root1.T, float(noise) + NOISE_FLOOR**2, float(drift)
+    return root0 @ root0.T, root1 @ root1.T, float(noise) + scene.noise_floor**2, float(drift)
 
 
 def energy(scene: Scene, motion: Motion) -> tuple[float, Motion]:
