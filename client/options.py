@@ -70,7 +70,8 @@ class Options(BaseModel):
         description="Residual size where the loss turns from quadratic to linear, in RMS radii of the tracks; null: the preset's.",
     )
     temporal_order: Literal[1, 2] | None = Field(
-        None, description="1 penalises velocity, 2 acceleration; null: the preset's."
+        None,
+        description="1 penalises velocity, 2 acceleration; null: the preset's. Without effect with prior gaussian.",
     )
     loss: Literal["l1", "l2", "huber"] = Field("l1", description="Loss of the data term when method is robust.")
     laplacian: Literal["auto", "grid8", "uniform", "cotangent"] = Field(
@@ -84,7 +85,9 @@ class Options(BaseModel):
         "explain (with preset paper only if low_rank_weight is given).",
     )
     low_rank_weight: Weight | None = Field(
-        None, description="λ3, strength of the low-rank prior, dimensionless; null: from the data."
+        None,
+        description="λ3, strength of the low-rank prior, dimensionless; null: from the data. Without effect unless prior is "
+        "smooth+low_rank.",
     )
     max_reweightings: int = Field(60, ge=1, le=1000, description="Upper bound on the reweightings of the robust loss.")
     tolerance: float = Field(

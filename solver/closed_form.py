@@ -31,7 +31,7 @@ def uniform_solution(problem: Problem, translations: Floats) -> Array:
     would give it full weight, and the reweighting would take long to leave it.
     """
     weights = np.array(np.broadcast_to(problem.confidence[:, None, :], problem.points.shape))
-    if problem.quadratic is not None:
+    if problem.quadratic is not None and problem.weights.temporal > 0:
         weights *= weights.dtype.type(problem.weights.temporal / DOUBT**2)
     operator = Operator(
         problem.projections, weights, problem.bands, problem.laplacian, problem.weights.spatial, None, problem.quadratic

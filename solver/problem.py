@@ -14,7 +14,7 @@ from pliant.solver.records import Choices, Mesh
 from pliant.solver.settings import Settings
 from pliant.solver.state import Problem, State
 from pliant.solver.temporal import difference_bands
-from pliant.solver.weights import bending_weight, choose_weights
+from pliant.solver.weights import bending_weight, choose_weights, without_effect
 
 
 def build_problem(
@@ -57,7 +57,7 @@ def build_problem(
         unit=normalised.unit,
         noise=noise * normalised.unit,
         reasons={**estimate.reasons, **reasons},
-        warnings=tuple(estimate.warnings),
+        warnings=(*estimate.warnings, *without_effect(settings)),
     )
     return problem, choices
 

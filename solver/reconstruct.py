@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from pliant.solver.cameras import CameraEstimate, estimate_cameras, given_cameras
@@ -90,14 +91,15 @@ def solve(
     began = time.perf_counter()
     problem, choices = build_problem(normalised, estimate, mesh, settings, covariance)
     problem, choices, state = with_bending(problem, choices, _start(problem, estimate, settings), settings)
-    if covariance is not None and estimate.outliers > SPOILED:
-        problem, state = without_outliers(problem, state, estimate.outliers)
+    if estimate.outliers > SPOILED:
+        problem, choices, state = _trimmed(problem, choices, state, estimate.outliers, should_stop)
     tell(_told("initialise", state, settings, normalised.unit))
     seconds["initialise"] = time.perf_counter() - began
 
     began = time.perf_counter()
     history, outcome = _loop(problem, state, settings, normalised.unit, tell, should_stop)
-    history[-1] = close_surface(problem, history[-1])
+    if covariance is not None:
+        history[-1] = close_surface(problem, history[-1])
     seconds["shapes"] = time.perf_counter() - began
 
     began = time.perf_counter()
@@ -107,6 +109,20 @@ def solve(
     seconds["finish"] = time.perf_counter() - began
     tell(_told("finish", history[-1], settings, normalised.unit, fraction=1.0))
     return solution
+
+
+def _trimmed(
+    problem: Problem, choices: Choices, state: State, outliers: float, should_stop: Callable[[], bool] | None
+) -> tuple[Problem, Choices, State]:
+    """Return the same without gross outliers, and the reason; the paper's prior keeps them, and so does one of no weight."""
+    if problem.quadratic is None or problem.weights.temporal == 0:
+        return problem, choices, state
+    kept, state = without_outliers(problem, state, outliers, should_stop=should_stop)
+    share = 1 - np.count_nonzero(kept.confidence) / np.count_nonzero(problem.confidence)
+    reason = (
+        f"{share:.1%} of what was seen is left out as gross outliers; {outliers:.1%} looked like it before the fit."
+    )
+    return kept, replace(choices, reasons={**choices.reasons, "outliers": reason}), state
 
 
 def _loop(

@@ -5,7 +5,9 @@ divided by the RMS of what is left; λ is therefore dimensionless)::
 
     E(S) = Σ_fp v_fp ρ(w_fp − s_f R_f S_fp)  +  λ1 ‖H S‖_F²  +  λ2 ‖A vec(S)‖²  (+ λ3 Σ_i log-det-like rank penalty)
 
-Dai, Deng, He (2017), eq. 7; the scale s_f, the weight v_fp and the rank term are ours.
+Dai, Deng, He (2017), eq. 7; the scale s_f, the weight v_fp and the rank term are ours. With the Gaussian prior λ1 Σ_p x_pᵀ Σ⁻¹ x_p
+stands where λ1 ‖H S‖² does, Σ the learned covariance of a point's positions x_p; λ2 then acts in the axes in which deformation varies
+alike, and neither H nor λ3 has a part in it.
 """
 
 from __future__ import annotations
@@ -43,7 +45,7 @@ class Settings:
     """`paper`: λ1 = 1e-3, λ2 = 1, L1 with ε = 1e-3, first order; `auto`: weights from the noise and motion measured in the data."""
 
     temporal_weight: float | None = None
-    """λ1, dimensionless; None takes the preset's."""
+    """λ1, dimensionless; None takes the preset's. 0 leaves depth to nothing but the start."""
 
     spatial_weight: float | None = None
     """λ2, dimensionless; None takes the preset's. Unused without a mesh."""
@@ -52,7 +54,7 @@ class Settings:
     """ε of the smoothed L1 (r ↦ √(r² + ε²)) or δ of Huber, in normalised units; None takes the preset's."""
 
     temporal_order: Literal[1, 2] | None = None
-    """Order of the difference operator H; None takes the preset's."""
+    """Order of the difference operator H; None takes the preset's. Without effect, and said so, with the Gaussian prior."""
 
     loss: Loss = "l1"
     """ρ of the data term when `method` is `robust`."""
@@ -64,11 +66,12 @@ class Settings:
     prior: Prior = "gaussian"
     """Of method `robust` with preset `auto`. `gaussian`: one Gaussian over all frames for the positions of a point, its covariance
     learned from the tracks (modes and a random walk, by expectation maximisation), estimated cameras refined with it; λ1 weighs
-    it. `smooth`: the paper's method exactly; `smooth+low_rank` adds a reweighted nuclear norm on the F×3P shape matrix. Other
-    methods and preset `paper` are smooth (with a low-rank term only if `low_rank_weight` is given)."""
+    it. `smooth`: the paper's method exactly; `smooth+low_rank` adds a reweighted nuclear norm on the F×3P shape matrix (with preset
+    `paper` only if `low_rank_weight` is given). With other methods or preset `paper`, `gaussian` means `smooth`."""
 
     low_rank_weight: float | None = None
-    """λ3, dimensionless, strength of the low-rank prior; None takes it from the data."""
+    """λ3, dimensionless, strength of the low-rank prior; None takes it from the data. Without effect, and said so, unless `prior` is
+    `smooth+low_rank`."""
 
     max_reweightings: int = 60
     """Upper bound on the outer IRLS steps."""

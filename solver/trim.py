@@ -7,6 +7,7 @@ stiff first, which shows what does not belong; then without that, as finely as t
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -33,15 +34,19 @@ FAR = 8.0
 """nor anything within this many robust standard deviations."""
 
 
-def without_outliers(problem: Problem, state: State, outliers: float) -> tuple[Problem, State]:
+def without_outliers(
+    problem: Problem, state: State, outliers: float, *, should_stop: Callable[[], bool] | None = None
+) -> tuple[Problem, State]:
     """Return the problem without its gross outliers, and a state of it to start from.
 
     Parameters
     ----------
     problem, state
-        With a Gaussian prior.
+        With a Gaussian prior of some weight.
     outliers : float
         Their share in the tracks, estimated.
+    should_stop : callable, optional
+        Asked between units of work; once it says True, nothing is left out.
     """
     assert problem.quadratic is not None
     weights = problem.weights
@@ -53,7 +58,9 @@ def without_outliers(problem: Problem, state: State, outliers: float) -> tuple[P
     )
     before = init(stiff, state.shapes, state.translations)
     for _ in range(STEPS):
-        after = no_higher(before, step(stiff, before))
+        if should_stop is not None and should_stop():
+            return problem, state
+        after = no_higher(before, step(stiff, before, should_stop=should_stop))
         settled = before.objective - after.objective <= SETTLED * before.objective
         before = after
         if settled:

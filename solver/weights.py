@@ -84,6 +84,16 @@ def choose_weights(
     return given, rough.noise, {"weights": reason}
 
 
+def without_effect(settings: Settings) -> tuple[str, ...]:
+    """Return a sentence for each weight that was set and has no part in the energy."""
+    said = []
+    if settings.low_rank_weight is not None and settings.prior != "smooth+low_rank":
+        said.append(f"low_rank_weight has no effect with prior {settings.prior}; set prior to smooth+low_rank.")
+    if settings.temporal_order is not None and settings.gaussian:
+        said.append("temporal_order has no effect with prior gaussian; set prior to smooth or smooth+low_rank.")
+    return tuple(said)
+
+
 @dataclass(frozen=True, slots=True)
 class Roughness:
     """What third differences over frames say about the tracks."""

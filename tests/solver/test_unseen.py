@@ -4,7 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from pliant.solver import KnownCamera, Mesh, Tracks, gallery, metrics, solve
+from pliant.solver import KnownCamera, Mesh, Settings, Tracks, gallery, metrics, solve
+from pliant.solver.cameras import given_cameras
+from pliant.solver.closed_form import uniform_solution
+from pliant.solver.iteration import init
+from pliant.solver.normalise import normalise
+from pliant.solver.problem import build_problem
+from pliant.solver.state import Problem, State
+from pliant.solver.unseen import close_surface
 
 MADE = gallery.face(16, 400, degrees=60, mesh="triangles")
 CAMERAS = KnownCamera.from_arrays(MADE.rotations, MADE.scales)
@@ -45,12 +52,47 @@ def test_what_hangs_on_nothing_stays_in_the_middle() -> None:
     assert np.linalg.norm(found.shapes[:, alone], axis=1).max() < 0.2 * size
 
 
-def test_nothing_moves_where_all_is_seen() -> None:
-    from pliant.solver.unseen import close_surface
+def problem_of(tracks: Tracks, mesh: Mesh | None) -> tuple[Problem, State]:
+    normalised, settings = normalise(tracks), Settings(prior="smooth")
+    estimate = given_cameras(normalised, CAMERAS, settings)
+    problem, _ = build_problem(normalised, estimate, mesh, settings)
+    return problem, init(problem, uniform_solution(problem, estimate.translations), estimate.translations)
 
-    class Untouched:
-        laplacian = None
-        confidence = np.ones((2, 3))
 
-    state = object()
-    assert close_surface(Untouched(), state) is state  # type: ignore[arg-type]
+@pytest.mark.parametrize(
+    ("tracks", "mesh"),
+    [(MADE.tracks, MADE.mesh), (seen_but([7]), None)],
+    ids=["everything seen", "no surface"],
+)
+def test_nothing_moves_where_there_is_nothing_to_close(tracks: Tracks, mesh: Mesh | None) -> None:
+    problem, state = problem_of(tracks, mesh)
+    assert close_surface(problem, state) is state
+
+
+def test_what_is_drawn_is_the_thinnest_plate_and_the_rest_stays() -> None:
+    hole = patch(190, 1)
+    problem, state = problem_of(seen_but(hole), MADE.mesh)
+    closed = close_surface(problem, state)
+    seen = np.delete(np.arange(400), hole)
+    moved = closed.shapes - closed.shapes.mean(axis=2, keepdims=True)
+    before = state.shapes - state.shapes[:, :, seen].mean(axis=2, keepdims=True)
+    after = moved - moved[:, :, seen].mean(axis=2, keepdims=True)
+    np.testing.assert_allclose(after[:, :, seen], before[:, :, seen], atol=1e-12)
+    assert problem.laplacian is not None
+    matrix = problem.laplacian.matrix
+    pull = np.asarray((matrix.T @ (matrix @ moved.reshape(-1, 400).T)).T).reshape(moved.shape)
+    assert np.abs(pull[:, :, hole]).max() < 1e-4 * np.abs(pull[:, :, seen]).max(), "stationary in the unseen points"
+
+
+def test_the_published_prior_is_left_as_its_energy_has_it() -> None:
+    """Of least energy, unseen points included: closing the surface afterwards would not be."""
+    hole, settings = patch(190, 1), Settings(prior="smooth", spatial_weight=0.1, tolerance=1e-10)
+    found = solve(seen_but(hole), MADE.mesh, cameras=CAMERAS, settings=settings)
+    assert found.trace.objective[-1] <= found.trace.objective.min()
+    problem, _ = problem_of(seen_but(hole), MADE.mesh)
+    closed = close_surface(
+        problem, init(problem, found.shapes.transpose(0, 2, 1) / found.choices.unit, np.zeros((16, 2)))
+    )
+    assert (
+        np.abs(closed.shapes[:, :, hole].transpose(0, 2, 1) * found.choices.unit - found.shapes[:, hole]).max() > 1e-3
+    )

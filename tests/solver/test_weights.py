@@ -42,6 +42,19 @@ def test_the_low_rank_prior_counts_only_where_it_is_asked_for(face: gallery.Sequ
     asked = solve(face.tracks, settings=Settings(prior="smooth+low_rank", max_reweightings=1)).choices
     assert smooth.low_rank_weight == 0
     assert asked.low_rank_weight > 0
+    assert any("low_rank_weight has no effect" in warning for warning in smooth.warnings)
+    assert not any("no effect" in warning for warning in asked.warnings)
+
+
+def test_a_weight_that_the_default_prior_does_not_have_is_said_to_be_without_effect(face: gallery.Sequence) -> None:
+    set_for_nothing = Settings(temporal_order=2, low_rank_weight=1.0, max_reweightings=1)
+    warnings = solve(face.tracks, settings=set_for_nothing).choices.warnings
+    assert [warning.split()[0] for warning in warnings if "no effect" in warning] == [
+        "low_rank_weight",
+        "temporal_order",
+    ]
+    plain = solve(face.tracks, settings=Settings(temporal_order=2, prior="smooth", max_reweightings=1)).choices
+    assert not any("no effect" in warning for warning in plain.warnings)
 
 
 def test_gross_outliers_ruin_least_squares_and_hardly_touch_the_default(face: gallery.Sequence) -> None:

@@ -1,0 +1,51 @@
+"""Gross outliers are left out of the Gaussian fit: the right ones, said in the reasons, and nothing where there are none."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from pliant.solver import KnownCamera, Outcome, Settings, gallery, metrics, solve
+
+MADE = gallery.face(24, 300, degrees=60)
+CAMERAS = KnownCamera.from_arrays(MADE.rotations, MADE.scales)
+SPOILED = gallery.corrupt(MADE, outliers=0.1, seed=4).tracks
+WRONG = np.abs(np.asarray(SPOILED.points) - np.asarray(MADE.tracks.points)).max(axis=2) > 0
+
+
+@pytest.mark.parametrize("cameras", [CAMERAS, None], ids=["known", "estimated"])
+def test_what_is_left_out_is_what_was_spoiled(cameras: KnownCamera | None) -> None:
+    found = solve(SPOILED, cameras=cameras)
+    left_out = found.weights == 0
+    size = np.abs(np.asarray(MADE.tracks.points)).max()
+    gross = np.linalg.norm(np.asarray(SPOILED.points) - np.asarray(MADE.tracks.points), axis=2) > 0.3 * size
+    assert left_out[gross].mean() > 0.97
+    assert left_out[~WRONG].mean() < 0.03
+    said = re.match(r"([\d.]+)% of what was seen", found.choices.reasons["outliers"])
+    assert said is not None
+    assert float(said.group(1)) == pytest.approx(100 * left_out.mean(), abs=0.06)
+
+
+def test_clean_tracks_and_the_published_prior_keep_everything() -> None:
+    clean = solve(MADE.tracks, cameras=CAMERAS)
+    assert "outliers" not in clean.choices.reasons
+    assert (clean.weights > 0).all()
+    published = solve(SPOILED, cameras=CAMERAS, settings=Settings(prior="smooth"))
+    assert "outliers" not in published.choices.reasons
+    assert (published.weights > 0).all()
+
+
+def test_a_prior_of_no_weight_is_minimised_as_told() -> None:
+    found = solve(SPOILED, cameras=CAMERAS, settings=Settings(temporal_weight=0))
+    assert np.isfinite(found.shapes).all()
+    assert found.choices.temporal_weight == 0
+    assert np.median(found.residuals) < 1e-6 * found.choices.unit, "every track can be followed"
+    assert (np.diff(found.trace.objective) <= 0).all()
+    assert metrics.e3d_frame(found.shapes, MADE.shapes) > 0.3, "and nothing says how deep it is"
+
+
+def test_stopped_before_the_stiff_fit_it_leaves_nothing_out() -> None:
+    found = solve(SPOILED, cameras=CAMERAS, should_stop=lambda: True)
+    assert found.outcome is Outcome.STOPPED
+    assert (found.weights > 0).all()
