@@ -397,7 +397,9 @@ class Jobs:
             self.blobs.delete(inputs)
             return self._same(kept, fingerprint, wanted=job.id)
         try:
-            if not self._held_back(mine.owner):
+            if self._held_back(mine.owner):
+                self.queue.hold(token)
+            else:
                 self.queue.push(job.id, token)
         except StoreUnavailable:
             return job  # the record is safe, and the keeper queues what the queue does not know

@@ -88,7 +88,6 @@ class Keeper:
     _tidied: float | None = None
     _swept: float | None = None
     _cleaned: set[str] = field(default_factory=set)
-    _held: set[str] = field(default_factory=set)
 
     def tick(self) -> None:
         """Do what is due.
@@ -150,16 +149,27 @@ class Keeper:
                     self.jobs.queue.push(id, fresh, front=True)  # it has waited before
 
     def _queue_forgotten(self, gap: float) -> None:
-        """Queue what the queue has lost, and what was held back until fewer of its owner's jobs run."""
+        """Queue what the queue has lost, and what was held back until fewer of its owner's jobs run.
+
+        The queue's own notes tell the two apart: what we saw at our last look would not do, since a job may be held back,
+        and its place become free, between two looks.
+        """
         records, queue = self.jobs.records, self.jobs.queue
+        noted = queue.held()  # read first: a note is written after its record, so one without a record has had its time
         queued = records.beats(records.ids(Status.QUEUED))
+        for token in noted - {beat.token for beat in queued.values()}:
+            queue.let_go(token)
         waiting = set(queue.waiting())
         absent = {id: beat for id, beat in queued.items() if beat.token not in waiting}
         held = self._over_the_limit(queued, absent)
-        for id in [id for id in absent if id in self._held - held]:
-            self._queue_again(id, absent.pop(id).token, front=False)
-        self._held = held
-        lost = {id: beat.token for id, beat in absent.items() if id not in held}
+        for id in held:
+            if absent[id].token not in noted:
+                queue.hold(absent[id].token)
+        free = {id: beat.token for id, beat in absent.items() if id not in held}
+        for id, token in free.items():
+            if token in noted:
+                self._queue_again(id, token, front=False)
+        lost = {id: token for id, token in free.items() if token not in noted}
         for id, still in self._queued.look(dict(lost), gap).items():
             if still >= FORGOTTEN_AFTER and self._queue_again(id, lost[id], front=True):
                 self._say(id, "The queue had forgotten it; queued again.")

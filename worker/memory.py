@@ -191,6 +191,7 @@ class MemoryQueue(Queue):
 
     def __init__(self) -> None:
         self._tokens: list[str] = []
+        self._held: set[str] = set()
 
     def push(self, id: str, token: str, *, front: bool = False) -> None:  # noqa: ARG002
         """See `Queue.push`."""
@@ -199,8 +200,21 @@ class MemoryQueue(Queue):
 
     def remove(self, token: str) -> None:
         """See `Queue.remove`."""
+        self.let_go(token)
         if token in self._tokens:
             self._tokens.remove(token)
+
+    def hold(self, token: str) -> None:
+        """See `Queue.hold`."""
+        self._held.add(token)
+
+    def held(self) -> set[str]:
+        """See `Queue.held`."""
+        return set(self._held)
+
+    def let_go(self, token: str) -> None:
+        """See `Queue.let_go`."""
+        self._held.discard(token)
 
     def waiting(self) -> list[str]:
         """See `Queue.waiting`."""

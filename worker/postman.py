@@ -173,10 +173,12 @@ class Postman:
             await answer.aclose()
         return answer.status_code
 
+    # Each is said before it is settled: what is owed no longer has its sentence in the log, whenever we are killed.
+
     def _answered(self, id: str, tries: int, status: int) -> None:
         if 200 <= status < 300:
-            self.outbox.delivered(id)
             self._say(id, f"Webhook delivered: the receiver answered {status} (try {tries}).")
+            self.outbox.delivered(id)
         elif status == 410:
             self._give_up(id, "the receiver answered 410, it wants no more.")
         else:
@@ -187,12 +189,12 @@ class Postman:
             self._give_up(id, f"{why}, at try {tries}, the last.")
             return
         pause = self.pauses[tries - 1] * (1 + 0.2 * random.random())  # noqa: S311 - so that not all return at once
-        self.outbox.later(id, due=int((self.clock() + pause) * 1000))
         self._say(id, f"Webhook not delivered: {why} (try {tries}); again in {pause:.0f} s.")
+        self.outbox.later(id, due=int((self.clock() + pause) * 1000))
 
     def _give_up(self, id: str, why: str) -> None:
-        self.outbox.given_up(id)
         self._say(id, f"Webhook given up: {why}")
+        self.outbox.given_up(id)
 
     def _say(self, id: str, sentence: str) -> None:
         logger.info("job %s: %s", id, sentence)

@@ -35,7 +35,19 @@ class Queue(ABC):
 
     @abstractmethod
     def remove(self, token: str) -> None:
-        """Take an attempt out."""
+        """Take an attempt out, whether it waits or is held back."""
+
+    @abstractmethod
+    def hold(self, token: str) -> None:
+        """Note that an attempt is kept out on purpose, until fewer of its owner's jobs run."""
+
+    @abstractmethod
+    def held(self) -> set[str]:
+        """Return the tokens that are noted as held back."""
+
+    @abstractmethod
+    def let_go(self, token: str) -> None:
+        """Strike the note that an attempt is held back; nothing else happens to it."""
 
     @abstractmethod
     def waiting(self) -> list[str]:
@@ -60,6 +72,7 @@ class RedisQueue(Queue):
     def __init__(self, client: redis.Redis, *, name: str) -> None:
         self._redis: Any = client
         self._name = name
+        self._held = f"{name}:held"
         self._queue = RqQueue(name, connection=client, serializer=JSONSerializer)
 
     def push(self, id: str, token: str, *, front: bool = False) -> None:
@@ -80,6 +93,7 @@ class RedisQueue(Queue):
 
     def remove(self, token: str) -> None:
         """See `Queue.remove`."""
+        self.let_go(token)
         with reachable():
             for key in (self._queue.key, self._queue.intermediate_queue_key):
                 self._redis.lrem(key, 0, token)
@@ -87,6 +101,21 @@ class RedisQueue(Queue):
                 RqJob.fetch(token, connection=self._redis, serializer=JSONSerializer).delete()
             except (NoSuchJobError, InvalidJobOperation):  # gone already, or just now
                 return
+
+    def hold(self, token: str) -> None:
+        """See `Queue.hold`."""
+        with reachable():
+            self._redis.sadd(self._held, token)
+
+    def held(self) -> set[str]:
+        """See `Queue.held`."""
+        with reachable():
+            return {token.decode() for token in self._redis.smembers(self._held)}
+
+    def let_go(self, token: str) -> None:
+        """See `Queue.let_go`."""
+        with reachable():
+            self._redis.srem(self._held, token)
 
     def waiting(self) -> list[str]:
         """See `Queue.waiting`."""

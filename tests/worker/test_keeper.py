@@ -297,6 +297,48 @@ def test_no_more_of_an_owners_jobs_run_than_may_and_the_next_begins_when_one_end
     assert "forgotten" not in world.jobs.log(adas[4])
 
 
+def test_a_job_held_back_and_let_go_between_two_looks_is_not_taken_for_forgotten(
+    tmp_path: Path, inputs_file: Path, interpretation: Interpretation
+) -> None:
+    world = World(tmp_path, max_running=1)
+
+    def made() -> str:
+        world.now += timedelta(milliseconds=10)
+        return world.jobs.submit(inputs_file, options=Options(), interpretation=interpretation).id
+
+    running = made()
+    token = world.claim(running)
+    world.pass_seconds(1)
+    held = made()
+    world.jobs.cancel(running)
+    world.jobs.records.update(
+        running, lambda stored: lifecycle.stop(stored, token=token, now=world.now, retention=60.0)
+    )
+    world.pass_seconds(1)
+    assert [each.rpartition("-")[0] for each in world.jobs.queue.waiting()] == [held], "at the very next look"
+    assert world.jobs.log(held) == ""
+    assert world.jobs.queue.held() == set()
+
+
+def test_what_is_held_back_is_known_to_a_keeper_that_has_only_begun(
+    tmp_path: Path, inputs_file: Path, interpretation: Interpretation
+) -> None:
+    world = World(tmp_path, max_running=1)
+    first, second = (
+        world.jobs.submit(inputs_file, options=Options(), interpretation=interpretation, id=f"job-{n}").id for n in "12"
+    )
+    world.jobs.queue.let_go(world.jobs.records.get(second).token)  # as if nobody had had the time to note it
+    world.pass_seconds(1)
+    assert world.jobs.queue.held() == {world.jobs.records.get(second).token}
+    world.keeper = Keeper(jobs=world.jobs, clock=lambda: world.monotonic)
+    world.jobs.cancel(first)
+    world.jobs.queue.hold("gone-0")
+    world.pass_seconds(1)
+    assert [each.rpartition("-")[0] for each in world.jobs.queue.waiting()] == [second]
+    assert "forgotten" not in world.jobs.log(second)
+    assert world.jobs.queue.held() == set(), "nor is a note kept of a job that is gone"
+
+
 def test_a_job_on_its_way_to_a_worker_counts_as_running(
     tmp_path: Path, inputs_file: Path, interpretation: Interpretation
 ) -> None:
