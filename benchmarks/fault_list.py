@@ -10,8 +10,8 @@ from pliant.client import Job, NotAllowedNow
 from pliant.solver.gallery import face
 
 from benchmarks.house import House
+from benchmarks.long_jobs import LONG, long_sequence
 
-LONG = {"max_reweightings": 1000, "tolerance": 1e-15, "prior": "smooth+low_rank"}
 SHORT = {"max_reweightings": 3}
 LARGE = {"method": "pseudo_inverse"}
 
@@ -41,9 +41,9 @@ def fault(when: str) -> Callable[[Fault], Fault]:
     return listed
 
 
-def submitted(house: House, *, frames: int = 40, points: int = 0, options: dict[str, object]) -> str:
+def submitted(house: House, *, frames: int = 40, points: int = 1200, options: dict[str, object]) -> str:
     """Submit a made-up sequence over HTTP; true cameras, so that the solver is soon at its loop."""
-    sequence = face(frames, points or (6000 if options is LONG else 1200))
+    sequence = long_sequence() if options is LONG else face(frames, points)
     with house.client() as client:
         job = client.submit(
             sequence.tracks.points, mesh="none", rotations=sequence.rotations, options=options, timeout=120

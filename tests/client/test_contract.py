@@ -12,6 +12,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 from blocking import Blocking
+from long_jobs import long_request
 from pliant.client import (
     AsyncClient,
     AsyncRemoteJob,
@@ -196,9 +197,7 @@ def test_events_tell_a_job_from_its_queue_to_its_end(client: Client) -> None:
 
 
 def test_a_result_before_its_time_is_refused(client: Client) -> None:
-    job = client.submit(
-        moving_points(60, 4000), options={"max_reweightings": 1000, "tolerance": 1e-9, "prior": "smooth+low_rank"}
-    )
+    job = client.submit(**long_request())
     with pytest.raises(NotAllowedNow, match="no result yet"):
         client.result(job.id)
     job.cancel()
@@ -208,10 +207,7 @@ def test_cancelling_ends_the_wait_and_a_retry_is_a_new_job(kind: str, asked: dic
     if "transport" in asked:
         asked["transport"] = FakeService(looks=float("inf"))
     with opened(kind, asked) as client:
-        job = client.submit(
-            moving_points(60, 4000), options={"max_reweightings": 1000, "tolerance": 1e-9, "prior": "smooth+low_rank"}
-        )
-
+        job = client.submit(**long_request())
         seen = []
         for now in job.events(timeout=60):
             seen.append(now.status)

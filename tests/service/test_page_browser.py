@@ -20,7 +20,9 @@ import httpx
 import numpy as np
 import pytest
 from browsing import Browsing, differing_pixels, why_not
+from long_jobs import long_request
 from playwright.sync_api import Browser, Locator, Page, Route, expect
+from pliant.client import Client
 from pliant.solver.gallery import corrupt, face, flag
 
 pytestmark = [
@@ -107,26 +109,12 @@ def small() -> dict[str, bytes]:
 
 @pytest.fixture
 def long_job(url: str) -> Iterator[Callable[[str], str]]:
-    """Queue a job that would run for minutes; it is cancelled after the test."""
+    """Queue a job that only ever ends from outside; it is cancelled after the test."""
     queued: list[str] = []
 
     def submit(name: str) -> str:
-        sequence = corrupt(face(40, 6000), outliers=0.05)
-        answer = httpx.post(
-            f"{url}/v1/jobs",
-            files={
-                "tracks": packed(tracks=sequence.tracks.points),
-                "mesh": packed(faces=sequence.mesh.faces),
-                "rotations": packed(rotations=sequence.rotations),  # so that the curves begin soon
-            },
-            data={
-                "name": name,
-                "options": json.dumps({"max_reweightings": 1000, "tolerance": 1e-12, "prior": "smooth+low_rank"}),
-            },
-            timeout=60,
-        )
-        assert answer.status_code == 202, answer.text
-        queued.append(str(answer.json()["id"]))
+        with Client(url) as client:
+            queued.append(client.submit(**long_request(), name=name).id)
         return queued[-1]
 
     yield submit

@@ -7,9 +7,10 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from long_jobs import LONG, long_sequence
 from pliant.client.options import Options
 from pliant.client.schemas import Interpretation, Job, Status
-from pliant.solver import gallery
+from pliant.solver import KnownCamera, Mesh, Tracks, gallery
 from pliant.worker.audit import findings
 from pliant.worker.formats import GroundTruth, Inputs, save_inputs
 from pliant.worker.jobs import Jobs
@@ -18,23 +19,33 @@ from pliant.worker.supervisor import Child, Supervisor, valkey_child, worker_chi
 from pliant.worker.valkey import Valkey
 
 SHORT = Options(max_reweightings=3)
-LONG = Options(max_reweightings=1000, tolerance=1e-15)
-"""On the long inputs: minutes, unless it is stopped."""
 
 
 def make_inputs(path: Path, *, frames: int, points: int) -> Inputs:
     sequence = gallery.corrupt(gallery.face(frames, points), noise=0.5, outliers=0.1)
+    return _saved(path, sequence.tracks, sequence.mesh, GroundTruth(sequence.shapes), None)
+
+
+def make_long_inputs(path: Path) -> Inputs:
+    """Canonical inputs of a job that is only ever ended from outside."""
+    sequence = long_sequence()
+    return _saved(path, sequence.tracks, None, None, KnownCamera(sequence.rotations))
+
+
+def _saved(
+    path: Path, tracks: Tracks, mesh: Mesh | None, truth: GroundTruth | None, cameras: KnownCamera | None
+) -> Inputs:
     interpretation = Interpretation(
-        num_frames=sequence.tracks.num_frames,
-        num_points=sequence.tracks.num_points,
-        num_faces=len(sequence.mesh.faces),
+        num_frames=tracks.num_frames,
+        num_points=tracks.num_points,
+        num_faces=0 if mesh is None else len(mesh.faces),
         hidden_fraction=0.0,
-        mesh_source="given",
-        has_ground_truth=True,
-        has_rotations=False,
+        mesh_source="none" if mesh is None else "given",
+        has_ground_truth=truth is not None,
+        has_rotations=cameras is not None,
         layout="tracks (F, P, 2)",
     )
-    inputs = Inputs(sequence.tracks, sequence.mesh, GroundTruth(sequence.shapes), None, interpretation)
+    inputs = Inputs(tracks, mesh, truth, cameras, interpretation)
     save_inputs(inputs, path)
     return inputs
 
@@ -78,7 +89,7 @@ class House:
             num_frames=4, num_points=4, num_faces=0, hidden_fraction=0, mesh_source="given", has_ground_truth=True,
             has_rotations=False, layout="",
         )  # fmt: skip
-        options = LONG if long else SHORT
+        options = Options.model_validate(LONG) if long else SHORT
         return self.jobs.submit(file, options=options, interpretation=interpretation, **more).id  # type: ignore[arg-type]
 
     def until(self, condition: Callable[[], object], what: str, *, seconds: float = 20.0) -> float:

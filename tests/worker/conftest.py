@@ -24,7 +24,7 @@ from pliant.worker.queue import RedisQueue
 from pliant.worker.redis_records import RedisRecords
 from pliant.worker.settings import Settings
 from pliant.worker.valkey import Valkey
-from worker_house import make_inputs
+from worker_house import make_inputs, make_long_inputs
 
 NANIO = shutil.which("nanio", path=f"{sysconfig.get_path('scripts')}:{Path(sys.executable).parent}")
 """A small S3 server."""
@@ -100,10 +100,10 @@ def options() -> Options:
 
 @pytest.fixture(scope="session")
 def inputs_files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Canonical inputs of a job of a moment and of a job of minutes."""
+    """Canonical inputs of a job of a moment and of one that is only ever ended from outside."""
     folder = tmp_path_factory.mktemp("inputs")
     make_inputs(folder / "short.npz", frames=6, points=40)
-    make_inputs(folder / "long.npz", frames=60, points=1500)
+    make_long_inputs(folder / "long.npz")
     return folder / "short.npz", folder / "long.npz"
 
 

@@ -7,9 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from long_jobs import LONG, long_sequence
 from pliant.client.options import SOLVER_FIELDS, Options
 from pliant.client.schemas import Progress
-from pliant.solver import InvalidInput, Mesh, Settings
+from pliant.solver import InvalidInput, KnownCamera, Mesh, Outcome, Settings, solve
+from pliant.solver.iteration import MAX_INNER
 from pliant.solver.metrics import e3d_frame
 from pliant.worker.errors import Interrupted, TimedOut
 from pliant.worker.formats import Inputs
@@ -87,3 +89,14 @@ def test_what_does_not_fit_is_refused_before_a_file_is_written(inputs: Inputs, t
     with pytest.raises(InvalidInput):
         reconstruct(without, Options(laplacian="grid8"), tmp_path)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_long_job_of_the_fault_tests_is_long_by_construction() -> None:
+    """Every reweighting takes as many inner iterations as may be, and its energy falls: a thousand of them on any machine."""
+    sequence, options = long_sequence(), dict(LONG, max_reweightings=4)
+    solved = solve(sequence.tracks, cameras=KnownCamera(sequence.rotations), settings=Settings(**options))
+    assert solved.outcome is Outcome.MAX_REWEIGHTINGS
+    assert solved.trace.iterations.tolist() == [0, *[MAX_INNER] * 4]
+    falls = -np.diff(solved.trace.objective) / solved.trace.objective[:-1]
+    assert falls.min() > 1e-4, "very far from where nothing falls any more"
+    assert LONG["max_reweightings"] == 1000
