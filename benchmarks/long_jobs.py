@@ -3,7 +3,7 @@
 Long by construction, not by size. The scale below which the loss is quadratic is so small that the weights of neighbouring
 reweightings differ by orders of magnitude, so the energy goes on falling through all the reweightings that may be; the low-rank
 prior keeps each one's inner solve at its upper bound of iterations; and the tolerance ends it only if nothing falls at all. The
-cameras are given, so that the reweighting begins at once..
+cameras are given, so that the reweighting begins at once.
 """
 
 from __future__ import annotations
