@@ -21,11 +21,15 @@ from pliant.solver.records import Floats
 
 Array = NDArray[np.floating]
 
-BLOCK = 2048
-"""Points worked on at a time: what one frame needs of them stays in the processor's cache."""
+BLOCK = 8192
+"""Points worked on at a time: what one frame needs of them stays in the processor's cache. Measured, 99 × 29,000, milliseconds for one
+application with 2,048, 4,096, 8,192 points at a time: 59, 41, 35 in double precision, 41, 27, 20 in single."""
 
 RIDGE = 1e-9
 """Added to every diagonal, as a share of λ1: a point that is never seen, with nothing but its path, has a singular system."""
+
+ROUNDING = 64.0
+"""Times the rounding of the arithmetic, where that is more: what elimination along a path can get wrong."""
 
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 """Where the six numbers of a symmetric 3×3 block stand."""
@@ -54,23 +58,24 @@ def build(operator: Operator) -> Linear:
     """Factor once a reweighting; returns r ↦ M⁻¹ r."""
     kind = operator.weights.dtype
     inverses = np.zeros((len(operator.projections), 6, operator.weights.shape[2]), dtype=kind)
-    shift = (stiffness_of_neighbours(operator) + RIDGE * operator.bands[0].max()).astype(kind)
+    ridge = max(RIDGE, ROUNDING * float(np.finfo(kind).eps)) * operator.bands[0].max()
+    shift = (stiffness_of_neighbours(operator) + ridge).astype(kind)
     coupling = operator.bands[1].astype(kind)
 
     def eliminate(start: int, stop: int) -> None:
         for first, last in _blocks(start, stop):
             _eliminate(operator, shift[first:last], coupling, inverses[:, :, first:last], slice(first, last))
 
-    over_ranges(eliminate, inverses.shape[2], smallest=BLOCK)
+    over_ranges(eliminate, inverses.shape[2], smallest=BLOCK // 2)
 
     def apply(r: Array, /, out: Array | None = None) -> Array:
-        result = np.zeros_like(r) if out is None else out
+        result = np.empty_like(r) if out is None else out
 
         def substitute(start: int, stop: int) -> None:
             for first, last in _blocks(start, stop):
                 _substitute(inverses[:, :, first:last], coupling, r[:, :, first:last], result[:, :, first:last])
 
-        over_ranges(substitute, r.shape[2], smallest=BLOCK)
+        over_ranges(substitute, r.shape[2], smallest=BLOCK // 2)
         return result
 
     return apply
@@ -82,12 +87,18 @@ def _blocks(start: int, stop: int) -> list[tuple[int, int]]:
 
 def _eliminate(operator: Operator, shift: Array, coupling: Array, inverses: Array, points: slice) -> None:
     """Fill in D̃_f⁻¹, with D̃_0 = D_0 and D̃_f = D_f − c² D̃_{f−1}⁻¹."""
-    for frame, camera in enumerate(operator.projections):
+    first, second = np.array(PAIRS).T
+    products = operator.projections[:, :, first] * operator.projections[:, :, second]  # (F, 2, 6)
+    block, spare = np.empty_like(inverses[0]), np.empty_like(inverses[0])
+    for frame, seen in enumerate(products):
         one, two = operator.weights[frame, :, points]
-        block = np.stack([camera[0, i] * camera[0, j] * one + camera[1, i] * camera[1, j] * two for i, j in PAIRS])
+        np.multiply(seen[0, :, None], one, out=block)
+        np.multiply(seen[1, :, None], two, out=spare)
+        block += spare
         block[[0, 3, 5]] += shift + shift.dtype.type(operator.bands[0, frame])
         if frame > 0:
-            block -= coupling[frame - 1] ** 2 * inverses[frame - 1]
+            np.multiply(inverses[frame - 1], coupling[frame - 1] ** 2, out=spare)
+            block -= spare
         _invert(block, inverses[frame])
 
 
@@ -102,7 +113,7 @@ def _invert(block: Array, out: Array) -> None:
 
 def _substitute(inverses: Array, coupling: Array, r: Array, out: Array) -> None:
     """Forward z_f = D̃_f⁻¹ (r_f − c z_{f−1}), then back z_f −= c D̃_f⁻¹ z_{f+1}."""
-    right, product, spare = (np.zeros_like(r[0]) for _ in range(3))
+    right, product, spare = (np.empty_like(r[0]) for _ in range(3))
     for frame in range(len(r)):
         if frame == 0:
             _product(inverses[0], r[0], out[0], spare)

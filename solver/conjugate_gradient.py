@@ -36,14 +36,14 @@ class Solved:
 def conjugate_gradient(
     apply: Linear,
     b: Array,
-    x: Array,
+    x: Array | None = None,
     *,
     precondition: Linear,
     reduction: float,
     max_iterations: int,
     should_stop: Callable[[], bool] | None = None,
 ) -> Solved:
-    """Improve x towards 𝒜 x = b for a symmetric positive (semi)definite 𝒜.
+    """Improve x, or 0, towards 𝒜 x = b for a symmetric positive (semi)definite 𝒜.
 
     Every iteration lowers ½ xᵀ𝒜x − bᵀx, so stopping early is always safe: an inexact inner solve inside
     majorise–minimise still descends. Stops when √(rᵀM⁻¹r) has
@@ -53,25 +53,30 @@ def conjugate_gradient(
     Five arrays of the size of x are all that is ever held: fresh ones in every iteration would cost more in page faults than
     in arithmetic.
     """
-    image = apply(x)
-    residual = b - image
-    z = precondition(residual)
-    first = rz = _dot(residual, z)
-    direction = precondition(b)
-    enough = max(reduction**2 * first, (10 * float(np.finfo(b.dtype).eps)) ** 2 * abs(_dot(b, direction)))
+    if x is None:
+        x, residual, image = np.zeros_like(b), b.copy(), np.empty_like(b)
+        z = precondition(residual)
+        direction = np.empty_like(b)
+        first = rz = beside = dot(residual, z)
+    else:
+        x, image = x.copy(), apply(x)
+        residual = b - image
+        z, direction = precondition(residual), precondition(b)
+        first, beside = dot(residual, z), abs(dot(b, direction))
+        rz = first
+    enough = max(reduction**2 * first, (10 * float(np.finfo(b.dtype).eps)) ** 2 * beside)
     direction[...] = z
-    x = x.copy()
     done = 0
     while done < max_iterations and rz > enough:
         if should_stop is not None and should_stop():
             break
         image = apply(direction, out=image)
-        curvature = _dot(direction, image)
+        curvature = dot(direction, image)
         if not curvature > 0:  # a null direction: nothing more to gain along it
             break
         _advance(rz / curvature, direction, image, x=x, residual=residual)
         z = precondition(residual, out=z)
-        before, rz = rz, _dot(residual, z)
+        before, rz = rz, dot(residual, z)
         _turn(rz / before, z, direction)
         done += 1
     return Solved(x, done, float(np.sqrt(max(rz, 0.0) / first)) if first > 0 else 0.0)
@@ -82,7 +87,7 @@ def _advance(step: float, direction: Array, image: Array, *, x: Array, residual:
     factor = x.dtype.type(step)
 
     def work(start: int, stop: int) -> None:
-        spare = np.zeros_like(x[start])
+        spare = np.empty_like(x[start])
         for i in range(start, stop):
             np.multiply(direction[i], factor, out=spare)
             x[i] += spare
@@ -103,7 +108,7 @@ def _turn(factor: float, z: Array, direction: Array) -> None:
     _over_slices(work, z)
 
 
-def _dot(one: Array, two: Array) -> float:
+def dot(one: Array, two: Array) -> float:
     """Inner product, slice by slice and then summed in double precision, which float32 needs.
 
     Not by the linear-algebra library: its threads wait for each other in a loop, which on a busy machine takes longer than the sum.

@@ -3,25 +3,64 @@
 from __future__ import annotations
 
 import numpy as np
-from pliant.solver.loss import loss_value
+from pliant.solver.bending import bends_of, frames_together
+from pliant.solver.loss import loss_value, loss_weights
 from pliant.solver.low_rank import rank_penalty
-from pliant.solver.operator import add_product
+from pliant.solver.operator import SMALLEST, add_product, rows_of
+from pliant.solver.parallel import over_ranges
 from pliant.solver.records import Floats
 from pliant.solver.state import Array, Problem
 
 
 def residuals(problem: Problem, shapes: Array, translations: Floats) -> Array:
     """Return w − s R x − t, shape `(F, 2, P)`, normalised units; meaningless where hidden."""
-    image = np.matmul(problem.projections, shapes)
-    image += translations[:, :, None].astype(shapes.dtype)
-    return np.subtract(problem.points, image, out=image)
+    left = np.empty_like(problem.points, dtype=shapes.dtype)
+
+    def work(start: int, stop: int) -> None:
+        for frame in range(start, stop):
+            left[frame] = residuals_of(problem, shapes, translations, frame)
+
+    over_ranges(work, len(shapes), smallest=max(1, SMALLEST // shapes[0].size))
+    return left
+
+
+def residuals_of(problem: Problem, shapes: Array, translations: Floats, frame: int) -> Array:
+    """Return the residuals of one frame, shape `(2, P)`."""
+    image: Array = np.matmul(problem.projections[frame], shapes[frame])
+    image += translations[frame][:, None].astype(shapes.dtype)
+    np.subtract(problem.points[frame], image, out=image)
+    return image
 
 
 def objective(problem: Problem, shapes: Array, residual: Array) -> float:
     """Return E = Σ v ρ(r) + λ1 ‖HX‖² + λ2 ‖AX‖² + rank penalty (Dai, Deng, He 2017, eq. 7, and ours)."""
+    parts = np.zeros(len(shapes))
+
+    def work(start: int, stop: int) -> None:
+        for frame in range(start, stop):
+            parts[frame] = loss_of(problem, residual[frame], frame)
+
+    over_ranges(work, len(shapes), smallest=max(1, SMALLEST // shapes[0].size))
+    return float(parts.sum()) + prior(problem, shapes)
+
+
+def loss_of(problem: Problem, residual: Array, frame: int) -> float:
+    """Return Σ v ρ(r) of one frame, r of shape `(2, P)`."""
+    confidence = problem.confidence[frame : frame + 1]
+    return loss_value(residual[None], confidence, loss=problem.loss, scale=problem.weights.robust_scale)
+
+
+def weights_of(problem: Problem, residual: Array, frame: int) -> Array:
+    """Return v ω(r) of one frame, shape `(2, P)`."""
+    confidence = problem.confidence[frame : frame + 1]
+    weights: Array = loss_weights(residual[None], confidence, loss=problem.loss, scale=problem.weights.robust_scale)[0]
+    return weights
+
+
+def prior(problem: Problem, shapes: Array) -> float:
+    """Return what of the energy the tracks have no part in."""
     weights = problem.weights
-    total = loss_value(residual, problem.confidence, loss=problem.loss, scale=weights.robust_scale)
-    return total + smoothness(problem, shapes) + rank_penalty(shapes, weights.low_rank, weights.rank_floor)
+    return smoothness(problem, shapes) + rank_penalty(shapes, weights.low_rank, weights.rank_floor)
 
 
 def smoothness(problem: Problem, shapes: Array) -> float:
@@ -32,14 +71,24 @@ def smoothness(problem: Problem, shapes: Array) -> float:
         image = np.zeros_like(shapes)
         add_product(problem.quadratic, shapes, image)
         total += float(np.einsum("fcp,fcp->", image, shapes, dtype=np.float64))
-    elif weights.temporal > 0:
-        order = len(problem.bands) - 1
-        for frame in range(len(shapes) - order):
-            step = np.diff(shapes[frame : frame + order + 1], n=order, axis=0)
-            total += weights.temporal * float(np.einsum("fcp,fcp->", step, step, dtype=np.float64))
-    if problem.laplacian is not None and weights.spatial > 0:
-        matrix = problem.laplacian.matrix.astype(shapes.dtype)
-        for row in shapes.reshape(-1, shapes.shape[2]):
-            bend = matrix @ row
-            total += weights.spatial * float(np.dot(bend, bend))
-    return total
+    temporal = weights.temporal if problem.quadratic is None else 0.0
+    laplacian = None if problem.laplacian is None else problem.laplacian.rounded(shapes.dtype)
+    order, together = len(problem.bands) - 1, frames_together(len(shapes))
+    parts = np.zeros(-(-len(shapes) // together))
+
+    def work(start: int, stop: int) -> None:
+        for part in range(start, stop):
+            low, high = part * together, min((part + 1) * together, len(shapes))
+            if temporal > 0:
+                for frame in range(low, min(high, len(shapes) - order)):
+                    parts[part] += temporal * _squared(np.diff(shapes[frame : frame + order + 1], n=order, axis=0))
+            if laplacian is not None and weights.spatial > 0:
+                parts[part] += weights.spatial * _squared(bends_of(laplacian, rows_of(shapes[low:high])))
+
+    over_ranges(work, len(parts), smallest=max(1, SMALLEST // (together * shapes[0].size)))
+    return total + float(parts.sum())
+
+
+def _squared(array: Array) -> float:
+    flat = array.ravel()
+    return float(np.einsum("i,i->", flat, flat, dtype=np.float64))

@@ -10,12 +10,13 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from pliant.solver import block_tridiagonal
 from pliant.solver.conjugate_gradient import conjugate_gradient
-from pliant.solver.energy import objective, residuals
+from pliant.solver.energy import loss_of, prior, residuals_of, weights_of
 from pliant.solver.errors import NotFinite
-from pliant.solver.loss import loss_weights
 from pliant.solver.low_rank import rank_term
-from pliant.solver.operator import Operator
+from pliant.solver.operator import SMALLEST, Operator
+from pliant.solver.parallel import over_ranges
 from pliant.solver.precondition import build_preconditioner
 from pliant.solver.records import Floats, Outcome
 from pliant.solver.state import Array, Problem, State
@@ -24,12 +25,15 @@ INNER_REDUCTION = 0.1
 """Inner solves reduce the residual by this factor: more is wasted on weights that are about to change."""
 MAX_INNER = 60
 """Upper bound on conjugate-gradient iterations in one reweighting."""
+SINGLE_REDUCTION = 1e-3
+"""Smallest reduction that is left to single precision."""
+SINGLE_SPAN = 1e5
+"""So many times the stiffness of a path at most may an observation weigh in single precision."""
 
 
 def init(problem: Problem, shapes: Array, translations: Floats) -> State:
     """Evaluate the start."""
-    shapes, translations = _centred(problem, shapes, translations)
-    return _evaluated(problem, shapes, translations, reweighting=0, iterations=0)
+    return _evaluated(problem, shapes.copy(), translations, None, reweighting=0, iterations=0)
 
 
 def step(
@@ -40,20 +44,37 @@ def step(
     max_inner: int = MAX_INNER,
     should_stop: Callable[[], bool] | None = None,
 ) -> State:
-    """Lower the energy once: shapes for the weights of `state`, then translations, then new weights."""
+    """Lower the energy once: shapes for the weights of `state`, then translations, then new weights.
+
+    What conjugate gradients solve for is the correction to the shapes: small, and wanted to a digit or two, for which single
+    precision does. The gradient that it has to undo, the sum, and the energy keep the problem's precision.
+    """
     operator = operator_at(problem, state)
     target = problem.points - state.translations[:, :, None].astype(problem.points.dtype)
+    gradient = operator.gradient(state.shapes, target)
+    inner = operator.rounded(_inner_precision(operator, reduction))
     solved = conjugate_gradient(
-        operator.apply, operator.right_hand_side(target), state.shapes, precondition=build_preconditioner(operator),
+        inner.apply, (-gradient).astype(inner.weights.dtype), precondition=build_preconditioner(inner),
         reduction=reduction, max_iterations=max_inner, should_stop=should_stop,
     )  # fmt: skip
-    shapes = solved.x
-    left = residuals(problem, shapes, state.translations)
-    total = state.omega.sum(axis=2, dtype=np.float64)
-    shift = np.einsum("fcp,fcp->fc", state.omega, left, dtype=np.float64)
-    translations = state.translations + np.divide(shift, total, out=np.zeros_like(shift), where=total > 0)
-    shapes, translations = _centred(problem, shapes, translations)
-    return _evaluated(problem, shapes, translations, reweighting=state.reweighting + 1, iterations=solved.iterations)
+    shapes = np.add(state.shapes, solved.x, out=gradient)
+    return _evaluated(
+        problem,
+        shapes,
+        state.translations,
+        state.omega,
+        reweighting=state.reweighting + 1,
+        iterations=solved.iterations,
+    )
+
+
+def _inner_precision(operator: Operator, reduction: float) -> np.dtype[np.floating]:
+    """Return single precision where it reaches the reduction and the equations do not span too many magnitudes for it."""
+    if reduction < SINGLE_REDUCTION or not block_tridiagonal.fits(operator):
+        return operator.weights.dtype
+    stiff = float(operator.bands[0].max()) + float(block_tridiagonal.stiffness_of_neighbours(operator).mean())
+    data = float(operator.weights.max()) * float((operator.projections**2).sum(axis=(1, 2)).max())
+    return np.dtype(np.float32) if data < SINGLE_SPAN * stiff else operator.weights.dtype
 
 
 def operator_at(problem: Problem, state: State) -> Operator:
@@ -62,7 +83,7 @@ def operator_at(problem: Problem, state: State) -> Operator:
         problem.projections,
         state.omega,
         problem.bands,
-        problem.laplacian,
+        None if problem.laplacian is None else problem.laplacian.rounded(problem.points.dtype),
         problem.weights.spatial,
         state.rank,
         problem.quadratic,
@@ -88,31 +109,56 @@ def no_higher(before: State, after: State) -> State:
     return replace(before, reweighting=after.reweighting, iterations=after.iterations)
 
 
-def _centred(problem: Problem, shapes: Array, translations: Floats) -> tuple[Array, Floats]:
-    """Move each frame's shape to its centroid; the translation takes up what the camera sees of the move.
+def _evaluated(
+    problem: Problem, shapes: Array, translations: Floats, omega: Array | None, *, reweighting: int, iterations: int
+) -> State:
+    """Move every frame's shape to its centroid, in place, and return the state there.
 
-    The data term does not notice, AX neither (rows of A sum to 0), and ‖HX‖ and the rank penalty cannot grow by it.
+    The translation takes up what the camera sees of the move: the data term does not notice, AX neither (rows of A sum to 0), and
+    ‖HX‖ and the rank penalty cannot grow by it. With weights ω given, translations first follow the residuals.
     """
-    middle = shapes.mean(axis=2, dtype=np.float64)
-    moved = translations + np.einsum("fic,fc->fi", problem.projections.astype(np.float64), middle)
-    return shapes - middle[:, :, None].astype(shapes.dtype), moved
+    frames, kind = len(shapes), shapes.dtype.type
+    translations, losses = translations.copy(), np.full(frames, np.inf)
+    fresh = np.zeros(problem.points.shape, dtype=shapes.dtype)
+    squared = np.zeros(problem.confidence.shape, dtype=shapes.dtype)
 
+    def work(start: int, stop: int) -> None:
+        for frame in range(start, stop):
+            if not np.isfinite(np.vdot(shapes[frame], shapes[frame])):
+                continue
+            left = residuals_of(problem, shapes, translations, frame)
+            if omega is not None:
+                shift = _mean(left, omega[frame])
+                left -= shift[:, None].astype(kind)
+                translations[frame] += shift
+            middle = shapes[frame].mean(axis=1, dtype=np.float64)
+            shapes[frame] -= middle[:, None].astype(kind)
+            translations[frame] += problem.projections[frame].astype(np.float64) @ middle
+            losses[frame] = loss_of(problem, left, frame)
+            fresh[frame] = weights_of(problem, left, frame)
+            np.einsum("cp,cp->p", left, left, out=squared[frame])
 
-def _evaluated(problem: Problem, shapes: Array, translations: Floats, *, reweighting: int, iterations: int) -> State:
-    left = residuals(problem, shapes, translations)
+    over_ranges(work, frames, smallest=max(1, SMALLEST // shapes[0].size))
     weights = problem.weights
-    whole = bool(np.isfinite(np.vdot(shapes, shapes)))
-    value = objective(problem, shapes, left) if whole else np.inf
+    value = float(losses.sum())
+    value = value + prior(problem, shapes) if np.isfinite(value) else value
     if not np.isfinite(value):
         raise NotFinite(f"the energy became {value} after {reweighting} reweightings")
     seen = problem.confidence > 0
     return State(
         shapes=shapes,
         translations=translations,
-        omega=loss_weights(left, problem.confidence, loss=problem.loss, scale=weights.robust_scale),
+        omega=fresh,
         rank=rank_term(shapes, weights.low_rank, weights.rank_floor),
         objective=value,
-        residual=float(np.median(np.hypot(left[:, 0][seen], left[:, 1][seen]))),
+        residual=float(np.sqrt(np.median(squared if seen.all() else squared[seen]))),
         reweighting=reweighting,
         iterations=iterations,
     )
+
+
+def _mean(left: Array, weights: Array) -> Floats:
+    """Return the weighted mean residual of a frame, shape `(2,)`; 0 where nothing is seen."""
+    total = weights.sum(axis=1, dtype=np.float64)
+    shift = np.einsum("cp,cp->c", weights, left, dtype=np.float64)
+    return np.asarray(np.divide(shift, total, out=np.zeros_like(shift), where=total > 0))

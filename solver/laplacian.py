@@ -8,7 +8,7 @@ vertex that no other row would touch keeps its plain row, so that it still hangs
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -40,6 +40,12 @@ class Laplacian:
 
     grid: Ints | None = None
     """Point index of each grid cell, −1 for holes, when the points lie on a grid: the preconditioner's short cut."""
+
+    def rounded(self, kind: np.dtype[np.floating]) -> Laplacian:
+        """Return the same in another precision."""
+        if self.matrix.dtype == kind:
+            return self
+        return replace(self, matrix=self.matrix.astype(kind), adjoint=self.adjoint.astype(kind))
 
 
 def build_laplacian(mesh: Mesh | None, kind: str, reference: Floats | None = None) -> Laplacian | None:
@@ -165,6 +171,7 @@ def _cotangent_weights(mesh: Mesh, reference: Floats) -> Floats:
 
 
 def _assemble(rows: NDArray[Any], columns: NDArray[Any], values: Floats, num_points: int) -> Matrix:
-    matrix = sparse.csr_array(sparse.coo_array((values, (rows, columns)), shape=(num_points, num_points)))
+    places = rows.astype(np.int32), columns.astype(np.int32)  # half the memory to fetch in every product
+    matrix = sparse.csr_array(sparse.coo_array((values, places), shape=(num_points, num_points)))
     matrix.sum_duplicates()
     return matrix

@@ -11,11 +11,12 @@ low-rank prior, kept as a multiple of the identity minus a few modes. The weight
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.solver.laplacian import Laplacian, Matrix
+from pliant.solver.bending import add_bending, frames_together
+from pliant.solver.laplacian import Laplacian
 from pliant.solver.parallel import over_ranges
 from pliant.solver.records import Floats
 
@@ -66,44 +67,57 @@ class Operator:
 
     def apply(self, shapes: Array, /, out: Array | None = None) -> Array:
         """Return 𝒜 X, shape `(F, 3, P)`, in `out` if it is given."""
-        result = np.zeros_like(shapes) if out is None else out
-        spatial = shapes.dtype.type(self.spatial_weight)
-        smooth = self.laplacian is not None and self.spatial_weight > 0
-        if smooth:
-            assert self.laplacian is not None
-            forward = _as_type(self.laplacian.matrix, shapes.dtype)
-            backward = _as_type(self.laplacian.adjoint, shapes.dtype)
+        return self._apply(shapes, None, np.empty_like(shapes) if out is None else out)
+
+    def gradient(self, shapes: Array, target: Array) -> Array:
+        """Return 𝒜 X − b for centred tracks W of shape `(F, 2, P)`: half the gradient of the energy that this majorises."""
+        return self._apply(shapes, target, np.empty_like(shapes))
+
+    def _apply(self, shapes: Array, target: Array | None, result: Array) -> Array:
+        together = frames_together(len(shapes))
 
         def work(start: int, stop: int) -> None:
-            for frame in range(start, stop):
-                camera = self.projections[frame]
-                image = camera @ shapes[frame]
-                image *= self.weights[frame]
-                row = result[frame]
-                np.matmul(camera.T, image, out=row)
-                if self.quadratic is None:
-                    self._add_temporal(shapes, frame, row)
-                if smooth:
-                    for axis in range(3):
-                        row[axis] += backward @ (spatial * (forward @ shapes[frame, axis]))
+            image, spare = np.empty_like(shapes[0, :2]), np.empty_like(shapes[0])
+            for low in range(start * together, min(stop * together, len(shapes)), together):
+                high = min(low + together, len(shapes))
+                for frame in range(low, high):
+                    camera, row = self.projections[frame], result[frame]
+                    np.matmul(camera, shapes[frame], out=image)
+                    if target is not None:
+                        image -= target[frame]
+                    image *= self.weights[frame]
+                    np.matmul(camera.T, image, out=row)
+                    if self.quadratic is None:
+                        self._add_temporal(shapes, frame, row, spare)
+                if self.laplacian is not None and self.spatial_weight > 0:
+                    add_bending(
+                        self.laplacian, self.spatial_weight, rows_of(shapes[low:high]), rows_of(result[low:high])
+                    )
 
-        over_ranges(work, len(shapes), smallest=max(1, SMALLEST // shapes[0].size))
+        over_ranges(work, -(-len(shapes) // together), smallest=max(1, SMALLEST // (together * shapes[0].size)))
         if self.rank is not None:
             self._add_rank(shapes, result)
         if self.quadratic is not None:
             add_product(self.quadratic, shapes, result)
         return result
 
-    def _add_temporal(self, shapes: Array, frame: int, out: Array) -> None:
+    def rounded(self, kind: np.dtype[np.floating]) -> Operator:
+        """Return the same in another precision."""
+        return replace(
+            self,
+            projections=self.projections.astype(kind),
+            weights=self.weights.astype(kind),
+            laplacian=None if self.laplacian is None else self.laplacian.rounded(kind),
+            quadratic=None if self.quadratic is None else self.quadratic.astype(kind),
+        )
+
+    def _add_temporal(self, shapes: Array, frame: int, out: Array, spare: Array) -> None:
         kind = shapes.dtype.type
         for k in range(len(self.bands)):
-            if k == 0:
-                out += kind(self.bands[0, frame]) * shapes[frame]
-                continue
-            if frame + k < len(shapes) and self.bands[k, frame] != 0:
-                out += kind(self.bands[k, frame]) * shapes[frame + k]
-            if frame - k >= 0 and self.bands[k, frame - k] != 0:
-                out += kind(self.bands[k, frame - k]) * shapes[frame - k]
+            for neighbour, first in ((frame + k, frame), (frame - k, frame - k))[: 1 if k == 0 else 2]:
+                if 0 <= neighbour < len(shapes) and self.bands[k, first] != 0:
+                    np.multiply(shapes[neighbour], kind(self.bands[k, first]), out=spare)
+                    out += spare
 
     def _add_rank(self, shapes: Array, result: Array) -> None:
         assert self.rank is not None
@@ -130,5 +144,6 @@ def add_product(quadratic: Array, shapes: Array, result: Array) -> None:
     over_ranges(work, shapes.shape[2], smallest=max(1, SMALLEST // (3 * len(shapes))))
 
 
-def _as_type(matrix: Matrix, kind: np.dtype[np.floating]) -> Matrix:
-    return matrix if matrix.dtype == kind else matrix.astype(kind)
+def rows_of(shapes: Array) -> Array:
+    """Return every frame and coordinate as a row, shape `(3F, P)`, without copying."""
+    return shapes.reshape(-1, shapes.shape[2])

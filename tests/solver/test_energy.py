@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pliant.solver import Mesh
+from pliant.solver import Mesh, iteration
 from pliant.solver.energy import objective, residuals
-from pliant.solver.iteration import init, operator_at, step
+from pliant.solver.iteration import init, no_higher, operator_at, step
 from pliant.solver.laplacian import build_laplacian
 from pliant.solver.state import Problem, State
 from waving_sheet import sheet, small_problem, triangulated, with_weights
@@ -135,3 +135,30 @@ def holed(mesh: Mesh) -> Problem:
         confidence=np.ascontiguousarray(whole.confidence[:, keep]),
         laplacian=build_laplacian(mesh, "auto"),
     )
+
+
+@pytest.mark.parametrize("mesh", MESHES)
+def test_corrections_in_single_precision_lead_to_the_same_energy(mesh: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = small_problem(MESHES[mesh], hidden=0.1, prior="smooth", temporal_weight=30.0, spatial_weight=0.009)
+
+    def descended() -> State:
+        state = started(problem)
+        for _ in range(25):
+            state = no_higher(state, step(problem, state))
+        return state
+
+    single = descended()
+    monkeypatch.setattr(iteration, "SINGLE_SPAN", 0.0)
+    double = descended()
+    assert single.shapes.dtype == np.float64
+    assert not np.array_equal(single.shapes, double.shapes)  # or single precision was not taken
+    np.testing.assert_allclose(single.objective, double.objective, rtol=1e-6)
+
+
+def test_single_precision_is_taken_where_it_can_reach_what_is_asked() -> None:
+    problem = small_problem(MESHES["triangles"], prior="smooth", temporal_weight=30.0, spatial_weight=0.009)
+    given = operator_at(problem, started(problem))
+    assert iteration._inner_precision(given, 0.1) == np.float32
+    assert iteration._inner_precision(given, 1e-6) == np.float64
+    assert iteration._inner_precision(replace(given, weights=1e8 * given.weights), 0.1) == np.float64
+    assert iteration._inner_precision(given.rounded(np.dtype(np.float32)), 1e-6) == np.float32
