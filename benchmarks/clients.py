@@ -1,7 +1,7 @@
 """The same faults against three clients: ours, PyODM and replicate-python, each asked through `clients_child.py`.
 
-    python -m venv /tmp/other && /tmp/other/bin/pip install pyodm replicate
-    python benchmarks/clients.py --other /tmp/other/bin/python
+    python -m venv build/other && build/other/bin/pip install pyodm replicate
+    python benchmarks/clients.py --other build/other/bin/python
 
 One small server here speaks as much of the three services' languages as the wishes need, and misbehaves on demand. Each client
 runs in a process of its own with its own defaults. Prints a table in Markdown.

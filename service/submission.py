@@ -8,8 +8,9 @@ from typing import Any
 
 from pliant.client.options import Options
 from pliant.client.schemas import Interpretation, Job
-from pliant.service.forms import File, Form
+from pliant.service.forms import File, Form, FormRules
 from pliant.service.problems import Refusal, from_validation
+from pliant.service.settings import ServiceSettings
 from pliant.worker.artifacts import kinds_for
 from pliant.worker.errors import Conflict, UnknownUpload
 from pliant.worker.formats import Limits, store_inputs
@@ -24,6 +25,17 @@ UPLOADS = {f"{part}_upload": part for part in sorted(FILES)}
 TEXTS = frozenset({"mesh", "options", "name", "webhook", "webhook_secret", *UPLOADS})
 LONGEST_NAME = 200
 """Characters of the user's label."""
+
+
+def form_rules(settings: ServiceSettings, *, max_body_bytes: int) -> FormRules:
+    """Return what the form of a job may hold; `max_body_bytes` is what whoever asks may send."""
+    return FormRules(
+        files=FILES,
+        texts=TEXTS,
+        max_body_bytes=max_body_bytes,
+        max_text_bytes=settings.max_text_bytes,
+        stall_seconds=settings.stall_seconds,
+    )
 
 
 def accept(

@@ -17,7 +17,6 @@ import typer
 from pliant.client.cli.exits import Exit
 from pliant.client.cli.session import HOME, Json, Session, Url
 from pliant.client.cli.show import out, print_json
-from pliant.client.cli.solve import THREAD_VARIABLES
 
 OLDEST_PYTHON = (3, 11)
 ROOM = 2 * 1024**3
@@ -111,7 +110,7 @@ def check_blas() -> Iterator[Finding]:
     import os
 
     import numpy as np
-    from pliant.worker.settings import usable_cores
+    from pliant.worker.settings import NUMERICAL_THREADS, usable_cores
 
     a = np.random.default_rng(0).normal(size=(1000, 1000))
     a @ a
@@ -121,7 +120,7 @@ def check_blas() -> Iterator[Finding]:
     seconds = time.perf_counter() - begin
     threads, speed = (time.process_time() - used) / seconds, 3 * 2 * 1000**3 / seconds / 1e9
     blas = np.show_config(mode="dicts")["Build Dependencies"]["blas"]["name"]
-    asked = {name: os.environ[name] for name in THREAD_VARIABLES if os.environ.get(name)}
+    asked = {name: os.environ[name] for name in NUMERICAL_THREADS if os.environ.get(name)}
     said = ", ".join(f"{name}={value}" for name, value in asked.items()) or "no variable limits them"
     found = f"{blas}, {speed:.0f} Gflop/s, {threads:.1f} threads at work ({said})"
     if speed < 1:

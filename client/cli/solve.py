@@ -14,9 +14,6 @@ if TYPE_CHECKING:
     from pliant.client.schemas import Interpretation
     from pliant.worker.run import Finished
 
-THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
-"""Read by the numerical libraries when they are loaded, which is after this."""
-
 Threads = Annotated[
     int | None,
     typer.Option("--threads", help="Threads to use; all cores if not given.", min=1),
@@ -36,7 +33,10 @@ def solve(
 ) -> None:
     """Reconstruct without a service: the same code, the same files."""
     ctx.obj.json = as_json
-    os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))  # the solver has threads of its own
+    from pliant.worker.settings import NUMERICAL_THREADS
+
+    # Read by the numerical libraries when they are loaded, which is after this; the solver has threads of its own.
+    os.environ.update(dict.fromkeys(NUMERICAL_THREADS, "1"))
     from pliant.client.parts import checked_options
     from pliant.client.progress import progress_bar
     from pliant.solver import threads_limited

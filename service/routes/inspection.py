@@ -9,9 +9,9 @@ from fastapi import APIRouter, Request
 from pliant.client.schemas import Inspection
 from pliant.service.core import Bound, Core, MyUploads
 from pliant.service.describe import SUBMIT_BODY, problems
-from pliant.service.forms import Form, FormRules, receive_form
+from pliant.service.forms import Form, receive_form
 from pliant.service.sample import sample_of
-from pliant.service.submission import FILES, TEXTS, parse_options, read_form, with_uploads
+from pliant.service.submission import form_rules, parse_options, read_form, with_uploads
 from pliant.worker.formats import Limits, load_inputs
 from pliant.worker.formats.apart import LARGE
 from pliant.worker.uploads import Uploads
@@ -30,14 +30,7 @@ async def inspect(request: Request, core: Core, bounds: Bound, uploads: MyUpload
 
     What submitting refuses is refused here in the same words, with the readings to choose from where several fit. Nothing is kept.
     """
-    settings = core.settings
-    rules = FormRules(
-        files=FILES,
-        texts=TEXTS,
-        max_body_bytes=bounds.max_body_bytes,
-        max_text_bytes=settings.max_text_bytes,
-        stall_seconds=settings.stall_seconds,
-    )
+    rules = form_rules(core.settings, max_body_bytes=bounds.max_body_bytes)
     with core.incoming.room() as room:
         form = await receive_form(request, room, rules=rules)
         return await to_thread.run_sync(lambda: understood(form, room, uploads, core.limits), limiter=core.parsing)

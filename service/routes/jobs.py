@@ -10,8 +10,8 @@ from fastapi import APIRouter, Header, Path, Query, Request, Response
 from pliant.client.schemas import Job, JobPage, Status
 from pliant.service.core import Bound, Bounds, Core, Mine, Service, my_uploads
 from pliant.service.describe import JOB_EXAMPLE, SUBMIT_BODY, problems
-from pliant.service.forms import FormRules, receive_form
-from pliant.service.submission import FILES, TEXTS, accept
+from pliant.service.forms import receive_form
+from pliant.service.submission import accept, form_rules
 from pliant.worker.jobs import LARGEST_PAGE, Jobs
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
@@ -131,14 +131,7 @@ async def _receive(
     idempotency_key: str | None = None,
 ) -> tuple[Job, bool]:
     """Receive a form into a room of its own and submit what it holds; the room is gone afterwards, whatever happened."""
-    settings = core.settings
-    rules = FormRules(
-        files=FILES,
-        texts=TEXTS,
-        max_body_bytes=bounds.max_body_bytes,
-        max_text_bytes=settings.max_text_bytes,
-        stall_seconds=settings.stall_seconds,
-    )
+    rules = form_rules(core.settings, max_body_bytes=bounds.max_body_bytes)
     await to_thread.run_sync(lambda: jobs.check_room(id=id, idempotency_key=idempotency_key))
     with core.incoming.room() as room:
         form = await receive_form(request, room, rules=rules)

@@ -18,6 +18,7 @@ from pliant.client.cli.demo import GOOD, announced, judge
 from pliant.client.cli.session import Session, parse_options
 from pliant.client.cli.solve import file_or_word
 from pliant.client.testing import FakeService
+from pliant.worker.settings import NUMERICAL_THREADS
 
 doctor = importlib.import_module("pliant.client.cli.doctor")  # the name in the package is the command's
 up = importlib.import_module("pliant.client.cli.up")
@@ -124,7 +125,7 @@ def test_the_doctor_misses_packages(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_doctor_measures_and_counts(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in doctor.THREAD_VARIABLES:
+    for name in NUMERICAL_THREADS:
         monkeypatch.delenv(name, raising=False)
     (blas,) = doctor.check_blas()
     assert re.search(r"\d+ Gflop/s, \d+\.\d threads at work \(no variable limits them\)", blas.found)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import sys
 from pathlib import Path
@@ -42,6 +43,12 @@ def test_the_stored_file_and_the_interpretation_are_the_same(all_apart: None, tm
     assert (tmp_path / "here.npz").read_bytes() == (tmp_path / "there.npz").read_bytes()
     assert store_inputs(tracks=tmp_path / "t.npz", mesh="none", options=Options(), target=None).num_points == 42
     assert sorted(path.name for path in tmp_path.iterdir()) == ["g.npz", "here.npz", "t.npz", "there.npz"]
+
+
+def test_both_doors_take_the_same() -> None:
+    here, apart_too = (dict(inspect.signature(door).parameters) for door in (read_inputs, store_inputs))
+    assert apart_too.pop("target").default is inspect.Parameter.empty
+    assert here == apart_too
 
 
 def test_refusals_come_back_whole(all_apart: None, tmp_path: Path) -> None:

@@ -78,13 +78,15 @@ def store_inputs(
     InvalidInput, AmbiguousInput
         As `read_inputs`; too_large also when reading needs more memory or time than the limits allow.
     """
-    parts = {"tracks": tracks, "mesh": mesh, "ground_truth": ground_truth, "rotations": rotations}
+    parts: dict[str, Any] = {"tracks": tracks, "mesh": mesh, "ground_truth": ground_truth, "rotations": rotations}
     files = {name: part for name, part in parts.items() if isinstance(part, Path)}
     if sum(announced(path, field=name) for name, path in files.items()) > LARGE:
         return _in_process(parts, options, limits, target)
-    inputs = read_inputs(
-        tracks=tracks, mesh=mesh, ground_truth=ground_truth, rotations=rotations, options=options, limits=limits
-    )
+    return _here(parts, options, limits, target)
+
+
+def _here(parts: dict[str, Any], options: Options, limits: Limits, target: Path | None) -> Interpretation:
+    inputs = read_inputs(**parts, options=options, limits=limits)
     if target is not None:
         save_inputs(inputs, target)
     return inputs.interpretation
@@ -179,9 +181,8 @@ def main() -> int:
     parts = {name: Path(part["path"]) if isinstance(part, dict) else part for name, part in request["parts"].items()}
     try:
         try:
-            inputs = read_inputs(**parts, options=Options.model_validate(request["options"]), limits=limits)
-            if request["target"] is not None:
-                save_inputs(inputs, Path(request["target"]))
+            target = None if request["target"] is None else Path(request["target"])
+            interpretation = _here(parts, Options.model_validate(request["options"]), limits, target)
         except MemoryError as error:
             raise too_large(
                 "tracks", expected=f"inputs that are read within {limits.read_memory} bytes", got="more"
@@ -190,7 +191,7 @@ def main() -> int:
         said = {name: getattr(error, name) for name in KEPT}
         sys.stdout.write(json.dumps({**said, "choices": getattr(error, "choices", None)}))
         return REFUSED
-    sys.stdout.write(inputs.interpretation.model_dump_json())
+    sys.stdout.write(interpretation.model_dump_json())
     return 0
 
 
