@@ -280,6 +280,11 @@ class Records(ABC):
                 return after
 
 
+def utc_now() -> datetime:
+    """Return the time."""
+    return datetime.now(UTC)
+
+
 def milliseconds(moment: datetime) -> int:
     """Return a moment as whole milliseconds since 1970."""
     return int(moment.timestamp() * 1000)

@@ -11,13 +11,14 @@ import hmac
 import re
 import secrets
 from collections.abc import Callable, Sequence
-from datetime import UTC, datetime, timedelta
+from datetime import datetime, timedelta
 from enum import StrEnum
 from typing import Any
 
 import redis
 from pliant.worker.connection import connect, reachable
 from pliant.worker.errors import InvalidRequest, UnknownToken
+from pliant.worker.records import utc_now
 from pliant.worker.settings import Settings
 from pydantic import BaseModel, ConfigDict
 
@@ -77,11 +78,6 @@ class Token(BaseModel):
     def expired(self, now: datetime) -> bool:
         """Tell whether its time is over."""
         return self.expires_at is not None and self.expires_at <= now
-
-
-def utc_now() -> datetime:
-    """Return the time."""
-    return datetime.now(UTC)
 
 
 class Tokens:
