@@ -49,7 +49,7 @@ class CameraEstimate:
     """K of the factorization; 0 for given cameras."""
 
     gram: Floats
-    """W Wᵀ / P of the completed tracks, shape `(2F, 2F)`, normalised units."""
+    """W Wᵀ / P of the completed tracks, shape `(2F, 2F)`, normalised units; empty where nothing asks for it."""
 
     outliers: float = 0.0
     """Share of the seen entries that completion replaced as gross outliers."""
@@ -134,15 +134,23 @@ def given_cameras(normalised: Normalised, known: KnownCamera, settings: Settings
 
     They are then those with which one rigid shape explains the tracks best: Σ_f ‖W_f − s_f R_f S‖². Shrinking them all gains
     nothing, for S grows in return.
+
+    Where the prior does not ask for the tracks' Gram matrix, scales are known and nothing is hidden, so that the centroids are right,
+    the tracks are not completed: that could take longer than the shapes.
     """
-    completed = complete(normalised, seed=settings.seed)
+    frames = len(known.rotations)
+    exact = known.scales is not None or settings.camera == "orthographic"
+    if exact and not settings.gaussian and bool((normalised.visible > 0).all()):
+        completed = Completed(np.zeros((0, 0)), np.zeros((frames, 0, 2)), np.zeros((frames, 2)), 0, 0.0)
+    else:
+        completed = complete(normalised, seed=settings.seed)
     if known.scales is not None:
         scales, reason = np.array(known.scales), "Rotations and scales were given."
     elif settings.camera == "scaled_orthographic":
         scales = _rigid_scales(completed.gram, known.rotations)
         reason = "Rotations were given; scales were estimated."
     else:
-        scales, reason = np.ones(len(known.rotations)), "Rotations were given; orthography has no scales."
+        scales, reason = np.ones(frames), "Rotations were given; orthography has no scales."
     return CameraEstimate(
         known.rotations, scales, completed.translations, 0, completed.gram, completed.outliers, {"camera": reason}
     )

@@ -107,12 +107,13 @@ def _shifted(grid: Ints, down: int, right: int) -> Ints:
 
 def _mesh_matrix(mesh: Mesh, weights: Floats) -> Matrix:
     """Weighted mean of the neighbours minus the vertex, times `STRENGTH`, for vertices off the rim."""
-    plain = _plain_rows(mesh.edges, weights, mesh.num_points)
+    edges = mesh.edges
+    plain = _plain_rows(edges, weights, mesh.num_points)
     keep = np.ones(mesh.num_points)
     keep[_rim(mesh)] = 0.0
     matrix = sparse.csr_array(sparse.diags_array(keep) @ plain)
     matrix.eliminate_zeros()
-    return _with_untouched_hung_on(matrix, mesh.edges, weights)
+    return _with_untouched_hung_on(matrix, edges, weights)
 
 
 def _plain_rows(edges: Ints, weights: Floats, num_points: int) -> Matrix:
@@ -141,9 +142,10 @@ def _with_untouched_hung_on(matrix: Matrix, edges: Ints, weights: Floats) -> Mat
 def _rim(mesh: Mesh) -> NDArray[np.intp]:
     """Vertices of edges that belong to one face only."""
     following = np.roll(mesh.faces, -1, axis=1)
-    pairs = np.sort(np.stack([mesh.faces, following], axis=-1).reshape(-1, 2), axis=1)
-    edges, count = np.unique(pairs, axis=0, return_counts=True)
-    return np.unique(edges[count == 1]).astype(np.intp)
+    low, high = np.minimum(mesh.faces, following), np.maximum(mesh.faces, following)
+    keys, count = np.unique(low.astype(np.int64) * mesh.num_points + high, return_counts=True)
+    single = keys[count == 1]
+    return np.unique(np.concatenate([single // mesh.num_points, single % mesh.num_points])).astype(np.intp)
 
 
 def _cotangent_weights(mesh: Mesh, reference: Floats) -> Floats:

@@ -130,7 +130,14 @@ class Operator:
 
     def right_hand_side(self, target: Array) -> Array:
         """Return s Rᵀ (ω ∘ W) for centred tracks W of shape `(F, 2, P)`."""
-        back: Array = np.matmul(self.projections.transpose(0, 2, 1), self.weights * target)
+        frames, _, points = target.shape
+        back = np.zeros((frames, 3, points), dtype=target.dtype)
+
+        def work(start: int, stop: int) -> None:
+            for frame in range(start, stop):
+                np.matmul(self.projections[frame].T, self.weights[frame] * target[frame], out=back[frame])
+
+        over_ranges(work, frames, smallest=max(1, SMALLEST // (3 * points)))
         return back
 
 
