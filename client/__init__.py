@@ -11,7 +11,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from pliant.client.asynchronous import AsyncClient, AsyncRemoteJob, AsyncResult
+    from pliant.client.async_remote import AsyncRemoteJob, AsyncResult
+    from pliant.client.asynchronous import AsyncClient
     from pliant.client.errors import (
         BadArgument,
         CorruptDownload,
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     )
     from pliant.client.options import Options
     from pliant.client.policy import Policy
+    from pliant.client.remote import RemoteJob, Result
     from pliant.client.schemas import (
         Artifact,
         Interpretation,
@@ -43,7 +45,7 @@ if TYPE_CHECKING:
         ServiceLimits,
         Status,
     )
-    from pliant.client.sync import Client, RemoteJob, Result
+    from pliant.client.sync import Client
 
 _HOMES = {
     "errors": (
@@ -54,8 +56,10 @@ _HOMES = {
     "options": ("Options",),
     "policy": ("Policy",),
     "schemas": ("Artifact", "Interpretation", "Job", "Problem", "Progress", "ServiceLimits", "Status"),
-    "asynchronous": ("AsyncClient", "AsyncRemoteJob", "AsyncResult"),
-    "sync": ("Client", "RemoteJob", "Result"),
+    "asynchronous": ("AsyncClient",),
+    "async_remote": ("AsyncRemoteJob", "AsyncResult"),
+    "sync": ("Client",),
+    "remote": ("RemoteJob", "Result"),
 }  # fmt: skip
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 

@@ -18,7 +18,8 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "support"))  # where pytest finds it too
 
-from attack_files import ATTACKS, CANARY, HONEST, Attack
+from attack_files import ATTACKS, Attack
+from crafting import CANARY, HONEST
 from peaks import Watched, descendants, watched
 from pliant.client.cli.demo import running
 

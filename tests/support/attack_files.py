@@ -7,27 +7,53 @@ that count as a defence; which of several comes depends on the library that meet
 # ruff: noqa: E501
 from __future__ import annotations
 
-import base64
-import io
-import json
 import pickle
 import struct
-import tempfile
-import warnings
 import zipfile
 import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import h5py
 import numpy as np
-import scipy.io
-
-CANARY = Path(tempfile.gettempdir()) / "pliant-canary-of-the-attack-tests"
-"""What code that ran would make."""
-
-SECRET = "/etc/passwd"
+from crafting import (
+    BINARY,
+    HONEST,
+    MAT_HEADER,
+    OBJ_POINTS,
+    PLY_FACE,
+    PLY_VERTEX,
+    SECRET,
+    Runs,
+    accessors,
+    archive,
+    declared_smaller,
+    described,
+    encrypted,
+    glb,
+    gltf,
+    hdf5,
+    hdf5_bomb,
+    hdf5_cells,
+    hdf5_circle,
+    hdf5_deep,
+    hdf5_external,
+    hdf5_virtual,
+    header,
+    many_members,
+    mat5,
+    mat_many_bombs,
+    mat_matrix,
+    mat_nested,
+    mat_packed_bomb,
+    npy,
+    observations,
+    overlapping,
+    patched,
+    ply,
+    png,
+    zeros,
+)
 
 
 @dataclass(frozen=True)
@@ -42,247 +68,6 @@ class Attack:
 
     def __str__(self) -> str:
         return self.name
-
-
-class Runs:
-    """Unpickling this makes the canary."""
-
-    def __reduce__(self) -> tuple[object, ...]:
-        return (open, (str(CANARY), "w"))
-
-
-def npy(array: np.ndarray) -> bytes:
-    buffer = io.BytesIO()
-    np.save(buffer, array, allow_pickle=True)
-    return buffer.getvalue()
-
-
-def header(text: str, data: bytes = b"", *, length: int | None = None) -> bytes:
-    """A .npy whose header is this text."""
-    raw = text.encode()
-    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(raw) if length is None else length) + raw + data
-
-
-def described(shape: str, descr: str = "'<f8'") -> str:
-    return f"{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}, }}\n"
-
-
-HONEST = npy(np.cumsum(np.random.default_rng(0).normal(size=(6, 20, 2)), axis=0) + 100)
-
-
-def archive(*members: tuple[str, bytes], method: int = zipfile.ZIP_DEFLATED) -> bytes:
-    buffer = io.BytesIO()
-    with warnings.catch_warnings(), zipfile.ZipFile(buffer, "w", method) as file:
-        warnings.simplefilter("ignore")
-        for name, content in members:
-            file.writestr(zipfile.ZipInfo(name), content, method)
-    return buffer.getvalue()
-
-
-def zeros(megabytes: int, shape: str) -> bytes:
-    """An npz of this many megabytes of zeros behind a header, a thousandth of that on disk."""
-    buffer = io.BytesIO()
-    with (
-        zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as file,
-        file.open("tracks.npy", "w", force_zip64=True) as out,
-    ):
-        out.write(header(described(shape)))
-        for _ in range(megabytes):
-            out.write(bytes(1 << 20))
-    return buffer.getvalue()
-
-
-def patched(content: bytes, old: bytes, new: bytes, *, count: int = -1) -> bytes:
-    assert old in content
-    return content.replace(old, new, count)
-
-
-def declared_smaller() -> bytes:
-    """A member whose directory entry tells 1 kB where 4 MB inflate."""
-    whole = archive(("tracks.npy", header(described("(64, 4096, 2)")) + bytes(64 * 4096 * 16)))
-    size = struct.pack("<L", len(header(described("(64, 4096, 2)"))) + 64 * 4096 * 16)
-    return patched(whole, size, struct.pack("<L", 1024))
-
-
-def overlapping() -> bytes:
-    """One compressed member that sixty directory entries share."""
-    whole = bytearray(archive(("tracks.npy", HONEST)))
-    start = whole.find(b"PK\x01\x02")
-    end = whole.find(b"PK\x05\x06")
-    entry = bytes(whole[start:end])
-    entries = b"".join(
-        patched(entry, b"tracks.npy", f"track{index:02d}py"[:6].encode() + b".npy") for index in range(60)
-    )
-    tail = bytearray(whole[end:])
-    tail[8:12] = struct.pack("<HH", 60, 60)
-    tail[12:16] = struct.pack("<L", len(entries))
-    return bytes(whole[:start]) + entries + bytes(tail)
-
-
-def many_members() -> bytes:
-    return archive(*((f"a{index}.npy", b"") for index in range(5000)), method=zipfile.ZIP_STORED)
-
-
-def encrypted() -> bytes:
-    whole = bytearray(archive(("tracks.npy", HONEST)))
-    for mark, at in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
-        whole[whole.find(mark) + at] |= 1
-    return bytes(whole)
-
-
-def hdf5(build: Callable[[h5py.File], object], **more: object) -> bytes:
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "t.mat"
-        with h5py.File(path, "w", **more) as file:
-            build(file)
-        return path.read_bytes()
-
-
-def hdf5_external(file: h5py.File) -> None:
-    file.create_dataset("W", (20, 20), dtype="u1", external=[(SECRET, 0, 400)])
-
-
-def hdf5_virtual(file: h5py.File) -> None:
-    layout = h5py.VirtualLayout((20, 20), "f8")
-    layout[:] = h5py.VirtualSource("/tmp/other.h5", "W", shape=(20, 20))
-    file.create_virtual_dataset("W", layout)
-
-
-def hdf5_circle(file: h5py.File) -> None:
-    inner = file.create_group("a/b")
-    inner["c"] = file["a"]
-
-
-def hdf5_deep(file: h5py.File) -> None:
-    group: h5py.Group = file
-    for _ in range(200):
-        group = group.create_group("g")
-    group["W"] = np.ones((20, 20))
-
-
-def hdf5_cells(file: h5py.File) -> None:
-    file["a"] = np.ones((2, 30))
-    cells = file.create_dataset("W", (1, 25_000), dtype=h5py.ref_dtype)
-    cells[...] = file["a"].ref
-
-
-def hdf5_bomb(file: h5py.File) -> None:
-    file.create_dataset("W", (2000, 50_000), dtype="f8", chunks=(2000, 1000), compression="gzip")  # none of it written
-
-
-def mat5(variables: dict[str, object], *, packed: bool = False) -> bytes:
-    buffer = io.BytesIO()
-    scipy.io.savemat(buffer, variables, do_compression=packed)
-    return buffer.getvalue()
-
-
-MAT_HEADER = b"MATLAB 5.0 MAT-file".ljust(124) + b"\x00\x01IM"
-
-
-def mat_element(kind: int, content: bytes, *, size: int | None = None) -> bytes:
-    return struct.pack("<II", kind, len(content) if size is None else size) + content + b"\0" * (-len(content) % 8)
-
-
-def mat_matrix(dims: tuple[int, ...], *, size: int | None = None, data: bytes = bytes(64), flags: int = 6) -> bytes:
-    """One variable W of doubles, with whatever dimensions and sizes."""
-    inside = mat_element(6, struct.pack("<II", flags, 0)) + mat_element(5, struct.pack(f"<{len(dims)}i", *dims))
-    inside += mat_element(1, b"W") + mat_element(9, data, size=size)
-    return MAT_HEADER + mat_element(14, inside)
-
-
-def mat_nested(depth: int) -> bytes:
-    """A cell in a cell in a cell …"""
-    content = b""
-    for _ in range(depth):
-        inside = (
-            mat_element(6, struct.pack("<II", 1, 0))
-            + mat_element(5, struct.pack("<2i", 1, 1))
-            + mat_element(1, b"W")
-            + content
-        )
-        content = mat_element(14, inside)
-    return MAT_HEADER + content
-
-
-def mat_packed_bomb() -> bytes:
-    """A compressed variable that inflates to a gigabyte whatever it says of itself."""
-    packer = zlib.compressobj(9)
-    inside = (
-        mat_element(6, struct.pack("<II", 6, 0)) + mat_element(5, struct.pack("<2i", 10, 10)) + mat_element(1, b"W")
-    )
-    content = packer.compress(struct.pack("<II", 14, 1 << 30) + inside + struct.pack("<II", 9, 1 << 30))
-    for _ in range(1 << 10):
-        content += packer.compress(bytes(1 << 20))
-    content += packer.flush()
-    return MAT_HEADER + struct.pack("<II", 15, len(content)) + content
-
-
-def ply(head: str, body: bytes = b"", *, kind: str = "binary_little_endian") -> bytes:
-    return f"ply\nformat {kind} 1.0\n{head}end_header\n".encode() + body
-
-
-def mat_many_bombs() -> bytes:
-    whole = mat5({"W": np.zeros((2400, 2400))}, packed=True)
-    return whole[:128] + 24 * whole[128:]
-
-
-PLY_VERTEX = "element vertex 20\nproperty float x\nproperty float y\nproperty float z\n"
-PLY_FACE = "element face 1\nproperty list uint int vertex_indices\n"
-OBJ_POINTS = "".join(f"v {index} 0 {index % 3}\n" for index in range(20))
-
-
-def glb(document: object, binary: bytes = b"", *, length: int | None = None) -> bytes:
-    text = json.dumps(document).encode() if not isinstance(document, bytes) else document
-    text += b" " * (-len(text) % 4)
-    body = (
-        struct.pack("<I4s", len(text) if length is None else length, b"JSON")
-        + text
-        + struct.pack("<I4s", len(binary), b"BIN\0")
-        + binary
-    )
-    return b"glTF" + struct.pack("<II", 2, 12 + len(body)) + body
-
-
-def gltf(**changed: object) -> dict[str, object]:
-    """A document of 20 vertices and 2 triangles, with parts exchanged."""
-    document: dict[str, object] = {
-        "asset": {"version": "2.0"}, "buffers": [{"byteLength": 264}],
-        "bufferViews": [{"buffer": 0, "byteLength": 240}, {"buffer": 0, "byteOffset": 240, "byteLength": 24}],
-        "accessors": [
-            {"bufferView": 0, "componentType": 5126, "count": 20, "type": "VEC3"},
-            {"bufferView": 1, "componentType": 5125, "count": 6, "type": "SCALAR"},
-        ],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
-    }  # fmt: skip
-    return {**document, **changed}
-
-
-def accessors(**first: object) -> list[dict[str, object]]:
-    return [
-        {"bufferView": 0, "componentType": 5126, "count": 20, "type": "VEC3", **first},
-        {"bufferView": 1, "componentType": 5125, "count": 6, "type": "SCALAR"},
-    ]
-
-
-BINARY = np.zeros((20, 3), "<f4").tobytes() + np.array([0, 1, 2, 3, 4, 5], "<u4").tobytes()
-
-
-GFACES = base64.b64encode(BINARY).decode()
-
-
-def png(width: int, height: int, *chunks: tuple[bytes, bytes], data: bytes = b"") -> bytes:
-    """A PNG of grey pixels with any size in its header."""
-
-    def chunk(kind: bytes, content: bytes) -> bytes:
-        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
-
-    start = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0))
-    rest = b"".join(chunk(*each) for each in chunks)
-    return b"\x89PNG\r\n\x1a\n" + start + rest + chunk(b"IDAT", data) + chunk(b"IEND", b"")
-
-
-def observations(*lines: str) -> bytes:
-    return ("frame,point,x,y\n" + "\n".join(lines) + "\n").encode()
 
 
 ZIPS = (

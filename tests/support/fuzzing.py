@@ -25,24 +25,8 @@ from hypothesis import strategies as st
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from attack_files import (
-    BINARY,
-    GFACES,
-    HDF5,
-    HEADERS,
-    HONEST,
-    MAT5,
-    MESHES,
-    OBJ_POINTS,
-    TEXT,
-    ZIPS,
-    archive,
-    glb,
-    gltf,
-    mat5,
-    ply,
-    png,
-)
+from attack_files import HDF5, HEADERS, MAT5, MESHES, TEXT, ZIPS
+from crafting import BINARY, GFACES, HONEST, OBJ_POINTS, archive, glb, gltf, mat5, ply, png
 from pliant.solver import InvalidInput
 from pliant.worker.formats.arrays import read_npy, read_npz
 from pliant.worker.formats.parsers import PARSERS, parse

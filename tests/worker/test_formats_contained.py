@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 import pytest
 import scipy.io
-from attack_files import GFACES, accessors, gltf
+from crafting import GFACES, accessors, gltf
 from PIL import Image
 from pliant.client.options import Options
 from pliant.solver import InvalidInput
