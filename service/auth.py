@@ -6,13 +6,13 @@ Pure ASGI. Everything needs a token but what `PUBLIC` lists, so a route that som
 from __future__ import annotations
 
 import time
-from datetime import UTC, datetime
 
 from anyio import to_thread
 from fastapi.responses import Response
 from pliant.service.problems import answer, from_error, problem
 from pliant.service.settings import ServiceSettings
 from pliant.worker.errors import StoreUnavailable, UnknownToken
+from pliant.worker.records import utc_now
 from pliant.worker.tokens import Scope, Token, Tokens
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Send
@@ -66,7 +66,7 @@ class StillGood:
             return False
         except StoreUnavailable:
             return True
-        return not token.expired(datetime.now(UTC))
+        return not token.expired(utc_now())
 
 
 class Authentication:
@@ -110,7 +110,7 @@ class Authentication:
                 "invalid_token",
                 "The token is not known here; it may have been revoked. Ask whoever runs the service for one.",
             )
-        if token.expired(datetime.now(UTC)):
+        if token.expired(utc_now()):
             return _unauthorised(
                 "expired_token", "The token's time is over. Ask whoever runs the service for a new one."
             )

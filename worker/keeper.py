@@ -88,6 +88,8 @@ class Keeper:
     _tidied: float | None = None
     _swept: float | None = None
     _cleaned: set[str] = field(default_factory=set)
+    _ended: int | None = None
+    """How many jobs had failed or been cancelled when we last cleaned up after them."""
 
     def tick(self) -> None:
         """Do what is due.
@@ -103,12 +105,13 @@ class Keeper:
         self._mind_the_clock(now)
         self._take_from_lost_workers(gap)
         self._queue_forgotten(gap)
+        self._clean_up_after_failures()
         if self._tidied is None or now >= self._tidied + TIDY_EVERY:
             if self._held_until is None or now >= self._held_until:
                 self._expire()
                 self._expire_uploads()
-            self._clean_up_after_failures()
             self._clear_work()
+            self._ended = None  # one may have expired while another failed: look again whatever the number
             self.jobs.queue.tidy()
             self._tidied = now
         if self._swept is None or now >= self._swept + SWEEP_EVERY:
@@ -234,12 +237,16 @@ class Keeper:
 
     def _clean_up_after_failures(self) -> None:
         """Remove what attempts had uploaded when they were killed, once for each job that ended badly of late."""
-        page = self.jobs.page(limit=LARGEST_PAGE, statuses=(Status.FAILED, Status.CANCELLED))
+        badly = (Status.FAILED, Status.CANCELLED)
+        ended = self.jobs.count(badly)
+        if ended == self._ended:
+            return
+        page = self.jobs.page(limit=LARGEST_PAGE, statuses=badly)
         for id in [job.id for job in page.jobs if job.id not in self._cleaned]:
             for key, _ in self.jobs.blobs.list(f"jobs/{id}/"):
                 if self._wanted(key) is False:
                     self.jobs.blobs.delete(key)
-        self._cleaned = {job.id for job in page.jobs}
+        self._cleaned, self._ended = {job.id for job in page.jobs}, ended
 
     def _sweep(self) -> None:
         """Remove files that belong to no job: of submissions that died before their record, of attempts that were killed."""

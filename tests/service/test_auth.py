@@ -111,11 +111,9 @@ def test_the_body_of_a_stranger_is_never_read(guarded: Running) -> None:
         f"POST /v1/jobs HTTP/1.1\r\nHost: {host}:{port}\r\nContent-Type: multipart/form-data; boundary=b\r\n"
         "Content-Length: 1000000000\r\n\r\n"
     )
-    with socket.create_connection((host, int(port)), timeout=10) as connection:
-        begun = time.monotonic()
+    with socket.create_connection((host, int(port)), timeout=guarded.settings.stall_seconds / 4) as connection:
         connection.sendall(head.encode())
         assert connection.recv(4096).startswith(b"HTTP/1.1 401 ")
-        assert time.monotonic() - begun < 1.5
     assert guarded.left_on_disk == []
 
 

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import httpx
 import pytest
+from pliant.worker.records import utc_now
 from pliant.worker.settings import Settings
 from serving import Running, Serve, claim, finish, form, submit, tracks, until
 
@@ -48,9 +49,9 @@ def test_a_listener_who_leaves_is_forgotten(restless: Running) -> None:
 
 
 @pytest.mark.parametrize("how", ["revoked", "expired"])
-def test_a_stream_ends_when_its_token_does(serve: Serve, how: str) -> None:
+def test_a_stream_ends_when_its_token_does(serve: Serve, how: str, monkeypatch: pytest.MonkeyPatch) -> None:
     running = serve(auth="required", heartbeat_seconds=0.2)
-    token, text = running.tokens.create("listener", expires=timedelta(seconds=2) if how == "expired" else None)
+    token, text = running.tokens.create("listener", expires=timedelta(hours=1) if how == "expired" else None)
     with httpx.Client(base_url=running.url, timeout=10, headers={"Authorization": f"Bearer {text}"}) as http:
         job = submit(http)
         with http.stream("GET", f"/v1/jobs/{job.id}/events") as answer:
@@ -58,6 +59,9 @@ def test_a_stream_ends_when_its_token_does(serve: Serve, how: str) -> None:
             assert next(line for line in lines if line.startswith(":"))
             if how == "revoked":
                 running.tokens.revoke(token.id)
+            else:
+                later = utc_now() + timedelta(hours=2)
+                monkeypatch.setattr("pliant.service.auth.utc_now", lambda: later)
             begun = time.monotonic()
             rest = list(lines)
         assert time.monotonic() - begun < 5
@@ -82,14 +86,14 @@ def test_a_submission_may_wait_for_the_end(running: Running, http: httpx.Client,
     assert late.json()["status"] == "succeeded"
 
 
-@pytest.mark.parametrize("wish", ["wait", "wait=", "wait=x", "wait=-1", "return=minimal", "wait=1.5", "wait=٣"])
+@pytest.mark.parametrize("wish", ["wait", "wait=", "wait=x", "wait=-9", "return=minimal", "wait=9.5", "wait=٩"])
 def test_a_wish_that_is_none_is_passed_over(http: httpx.Client, wish: str) -> None:
     job = submit(http)
     begun = time.monotonic()
     answer = http.get(f"/v1/jobs/{job.id}", headers={b"Prefer": wish.encode()})
     assert answer.status_code == 200
     assert "preference-applied" not in answer.headers
-    assert time.monotonic() - begun < 0.9
+    assert time.monotonic() - begun < 8
 
 
 def test_nobody_waits_longer_than_the_service_lets_him(serve: Serve) -> None:
@@ -161,7 +165,7 @@ def test_sigterm_ends_streams_and_waits_at_once_and_cleanly(
         threads = [threading.Thread(target=each) for each in (listen, wait)]
         for thread in threads:
             thread.start()
-        time.sleep(1.0)
+        until(lambda: "pliant_http_under_way 3" in http.get("/metrics").text)  # both, and the one that asks
         told = time.monotonic()
         service.send_signal(signal.SIGTERM)
         assert service.wait(20) == 0

@@ -201,7 +201,7 @@ def test_what_a_killed_attempt_had_uploaded_is_removed(
         id, lambda held: lifecycle.fail(held, token=token, problem=problem, now=world.now, retention=0)
     )
     assert any("belongs to no attempt" in each for each in findings(world.jobs, settle=0))
-    world.pass_seconds(31)
+    world.pass_seconds(1)
     assert findings(world.jobs, settle=0) == []
     assert [key for key, _ in world.jobs.blobs.list("jobs/")] == [world.jobs.records.get(id).inputs]
 

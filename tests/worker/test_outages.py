@@ -36,11 +36,11 @@ def test_a_job_lives_through_an_outage_of_the_store(tmp_path: Path, inputs_files
         time.sleep(3.5)
         os.kill(server, signal.SIGCONT)
         before = house.jobs.get(id).progress
-        house.until(lambda: house.jobs.get(id).progress != before, "it goes on telling", seconds=10)
+        house.until(lambda: house.jobs.get(id).progress != before, "it goes on telling")
         assert (house.jobs.get(id).attempt, house.horses()) == (1, [horse])
         os.kill(server, signal.SIGKILL)
         house.until(lambda: house.supervisor.pids().get("valkey", server) != server, "it is started again")
-        house.until(lambda: house.jobs.get(id).progress != before, "it goes on telling", seconds=10)
+        house.until(lambda: house.jobs.get(id).progress != before, "it goes on telling")
         assert (house.jobs.get(id).attempt, house.horses()) == (1, [horse])
         house.jobs.cancel(id)
         assert house.final(id).status is Status.CANCELLED
@@ -53,7 +53,7 @@ def test_killing_valkey_loses_nothing(tmp_path: Path, inputs_files: tuple[Path, 
         ids = [house.submit() for _ in range(20)]
         old = house.supervisor.pids()["valkey"]
         os.kill(old, signal.SIGKILL)
-        house.until(lambda: house.supervisor.pids().get("valkey", old) != old, "it is started again", seconds=5)
+        house.until(lambda: house.supervisor.pids().get("valkey", old) != old, "it is started again")
         jobs = [house.final(id, seconds=60) for id in ids]
         assert [job.status for job in jobs] == [Status.SUCCEEDED] * 20
         assert max(job.attempt for job in jobs) <= 2
@@ -126,7 +126,7 @@ def test_killing_the_supervisor_kills_all_and_loses_nothing(tmp_path: Path, inpu
         process.kill()
         process.wait()
         process.stdout.close()
-        outside.until(lambda: not any(running(pid) for pid in pids), "all its children end", seconds=15)
+        outside.until(lambda: not any(running(pid) for pid in pids), "all its children end")
         with pytest.raises(StoreUnavailable):
             outside.jobs.get(busy)
     with House(settings, own_valkey=True, inputs=inputs_files) as house:
