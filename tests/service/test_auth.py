@@ -172,7 +172,9 @@ def test_to_another_token_a_job_is_not_there_on_any_route(
     assert ada.get(f"/v1/jobs/{queued.id}").json()["status"] == "queued"
 
 
-def test_another_tokens_id_is_taken_and_nothing_is_said_of_its_job(ada: httpx.Client, bob: httpx.Client) -> None:
+def test_another_tokens_id_is_taken_and_nothing_is_said_of_its_job(
+    guarded: Running, ada: httpx.Client, bob: httpx.Client
+) -> None:
     body = tracks(seed=3)
     assert ada.put("/v1/jobs/shared-name", files=form(body, name="ada's")).status_code == 202
     answer = bob.put("/v1/jobs/shared-name", files=form(body, name="ada's"))
@@ -180,6 +182,15 @@ def test_another_tokens_id_is_taken_and_nothing_is_said_of_its_job(ada: httpx.Cl
     assert "ada" not in answer.text
     assert ada.put("/v1/jobs/shared-name", files=form(body, name="ada's")).status_code == 200
     assert bob.get("/v1/jobs/shared-name").status_code == 404
+
+    def refused(client: httpx.Client, sent: bytes) -> str:
+        again = client.put("/v1/jobs/shared-name", files=form(sent))
+        assert again.status_code == 409
+        return again.text
+
+    assert refused(ada, tracks(seed=5)) == answer.text, "nor that it is another's"
+    finish(guarded, "shared-name", b"result")
+    assert refused(bob, tracks(seed=6)) == answer.text, "nor how it stands"
 
 
 def test_idempotency_keys_are_each_tokens_own(ada: httpx.Client, bob: httpx.Client) -> None:

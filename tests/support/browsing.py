@@ -8,7 +8,7 @@ import shutil
 from pathlib import Path
 from types import TracebackType
 
-from playwright.sync_api import Browser, Page, Playwright, sync_playwright
+from playwright.sync_api import Browser, Page, Playwright, expect, sync_playwright
 
 ROOT = Path(__file__).parents[2]
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
@@ -27,6 +27,9 @@ def why_not() -> str | None:
     if not (ROOT / "service" / "web" / "dist" / "index.html").is_file():
         return "the page is not built; say `make page`"
     return None
+
+
+expect.set_options(timeout=20_000)  # milliseconds; a busy machine may need more than the usual five seconds
 
 
 class Browsing:

@@ -1,0 +1,120 @@
+"""The page in a real browser against the whole service, started once: API, queue, worker, embedded Valkey."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+
+import httpx
+import pytest
+from browsing import Browsing
+from long_jobs import long_request
+from paging import TRACKS, packed
+from playwright.sync_api import Browser, Page
+from pliant.client import Client
+from pliant.solver.gallery import corrupt, flag
+
+
+@pytest.fixture(scope="session")
+def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Start everything as a user does, on a free port."""
+    data = tmp_path_factory.mktemp("data")
+    command = [
+        sys.executable,
+        "-m",
+        "pliant.client.cli",
+        "up",
+        "--port",
+        "0",
+        "--workers",
+        "1",
+        "--json",
+        "--data",
+        str(data),
+    ]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as up:
+        assert up.stdout is not None
+        try:
+            said = ""
+            while not said.endswith("}\n"):
+                line = up.stdout.readline()
+                assert line != "", "pliant up ended at once"
+                said += line
+            yield json.loads(said)["url"]
+        finally:
+            up.send_signal(signal.SIGINT)
+            up.wait(30)
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Browser]:
+    with Browsing() as browsing:
+        yield browsing
+
+
+@pytest.fixture
+def page(browser: Browser, url: str) -> Iterator[Page]:
+    """A page of its own on the front page; a script error or a blocked request fails the test."""
+    context = browser.new_context(viewport={"width": 1280, "height": 900}, reduced_motion="reduce")
+    context.add_init_script(
+        "addEventListener('securitypolicyviolation', (event) => console.error('CSP blocked ' + event.blockedURI));"
+    )
+    page = context.new_page()
+    troubles: list[str] = []
+    page.on("pageerror", lambda error: troubles.append(str(error)))
+    page.on("console", lambda message: troubles.append(message.text) if "CSP" in message.text else None)
+    page.goto(url)
+    yield page
+    context.close()
+    for job in httpx.get(f"{url}/v1/jobs?status=queued&status=running&limit=100").json()["jobs"]:
+        httpx.post(f"{url}/v1/jobs/{job['id']}/cancel")  # the next test wants the one worker
+    assert troubles == []
+
+
+@pytest.fixture(scope="session")
+def small() -> dict[str, bytes]:
+    """A flag of a few hundred points, which moves as a whole: a result within seconds."""
+    sequence = corrupt(flag(10, 300), outliers=0.02)
+    return {
+        TRACKS: packed(tracks=sequence.tracks.points, visibility=sequence.tracks.visible > 0),
+        "mesh.npz": packed(faces=sequence.mesh.faces),
+        "truth.npz": packed(shapes=sequence.shapes),
+    }
+
+
+@pytest.fixture
+def long_job(url: str) -> Iterator[Callable[[str], str]]:
+    """Queue a job that only ever ends from outside; it is cancelled after the test."""
+    queued: list[str] = []
+
+    def submit(name: str) -> str:
+        with Client(url) as client:
+            queued.append(client.submit(**long_request(), name=name).id)
+        return queued[-1]
+
+    yield submit
+    for id in queued:
+        httpx.post(f"{url}/v1/jobs/{id}/cancel", timeout=60)
+
+
+@pytest.fixture(scope="session")
+def finished(url: str, small: dict[str, bytes]) -> str:
+    """The id of a finished job with ground truth."""
+    answer = httpx.post(
+        f"{url}/v1/jobs",
+        files={"tracks": small[TRACKS], "mesh": small["mesh.npz"], "ground_truth": small["truth.npz"]},
+        data={"name": "a finished face"},
+        timeout=60,
+    )
+    assert answer.status_code == 202, answer.text
+    id = str(answer.json()["id"])
+    while (job := httpx.get(f"{url}/v1/jobs/{id}", headers={"Prefer": "wait=20"}, timeout=60).json())["status"] in (
+        "queued",
+        "running",
+    ):
+        pass
+    assert job["status"] == "succeeded", job["error"]
+    return id

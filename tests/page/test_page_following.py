@@ -1,0 +1,102 @@
+"""Jobs followed in the page: running, waiting, beside the one that is shown; a service that is away; a token."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import httpx
+import pytest
+from browsing import why_not
+from paging import DONE, steps_of, until
+from playwright.sync_api import Page, Route, expect
+
+pytestmark = [
+    pytest.mark.chromium,
+    pytest.mark.skipif(why_not() is not None and not os.environ.get("CI"), reason=str(why_not())),
+]
+
+
+def test_a_running_job_survives_a_reload_and_can_be_cancelled(
+    page: Page, url: str, long_job: Callable[[str], str]
+) -> None:
+    id = long_job("a long job")
+    waiting = long_job("a job behind it")
+    page.goto(f"{url}/#job={id}")
+    objective = page.get_by_role("img", name=re.compile("^Objective from"))
+    objective.wait_for(timeout=DONE)
+    until(lambda: steps_of(objective) >= 4)
+    page.reload()
+    # The events of before the reload are told again: the curve is whole.
+    objective.wait_for(timeout=10_000)
+    until(lambda: steps_of(objective) >= 4, seconds=5)
+    expect(page.get_by_text(re.compile(r"reweighting \d+ of at most 1000"))).to_be_visible()
+
+    page.get_by_role("link", name="a job behind it").click()
+    expect(page.get_by_text("Next in the queue.")).to_be_visible()
+    page.get_by_role("button", name="Cancel").click()
+    expect(page.get_by_role("article").get_by_text("Cancelled", exact=True)).to_be_visible()
+    page.get_by_role("button", name="Try again").click()
+    expect(page.get_by_text("Next in the queue.")).to_be_visible()
+    page.get_by_role("button", name="Cancel").click()
+    expect(page.get_by_role("article").get_by_text("Cancelled", exact=True)).to_be_visible()
+    page.get_by_role("link", name="a long job").click()
+    page.get_by_role("button", name="Cancel").click()
+    expect(page.get_by_role("article").get_by_text("Cancelled", exact=True)).to_be_visible(timeout=30_000)
+    assert httpx.get(f"{url}/v1/jobs/{id}").json()["status"] == "cancelled"
+
+    page.get_by_role("button", name="Delete").click()
+    page.get_by_role("button", name="Delete it for good?").click()
+    expect(page.get_by_role("link", name="a long job")).to_have_count(0)
+    assert httpx.get(f"{url}/v1/jobs/{id}").status_code == 404
+    assert httpx.get(f"{url}/v1/jobs/{waiting}").json()["status"] == "cancelled"
+
+
+def test_the_list_follows_a_running_job_that_is_not_shown(
+    page: Page, url: str, finished: str, long_job: Callable[[str], str]
+) -> None:
+    page.goto(f"{url}/#job={finished}")
+    long_job("a job beside it")
+    row = page.get_by_role("link", name="a job beside it")
+    asked: list[str] = []
+    page.on("request", lambda request: asked.append(request.url))
+    expect(row).to_contain_text(re.compile(r"Running, \d+"), timeout=DONE)
+    until(lambda: any(address.endswith("/events") for address in asked))
+    # With the list itself kept away, it is the events that move the bar.
+    page.route(re.compile(r"/v1/jobs\?"), lambda route: route.abort())
+    before = float(row.get_by_role("progressbar", include_hidden=True).get_attribute("value") or 0)
+    until(lambda: float(row.get_by_role("progressbar", include_hidden=True).evaluate("(it) => it.value")) > before)
+
+
+def test_a_service_that_is_away_is_said_and_its_return_noticed(page: Page, url: str, finished: str) -> None:
+    page.route("**/v1/**", lambda route: route.abort())
+    page.goto(f"{url}/#job={finished}")
+    page.reload()
+    expect(page.get_by_role("alert").first).to_contain_text("The service does not answer.")
+    page.unroute_all()
+    page.locator(".view canvas").wait_for(timeout=30_000)
+    expect(page.get_by_role("alert")).to_have_count(0, timeout=15_000)
+
+
+def test_a_token_is_asked_for_and_then_sent_with_everything(page: Page, url: str, finished: str) -> None:
+    def guarded(route: Route) -> None:
+        if route.request.headers.get("authorization") == "Bearer a-token":
+            route.continue_()
+        else:
+            problem = {"title": "Unauthorised", "status": 401, "detail": "Send a token.", "code": "unauthorised"}
+            route.fulfill(status=401, content_type="application/problem+json", body=json.dumps(problem))
+
+    page.route("**/v1/**", guarded)
+    page.goto(f"{url}/#job={finished}")
+    page.reload()
+    expect(page.get_by_role("alert").first).to_contain_text("Send a token.")
+    page.get_by_label("Token").fill("a-token")
+    page.get_by_role("button", name="Use it").click()
+    page.locator(".view canvas").wait_for(timeout=30_000)
+    expect(page.get_by_role("alert")).to_have_count(0)
+    with page.expect_download() as download:
+        page.get_by_role("link", name="report.json").click()
+    assert "metrics" in json.loads(Path(download.value.path()).read_text())

@@ -1,0 +1,80 @@
+"""The page's manners: the keyboard alone, accessibility, and no request to anybody else."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+from browsing import differing_pixels, why_not
+from paging import DONE, until
+from playwright.sync_api import Page, expect
+
+pytestmark = [
+    pytest.mark.chromium,
+    pytest.mark.skipif(why_not() is not None and not os.environ.get("CI"), reason=str(why_not())),
+]
+
+
+def test_the_example_by_keyboard_alone(page: Page) -> None:
+    def tab_to(name: str, most: int = 60) -> None:
+        for _ in range(most):
+            page.keyboard.press("Tab")
+            if page.evaluate("document.activeElement?.textContent || document.activeElement?.ariaLabel") == name:
+                return
+        pytest.fail(f"the Tab key does not reach {name!r}")
+
+    tab_to("breathing sphere")
+    page.keyboard.press("Enter")
+    expect(page.get_by_role("button", name="Reconstruct")).to_be_focused()
+    expect(page.locator("[data-part=tracks]")).to_contain_text("tracks 30 × 500 × 2 float32")
+    page.keyboard.press("Enter")
+    expect(page.get_by_role("heading", name="breathing sphere")).to_be_focused()
+    canvas = page.locator(".view canvas")
+    canvas.wait_for(timeout=DONE)
+    tab_to("Play")
+    page.keyboard.press("Space")
+    until(lambda: float(page.get_by_role("slider", name="Frame").input_value()) > 1)
+    page.keyboard.press("Space")
+    page.keyboard.press("Shift+Tab")
+    before = canvas.screenshot()
+    for _ in range(4):
+        page.keyboard.press("ArrowRight")
+    page.wait_for_timeout(300)
+    assert differing_pixels(page, before, canvas.screenshot()) > 0.01
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [1280, 390])
+def test_no_accessibility_finding_and_nothing_wider_than_the_screen(
+    page: Page, url: str, finished: str, scheme: str, width: int
+) -> None:
+    axe = Path(__file__).parents[2] / "service" / "web" / "node_modules" / "axe-core" / "axe.min.js"
+    if not axe.is_file() and not os.environ.get("CI"):
+        pytest.skip("axe-core is not installed; say `make page`")
+    page.emulate_media(color_scheme=scheme, reduced_motion="reduce")  # type: ignore[arg-type]
+    page.set_viewport_size({"width": width, "height": 844})
+    for address, landmark in (("", "Point tracks in"), (f"#job={finished}", "a finished face"), ("docs", "Pliant API")):
+        page.goto(f"{url}/{address}")
+        page.get_by_role("heading", name=landmark).wait_for()
+        if "#" in address:
+            page.locator(".view canvas").wait_for(timeout=DONE)
+        if address == "":
+            page.get_by_text("More options").click()
+        page.evaluate(axe.read_text())
+        found = page.evaluate("axe.run().then((found) => found.violations)")
+        said = [f"{one['id']} ({one['impact']}): {[node['html'] for node in one['nodes']][:3]}" for one in found]
+        assert said == [], address
+        assert page.evaluate("document.documentElement.scrollWidth") <= width, address
+
+
+def test_no_request_leaves_the_host(page: Page, url: str, finished: str) -> None:
+    asked: list[str] = []
+    page.context.on("request", lambda request: asked.append(request.url))
+    for address in (f"#job={finished}", "docs"):
+        answer = page.goto(f"{url}/{address}")
+        page.reload()
+        page.wait_for_timeout(1500)
+        assert answer is None or answer.headers["content-security-policy"].startswith("default-src 'self';")
+    assert len(asked) > 10
+    assert [address for address in asked if not address.startswith(f"{url}/")] == []

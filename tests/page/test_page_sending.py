@@ -1,0 +1,143 @@
+"""Sending from the page: files chosen or dropped, how they are understood, what is refused."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+from browsing import differing_pixels, why_not
+from paging import DONE, TRACKS, choose, drop, packed, seek, until
+from playwright.sync_api import Page, Route, expect
+
+pytestmark = [
+    pytest.mark.chromium,
+    pytest.mark.skipif(why_not() is not None and not os.environ.get("CI"), reason=str(why_not())),
+]
+
+
+def test_from_an_upload_to_a_playing_mesh(page: Page, url: str, small: dict[str, bytes]) -> None:
+    choose(page, small)
+    expect(page.locator("[data-part=tracks]")).to_contain_text("tracks 10 × 300 × 2 float64")
+    seen = page.get_by_role("region", name="How your files are understood")
+    expect(seen).to_contain_text("10 frames of 300 points")
+    expect(seen).to_contain_text("tracks (F, P, 2), y down")
+    expect(seen).to_contain_text("given; errors are measured against it")
+    expect(seen.get_by_role("img", name="Some of the tracks")).to_be_visible()
+    painted = "(it) => it.getContext('2d').getImageData(0, 0, it.width, it.height).data.filter((v, i) => i % 4 === 3 && v > 0).length"
+    assert seen.get_by_role("img", name="Some of the tracks").evaluate(painted) > 200 * 9  # a dot each of 200 points
+    page.get_by_label("Preset").select_option(label="automatic")
+    page.get_by_label("name (optional)").fill("my flag")
+    page.get_by_role("button", name="Reconstruct").click()
+    expect(page.get_by_role("heading", name="my flag")).to_be_focused()
+    expect(page.get_by_role("article").get_by_text("10 frames of 300 points")).to_be_visible()
+    canvas = page.locator(".view canvas")
+    canvas.wait_for(timeout=DONE)
+    expect(page.get_by_role("article").get_by_text("Done", exact=True)).to_be_visible()
+
+    seek(page, 0)
+    first, again = canvas.screenshot(), canvas.screenshot()
+    assert differing_pixels(page, first, again) == 0
+    later = []
+    for frame in range(1, 10, 2):
+        seek(page, frame)
+        later.append(differing_pixels(page, first, canvas.screenshot()))
+    assert min(later) > 0.001
+    assert max(later) > 0.02
+
+    page.get_by_role("button", name="Play").click()
+    shown = page.get_by_role("slider", name="Frame").input_value()
+    until(lambda: page.get_by_role("slider", name="Frame").input_value() != shown)
+    page.get_by_role("button", name="Pause").click()
+
+    id = re.search(r"job=(\w+)", page.url)
+    assert id is not None
+    job = httpx.get(f"{url}/v1/jobs/{id[1]}").json()
+    rows = page.locator("tbody tr")
+    assert rows.count() == len(job["metrics"])
+    for name, value in job["metrics"].items():
+        text = rows.filter(has=page.get_by_text(name, exact=True)).locator("td").inner_text()
+        assert float(text) == pytest.approx(value, rel=0.01, abs=1e-9)
+    names = {artifact["name"] for artifact in job["artifacts"]}
+    assert {"shapes.npz", "shapes.glb", "report.json", "preview.bin"} <= names
+    assert set(page.get_by_role("region", name="Files").get_by_role("link").all_inner_texts()) == names
+    with page.expect_download() as download:
+        page.get_by_role("link", name="report.json").click()
+    assert json.loads(Path(download.value.path()).read_text())["metrics"] == job["metrics"]
+
+
+def test_a_refusal_is_shown_as_the_services_own_sentence(page: Page, url: str) -> None:
+    said = httpx.post(f"{url}/v1/jobs", files={"tracks": ("tracks.npz", b"hello, I am not tracks")}).json()
+    choose(page, {TRACKS: b"hello, I am not tracks"})
+    page.get_by_role("button", name="Reconstruct").click()
+    alert = page.get_by_role("alert")
+    expect(alert).to_contain_text(said["detail"])
+    expect(alert).to_contain_text(said["code"])
+    assert "#job" not in page.url
+    choose(page, {TRACKS: packed(tracks=np.zeros((2, 50, 2)))})
+    page.get_by_role("button", name="Reconstruct").click()
+    expect(alert).to_contain_text("too_few_frames")
+
+
+def test_dropped_files_find_their_places_and_say_what_they_are(page: Page, url: str, small: dict[str, bytes]) -> None:
+    jobs = len(httpx.get(f"{url}/v1/jobs?limit=100").json()["jobs"])
+    drop(page, small)
+    for part, name in (("tracks", TRACKS), ("mesh", "mesh.npz"), ("ground_truth", "truth.npz")):
+        expect(page.locator(f"[data-part={part}]")).to_contain_text(name)
+    expect(page.get_by_role("region", name="How your files are understood")).to_contain_text("10 frames of 300 points")
+    page.get_by_role("button", name="Remove mesh").click()
+    expect(page.get_by_role("region", name="How your files are understood")).to_contain_text("made by triangulating")
+    page.get_by_label("or points on a grid").fill("15×20")
+    page.get_by_label("or points on a grid").press("Tab")
+    expect(page.get_by_role("region", name="How your files are understood")).to_contain_text("266 faces, from the grid")
+    page.get_by_label("or points on a grid").fill("3x3")
+    page.get_by_label("or points on a grid").press("Tab")
+    expect(page.get_by_role("alert")).to_contain_text("vertex_count_mismatch")
+    assert len(httpx.get(f"{url}/v1/jobs?limit=100").json()["jobs"]) == jobs
+
+
+def test_a_reading_can_be_chosen_before_anything_is_made_of_it(page: Page, url: str) -> None:
+    jobs = len(httpx.get(f"{url}/v1/jobs?limit=100").json()["jobs"])
+    choose(page, {TRACKS: packed(W=np.random.default_rng(0).normal(size=(40, 50)))})
+    page.get_by_role("button", name="W (2F, P), rows stacked").click()
+    expect(page.get_by_role("region", name="How your files are understood")).to_contain_text("W (2F, P), rows stacked")
+    expect(page.get_by_role("alert")).to_have_count(0)
+    assert len(httpx.get(f"{url}/v1/jobs?limit=100").json()["jobs"]) == jobs
+
+
+def test_sending_again_after_a_lost_answer_makes_no_second_job(page: Page, url: str, small: dict[str, bytes]) -> None:
+    def lost(route: Route) -> None:
+        route.fetch()
+        route.abort()
+
+    page.route("**/v1/jobs", lost, times=1)
+    choose(page, small)
+    page.get_by_label("name (optional)").fill("sent twice")
+    page.get_by_role("button", name="Reconstruct").click()
+    expect(page.get_by_role("alert")).to_contain_text("The service does not answer.")
+    page.get_by_role("button", name="Reconstruct").click()
+    expect(page.get_by_role("heading", name="sent twice")).to_be_focused()
+    jobs = httpx.get(f"{url}/v1/jobs").json()["jobs"]
+    assert len([job for job in jobs if job["name"] == "sent twice"]) == 1
+
+
+def test_where_two_readings_fit_a_click_chooses_one(page: Page, url: str) -> None:
+    noise = np.random.default_rng(0).normal(size=(40, 50))
+    choose(page, {TRACKS: packed(W=noise)})
+    page.get_by_role("button", name="Reconstruct").click()
+    expect(page.get_by_role("alert")).to_contain_text("ambiguous_layout")
+    page.get_by_role("button", name="W (2F, P), rows stacked").click()
+    expect(page.get_by_role("article").get_by_text("20 frames of 50 points")).to_be_visible()
+    expect(page.get_by_role("article").get_by_text("W (2F, P), rows stacked")).to_be_visible()
+    id = page.url.partition("job=")[2]
+    assert httpx.get(f"{url}/v1/jobs/{id}").json()["options"]["rows"] == "stacked"
+
+
+def test_sending_nothing_says_what_is_missing(page: Page) -> None:
+    page.get_by_role("button", name="Reconstruct").click()
+    expect(page.get_by_text("Choose a track file first")).to_be_visible()
+    expect(page.get_by_label("Tracks", exact=True)).to_be_focused()

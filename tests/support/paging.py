@@ -1,0 +1,63 @@
+"""What tests of the page do again and again: give it files, wait, read a chart, move to a frame."""
+
+from __future__ import annotations
+
+import base64
+import io
+import re
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from playwright.sync_api import Locator, Page
+
+TRACKS = "tracks.npz"
+DONE = 180_000
+
+
+def packed(**arrays: Any) -> bytes:
+    file = io.BytesIO()
+    np.savez(file, allow_pickle=False, **arrays)
+    return file.getvalue()
+
+
+def choose(page: Page, files: dict[str, bytes]) -> None:
+    for label, name in (("Tracks", TRACKS), ("Mesh", "mesh.npz"), ("Ground truth", "truth.npz")):
+        if name in files:
+            given = {"name": name, "mimeType": "application/octet-stream", "buffer": files[name]}
+            page.get_by_label(label, exact=True).set_input_files(given)  # type: ignore[arg-type]
+
+
+DROP = """([files]) => {
+  const held = new DataTransfer();
+  for (const [name, text] of files) held.items.add(new File([Uint8Array.from(atob(text), (sign) => sign.charCodeAt(0))], name));
+  const zone = document.querySelector(".zone");
+  for (const type of ["dragover", "drop"]) {
+    zone.dispatchEvent(new DragEvent(type, { dataTransfer: held, bubbles: true, cancelable: true }));
+  }
+}"""
+
+
+def drop(page: Page, files: dict[str, bytes]) -> None:
+    page.evaluate(DROP, [[[name, base64.b64encode(content).decode()] for name, content in files.items()]])
+
+
+def until(holds: Callable[[], bool], seconds: float = 30) -> None:
+    """Wait in Python: the browser's own way to wait evaluates strings, which the page's policy forbids."""
+    end = time.monotonic() + seconds
+    while not holds():
+        assert time.monotonic() < end, "it did not happen in time"
+        time.sleep(0.05)
+
+
+def steps_of(chart: Locator) -> int:
+    found = re.search(r"in (\d+) steps", chart.get_attribute("aria-label") or "")
+    return int(found[1]) if found else 0
+
+
+def seek(page: Page, frame: float) -> None:
+    page.get_by_role("slider", name="Frame").evaluate(
+        "(it, at) => { it.value = at; it.dispatchEvent(new Event('input')); }", frame
+    )
+    page.wait_for_timeout(300)
