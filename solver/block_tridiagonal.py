@@ -37,8 +37,8 @@ PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 def fits(operator: Operator) -> bool:
     """Return whether paths over frames are all but the whole of this operator."""
-    stiffest = float(operator.bands[0].max())
-    if operator.rank is not None or len(operator.bands) != 2 or stiffest == 0:
+    stiffest = float(operator.stencil[0].max())
+    if operator.rank is not None or len(operator.stencil) != 2 or stiffest == 0:
         return False
     if operator.laplacian is None or operator.spatial_weight == 0:
         return True
@@ -58,9 +58,9 @@ def build(operator: Operator) -> Linear:
     """Factor once a reweighting; returns r ↦ M⁻¹ r."""
     kind = operator.weights.dtype
     inverses = np.zeros((len(operator.projections), 6, operator.weights.shape[2]), dtype=kind)
-    ridge = max(RIDGE, ROUNDING * float(np.finfo(kind).eps)) * operator.bands[0].max()
+    ridge = max(RIDGE, ROUNDING * float(np.finfo(kind).eps)) * operator.stencil[0].max()
     shift = (stiffness_of_neighbours(operator) + ridge).astype(kind)
-    coupling = operator.bands[1].astype(kind)
+    coupling = operator.stencil[1].astype(kind)
 
     def eliminate(start: int, stop: int) -> None:
         for first, last in _blocks(start, stop):
@@ -95,7 +95,7 @@ def _eliminate(operator: Operator, shift: Array, coupling: Array, inverses: Arra
         np.multiply(seen[0, :, None], one, out=block)
         np.multiply(seen[1, :, None], two, out=spare)
         block += spare
-        block[[0, 3, 5]] += shift + shift.dtype.type(operator.bands[0, frame])
+        block[[0, 3, 5]] += shift + shift.dtype.type(operator.stencil[0, frame])
         if frame > 0:
             np.multiply(inverses[frame - 1], coupling[frame - 1] ** 2, out=spare)
             block -= spare

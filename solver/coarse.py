@@ -19,11 +19,10 @@ from numpy.typing import NDArray
 from pliant.solver.operator import Operator
 from pliant.solver.parallel import over_ranges
 from pliant.solver.records import Floats
-from scipy import linalg
 
 Array = NDArray[np.floating]
 
-MOST = 16
+MOST = 12
 """Modes of a coordinate at most: memory grows with the square."""
 
 HELD = 0.05
@@ -101,10 +100,9 @@ def _free_modes(operator: Operator, limit: float) -> tuple[tuple[Floats, Floats,
     """Return for each coordinate the modes that the prior holds least, and how much it holds them."""
     assert operator.quadratic is not None
     modes, held = [], []
-    for matrix in operator.quadratic:
-        values, vectors = linalg.eigh(matrix.astype(np.float64), subset_by_index=[0, min(MOST, len(matrix)) - 1])
+    for directions, values in operator.quadratic.loosest(MOST):
         free = values < limit
-        modes.append(np.ascontiguousarray(vectors[:, free]))
+        modes.append(np.ascontiguousarray(directions[:, free]))
         held.append(np.maximum(values[free], 1e-12 * limit))
     return (modes[0], modes[1], modes[2]), held
 

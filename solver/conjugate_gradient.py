@@ -8,12 +8,9 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.solver.parallel import over_ranges
+from pliant.solver.parallel import SMALLEST, over_ranges
 
 Array = NDArray[np.floating]
-
-SMALLEST = 200_000
-"""Numbers a thread should have to work on, at least."""
 
 
 class Linear(Protocol):

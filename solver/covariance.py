@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from pliant.solver.path_prior import PathPrior
 from pliant.solver.records import Floats
 from pliant.solver.temporal import difference_bands
 from scipy import linalg
@@ -78,12 +79,14 @@ class ShapeCovariance:
         values, vectors = linalg.eigh(self.extent, self.play)
         return np.asarray(np.linalg.inv(vectors).T, dtype=np.float64), np.maximum(values, 0.0)
 
-    def precisions(self) -> tuple[Floats, Floats]:
-        """Return B and the inverse covariance over frames of each coordinate of y = B⁻¹x, shape `(3, F, F)`."""
+    def precisions(self) -> tuple[Floats, PathPrior]:
+        """Return B (3×3) and the inverse covariance over frames of each coordinate of y = B⁻¹x."""
         basis, extents = self.axes()
-        over_frames = self.over_frames()
-        each = [linalg.inv(over_frames + extent) for extent in extents]
-        return basis, np.stack([(one + one.T) / 2 for one in each])
+        chain, norm = walk_bands(len(self.modes))
+        first, second, third = (
+            np.column_stack([self.modes, np.full(len(self.modes), extent**0.5)]) for extent in extents
+        )
+        return basis, PathPrior.of(chain * (norm / self.drift), (first, second, third))
 
     def stretched(self, used: NDArray[np.intp], num_frames: int) -> ShapeCovariance:
         """Return the covariance for all of `num_frames` frames when this one belongs to the frames `used`.
@@ -103,11 +106,18 @@ def random_walk(num_frames: int) -> Floats:
 
 def _walk_precision(num_frames: int) -> tuple[Floats, float]:
     """Return HᵀH with enough on its diagonal to be invertible, and the mean of its inverse's diagonal."""
-    bands = difference_bands(num_frames, 1)
-    matrix = np.diag(bands[0]) + 10.0 / num_frames**2 * np.eye(num_frames)
-    if num_frames > 1:
-        matrix += np.diag(bands[1, :-1], 1) + np.diag(bands[1, :-1], -1)
-    return matrix, float(np.trace(np.linalg.inv(matrix))) / num_frames
+    bands, norm = walk_bands(num_frames)
+    return np.diag(bands[0]) + np.diag(bands[1, :-1], 1) + np.diag(bands[1, :-1], -1), norm
+
+
+def walk_bands(num_frames: int) -> tuple[Floats, float]:
+    """Return the same by its upper bands, shape `(2, F)`."""
+    bands = np.zeros((2, num_frames))
+    differences = difference_bands(num_frames, 1)
+    bands[: len(differences)] = differences
+    bands[0] += 10.0 / num_frames**2
+    upper = np.stack([np.roll(bands[1], 1), bands[0]])
+    return bands, float(np.trace(linalg.solveh_banded(upper, np.eye(num_frames)))) / num_frames
 
 
 def begin(gram: Floats, pairs: Floats) -> ShapeCovariance:

@@ -6,8 +6,8 @@ import numpy as np
 from pliant.solver.bending import bends_of, frames_together
 from pliant.solver.loss import loss_value, loss_weights
 from pliant.solver.low_rank import rank_penalty
-from pliant.solver.operator import SMALLEST, add_product, rows_of
-from pliant.solver.parallel import over_ranges
+from pliant.solver.operator import rows_of
+from pliant.solver.parallel import SMALLEST, over_ranges
 from pliant.solver.records import Floats
 from pliant.solver.state import Array, Problem
 
@@ -66,11 +66,7 @@ def prior(problem: Problem, shapes: Array) -> float:
 def smoothness(problem: Problem, shapes: Array) -> float:
     """Return λ1 ‖HX‖² + λ2 ‖AX‖², the first replaced by λ1 tr XᵀQX with a Gaussian prior."""
     weights = problem.weights
-    total = 0.0
-    if problem.quadratic is not None:
-        image = np.zeros_like(shapes)
-        add_product(problem.quadratic, shapes, image)
-        total += float(np.einsum("fcp,fcp->", image, shapes, dtype=np.float64))
+    total = 0.0 if problem.quadratic is None else problem.quadratic.value(shapes)
     temporal = weights.temporal if problem.quadratic is None else 0.0
     laplacian = None if problem.laplacian is None else problem.laplacian.rounded(shapes.dtype)
     order, together = len(problem.bands) - 1, frames_together(len(shapes))

@@ -15,8 +15,8 @@ from pliant.solver.conjugate_gradient import conjugate_gradient
 from pliant.solver.energy import loss_of, prior, residuals_of, weights_of
 from pliant.solver.errors import NotFinite
 from pliant.solver.low_rank import rank_term
-from pliant.solver.operator import SMALLEST, Operator
-from pliant.solver.parallel import over_ranges
+from pliant.solver.operator import Operator
+from pliant.solver.parallel import SMALLEST, over_ranges
 from pliant.solver.precondition import build_preconditioner
 from pliant.solver.records import Floats, Outcome
 from pliant.solver.state import Array, Problem, State
@@ -72,7 +72,7 @@ def _inner_precision(operator: Operator, reduction: float) -> np.dtype[np.floati
     """Return single precision where it reaches the reduction and the equations do not span too many magnitudes for it."""
     if reduction < SINGLE_REDUCTION or not block_tridiagonal.fits(operator):
         return operator.weights.dtype
-    stiff = float(operator.bands[0].max()) + float(block_tridiagonal.stiffness_of_neighbours(operator).mean())
+    stiff = float(operator.stencil[0].max()) + float(block_tridiagonal.stiffness_of_neighbours(operator).mean())
     data = float(operator.weights.max()) * float((operator.projections**2).sum(axis=(1, 2)).max())
     return np.dtype(np.float32) if data < SINGLE_SPAN * stiff else operator.weights.dtype
 

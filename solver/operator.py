@@ -5,8 +5,8 @@ For shapes X of layout `(F, 3, P)` the operator is
     𝒜 X = s² Rᵀ(ω ∘ (R X))  +  λ1 (HᵀH) X  +  λ2 X (AᵀA)  +  Q X
 
 frame by frame: a 2×3 projection, a stencil over frames, a sparse product along the surface, and the F×F matrix Q of the
-low-rank prior, kept as a multiple of the identity minus a few modes. The weights stand in 𝒜 and in the right-hand side alike
-(the paper's printed eq. 9 has them in the first only).
+low-rank prior, kept as a multiple of the identity minus a few modes. With the Gaussian prior stencil and modes are its own.
+The weights stand in 𝒜 and in the right-hand side alike (the paper's printed eq. 9 has them in the first only).
 """
 
 from __future__ import annotations
@@ -17,12 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.bending import add_bending, frames_together
 from pliant.solver.laplacian import Laplacian
-from pliant.solver.parallel import over_ranges
+from pliant.solver.parallel import SMALLEST, over_ranges
+from pliant.solver.path_prior import PathPrior
 from pliant.solver.records import Floats
 
 Array = NDArray[np.floating]
-SMALLEST = 200_000
-"""Numbers a thread should have to work on, at least: below, starting it costs more than it saves."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,8 +61,13 @@ class Operator:
 
     rank: RankTerm | None = None
 
-    quadratic: Array | None = None
-    """The Gaussian prior over frames of each coordinate, shape `(3, F, F)`."""
+    quadratic: PathPrior | None = None
+    """The Gaussian prior over frames of each coordinate; it has a stencil of its own."""
+
+    @property
+    def stencil(self) -> Floats:
+        """Upper bands over frames of whichever prior there is, shape `(order + 1, F)`."""
+        return self.bands if self.quadratic is None else self.quadratic.bands
 
     def apply(self, shapes: Array, /, out: Array | None = None) -> Array:
         """Return 𝒜 X, shape `(F, 3, P)`, in `out` if it is given."""
@@ -87,8 +91,7 @@ class Operator:
                         image -= target[frame]
                     image *= self.weights[frame]
                     np.matmul(camera.T, image, out=row)
-                    if self.quadratic is None:
-                        self._add_temporal(shapes, frame, row, spare)
+                    self._add_temporal(shapes, frame, row, spare)
                 if self.laplacian is not None and self.spatial_weight > 0:
                     add_bending(
                         self.laplacian, self.spatial_weight, rows_of(shapes[low:high]), rows_of(result[low:high])
@@ -98,7 +101,7 @@ class Operator:
         if self.rank is not None:
             self._add_rank(shapes, result)
         if self.quadratic is not None:
-            add_product(self.quadratic, shapes, result)
+            self.quadratic.subtract_modes(shapes, result)
         return result
 
     def rounded(self, kind: np.dtype[np.floating]) -> Operator:
@@ -108,15 +111,15 @@ class Operator:
             projections=self.projections.astype(kind),
             weights=self.weights.astype(kind),
             laplacian=None if self.laplacian is None else self.laplacian.rounded(kind),
-            quadratic=None if self.quadratic is None else self.quadratic.astype(kind),
+            quadratic=None if self.quadratic is None else self.quadratic.rounded(kind),
         )
 
     def _add_temporal(self, shapes: Array, frame: int, out: Array, spare: Array) -> None:
-        kind = shapes.dtype.type
-        for k in range(len(self.bands)):
+        kind, bands = shapes.dtype.type, self.stencil
+        for k in range(len(bands)):
             for neighbour, first in ((frame + k, frame), (frame - k, frame - k))[: 1 if k == 0 else 2]:
-                if 0 <= neighbour < len(shapes) and self.bands[k, first] != 0:
-                    np.multiply(shapes[neighbour], kind(self.bands[k, first]), out=spare)
+                if 0 <= neighbour < len(shapes) and bands[k, first] != 0:
+                    np.multiply(shapes[neighbour], kind(bands[k, first]), out=spare)
                     out += spare
 
     def _add_rank(self, shapes: Array, result: Array) -> None:
@@ -139,16 +142,6 @@ class Operator:
 
         over_ranges(work, frames, smallest=max(1, SMALLEST // (3 * points)))
         return back
-
-
-def add_product(quadratic: Array, shapes: Array, result: Array) -> None:
-    """Add Q_c X_c to every coordinate c of the result, blocks of points in parallel."""
-
-    def work(start: int, stop: int) -> None:
-        for axis, over_frames in enumerate(quadratic):
-            result[:, axis, start:stop] += over_frames @ shapes[:, axis, start:stop]
-
-    over_ranges(work, shapes.shape[2], smallest=max(1, SMALLEST // (3 * len(shapes))))
 
 
 def rows_of(shapes: Array) -> Array:

@@ -9,6 +9,9 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
 
+SMALLEST = 200_000
+"""Numbers a thread should have to work on, at least: below, starting it costs more than it saves."""
+
 _LIMIT: ContextVar[int | None] = ContextVar("threads", default=None)
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pliant.solver import block_tridiagonal
 from pliant.solver.coarse import build_coarse
 from pliant.solver.conjugate_gradient import Linear
+from pliant.solver.mean_modes import MeanModes
 from pliant.solver.operator import Operator
 from pliant.solver.parallel import available_cores, over_ranges
 from pliant.solver.records import Floats, Ints
@@ -39,7 +40,7 @@ def temporal_matrix(operator: Operator) -> Floats:
     index = np.arange(frames)
     whole[index, :, index, :] += blocks
     if operator.quadratic is not None:
-        for axis, matrix in enumerate(operator.quadratic):
+        for axis, matrix in enumerate(operator.quadratic.matrices()):
             whole[:, axis, :, axis] += matrix
     return np.asarray(whole.reshape(3 * frames, 3 * frames), dtype=np.float64)
 
@@ -60,18 +61,20 @@ class Diagonalised:
 
 def build_preconditioner(operator: Operator) -> Linear:
     """Return M⁻¹ for this reweighting's operator."""
-    if block_tridiagonal.fits(operator):
-        return block_tridiagonal.build(operator)
-    alike, coarse = _alike(operator), build_coarse(operator)
-    if coarse is None:
-        return alike
+    paths = block_tridiagonal.fits(operator)
+    first = block_tridiagonal.build(operator) if paths else _alike(operator)
+    if operator.quadratic is None or operator.stencil[0].max() == 0:
+        return first
+    modes, coarse = MeanModes.of(operator) if paths else None, build_coarse(operator)
 
-    def both(x: Array, /, out: Array | None = None) -> Array:
-        result = alike(x, out=out)
-        coarse.add(x, result)
+    def sum_of(x: Array, /, out: Array | None = None) -> Array:
+        result = first(x, out=out)
+        for each in (modes, coarse):
+            if each is not None:
+                each.add(x, result)
         return result
 
-    return both
+    return sum_of
 
 
 def _alike(operator: Operator) -> Linear:

@@ -33,7 +33,7 @@ def build_problem(
     axes, quadratic = np.eye(3), None
     if covariance is not None:
         axes, precisions = covariance.precisions()
-        bands, quadratic = np.zeros_like(bands), (weights.temporal * precisions).astype(kind)
+        bands, quadratic = np.zeros_like(bands), precisions.scaled(weights.temporal)
     projections = np.asarray(estimate.scales)[:, None, None] * np.asarray(estimate.rotations)[:, :2] @ axes
     problem = Problem(
         points=np.ascontiguousarray(normalised.points.transpose(0, 2, 1), dtype=kind),

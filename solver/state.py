@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.laplacian import Laplacian
 from pliant.solver.operator import RankTerm
+from pliant.solver.path_prior import PathPrior
 from pliant.solver.records import Floats
 
 Array = NDArray[np.floating]
@@ -48,8 +49,8 @@ class Problem:
     laplacian: Laplacian | None
     axes: Floats
     """B (3×3): shapes are B X in the world. The identity but for the Gaussian prior, which has axes of its own."""
-    quadratic: Array | None = None
-    """λ1 times the inverse covariance over frames of each coordinate, shape `(3, F, F)`: the Gaussian prior."""
+    quadratic: PathPrior | None = None
+    """λ1 times the inverse covariance over frames of each coordinate: the Gaussian prior."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -54,7 +54,7 @@ def without_outliers(
     stiff = replace(
         problem,
         weights=replace(weights, temporal=weights.temporal * stiffer, spatial=weights.spatial * stiffer),
-        quadratic=problem.quadratic * problem.quadratic.dtype.type(stiffer),
+        quadratic=problem.quadratic.scaled(stiffer),
     )
     before = init(stiff, state.shapes, state.translations)
     for _ in range(STEPS):

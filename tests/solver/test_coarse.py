@@ -7,6 +7,7 @@ from pliant.solver import gallery
 from pliant.solver.coarse import build_coarse
 from pliant.solver.conjugate_gradient import conjugate_gradient
 from pliant.solver.operator import Operator
+from pliant.solver.path_prior import PathPrior
 from pliant.solver.precondition import _alike, build_preconditioner
 
 
@@ -16,10 +17,11 @@ def operator(*, hidden: float) -> Operator:
     made = gallery.face(frames, points)
     time = np.linspace(0, 1, frames)
     modes = np.stack([np.ones(frames), np.sin(6 * time), np.cos(9 * time)], axis=1)
-    precision = 1e-3 * np.linalg.inv(modes @ modes.T * 0.2 + 1e-4 * np.eye(frames))
+    bands = np.stack([np.full(frames, 1e4), np.zeros(frames)])
+    prior = PathPrior.of(bands, (0.2**0.5 * modes,) * 3).scaled(1e-3)
     weights = np.where(random.random((frames, 1, points)) < hidden, 0.0, 500.0) * np.ones((1, 2, 1))
     projections = np.asarray(made.rotations)[:, :2]
-    return Operator(projections, weights, np.zeros((2, frames)), None, 0.0, None, np.stack([precision] * 3))
+    return Operator(projections, weights, np.zeros((2, frames)), None, 0.0, None, prior)
 
 
 def test_points_that_are_all_alike_need_none() -> None:

@@ -63,7 +63,7 @@ def test_precisions_are_the_inverse_of_the_covariance() -> None:
     whole = np.kron(np.ones((FRAMES, FRAMES)), turned.extent) + np.kron(turned.over_frames(), turned.play)
     inverse = np.zeros((FRAMES, 3, FRAMES, 3))
     for axis in range(3):
-        inverse[:, axis, :, axis] = precisions[axis]
+        inverse[:, axis, :, axis] = precisions.matrices()[axis]
     back = np.kron(np.eye(FRAMES), np.linalg.inv(basis))
     np.testing.assert_allclose(
         back.T @ inverse.reshape(3 * FRAMES, -1) @ back, np.linalg.inv(whole), rtol=1e-6, atol=1e-4

@@ -149,7 +149,7 @@ def test_the_unit_scales_the_shapes_and_nothing_else(factor: float) -> None:
     plain, scaled = (each.solved() for each in (SCENE, replace(SCENE, points=SCENE.points * factor)))
     assert_same(scaled.shapes / factor, plain.shapes, 1e-6)
     assert_same(scaled.residuals / factor, plain.residuals, 1e-5)
-    np.testing.assert_allclose(scaled.weights, plain.weights, atol=1e-5)
+    np.testing.assert_allclose(scaled.weights, plain.weights, atol=1e-4)  # steep: a residual's rounding over ε
     assert scaled.choices.temporal_weight == pytest.approx(plain.choices.temporal_weight, rel=1e-9)
     assert scaled.choices.noise / factor == pytest.approx(plain.choices.noise, rel=1e-9)
 
