@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 from pliant.solver.cameras import CameraEstimate, estimate_cameras, given_cameras
 from pliant.solver.closed_form import pseudo_inverse, uniform_solution
+from pliant.solver.covariance import ShapeCovariance
 from pliant.solver.energy import residuals
 from pliant.solver.errors import InvalidInput
 from pliant.solver.iteration import init, no_higher, step, terminate
@@ -29,10 +30,10 @@ from pliant.solver.records import (
     Tracks,
     read_only,
 )  # fmt: skip
+from pliant.solver.seldom import SELDOM, OftenSeen, draw_the_rest, often_seen
 from pliant.solver.settings import Settings
 from pliant.solver.state import Problem, State
-from pliant.solver.trim import SPOILED, without_outliers
-from pliant.solver.unseen import close_surface
+from pliant.solver.trim import SPOILED, stiffness, without_outliers
 
 CAMERA_SHARE = 0.3
 """Share of the whole that progress gives to the cameras."""
@@ -89,7 +90,11 @@ def solve(
     seconds = {"cameras": time.perf_counter() - began}
 
     began = time.perf_counter()
-    problem, choices = build_problem(normalised, estimate, mesh, settings, covariance)
+    part = None if covariance is None or settings.temporal_weight == 0 else often_seen(normalised, mesh)
+    if part is None:
+        problem, choices = build_problem(normalised, estimate, mesh, settings, covariance)
+    else:
+        problem, choices = build_problem(part.normalised, estimate, part.mesh, settings, covariance)
     problem, choices, state = with_bending(problem, choices, _start(problem, estimate, settings), settings)
     if estimate.outliers > SPOILED:
         problem, choices, state = _trimmed(problem, choices, state, estimate.outliers, should_stop)
@@ -98,8 +103,11 @@ def solve(
 
     began = time.perf_counter()
     history, outcome = _loop(problem, state, settings, normalised.unit, tell, should_stop)
-    if covariance is not None:
-        history[-1] = close_surface(problem, history[-1])
+    if part is not None and covariance is not None:
+        whole, _ = build_problem(normalised, estimate, mesh, settings, covariance)
+        problem, choices, history[-1] = _with_the_rest(
+            part, whole, covariance, problem, choices, history[-1], estimate.outliers
+        )
     seconds["shapes"] = time.perf_counter() - began
 
     began = time.perf_counter()
@@ -123,6 +131,29 @@ def _trimmed(
         f"{share:.1%} of what was seen is left out as gross outliers; {outliers:.1%} looked like it before the fit."
     )
     return kept, replace(choices, reasons={**choices.reasons, "outliers": reason}), state
+
+
+def _with_the_rest(
+    part: OftenSeen,
+    whole: Problem,
+    covariance: ShapeCovariance,
+    problem: Problem,
+    choices: Choices,
+    state: State,
+    outliers: float,
+) -> tuple[Problem, Choices, State]:
+    """Return problem and state of all points from those of the points often seen, and the reason."""
+    confidence = whole.confidence.copy()
+    confidence[:, part.kept] = problem.confidence
+    whole = replace(whole, confidence=confidence)
+    stiffer = stiffness(problem.weights, outliers) if outliers > SPOILED else 1.0
+    state = draw_the_rest(part, whole, covariance, state, stiffer=stiffer)
+    seldom, never = 1 - len(part.kept) / confidence.shape[1], float((confidence == 0).all(axis=0).mean())
+    reason = (
+        f"{seldom:.1%} of the points were seen in fewer than {SELDOM:.0%} of the frames ({never:.1%} in none): drawn along the "
+        "surface, then moved to what was seen of them."
+    )
+    return whole, replace(choices, reasons={**choices.reasons, "seldom_seen": reason}), state
 
 
 def _loop(

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from pliant.solver.energy import residuals
 from pliant.solver.iteration import init, no_higher, step
-from pliant.solver.state import Problem, State
+from pliant.solver.state import Problem, State, Weights
 
 SPOILED = 0.005
 """Share of gross outliers in the completion of the tracks from which they are left out."""
@@ -34,6 +34,11 @@ FAR = 8.0
 """nor anything within this many robust standard deviations."""
 
 
+def stiffness(weights: Weights, outliers: float) -> float:
+    """Return how many times stiffer than for the noise a fit must be that such a share of outliers does not bend."""
+    return max(STIFF * outliers / weights.temporal, 1.0)
+
+
 def without_outliers(
     problem: Problem, state: State, outliers: float, *, should_stop: Callable[[], bool] | None = None
 ) -> tuple[Problem, State]:
@@ -50,7 +55,7 @@ def without_outliers(
     """
     assert problem.quadratic is not None
     weights = problem.weights
-    stiffer = max(STIFF * outliers / weights.temporal, 1.0)
+    stiffer = stiffness(weights, outliers)
     stiff = replace(
         problem,
         weights=replace(weights, temporal=weights.temporal * stiffer, spatial=weights.spatial * stiffer),

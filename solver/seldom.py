@@ -1,0 +1,191 @@
+"""Points that are seldom or never seen: left out of the minimisation, then drawn along the surface and moved to what was seen of them.
+
+Hardly anything holds such a point but its prior, which says that it is somewhere about the middle, and its neighbours. In the
+minimisation it would go where those want it at the pace of diffusion, and wherever a patch of such points lies the prior would win:
+it takes every point by itself. Therefore in two steps, from the shapes of the points that are seen often enough:
+
+- the surface is closed: among all positions of the others, those of least ‖A X‖² + μ Σ ‖x_i − x_j‖², the second sum over edges: a thin
+  plate through their neighbours, under a little tension, for a plate alone that hangs on an edge goes on at its slope without end;
+- what was seen of a point, if anything, moves it off the plate. The deviation of its path has the learned covariance Σ, so that it is,
+  with K = ΠΣΠᵀ + diag(λ1/ω) over its observations r, the conditional mean Σ Πᵀ K⁻¹ r: kriging, the plate for its trend
+  (Cressie, Statistics for Spatial Data, 1993, section 3.4). It meets what was seen and follows the modes of the body elsewhere.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pliant.solver.covariance import ShapeCovariance
+from pliant.solver.iteration import init
+from pliant.solver.laplacian import Matrix
+from pliant.solver.loss import loss_weights
+from pliant.solver.normalise import Normalised
+from pliant.solver.parallel import over_ranges
+from pliant.solver.records import MIN_POINTS, Floats, Mesh
+from pliant.solver.state import Problem, State
+from scipy import linalg, sparse
+from scipy.sparse.linalg import splu
+
+SELDOM = 0.25
+"""A point is seldom seen below this share of the frames. Measured on turning bodies: .15 to .35 alike."""
+
+MOST = 0.5
+"""Where more of the points are seldom seen, tracks come and go, and all of them are needed together."""
+
+TENSION = 1.0
+"""μ: felt beyond some three rings of neighbours. Measured on four bodies: 1 to 10 alike; at .01 patches hung on an edge fly off."""
+
+LOOSE = 1e-6
+"""Ridge beside AᵀA, whose diagonal is about 150: points that hang on nothing stay in the middle."""
+
+ROUNDING = 1e-10
+"""Share added to the diagonal of K, against rounding."""
+
+ROUNDS = 3
+"""Reweightings of the deviations."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OftenSeen:
+    """The points that are seen often enough, as a sequence of their own."""
+
+    normalised: Normalised
+    mesh: Mesh
+    """Faces, or cells of the grid, whose corners are all among them."""
+
+    kept: NDArray[np.intp]
+    """Which points they are, ascending."""
+
+    pull: Matrix
+    """√μ times the differences along the edges of the whole surface, shape `(E, P)`."""
+
+
+def often_seen(normalised: Normalised, mesh: Mesh | None) -> OftenSeen | None:
+    """Return the points that are seen often enough; None if that is all, hardly any, or if there is no surface to draw the rest on."""
+    if mesh is None or (len(mesh.faces) == 0 and mesh.grid is None):
+        return None
+    count = normalised.visible.shape[1]
+    kept = np.flatnonzero((normalised.visible > 0).mean(axis=0) >= SELDOM)
+    if len(kept) == count or len(kept) < max(MIN_POINTS, (1 - MOST) * count):
+        return None
+    part = Normalised(normalised.points[:, kept], normalised.visible[:, kept], normalised.centroid, normalised.unit)
+    return OftenSeen(part, _mesh_of(mesh, kept), kept, TENSION**0.5 * _differences(mesh))
+
+
+def draw_the_rest(
+    part: OftenSeen, problem: Problem, covariance: ShapeCovariance, state: State, *, stiffer: float = 1.0
+) -> State:
+    """Return the state of all points, its energy, counts and cameras those of the points kept.
+
+    Parameters
+    ----------
+    part : OftenSeen
+        Which points have been found.
+    problem : Problem
+        Of all points, with the Gaussian prior of `covariance`.
+    covariance : ShapeCovariance
+        Σ of the paths.
+    state : State
+        Of the points of the part.
+    stiffer : float
+        Factor on λ1, against outliers.
+    """
+    shapes = np.zeros((len(problem.points), 3, problem.points.shape[2]))
+    shapes[:, :, part.kept] = state.shapes
+    seen = np.flatnonzero((problem.confidence > 0).any(axis=0))
+    energy = part.pull if problem.laplacian is None else sparse.vstack([problem.laplacian.matrix, part.pull])
+    close_surface(shapes, part.kept, energy)
+    seldom = np.setdiff1d(seen, part.kept)
+    if len(seldom) > 0:
+        _meet_what_was_seen(problem, covariance, shapes, seldom, state.translations, stiffer)
+    if len(seen) < problem.points.shape[2]:
+        close_surface(shapes, seen, energy)
+    whole = init(problem, shapes.astype(problem.points.dtype), state.translations)
+    return State(
+        whole.shapes, whole.translations, whole.omega, whole.rank, state.objective, whole.residual, state.reweighting,
+        state.iterations,
+    )  # fmt: skip
+
+
+def close_surface(shapes: Floats, known: NDArray[np.intp], energy: Matrix) -> None:
+    """Put all other points where ‖E X‖² is least.
+
+    Parameters
+    ----------
+    shapes : array, shape (F, 3, P)
+        Right at the known points; the others are written to.
+    known : array of int
+        Which points are known.
+    energy : sparse array, shape (R, P)
+        E: A, and what is to be small besides.
+    """
+    unknown = np.setdiff1d(np.arange(shapes.shape[2]), known)
+    matrix = sparse.csc_array(energy, dtype=np.float64)
+    there, elsewhere = matrix[:, unknown], matrix[:, known]
+    normal = sparse.csc_array(there.T @ there + LOOSE * sparse.eye_array(len(unknown)))
+    flat = shapes.reshape(-1, shapes.shape[2])
+    drawn = splu(normal).solve(np.asarray(-(there.T @ (elsewhere @ flat[:, known].T))))
+    shapes[:, :, unknown] = drawn.T.reshape(shapes.shape[0], 3, len(unknown))
+
+
+def _meet_what_was_seen(
+    problem: Problem,
+    covariance: ShapeCovariance,
+    shapes: Floats,
+    points: NDArray[np.intp],
+    translations: Floats,
+    stiffer: float,
+) -> None:
+    """Add to some points of the shapes, in place, the deviation that their observations ask for."""
+    frames = len(shapes)
+    rows = problem.projections.astype(np.float64)
+    over_frames, extents = covariance.over_frames(), covariance.axes()[1]
+    # Σ Πᵀ: what an observation, frame and image axis, says of the path, coordinate by coordinate
+    reach = np.einsum("gic,cfg->fcgi", rows, over_frames + extents[:, None, None]).reshape(3 * frames, 2 * frames)
+    image = np.einsum("fic,fcm->fim", rows, reach.reshape(frames, 3, -1)).reshape(2 * frames, 2 * frames)
+    weights = problem.weights
+    strength = weights.temporal * stiffer
+
+    def work(start: int, stop: int) -> None:
+        for point in points[start:stop]:
+            one = slice(point, point + 1)
+            confidence = problem.confidence[:, one]
+            there = np.repeat(confidence[:, 0] > 0, 2)
+            trend = shapes[:, :, one].copy()
+            off = np.asarray(_left(problem, trend, translations, one).reshape(-1)[there], dtype=np.float64)
+            for _ in range(ROUNDS):
+                left = _left(problem, shapes[:, :, one], translations, one)
+                omega = loss_weights(left, confidence, loss=problem.loss, scale=weights.robust_scale).reshape(-1)[there]
+                matrix = image[np.ix_(there, there)]
+                matrix[np.diag_indices_from(matrix)] *= 1 + ROUNDING
+                matrix[np.diag_indices_from(matrix)] += strength / np.maximum(omega, np.finfo(float).tiny)
+                deviation = reach[:, there] @ linalg.solve(matrix, off, assume_a="pos")
+                shapes[:, :, one] = trend + deviation.reshape(frames, 3, 1)
+
+    over_ranges(work, len(points), smallest=64)
+
+
+def _left(problem: Problem, shapes: Floats, translations: Floats, one: slice) -> Floats:
+    """Return the residuals of one point, shape `(F, 2, 1)`."""
+    image = np.matmul(problem.projections, shapes) + translations[:, :, None]
+    return np.asarray(problem.points[:, :, one] - image, dtype=np.float64)
+
+
+def _differences(mesh: Mesh) -> Matrix:
+    """Return x ↦ x_i − x_j along every edge, shape `(E, P)`."""
+    edges = mesh.edges
+    rows, ones = np.arange(len(edges)), np.ones(len(edges))
+    values, places = np.concatenate([ones, -ones]), (np.concatenate([rows, rows]), edges.T.ravel())
+    return sparse.csr_array((values, places), shape=(len(edges), mesh.num_points))
+
+
+def _mesh_of(mesh: Mesh, kept: NDArray[np.intp]) -> Mesh:
+    """Return the mesh of the kept points, numbered anew: a grid with more holes, or the faces that are left."""
+    number = np.full(mesh.num_points + 1, -1, dtype=np.int32)  # the last entry stands for −1, a hole
+    number[kept] = np.arange(len(kept))
+    if mesh.grid is not None:
+        return Mesh.from_grid(number[mesh.grid])
+    faces = number[mesh.faces]
+    return Mesh.from_faces(faces[(faces >= 0).all(axis=1)], len(kept))
