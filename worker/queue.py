@@ -101,6 +101,8 @@ class RedisQueue(Queue):
                 RqJob.fetch(token, connection=self._redis, serializer=JSONSerializer).delete()
             except (NoSuchJobError, InvalidJobOperation):  # gone already, or just now
                 return
+            except ValueError:  # the worker that took it strikes its note of that just now; RQ stumbles over the gap
+                self._redis.delete(RqJob.key_for(token))
 
     def hold(self, token: str) -> None:
         """See `Queue.hold`."""

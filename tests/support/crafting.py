@@ -58,17 +58,34 @@ def archive(*members: tuple[str, bytes], method: int = zipfile.ZIP_DEFLATED) -> 
     return buffer.getvalue()
 
 
+def deflated(start: bytes, megabytes: int, *, window: int = 15) -> bytes:
+    """A zlib stream (raw deflate with a window of −15) of some bytes and so many megabytes of zeros behind them.
+
+    Compressed is one megabyte: flushed before and after, it is the same whatever stands before it.
+    """
+    packer, zero = zlib.compressobj(9, zlib.DEFLATED, window), bytes(1 << 20)
+    head = packer.compress(start) + packer.flush(zlib.Z_FULL_FLUSH)
+    block = packer.compress(zero) + packer.flush(zlib.Z_FULL_FLUSH)
+    last = packer.flush()
+    if window > 0:
+        check = zlib.adler32(start)
+        for _ in range(megabytes):
+            check = zlib.adler32(zero, check)
+        last = last[:-4] + struct.pack(">I", check)
+    return head + megabytes * block + last
+
+
 def zeros(megabytes: int, shape: str) -> bytes:
     """An npz of this many megabytes of zeros behind a header, a thousandth of that on disk."""
-    buffer = io.BytesIO()
-    with (
-        zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as file,
-        file.open("tracks.npy", "w", force_zip64=True) as out,
-    ):
-        out.write(header(described(shape)))
-        for _ in range(megabytes):
-            out.write(bytes(1 << 20))
-    return buffer.getvalue()
+    start, zero = header(described(shape)), bytes(1 << 20)
+    check, name = zlib.crc32(start), b"tracks.npy"
+    for _ in range(megabytes):
+        check = zlib.crc32(zero, check)
+    content = deflated(start, megabytes, window=-15)
+    told = struct.pack("<3H4x3I2H", 20, 0, 8, check, len(content), len(start) + (megabytes << 20), len(name), 0)
+    local = b"PK\x03\x04" + told + name + content
+    entry = b"PK\x01\x02" + struct.pack("<H", 20) + told + bytes(14) + name
+    return local + entry + b"PK\x05\x06" + struct.pack("<4H2IH", 0, 0, 1, 1, len(entry), len(local), 0)
 
 
 def patched(content: bytes, old: bytes, new: bytes, *, count: int = -1) -> bytes:
@@ -185,14 +202,10 @@ def mat_nested(depth: int) -> bytes:
 
 def mat_packed_bomb() -> bytes:
     """A compressed variable that inflates to a gigabyte whatever it says of itself."""
-    packer = zlib.compressobj(9)
     inside = (
         mat_element(6, struct.pack("<II", 6, 0)) + mat_element(5, struct.pack("<2i", 10, 10)) + mat_element(1, b"W")
     )
-    content = packer.compress(struct.pack("<II", 14, 1 << 30) + inside + struct.pack("<II", 9, 1 << 30))
-    for _ in range(1 << 10):
-        content += packer.compress(bytes(1 << 20))
-    content += packer.flush()
+    content = deflated(struct.pack("<II", 14, 1 << 30) + inside + struct.pack("<II", 9, 1 << 30), 1 << 10)
     return MAT_HEADER + struct.pack("<II", 15, len(content)) + content
 
 

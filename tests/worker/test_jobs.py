@@ -377,18 +377,6 @@ def test_a_repeated_key_finds_its_job_though_the_queue_is_full(jobs: Jobs, submi
     assert submit(ada, idempotency_key="k", fingerprint="f").id == job.id
 
 
-def test_the_queue_notes_what_is_held_back_and_forgets_what_is_not(jobs: Jobs) -> None:
-    queue = jobs.queue
-    for token in ("job-1", "job-2"):
-        queue.hold(token)
-    assert (queue.held(), queue.waiting()) == ({"job-1", "job-2"}, [])
-    queue.push("job", "job-3")
-    queue.let_go("job-1")
-    queue.let_go("job-3")
-    queue.remove("job-2")
-    assert (queue.held(), queue.waiting()) == (set(), ["job-3"])
-
-
 def test_a_job_over_its_owners_limit_is_noted_as_held_back_until_it_is_cancelled(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
     ada = dataclasses.replace(jobs.of("ada"), max_running=1)
     first, second = submit(ada), submit(ada)
