@@ -18,10 +18,11 @@ FRAMES = (10, 25, 50, 100, 200, 400, 800)
 """At `FIXED_POINTS` points."""
 FIXED_FRAMES, FIXED_POINTS = 10, 2_000
 
-NUMBERS_MOVED = 53
-"""Numbers for each of the F·P observations that one iteration of conjugate gradients moves at least, operation by operation:
-the operator reads x and the weights and writes 𝒜x (3 + 2 + 3), the preconditioner reads and writes (3 + 3), three vector updates
-read two and write one (27), two inner products read two (12), and x and its neighbours in time are taken from the cache."""
+NUMBERS_MOVED, BYTES = 65, 4
+"""Numbers for each of the F·P observations that one iteration of conjugate gradients moves at least, operation by operation, and the
+size of one, corrections being solved in single precision: the operator reads x and the weights and writes 𝒜x (3 + 2 + 3), the
+preconditioner reads and writes (3 + 3) and reads its factors on the way there and back (6 + 6), three vector updates read two and write
+one (27), two inner products read two (12), and x and its neighbours in time are taken from the cache."""
 
 
 def growth(work: Workload, *, points: tuple[int, ...] = POINTS, frames: tuple[int, ...] = FRAMES) -> list[str]:
@@ -110,15 +111,14 @@ def bandwidth(work: Workload) -> list[str]:
     copied = copying()
     ours: Ours = best_of(work).value
     frames, points = ours.size
-    itemsize = 4 if work.chosen().precision == "float32" else 8
-    must = NUMBERS_MOVED * itemsize * frames * points
+    must = NUMBERS_MOVED * BYTES * frames * points
     seconds = per_iteration(ours)
     lines: list[str] = []
     _say(
         lines,
         f"{frames} × {points}: an iteration takes {1e3 * seconds:.1f} ms, reweighting included ({ours.iterations} iterations)",
     )
-    _say(lines, f"it moves at least {must / 1e6:.0f} MB ({NUMBERS_MOVED} numbers of {itemsize} bytes for each of F·P)")
+    _say(lines, f"it moves at least {must / 1e6:.0f} MB ({NUMBERS_MOVED} numbers of {BYTES} bytes for each of F·P)")
     _say(
         lines,
         f"copying on {available_cores()} threads: {copied / 1e9:.1f} GB/s; the iteration: {must / seconds / 1e9:.1f} GB/s",

@@ -134,53 +134,49 @@ def alternate(points: Floats, weight: Floats, basis: Floats, *, sweeps: int) -> 
 
     Weights are those of the Cauchy loss, whose scale follows three times the median residual.
     """
-    coefficients, _ = coefficients_of(points, weight, basis, None, 1.0, sweeps=3)
-    spread = np.asarray(coefficients.T @ coefficients / len(coefficients))
+    coefficients, spread = coefficients_of(points, weight, basis, None, 1.0, sweeps=3)
     scale = FINE
     for _ in range(sweeps):
         lengths = _lengths(points - predict(basis, coefficients))
         scale = max(_typical(lengths, weight > 0), FINE)
         robust = weight / (1 + (lengths / (3 * scale)) ** 2)
         extended = np.concatenate([coefficients, np.ones((len(coefficients), 1))], axis=1)
-        products = (extended[:, :, None] * extended[:, None]).reshape(len(extended), -1)
-        normal = (robust @ products).reshape(len(basis), *basis.shape[2:], -1)
+        normal = np.einsum("fp,pi,pj->fij", robust, extended, extended, optimize=True)
         normal += _ridge(normal)
-        right = np.matmul(extended.T, robust[..., None] * points)
+        right = np.einsum("fp,fpc,pi->fic", robust, points, extended, optimize=True)
         basis = np.linalg.solve(normal, right).transpose(0, 2, 1)
         basis, change = _orthonormal(basis)
-        coefficients, normal = coefficients_of(points, robust, basis, change @ spread @ change.T, scale, sweeps=1)
-        spread = _spread_of(coefficients, normal, scale)
+        coefficients, spread = coefficients_of(points, robust, basis, change @ spread @ change.T, scale, sweeps=1)
     return basis, coefficients, spread, scale
 
 
 def coefficients_of(
     points: Floats, weight: Floats, basis: Floats, spread: Floats | None, scale: float, *, sweeps: int
 ) -> tuple[Floats, Floats]:
-    """Return each point's coefficients on the basis, shape (S, r−1), and the normal equations they solve, shape (S, r−1, r−1).
+    """Return each point's coefficients on the basis, shape (S, r−1), and their spread, shape (r−1, r−1).
 
     Reweighted least squares with a Gaussian prior: a point that was seen in few frames shows few of its coefficients, and least
-    squares alone sends the others, and with them the hidden positions, anywhere. Without a spread least squares are strongly damped.
+    squares alone sends the others, and with them the hidden positions, anywhere. The spread is the points' second moment,
+    posterior variance included (one EM step); without one, a first spread comes from strongly damped least squares.
     """
     columns, shift = basis[:, :, :-1], basis[:, :, -1]
     products = np.einsum("fci,fcj->fij", columns, columns).reshape(len(basis), -1)
     robust, size = weight, columns.shape[2]
-    coefficients, normal = np.zeros((points.shape[1], size)), np.zeros((0, size, size))
+    coefficients, moment = np.zeros((points.shape[1], size)), np.eye(size)
     for sweep in range(sweeps):
         normal = (robust.T @ products).reshape(-1, size, size)
         normal += _ridge(normal, DAMPING) if spread is None else _prior(spread, scale) + _ridge(normal)
-        weighted = robust[..., None] * (points - shift[:, None])
-        right = np.tensordot(weighted, columns, axes=([0, 2], [0, 1]))
-        coefficients = np.linalg.solve(normal, right[..., None])[..., 0]
+        right = np.einsum("fp,fpc,fci->pi", robust, points - shift[:, None], columns, optimize=True)
+        inverse = np.linalg.inv(normal)
+        coefficients = np.einsum("pij,pj->pi", inverse, right)
+        moment = coefficients.T @ coefficients / len(coefficients)
+        if spread is not None:
+            moment = moment + scale**2 * inverse.mean(axis=0)
         if sweep + 1 < sweeps:
             lengths = _lengths(points - predict(basis, coefficients))
             typical = max(_typical(lengths, weight > 0), FINE)
             robust = weight / (1 + (lengths / (3 * typical)) ** 2)
-    return coefficients, normal
-
-
-def _spread_of(coefficients: Floats, normal: Floats, scale: float) -> Floats:
-    """Return the second moment of the coefficients, posterior variance included (one EM step), shape (r−1, r−1)."""
-    return np.asarray(coefficients.T @ coefficients / len(coefficients) + scale**2 * np.linalg.inv(normal).mean(axis=0))
+    return coefficients, moment
 
 
 def predict(basis: Floats, coefficients: Floats) -> Floats:
