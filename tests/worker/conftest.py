@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 from pliant.client.options import Options
-from pliant.client.schemas import Interpretation
+from pliant.client.schemas import Interpretation, Job
 from pliant.worker.blobs import Blobs
 from pliant.worker.connection import connect
 from pliant.worker.jobs import Jobs
@@ -96,6 +96,14 @@ def inputs_file(tmp_path: Path) -> Path:
 @pytest.fixture
 def options() -> Options:
     return Options()
+
+
+@pytest.fixture
+def submit(jobs: Jobs, inputs_file: Path, options: Options, interpretation: Interpretation):  # type: ignore[no-untyped-def]
+    def call(door: Jobs = jobs, **more: object) -> Job:
+        return door.submit(inputs_file, options=options, interpretation=interpretation, **more)  # type: ignore[arg-type]
+
+    return call
 
 
 @pytest.fixture(scope="session")

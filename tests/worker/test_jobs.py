@@ -8,8 +8,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
-from pliant.client.options import Options
-from pliant.client.schemas import Artifact, Interpretation, Job, Problem, Progress, Status
+from pliant.client.schemas import Artifact, Job, Problem, Progress, Status
 from pliant.worker import lifecycle
 from pliant.worker.errors import (
     Conflict,
@@ -17,7 +16,6 @@ from pliant.worker.errors import (
     NotAllowedNow,
     QuotaExceeded,
     StaleAttempt,
-    TooManyQueued,
     UnknownArtifact,
     UnknownJob,
 )
@@ -28,14 +26,6 @@ NOW = datetime(2030, 1, 2, tzinfo=UTC)
 PROBLEM = Problem(
     title="Lost", status=503, detail="The worker was lost. Try again.", code="worker_lost", retryable=True
 )
-
-
-@pytest.fixture
-def submit(jobs: Jobs, inputs_file: Path, options: Options, interpretation: Interpretation):  # type: ignore[no-untyped-def]
-    def call(door: Jobs = jobs, **more: object) -> Job:
-        return door.submit(inputs_file, options=options, interpretation=interpretation, **more)  # type: ignore[arg-type]
-
-    return call
 
 
 def claim(jobs: Jobs, id: str) -> Stored:
@@ -315,7 +305,6 @@ def test_events_are_capped(jobs: Jobs, submit) -> None:  # type: ignore[no-untyp
 
 
 def test_the_quota_refuses_what_does_not_fit(jobs: Jobs, submit, inputs_file: Path) -> None:  # type: ignore[no-untyped-def]
-    import dataclasses
 
     tight = dataclasses.replace(jobs, settings=dataclasses.replace(jobs.settings, disk_quota=4_000_000))
     submit(tight)
@@ -328,66 +317,3 @@ def test_readiness_names_each_part(jobs: Jobs) -> None:
     found = jobs.ready()
     assert (found["redis"], found["blobs"]) == ("ok", "ok")
     assert found["workers"] == "ok" or "pliant work" in found["workers"]
-
-
-def test_no_more_of_an_owners_jobs_wait_than_may(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
-    ada, bob = (dataclasses.replace(jobs.of(owner), max_queued=2) for owner in ("ada", "bob"))
-    first, _ = submit(ada), submit(ada, id="second", fingerprint="f")
-    before = blob_names(jobs)
-    ada.check_room(id="second")
-    for refused in (
-        lambda: submit(ada),
-        lambda: ada.check_room(id="third"),
-        lambda: ada.check_room(idempotency_key="k"),
-    ):
-        with pytest.raises(TooManyQueued, match="2 of your jobs wait"):
-            refused()
-    assert blob_names(jobs) == before, "what was refused leaves no file"
-    assert submit(ada, id="second", fingerprint="f").id == "second"
-    submit(bob)
-    submit(jobs)
-    claim(jobs, first.id)
-    submit(ada)
-    with pytest.raises(TooManyQueued):
-        submit(ada)
-
-
-def test_submissions_at_the_same_moment_do_not_slip_past_the_limit(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
-    ada = dataclasses.replace(jobs.of("ada"), max_queued=3)
-    refused: list[Exception] = []
-
-    def one() -> None:
-        try:
-            submit(ada)
-        except TooManyQueued as error:
-            refused.append(error)
-
-    threads = [threading.Thread(target=one) for _ in range(12)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert (ada.count([Status.QUEUED]), len(refused)) == (3, 9)
-
-
-def test_a_repeated_key_finds_its_job_though_the_queue_is_full(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
-    ada = dataclasses.replace(jobs.of("ada"), max_queued=1)
-    job = submit(ada, idempotency_key="k", fingerprint="f")
-    ada.check_room(idempotency_key="k")
-    assert submit(ada, idempotency_key="k", fingerprint="f").id == job.id
-
-
-def test_a_job_over_its_owners_limit_is_noted_as_held_back_until_it_is_cancelled(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
-    ada = dataclasses.replace(jobs.of("ada"), max_running=1)
-    first, second = submit(ada), submit(ada)
-    assert jobs.queue.waiting() == [jobs.records.get(first.id).token]
-    assert jobs.queue.held() == {jobs.records.get(second.id).token}
-    ada.cancel(second.id)
-    assert jobs.queue.held() == set()
-
-
-def test_what_a_token_says_of_running_jobs_is_kept_with_each(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
-    ids = [submit(dataclasses.replace(jobs.of("ada"), max_running=most)).id for most in (None, 0, 3)]
-    beats = jobs.records.beats(ids)
-    assert [(beats[id].owner, beats[id].max_running) for id in ids] == [("ada", None), ("ada", 0), ("ada", 3)]
-    assert [jobs.records.get(id).max_running for id in ids] == [None, 0, 3]

@@ -1,0 +1,44 @@
+"""Jobs in memory and a keeper, on clocks that a test turns."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+from pliant.worker import lifecycle
+from pliant.worker.blobs import Blobs
+from pliant.worker.jobs import Jobs
+from pliant.worker.keeper import Keeper
+from pliant.worker.memory import MemoryQueue, MemoryRecords
+from pliant.worker.settings import Settings
+
+
+class World:
+    """Jobs in memory, two clocks that we turn, a keeper."""
+
+    def __init__(self, data: Path, **settings: object) -> None:
+        self.now = datetime(2030, 1, 1, tzinfo=UTC)
+        self.monotonic = 1000.0
+        self.jobs = Jobs(
+            records=MemoryRecords(),
+            blobs=Blobs.open("memory:///"),
+            queue=MemoryQueue(),
+            settings=Settings(data=data, lost_after=5.0, retention=60.0, max_attempts=2, **settings),  # type: ignore[arg-type]
+            clock=lambda: self.now,
+        )
+        self.keeper = Keeper(jobs=self.jobs, clock=lambda: self.monotonic)
+        self.keeper.tick()
+
+    def pass_seconds(self, seconds: float, *, meanwhile: Callable[[], object] = lambda: None) -> None:
+        for _ in range(round(seconds)):
+            self.monotonic += 1
+            self.now += timedelta(seconds=1)
+            meanwhile()
+            self.keeper.tick()
+
+    def claim(self, id: str) -> str:
+        token = self.jobs.records.get(id).token
+        self.jobs.queue.remove(token)
+        self.jobs.records.update(id, lambda held: lifecycle.claim(held, token=token, worker="w", now=self.now))
+        return token
