@@ -31,8 +31,8 @@ def test_a_running_job_survives_a_reload_and_can_be_cancelled(
     until(lambda: steps_of(objective) >= 4)
     page.reload()
     # The events of before the reload are told again: the curve is whole.
-    objective.wait_for(timeout=10_000)
-    until(lambda: steps_of(objective) >= 4, seconds=5)
+    objective.wait_for()
+    until(lambda: steps_of(objective) >= 4)
     expect(page.get_by_text(re.compile(r"reweighting \d+ of at most 1000"))).to_be_visible()
 
     page.get_by_role("link", name="a job behind it").click()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import socket
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -64,6 +65,16 @@ def until(holds: Callable[[], Any], *, seconds: float = 10.0) -> None:
     while not holds():
         assert time.monotonic() < deadline, "it did not come to hold in time"
         time.sleep(0.01)
+
+
+def heard(connection: socket.socket, words: bytes) -> bytes:
+    """Read an answer until these words have come, in however many pieces; fail if it ends without them."""
+    answer = b""
+    while words not in answer:
+        piece = connection.recv(65536)
+        assert piece, answer
+        answer += piece
+    return answer
 
 
 def npz(**arrays: Any) -> bytes:

@@ -99,9 +99,10 @@ def test_hdf5_that_points_elsewhere_or_declares_too_much_is_refused(tmp_path: Pa
 
 
 def test_a_child_out_of_time_or_memory_costs_nothing_else(tmp_path: Path) -> None:
-    (tmp_path / "m.obj").write_text("v 1 2 3\n" * 900_000)
+    (tmp_path / "m.obj").write_text("v 1 2 3\n" * 8_000_000)  # several seconds on any machine, and one is all it gets
+    limits = Limits(parse_seconds=1, max_points=10**8)
     with pytest.raises(InvalidInput) as caught:
-        parse_in_child("obj", tmp_path / "m.obj", field="mesh", limits=Limits(parse_seconds=1))
+        parse_in_child("obj", tmp_path / "m.obj", field="mesh", limits=limits)
     assert caught.value.code == "too_slow"
     scipy.io.savemat(tmp_path / "t.mat", {"W": np.zeros((4000, 9000))}, do_compression=True)
     assert code_of(tmp_path / "t.mat", limits=Limits(parse_memory=700 << 20)) == "too_large"
