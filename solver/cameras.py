@@ -13,20 +13,11 @@ from pliant.solver.race import CANDIDATES, Candidate, carried, frames_used, gram
 from pliant.solver.records import Floats, KnownCamera, Step, read_only
 from pliant.solver.rotation import angles_between, start_at_identity
 from pliant.solver.settings import Settings
+from pliant.solver.sheet import is_flat, on_its_sides
+from pliant.solver.zoom import rigid_evidence, rigid_scales
 
 SHARE = 0.3
 """Share of the whole solve that progress gives to the cameras."""
-
-SCALE_SHARE = 0.85
-"""Scales are adopted where they explain at least this share of what one rigid shape under orthography leaves, an affine camera's
-share apart. Measured: .98 on a rigid real scene; but .76 on real bending paper and .78 on faces whose camera has no scale, which
-this cannot tell apart: between them, no scale is the smaller mistake."""
-
-RIGID_ENOUGH = 0.01
-"""And where the rest, relative to the tracks' variance, is below this: only then can one shape measure them."""
-
-WIDEST = 0.3
-"""And where the standard deviation of their logarithm is below this: no camera zooms more by accident."""
 
 HARDLY = np.radians(10.0)
 """Largest turn between any frame and the first below which the user is warned."""
@@ -84,7 +75,7 @@ def estimate_cameras(
     tell = on_step if on_step is not None else _silent
     completed = complete(normalised, seed=settings.seed)
     tell(Step("cameras", 0.4 * SHARE))
-    scales, scale_reason = _adopted_scales(completed.gram, settings)
+    scales, scale_reason = rigid_evidence(completed.gram, settings)
     gram = completed.gram / np.outer(np.repeat(scales, 2), np.repeat(scales, 2))
     used = frames_used(len(scales))
     part = gram_of(gram, used)
@@ -102,6 +93,9 @@ def estimate_cameras(
     own = next(each for each in upgrades if each.basis_size == best.basis_size)
     tell(Step("cameras", 0.8 * SHARE))
     rotations, refined = _everywhere(own.rotations, best, used, settings)
+    if settings.refine_rotations and is_flat(gram):
+        rotations, sheet = on_its_sides(gram, rotations, should_stop=should_stop)
+        refined = f"{refined} {sheet}"
     read_only(rotations)
     read_only(scales)
     tell(Step("cameras", SHARE))
@@ -147,7 +141,7 @@ def given_cameras(normalised: Normalised, known: KnownCamera, settings: Settings
     if known.scales is not None:
         scales, reason = np.array(known.scales), "Rotations and scales were given."
     elif settings.camera == "scaled_orthographic":
-        scales = _rigid_scales(completed.gram, known.rotations)
+        scales = rigid_scales(completed.gram, known.rotations)
         reason = "Rotations were given; scales were estimated."
     else:
         scales, reason = np.ones(frames), "Rotations were given; orthography has no scales."
@@ -177,49 +171,6 @@ def _warnings(rotations: Floats) -> tuple[str, ...]:
     if angles_between(rotations, rotations[:1]).max() >= HARDLY:
         return ()
     return ("The camera hardly turns about the object: depth cannot be told from the tracks and is a guess.",)
-
-
-def _adopted_scales(gram: Floats, settings: Settings) -> tuple[Floats, str]:
-    """Return the scales where the tracks show them beyond doubt, else 1; deformation must not pass for a zooming camera."""
-    frames = len(gram) // 2
-    none = np.ones(frames)
-    if settings.camera == "orthographic":
-        return none, "Plain orthography as set."
-    rotations = upgrade(gram, 1).rotations
-    scales = _rigid_scales(gram, rotations)
-    total = float(np.trace(gram))
-    affine = float(np.linalg.eigvalsh(gram)[:-3].sum()) / total
-    without, with_them = _unexplained(gram, rotations, none) / total, _unexplained(gram, rotations, scales) / total
-    share = (without - with_them) / max(without - affine, 1e-12)
-    if share > SCALE_SHARE and with_them < RIGID_ENOUGH and np.log(scales).std() < WIDEST:
-        return (
-            scales,
-            f"Scales from {scales.min():.3f} to {scales.max():.3f} explain {share:.0%} of what orthography leaves.",
-        )
-    return (
-        none,
-        f"Every scale is 1: scales explain {max(share, 0):.0%} of what orthography leaves, too little to tell from deformation.",
-    )
-
-
-def _unexplained(gram: Floats, rotations: Floats, scales: Floats) -> float:
-    basis = np.linalg.qr((rotations[:, :2] * scales[:, None, None]).reshape(len(gram), 3))[0]
-    return float(np.trace(gram) - np.trace(basis.T @ gram @ basis))
-
-
-def _rigid_scales(gram: Floats, rotations: Floats, *, rounds: int = 30) -> Floats:
-    frames = len(rotations)
-    scales = np.ones(frames)
-    for _ in range(rounds):
-        rows = (rotations[:, :2] * scales[:, None, None]).reshape(2 * frames, 3)
-        pseudo = np.linalg.pinv(rows)
-        shape_gram, cross = pseudo @ gram @ pseudo.T, (gram @ pseudo.T).reshape(frames, 2, 3)
-        pair = rotations[:, :2]
-        hit = np.einsum("fij,fij->f", pair, cross)
-        size = np.einsum("fij,jk,fik->f", pair, shape_gram, pair)
-        scales = np.maximum(hit, 1e-3 * size) / np.maximum(size, np.finfo(float).tiny)
-        scales = np.asarray(scales / np.exp(np.log(scales).mean()))
-    return scales
 
 
 def _silent(_: Step) -> None:

@@ -8,7 +8,7 @@ without its penalty on rough modes: the random walk is penalty enough), and both
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,7 @@ from pliant.solver.covariance import (
 from pliant.solver.likelihood import LOWER, Motion, Scene, cameras_of, covariances_of, fit
 from pliant.solver.records import Floats, read_only
 from pliant.solver.rotation import angles_between, exponential
+from pliant.solver.zoom import rigid_scales
 from scipy.spatial.transform import Rotation
 
 LEARNED_FRAMES = 360
@@ -40,6 +41,33 @@ STEADY = 0.01
 TURNS = 60
 """L-BFGS iterations of one refinement of the rotations."""
 
+ZOOM_FRAMES = 60
+"""Frames on which it is decided whether the camera zooms."""
+
+ZOOM_GAIN = 0.05
+"""Scales are adopted where they gain more than this in the energy: the logarithm of the number of points that a surface is worth
+(`pliant.solver.likelihood.STEADINESS`), halved and per point, as Schwarz's criterion asks of one parameter per frame, is .07.
+Measured: -.03 to .02 where there are none, .09 to .3 where the logarithm swings by 0.1."""
+
+ZOOM_LEAST = 0.01
+"""And where the standard deviation of their logarithm is above this: less is not worth a parameter per frame."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Learned:
+    """Cameras and covariance that belong together."""
+
+    rotations: Floats
+    """Shape `(F, 3, 3)`."""
+
+    scales: Floats
+    """Shape `(F,)`, mean of the logarithm 0."""
+
+    covariance: ShapeCovariance
+
+    energy: float
+    """Of `pliant.solver.likelihood`, without a penalty on modes; infinite before the first refinement."""
+
 
 def learn(
     gram: Floats,
@@ -47,6 +75,7 @@ def learn(
     shown: NDArray[np.bool_],
     *,
     turning: bool,
+    zooming: bool = False,
     should_stop: Callable[[], bool] | None = None,
 ) -> tuple[CameraEstimate, ShapeCovariance]:
     """Return the cameras, refined if `turning`, and the shape covariance of all frames.
@@ -56,37 +85,102 @@ def learn(
     gram : array, shape (2F, 2F)
         W Wᵀ / P of centred, complete tracks, normalised units.
     estimate : CameraEstimate
-        Where to start; its scales and translations are kept.
+        Where to start; its translations are kept.
     shown : array, shape (F,)
         Which frames show enough to learn from; the others are taken to lie between them.
     turning : bool
-        False leaves the rotations as they are: given ones, or as the user wished.
+        False leaves the cameras as they are: given ones, or as the user wished.
+    zooming : bool
+        True: scales that are all 1 are refined with the rotations, if that makes the tracks more probable than chance does.
     should_stop : callable, optional
         Asked between refinements; once it says True, the best so far is returned.
     """
     frames = len(estimate.rotations)
-    places = np.flatnonzero(shown)
-    used = places[np.unique(np.linspace(0, len(places) - 1, min(len(places), LEARNED_FRAMES)).round().astype(np.intp))]
-    rows = np.stack([2 * used, 2 * used + 1], axis=1).ravel()
-    scales = np.repeat(np.asarray(estimate.scales), 2)
-    unscaled = (gram / np.outer(scales, scales))[np.ix_(rows, rows)]
+    used = _some(np.flatnonzero(shown), LEARNED_FRAMES)
+    start = np.asarray(estimate.scales)
+    unscaled = _of_frames(gram / np.outer(np.repeat(start, 2), np.repeat(start, 2)), used)
     before = np.asarray(estimate.rotations)[used]
-    rotations = before
-    covariance = improve(
-        begin(unscaled, rotations[:, :2]), unscaled, rotations[:, :2], iterations=ITERATIONS, warm=WARM
-    )
-    for _ in range(ROUNDS if turning else 0):
-        if should_stop is not None and should_stop():
-            break
-        rotations, covariance = _turn(unscaled, rotations, covariance)
-        covariance = improve(covariance, unscaled, rotations[:, :2], iterations=15)
-    if len(used) < frames:
-        covariance = covariance.stretched(used, frames)
+    zoom, why = None, None
+    if turning and zooming and (start == 1).all():
+        zoom, why = _zoom(unscaled, before, should_stop)
+    found = refined(
+        unscaled, before, np.ones(len(used)) if zoom is None else zoom, with_scales=zoom is not None,
+        rounds=ROUNDS if turning else 0, should_stop=should_stop,
+    )  # fmt: skip
+    covariance = found.covariance if len(used) == frames else found.covariance.stretched(used, frames)
     if not turning:
         return estimate, covariance
-    turns = Rotation.from_matrix(rotations @ before.transpose(0, 2, 1)).as_rotvec()
+    turns = Rotation.from_matrix(found.rotations @ before.transpose(0, 2, 1)).as_rotvec()
     whole = exponential(_between(used, turns, frames)) @ estimate.rotations
+    if why is not None:
+        estimate = replace(estimate, reasons={**estimate.reasons, "scales": why})
+    if zoom is not None:
+        logs = _between(used, np.log(found.scales)[:, None], frames)[:, 0]
+        scales = np.exp(logs - logs.mean())
+        read_only(scales)
+        estimate = replace(estimate, scales=scales)
     return _told(estimate, whole), _seen_from(covariance, whole[0])
+
+
+def refined(
+    gram: Floats,
+    rotations: Floats,
+    scales: Floats,
+    *,
+    with_scales: bool,
+    rounds: int,
+    should_stop: Callable[[], bool] | None = None,
+) -> Learned:
+    """Return cameras and covariance after rounds in which one is refined for the other; scales stay 1 without `with_scales`."""
+    pairs = rotations[:, :2] * scales[:, None, None]
+    covariance = improve(begin(gram, pairs), gram, pairs, iterations=ITERATIONS, warm=WARM)
+    found = Learned(rotations, scales, covariance, np.inf)
+    for _ in range(rounds):
+        if should_stop is not None and should_stop():
+            break
+        found = _turn(gram, found, with_scales=with_scales)
+        pairs = found.rotations[:, :2] * found.scales[:, None, None]
+        found = replace(found, covariance=improve(found.covariance, gram, pairs, iterations=15))
+    return found
+
+
+def _zoom(gram: Floats, rotations: Floats, should_stop: Callable[[], bool] | None) -> tuple[Floats | None, str]:
+    """Return scales to start from, or None where those found gain no more than chance, and a sentence.
+
+    Measured on some frames. Scales are free from two starts, 1 and those of a rigid shape: deformation that passes for a zoom ends in
+    a worse minimum than no scales, or in one with hardly any.
+    """
+    used = _some(np.arange(len(rotations)), ZOOM_FRAMES)
+    part, given, none = _of_frames(gram, used), rotations[used], np.ones(len(used))
+
+    def energies(scales: Floats, *, with_scales: bool) -> Learned:
+        return refined(part, given, scales, with_scales=with_scales, rounds=ROUNDS, should_stop=should_stop)
+
+    fixed = energies(none, with_scales=False)
+    runs = [energies(scales, with_scales=True) for scales in (none, rigid_scales(part, given))]
+    best = min(runs, key=lambda run: run.energy)
+    gain, least, most = fixed.energy - best.energy, float(best.scales.min()), float(best.scales.max())
+    if not (gain > ZOOM_GAIN and np.log(best.scales).std() > ZOOM_LEAST):
+        return None, (
+            f"Every scale is 1: free ones, from {least:.3f} to {most:.3f}, would gain {gain:.3f} in the logarithm of the "
+            "likelihood, no more than deformation alone does."
+        )
+    logs = _between(used, np.log(best.scales)[:, None], len(rotations))[:, 0]
+    return np.exp(logs - logs.mean()), (
+        f"Scales from {least:.3f} to {most:.3f} gain {gain:.3f} in the logarithm of the likelihood, per point and frame."
+    )
+
+
+def _some(places: NDArray[np.intp], count: int) -> NDArray[np.intp]:
+    """Return at most so many of the places, evenly spread."""
+    chosen = np.linspace(0, len(places) - 1, min(len(places), count)).round().astype(np.intp)
+    return np.asarray(places[np.unique(chosen)])
+
+
+def _of_frames(gram: Floats, used: NDArray[np.intp]) -> Floats:
+    """Return the Gram matrix of some frames."""
+    rows = np.stack([2 * used, 2 * used + 1], axis=1).ravel()
+    return gram[np.ix_(rows, rows)]
 
 
 def telling_frames(visible: Floats) -> NDArray[np.bool_]:
@@ -96,26 +190,26 @@ def telling_frames(visible: Floats) -> NDArray[np.bool_]:
     return telling if telling.sum() >= 3 else np.ones(len(seen), dtype=bool)
 
 
-def _turn(gram: Floats, rotations: Floats, covariance: ShapeCovariance) -> tuple[Floats, ShapeCovariance]:
-    """Return rotations and covariance of higher likelihood."""
-    frames = len(rotations)
+def _turn(gram: Floats, found: Learned, *, with_scales: bool) -> Learned:
+    """Return cameras and covariance of higher likelihood."""
+    frames, covariance = len(found.rotations), found.covariance
     scene = Scene(
-        gram, rotations, with_scales=False, walk=random_walk(frames), steadiness=STEADY,
+        gram, found.rotations, with_scales=with_scales, walk=random_walk(frames), steadiness=STEADY,
         noise_floor=NOISE_FLOOR**0.5, smoothness=0.0,
     )  # fmt: skip
     started = Motion(
-        np.zeros((frames, 3)), np.zeros(frames), covariance.modes,
+        np.zeros((frames, 3)), np.log(found.scales), covariance.modes,
         _lower(covariance.extent), _lower(covariance.play),
         0.5 * np.log([covariance.noise, covariance.drift]),
     )  # fmt: skip
-    moved, _ = fit(scene, started, iterations=TURNS, turning=True)
+    moved, energy = fit(scene, started, iterations=TURNS, turning=True)
     extent, play, noise, drift = covariances_of(scene, moved)
     play = play + FLATTEST * np.trace(play) / 3 * np.eye(3)
     size = np.trace(play) / 3
-    found = replace(
+    better = replace(
         covariance, extent=extent, play=play / size, modes=moved.modes * np.sqrt(size), drift=drift * size, noise=noise
     )
-    return cameras_of(scene, moved)[0], found
+    return Learned(*cameras_of(scene, moved), better, energy)
 
 
 def _lower(matrix: Floats) -> Floats:

@@ -84,7 +84,12 @@ def solve(
     if settings.gaussian:
         turning = cameras is None and settings.refine_rotations
         estimate, covariance = learn(
-            estimate.gram, estimate, telling_frames(normalised.visible), turning=turning, should_stop=should_stop
+            estimate.gram,
+            estimate,
+            telling_frames(normalised.visible),
+            turning=turning,
+            zooming=settings.camera == "scaled_orthographic",
+            should_stop=should_stop,
         )
     tell(Step("cameras", CAMERA_SHARE, max_reweightings=settings.max_reweightings))
     seconds = {"cameras": time.perf_counter() - began}
