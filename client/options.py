@@ -93,7 +93,9 @@ class Options(BaseModel):
     tolerance: float = Field(
         1e-4, gt=0, lt=1, description="Converged when the objective's relative change in one reweighting is below this."
     )
-    precision: Literal["float64", "float32"] = Field("float64", description="Arithmetic of the large arrays.")
+    precision: Literal["float64", "float32"] = Field(
+        "float64", description="Arithmetic of the large arrays; prior gaussian needs float64."
+    )
     seed: int = Field(0, ge=0, lt=2**32, description="Seed of every random choice.")
 
     time_limit: Annotated[float, Field(gt=0, le=604_800, allow_inf_nan=False)] | None = Field(

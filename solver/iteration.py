@@ -70,7 +70,13 @@ def step(
 
 
 def _inner_precision(operator: Operator, reduction: float) -> np.dtype[np.floating]:
-    """Return single precision where it reaches the reduction and the equations do not span too many magnitudes for it."""
+    """Return single precision where it reaches the reduction and the equations do not span too many magnitudes for it.
+
+    The Gaussian prior spans ten: its chain is as stiff as the random walk is short, and its modes are the small rest that is left when
+    they are subtracted from it.
+    """
+    if operator.quadratic is not None:
+        return operator.weights.dtype
     if reduction < SINGLE_REDUCTION or not block_tridiagonal.fits(operator):
         return operator.weights.dtype
     stiff = float(operator.stencil[0].max()) + float(block_tridiagonal.stiffness_of_neighbours(operator).mean())

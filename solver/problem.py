@@ -25,7 +25,8 @@ def build_problem(
     covariance: ShapeCovariance | None = None,
 ) -> tuple[Problem, Choices]:
     """Choose what the settings leave open, and put the energy together; a covariance makes the prior Gaussian."""
-    kind = np.dtype(settings.precision)
+    # The Gaussian prior is a small difference of large numbers: single precision loses it where a fit is stiff.
+    kind = np.dtype(settings.precision if covariance is None else "float64")
     laplacian = _laplacian(normalised, mesh, settings)
     weights, noise, reasons = choose_weights(normalised, covariance, laplacian, settings)
     frames = len(normalised.points)

@@ -80,7 +80,7 @@ class Settings:
     """Converged when the relative change of the objective over one reweighting falls below this."""
 
     precision: Literal["float64", "float32"] = "float64"
-    """Arithmetic of the large arrays. Measured: see benchmarks/README.md."""
+    """Arithmetic of the large arrays. With the Gaussian prior always double, for its equations span ten magnitudes."""
 
     seed: int = 0
     """Seed of every random choice (restarts, sampled points). The same seed and thread count give the same bits."""

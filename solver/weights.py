@@ -85,12 +85,14 @@ def choose_weights(
 
 
 def without_effect(settings: Settings) -> tuple[str, ...]:
-    """Return a sentence for each weight that was set and has no part in the energy."""
+    """Return a sentence for each setting that was made and has no part in the solve."""
     said = []
     if settings.low_rank_weight is not None and settings.prior != "smooth+low_rank":
         said.append(f"low_rank_weight has no effect with prior {settings.prior}; set prior to smooth+low_rank.")
     if settings.temporal_order is not None and settings.gaussian:
         said.append("temporal_order has no effect with prior gaussian; set prior to smooth or smooth+low_rank.")
+    if settings.precision == "float32" and settings.gaussian:
+        said.append("precision has no effect with prior gaussian, which needs float64.")
     return tuple(said)
 
 

@@ -162,3 +162,5 @@ def test_single_precision_is_taken_where_it_can_reach_what_is_asked() -> None:
     assert iteration._inner_precision(given, 1e-6) == np.float64
     assert iteration._inner_precision(replace(given, weights=1e8 * given.weights), 0.1) == np.float64
     assert iteration._inner_precision(given.rounded(np.dtype(np.float32)), 1e-6) == np.float32
+    gaussian = small_problem(MESHES["triangles"], prior="gaussian")
+    assert iteration._inner_precision(operator_at(gaussian, started(gaussian)), 0.1) == np.float64

@@ -6,7 +6,7 @@ import re
 
 import numpy as np
 import pytest
-from pliant.solver import KnownCamera, Outcome, Settings, gallery, metrics, solve
+from pliant.solver import KnownCamera, Outcome, Settings, Tracks, gallery, metrics, solve
 
 MADE = gallery.face(24, 300, degrees=60)
 CAMERAS = KnownCamera.from_arrays(MADE.rotations, MADE.scales)
@@ -34,6 +34,20 @@ def test_clean_tracks_and_the_published_prior_keep_everything() -> None:
     published = solve(SPOILED, cameras=CAMERAS, settings=Settings(prior="smooth"))
     assert "outliers" not in published.choices.reasons
     assert (published.weights > 0).all()
+
+
+def test_the_stiff_fit_descends_though_the_learned_paths_hardly_move() -> None:
+    """A nearly rigid body: the prior's precision spans ten magnitudes, and 300 times that in the stiff fit."""
+    rigid = gallery.face(40, 200, degrees=60)
+    still = rigid.shapes.mean(axis=0) + 0.02 * (rigid.shapes - rigid.shapes.mean(axis=0))
+    points = np.einsum("fij,fpj->fpi", rigid.rotations[:, :2], still)
+    random = np.random.default_rng(2)
+    wrong = random.random(points.shape[:2]) < 0.1
+    points[wrong] = random.uniform(points.min(), points.max(), (int(wrong.sum()), 2))
+    found = solve(Tracks.from_arrays(points), rigid.mesh)
+    assert (found.weights[wrong] == 0).mean() > 0.95
+    assert (found.weights[~wrong] == 0).mean() < 0.03
+    assert metrics.e3d_frame(found.shapes, still) < 0.02
 
 
 def test_a_prior_of_no_weight_is_minimised_as_told() -> None:

@@ -57,6 +57,13 @@ def test_a_weight_that_the_default_prior_does_not_have_is_said_to_be_without_eff
     assert not any("no effect" in warning for warning in plain.warnings)
 
 
+def test_the_gaussian_prior_is_solved_in_double_precision_whatever_is_set(face: gallery.Sequence) -> None:
+    single, double = (solve(face.tracks, settings=Settings(precision=each)) for each in ("float32", "float64"))
+    np.testing.assert_array_equal(single.shapes, double.shapes)
+    assert any("needs float64" in warning for warning in single.choices.warnings)
+    assert not any("needs float64" in warning for warning in double.choices.warnings)
+
+
 def test_gross_outliers_ruin_least_squares_and_hardly_touch_the_default(face: gallery.Sequence) -> None:
     spoiled = gallery.corrupt(face, outliers=0.1, seed=3).tracks
     pseudo = error(face, spoiled, Settings(method="pseudo_inverse"))
