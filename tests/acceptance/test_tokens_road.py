@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 from browsing import Browsing, why_not
+from long_jobs import long_request
 from pliant.client import AsyncClient, Client, NotAuthorized
 from pliant.client.cli.demo import announced
 from pliant.client.cli.exits import Exit
@@ -207,7 +208,10 @@ def test_the_page_asks_for_the_token_and_shows_its_jobs(url: str, first: dict[st
         expect(page.get_by_role("region", name="How your files are understood")).to_contain_text(
             "30 frames", timeout=20_000
         )
-        page.get_by_role("button", name="Reconstruct").click()
-        expect(page.get_by_role("heading", name="waving flag")).to_be_visible(timeout=20_000)
-        page.get_by_role("button", name="Cancel").click()
-        expect(page.get_by_role("article").get_by_text("Cancelled", exact=True)).to_be_visible(timeout=30_000)
+        with Client(url, token=first["token"]) as client:
+            before_it = client.submit(**long_request())  # keeps the one worker: what is sent now waits to be cancelled
+            page.get_by_role("button", name="Reconstruct").click()
+            expect(page.get_by_role("heading", name="waving flag")).to_be_visible(timeout=20_000)
+            page.get_by_role("button", name="Cancel").click()
+            expect(page.get_by_role("article").get_by_text("Cancelled", exact=True)).to_be_visible(timeout=30_000)
+            before_it.cancel()
