@@ -21,7 +21,7 @@ import redis
 from pliant.client.schemas import Status
 from pliant.worker import job as work
 from pliant.worker.errors import StoreUnavailable, UnknownJob
-from pliant.worker.files import clean_up, last_words
+from pliant.worker.files import clean_up
 from pliant.worker.lifecycle import ACTIVE
 from pliant.worker.processes import die_with_parent
 from pliant.worker.queue import FUNCTION, Queue, alive_key
@@ -195,10 +195,8 @@ class PliantWorker(Worker):
         patience = 60.0 if self._stop_by is None else 2.0
         try:
             settled = settle(watch, status=status, peak=peak, patience=patience)
-            if settled is not None:
-                self._records.append_log(watch.id, last_words(self._settings, watch.token))
-                if settled.job.status is Status.QUEUED:
-                    self._deliveries.push(watch.id, settled.token, front=True)  # it has waited before
+            if settled is not None and settled.job.status is Status.QUEUED:
+                self._deliveries.push(watch.id, settled.token, front=True)  # it has waited before
             self._deliveries.remove(job.id)
         except StoreUnavailable as error:
             logger.warning("job %s: %s; the keeper will look after it", watch.id, error)

@@ -14,6 +14,7 @@ from enum import StrEnum
 from pliant.client.schemas import Problem, Status
 from pliant.worker import lifecycle
 from pliant.worker.errors import StaleAttempt, StoreUnavailable, UnknownJob
+from pliant.worker.files import last_words
 from pliant.worker.problems import how_it_ended, out_of_memory, timed_out, worker_lost
 from pliant.worker.processes import OomKills
 from pliant.worker.records import Records, Stored, new_token
@@ -96,7 +97,8 @@ class Watch:
 def settle(watch: Watch, *, status: int, peak: int, patience: float) -> Stored | None:
     """Write the record's last word for a horse that ended without one; one that spoke is left alone.
 
-    Returns the record if there was something to write.
+    Returns the record if there was something to write. The job's log has the reason and the end of the horse's own output
+    before the record is final: whoever is told that a job has ended finds its log whole.
 
     Parameters
     ----------
@@ -113,13 +115,20 @@ def settle(watch: Watch, *, status: int, peak: int, patience: float) -> Stored |
         The store does not answer.
     """
     change = _verdict(watch, status=status, peak=peak)
+    sentence = f"Ended from outside: {watch.reason}." if watch.reason is not None else how_it_ended(status)
+    words = [sentence, *last_words(watch.settings, watch.token)]
+
+    def speak() -> Stored:
+        change(watch.records.get(watch.id))  # raises where there is nothing to say
+        watch.records.append_log(watch.id, words)
+        words.clear()
+        return watch.records.update(watch.id, change)
+
     try:
-        settled = patiently(lambda: watch.records.update(watch.id, change), seconds=patience)
+        settled = patiently(speak, seconds=patience)
     except (StaleAttempt, UnknownJob):
         return None
-    sentence = f"Ended from outside: {watch.reason}." if watch.reason is not None else how_it_ended(status)
     logger.warning("job %s: %s", watch.id, sentence)
-    watch.records.append_log(watch.id, [sentence])
     return settled
 
 

@@ -49,7 +49,7 @@ def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
             up.wait(30)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")  # not longer: while Playwright is there, no other test may run an event loop
 def browser() -> Iterator[Browser]:
     with Browsing() as browsing:
         yield browsing

@@ -15,10 +15,12 @@ from pliant.client.schemas import Interpretation, Problem, Status
 from pliant.solver import InvalidInput
 from pliant.worker import lifecycle
 from pliant.worker.errors import StoreUnavailable
+from pliant.worker.files import OUTPUT, working_directory
 from pliant.worker.jobs import Jobs
 from pliant.worker.problems import how_it_ended, out_of_memory, problem_of, timed_out
 from pliant.worker.processes import OomKills
 from pliant.worker.progress import SHARES, Teller
+from pliant.worker.records import Change, Records, Stored
 from pliant.worker.watch import Reason, Watch, patiently, settle
 
 NOW = datetime(2030, 1, 1, tzinfo=UTC)
@@ -235,3 +237,23 @@ def test_progress_never_falls_and_estimates_what_is_left() -> None:
     assert edges[0][0] == 0
     assert edges[-1][1] == 1
     assert all(before[1] == after[0] for before, after in itertools.pairwise(edges))
+
+
+def test_the_log_is_whole_before_the_record_is_final(
+    jobs: Jobs, running: Callable[..., Watch], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    watch = running([0.0])
+    output = working_directory(watch.settings, watch.token) / OUTPUT
+    output.parent.mkdir(parents=True)
+    output.write_text("Segmentation fault\n")
+    logged: list[str] = []
+    update = type(jobs.records).update
+
+    def seen(self: Records, id: str, change: Change) -> Stored:
+        logged.extend(self.log(id))
+        return update(self, id, change)
+
+    monkeypatch.setattr(type(jobs.records), "update", seen)
+    assert settle(watch, status=KILLED, peak=0, patience=0) is not None
+    assert "SIGKILL" in logged[0]
+    assert logged[1:] == ["Segmentation fault"] == jobs.records.log(watch.id)[1:]
