@@ -23,15 +23,14 @@ TILE = 2048
 
 def bends_of(laplacian: Laplacian, rows: Array) -> Array:
     """Return A x for every row x, points first, shape `(P, k)` for rows of shape `(k, P)`."""
-    bends: Array = laplacian.matrix @ _turned(rows, 1.0)
+    bends: Array = laplacian.matrix @ turned(rows)
     return bends
 
 
 def add_bending(laplacian: Laplacian, weight: float, rows: Array, out: Array) -> None:
     """Add weight · AᵀA x to the rows of `out`, both of shape `(k, P)`."""
-    back = laplacian.adjoint @ (laplacian.matrix @ _turned(rows, weight))
-    for low in range(0, len(back), TILE):
-        out[:, low : low + TILE] += back[low : low + TILE].T
+    back = laplacian.adjoint @ (laplacian.matrix @ turned(rows, weight))
+    turned_back(back, out)
 
 
 def frames_together(num_frames: int) -> int:
@@ -39,8 +38,15 @@ def frames_together(num_frames: int) -> int:
     return min(TOGETHER, -(-num_frames // 4))
 
 
-def _turned(rows: Array, weight: float) -> Array:
-    turned = np.zeros(rows.shape[::-1], dtype=rows.dtype)
-    for low in range(0, len(turned), TILE):
-        np.multiply(rows[:, low : low + TILE].T, rows.dtype.type(weight), out=turned[low : low + TILE])
-    return turned
+def turned(rows: Array, weight: float = 1.0) -> Array:
+    """Return weight times the transpose of rows `(k, P)`, laid out anew."""
+    result = np.zeros(rows.shape[::-1], dtype=rows.dtype)
+    for low in range(0, len(result), TILE):
+        np.multiply(rows[:, low : low + TILE].T, rows.dtype.type(weight), out=result[low : low + TILE])
+    return result
+
+
+def turned_back(columns: Array, out: Array) -> None:
+    """Add the transpose of columns `(P, k)` to `out`."""
+    for low in range(0, len(columns), TILE):
+        out[:, low : low + TILE] += columns[low : low + TILE].T

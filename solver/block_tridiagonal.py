@@ -7,7 +7,7 @@ Without the coupling of neighbours, what is left of 𝒜 for one point is block-
 3×3 blocks, the neighbours' own stiffness kept on the diagonal. Block elimination (Golub and Van Loan, Matrix Computations, 4.5.1) costs
 the same for every frame and point: six numbers to keep, no product over frames. IRLS weights of inliers and outliers lie two orders of
 magnitude apart, so that a mean weight for a whole frame, as the cosine preconditioner has to take it, is wrong for both; in return this
-one knows nothing of smoothness along the surface, and is meant for spatial weights that are small beside the temporal one.
+one knows nothing of smoothness along the surface, for which there is `pliant.solver.multilevel`.
 """
 
 from __future__ import annotations
@@ -36,13 +36,8 @@ PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 def fits(operator: Operator) -> bool:
-    """Return whether paths over frames are all but the whole of this operator."""
-    stiffest = float(operator.stencil[0].max())
-    if operator.rank is not None or len(operator.stencil) != 2 or stiffest == 0:
-        return False
-    if operator.laplacian is None or operator.spatial_weight == 0:
-        return True
-    return float(stiffness_of_neighbours(operator).mean()) < stiffest
+    """Return whether elimination along paths can be part of the preconditioner."""
+    return operator.rank is None and len(operator.stencil) == 2 and float(operator.stencil[0].max()) > 0
 
 
 def stiffness_of_neighbours(operator: Operator) -> Floats:
@@ -54,12 +49,13 @@ def stiffness_of_neighbours(operator: Operator) -> Floats:
     return operator.spatial_weight * np.asarray(squared, dtype=np.float64).ravel()
 
 
-def build(operator: Operator) -> Linear:
-    """Factor once a reweighting; returns r ↦ M⁻¹ r."""
+def build(operator: Operator, stiffness: Floats | None = None) -> Linear:
+    """Factor once a reweighting; returns r ↦ M⁻¹ r. The neighbours' stiffness, shape `(P,)`, is the operator's own if not given."""
+    stiffness = stiffness_of_neighbours(operator) if stiffness is None else stiffness
     kind = operator.weights.dtype
     inverses = np.zeros((len(operator.projections), 6, operator.weights.shape[2]), dtype=kind)
     ridge = max(RIDGE, ROUNDING * float(np.finfo(kind).eps)) * operator.stencil[0].max()
-    shift = (stiffness_of_neighbours(operator) + ridge).astype(kind)
+    shift = (stiffness + ridge).astype(kind)
     coupling = operator.stencil[1].astype(kind)
 
     def eliminate(start: int, stop: int) -> None:

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
+from pliant.solver.conjugate_gradient import conjugate_gradient
+from pliant.solver.iteration import inner_precision
 from pliant.solver.operator import Operator
 from pliant.solver.precondition import build_preconditioner
 from pliant.solver.records import Floats
 from pliant.solver.state import Array, Problem
+
+EXACT, ROUGH, MOST = 1e-4, 0.1, 200
+"""Reduction of the residual where least squares are the answer, where they are but a start, and iterations at most."""
 
 DOUBT = 0.1
 """Standard deviation of an image coordinate, normalised units, that the start assumes with a Gaussian prior."""
@@ -26,9 +31,9 @@ def pseudo_inverse(problem: Problem, translations: Floats) -> Array:
 def uniform_solution(problem: Problem, translations: Floats) -> Array:
     """Return the least-squares shapes if every observation weighed the same (eq. 5 when λ2 is 0).
 
-    min_S ‖W − R S‖² + λ1 ‖H S‖² + λ2 ‖A S‖²: exact where all is visible and space is a whole grid or has no weight,
-    a good start for the iteration elsewhere. With a Gaussian prior the tracks are doubted first: shapes that followed an outlier
-    would give it full weight, and the reweighting would take long to leave it.
+    min_S ‖W − R S‖² + λ1 ‖H S‖² + λ2 ‖A S‖²: the answer for least squares, and roughly a start for robust losses. With a
+    Gaussian prior the tracks are doubted first: shapes that followed an outlier would give it full weight, and the reweighting would
+    take long to leave it.
     """
     weights = np.array(np.broadcast_to(problem.confidence[:, None, :], problem.points.shape))
     if problem.quadratic is not None and problem.weights.temporal > 0:
@@ -37,4 +42,10 @@ def uniform_solution(problem: Problem, translations: Floats) -> Array:
         problem.projections, weights, problem.bands, problem.laplacian, problem.weights.spatial, None, problem.quadratic
     )
     target = problem.points - translations[:, :, None].astype(problem.points.dtype)
-    return build_preconditioner(operator)(operator.right_hand_side(target))
+    reduction = EXACT if problem.loss == "l2" else ROUGH
+    operator = operator.rounded(inner_precision(operator, reduction))
+    solved = conjugate_gradient(
+        operator.apply, operator.right_hand_side(target.astype(operator.weights.dtype)),
+        precondition=build_preconditioner(operator), reduction=reduction, max_iterations=MOST,
+    )  # fmt: skip
+    return solved.x.astype(problem.points.dtype)

@@ -53,7 +53,7 @@ def step(
     operator = operator_at(problem, state)
     target = problem.points - state.translations[:, :, None].astype(problem.points.dtype)
     gradient = operator.gradient(state.shapes, target)
-    inner = operator.rounded(_inner_precision(operator, reduction))
+    inner = operator.rounded(inner_precision(operator, reduction))
     solved = conjugate_gradient(
         inner.apply, (-gradient).astype(inner.weights.dtype), precondition=build_preconditioner(inner),
         reduction=reduction, max_iterations=max_inner, should_stop=should_stop,
@@ -69,7 +69,7 @@ def step(
     )
 
 
-def _inner_precision(operator: Operator, reduction: float) -> np.dtype[np.floating]:
+def inner_precision(operator: Operator, reduction: float) -> np.dtype[np.floating]:
     """Return single precision where it reaches the reduction and the equations do not span too many magnitudes for it.
 
     The Gaussian prior spans ten: its chain is as stiff as the random walk is short, and its modes are the small rest that is left when

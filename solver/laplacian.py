@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.errors import InvalidSettings
+from pliant.solver.levels import Level, build_levels
 from pliant.solver.records import Floats, Ints, Mesh
 from scipy import sparse
 
@@ -41,11 +42,19 @@ class Laplacian:
     grid: Ints | None = None
     """Point index of each grid cell, −1 for holes, when the points lie on a grid: the preconditioner's short cut."""
 
+    levels: tuple[Level, ...] = ()
+    """Coarser surfaces, finest first, for the preconditioner."""
+
     def rounded(self, kind: np.dtype[np.floating]) -> Laplacian:
         """Return the same in another precision."""
         if self.matrix.dtype == kind:
             return self
-        return replace(self, matrix=self.matrix.astype(kind), adjoint=self.adjoint.astype(kind))
+        return replace(
+            self,
+            matrix=self.matrix.astype(kind),
+            adjoint=self.adjoint.astype(kind),
+            levels=tuple(level.rounded(kind) for level in self.levels),
+        )
 
 
 def build_laplacian(mesh: Mesh | None, kind: str, reference: Floats | None = None) -> Laplacian | None:
@@ -77,7 +86,9 @@ def build_laplacian(mesh: Mesh | None, kind: str, reference: Floats | None = Non
         matrix, name = _mesh_matrix(mesh, _cotangent_weights(mesh, reference)), "cotangent"
     else:
         matrix, name = _mesh_matrix(mesh, np.ones(len(mesh.edges))), "uniform"
-    return Laplacian(matrix, name, sparse.csr_array(matrix.T), mesh.grid) if matrix.nnz > 0 else None
+    if matrix.nnz == 0:
+        return None
+    return Laplacian(matrix, name, sparse.csr_array(matrix.T), mesh.grid, build_levels(matrix))
 
 
 def _grid_matrix(grid: Ints, num_points: int) -> Matrix:

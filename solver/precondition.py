@@ -1,7 +1,10 @@
-"""Preconditioners: the same equations with one weight a frame, which decouple.
+"""Preconditioners: sums of what inverts parts of the equations, in the frames and in the points no dearer than the equations.
 
-With uniform weights 𝒜 is the Sylvester operator X ↦ T X + λ2 X K, T the 3F×3F temporal part, K = AᵀA over points. T is
-diagonalised once a reweighting (3F numbers); on a grid K is nearly diagonal in the cosine basis.
+Where a frame is coupled to the next alone, every point's own path is inverted (`pliant.solver.block_tridiagonal`), with coarser surfaces
+beside it where bending counts (`pliant.solver.multilevel`), and with the modes of a Gaussian prior (`pliant.solver.mean_modes`,
+`pliant.solver.coarse`). Elsewhere, which is with a rank term, second differences or no smoothness in time, one weight a frame has to do:
+then 𝒜 is the Sylvester operator X ↦ T X + λ2 X K, T the 3F×3F temporal part, diagonalised once a reweighting, K = AᵀA over points,
+nearly diagonal in the cosine basis on a grid.
 """
 
 from __future__ import annotations
@@ -10,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.solver import block_tridiagonal
+from pliant.solver import block_tridiagonal, multilevel
 from pliant.solver.coarse import build_coarse
 from pliant.solver.conjugate_gradient import Linear
 from pliant.solver.mean_modes import MeanModes
@@ -22,6 +25,8 @@ from scipy import fft, linalg
 Array = NDArray[np.floating]
 BLOCK = 1024
 """Points a thread should have to work on, at least."""
+BENDS = 1.0
+"""Coarser levels are taken where bending is this much beside the slowest smoothness in time."""
 
 
 def temporal_matrix(operator: Operator) -> Floats:
@@ -62,7 +67,12 @@ class Diagonalised:
 def build_preconditioner(operator: Operator) -> Linear:
     """Return M⁻¹ for this reweighting's operator."""
     paths = block_tridiagonal.fits(operator)
-    first = block_tridiagonal.build(operator) if paths else _alike(operator)
+    if not paths:
+        first = _alike(operator)
+    elif bends(operator):
+        first = multilevel.build(operator)
+    else:
+        first = block_tridiagonal.build(operator)
     if operator.quadratic is None or operator.stencil[0].max() == 0:
         return first
     modes, coarse = MeanModes.of(operator) if paths else None, build_coarse(operator)
@@ -75,6 +85,14 @@ def build_preconditioner(operator: Operator) -> Linear:
         return result
 
     return sum_of
+
+
+def bends(operator: Operator) -> bool:
+    """Return whether bending counts beside what holds a path that moves slowly, which is its stiffness over F²."""
+    if operator.laplacian is None or operator.spatial_weight == 0:
+        return False
+    slow = float(operator.stencil[0].max()) / len(operator.projections) ** 2
+    return float(block_tridiagonal.stiffness_of_neighbours(operator).mean()) > BENDS * slow
 
 
 def _alike(operator: Operator) -> Linear:

@@ -7,9 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from pliant.solver import Mesh, iteration
+from pliant.solver.covariance import walk_bands
 from pliant.solver.energy import objective, residuals
 from pliant.solver.iteration import init, no_higher, operator_at, step
 from pliant.solver.laplacian import build_laplacian
+from pliant.solver.path_prior import PathPrior
 from pliant.solver.state import Problem, State
 from waving_sheet import sheet, small_problem, triangulated, with_weights
 
@@ -158,9 +160,9 @@ def test_corrections_in_single_precision_lead_to_the_same_energy(mesh: str, monk
 def test_single_precision_is_taken_where_it_can_reach_what_is_asked() -> None:
     problem = small_problem(MESHES["triangles"], prior="smooth", temporal_weight=30.0, spatial_weight=0.009)
     given = operator_at(problem, started(problem))
-    assert iteration._inner_precision(given, 0.1) == np.float32
-    assert iteration._inner_precision(given, 1e-6) == np.float64
-    assert iteration._inner_precision(replace(given, weights=1e8 * given.weights), 0.1) == np.float64
-    assert iteration._inner_precision(given.rounded(np.dtype(np.float32)), 1e-6) == np.float32
-    gaussian = small_problem(MESHES["triangles"], prior="gaussian")
-    assert iteration._inner_precision(operator_at(gaussian, started(gaussian)), 0.1) == np.float64
+    assert iteration.inner_precision(given, 0.1) == np.float32
+    assert iteration.inner_precision(given, 1e-6) == np.float64
+    assert iteration.inner_precision(replace(given, weights=1e8 * given.weights), 0.1) == np.float64
+    assert iteration.inner_precision(given.rounded(np.dtype(np.float32)), 1e-6) == np.float32
+    prior = PathPrior.of(walk_bands(4)[0], (np.ones((4, 1)),) * 3)
+    assert iteration.inner_precision(replace(given, quadratic=prior), 0.1) == np.float64

@@ -1,0 +1,132 @@
+"""Coarser and coarser surfaces, for the preconditioner: what a point alone cannot see of its surroundings.
+
+A block for each point knows nothing of its neighbours, and bending couples them over any distance: a smooth dent costs next to nothing,
+so that conjugate gradients would take as many steps as the surface is wide. On a surface of few points the same dent is rough. Every
+level joins points with their neighbours round a set of centres, no two of which share a neighbour (Luby, 1986: all at once that
+have the largest random number around), and smooths the result once over the graph, as in smoothed aggregation (Vaněk, Mandel,
+Brezina 1996). Corrections of all levels are added (Bramble, Pasciak, Xu 1990), so that nothing but the levels' own blocks is solved.
+Columns of every Π_l are of unit length, so that the smoothness in time looks the same on all levels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pliant.solver.records import Floats
+from scipy import sparse
+
+Matrix = sparse.csr_array[Any]
+
+COARSEST = 8
+"""No further level below this many points."""
+
+SMOOTHING = 0.6
+"""Share of the neighbours' mean in one smoothing."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Level:
+    """From one level to the next coarser."""
+
+    down: Matrix
+    """Restriction of residuals, shape `(P_l, P_l−1)`: the transpose of `up`."""
+
+    up: Matrix
+    """Prolongation of corrections."""
+
+    mean: Matrix
+    """How weights are averaged: rows of sum 1, shape `(P_l, P_l−1)`."""
+
+    bending: Floats
+    """Diagonal of ΠᵀAᵀAΠ, shape `(P_l,)`."""
+
+    def rounded(self, kind: np.dtype[np.floating]) -> Level:
+        """Return the same in another precision."""
+        return replace(self, down=self.down.astype(kind), up=self.up.astype(kind), mean=self.mean.astype(kind))
+
+
+def build_levels(laplacian: Matrix) -> tuple[Level, ...]:
+    """Return the levels below the points of a Laplacian A, shape `(P, P)`."""
+    graph = _joined(abs(laplacian) + abs(laplacian.T))
+    whole: Matrix = sparse.csr_array(sparse.eye_array(laplacian.shape[0], format="csr"))
+    scale = np.ones(laplacian.shape[0])
+    levels: list[Level] = []
+    while graph.shape[0] > COARSEST:
+        joined = _aggregates(graph)
+        if joined.shape[1] > 0.7 * joined.shape[0]:  # nothing but isolated points is left
+            break
+        smooth = _smoothed(graph, joined)
+        whole = sparse.csr_array(whole @ smooth)
+        before, scale = scale, 1 / np.sqrt(np.asarray(whole.power(2).sum(axis=0)).ravel())
+        up = sparse.csr_array(sparse.diags_array(1 / before) @ smooth @ sparse.diags_array(scale))
+        squared = sparse.csr_array(up.power(2).T)
+        share = 1 / np.asarray(squared.sum(axis=1)).ravel()
+        bends = sparse.csr_array(laplacian @ whole).power(2).sum(axis=0)
+        levels.append(
+            Level(
+                _short(up.T),
+                _short(up),
+                _short(sparse.diags_array(share) @ squared),
+                np.asarray(bends, dtype=np.float64).ravel() * scale**2,
+            )
+        )
+        graph = _joined(joined.T @ graph @ joined)
+    return tuple(levels)
+
+
+def _aggregates(graph: Matrix) -> Matrix:
+    """Return which centre every point belongs to, zeros and ones, shape `(P, centres)`."""
+    size = graph.shape[0]
+    near = _joined(graph @ graph + graph)
+    centre = _independent(near)
+    owner = np.full(size, -1)
+    owner[centre] = np.arange(len(centre))
+    for _ in range(2):  # neighbours of centres, then what is left: a neighbour's neighbour
+        owner = np.where(owner >= 0, owner, _largest(graph, owner))
+    left = owner < 0
+    owner[left] = len(centre) + np.arange(int(left.sum()))
+    return sparse.csr_array((np.ones(size), (np.arange(size), owner)), shape=(size, int(owner.max()) + 1))
+
+
+def _independent(graph: Matrix) -> NDArray[np.intp]:
+    """Return points no two of which are joined, to which none can be added."""
+    size = graph.shape[0]
+    rank = np.random.default_rng(0).permutation(size)
+    open_, chosen = np.ones(size, dtype=bool), np.zeros(size, dtype=bool)
+    while open_.any():
+        mine = np.where(open_, rank, -1)
+        taken = open_ & (mine > _largest(graph, mine))
+        chosen |= taken
+        open_ &= ~taken & (_largest(graph, np.where(taken, 1, -1)) < 0)
+    return np.flatnonzero(chosen)
+
+
+def _largest(graph: Matrix, values: NDArray[Any]) -> NDArray[Any]:
+    """Return the largest value among each point's neighbours, −1 if it has none."""
+    padded = np.append(values[graph.indices], -1)  # a last row without neighbours would start beyond the end
+    largest = np.maximum.reduceat(padded, graph.indptr[:-1])
+    return np.where(np.diff(graph.indptr) > 0, largest, -1)
+
+
+def _smoothed(graph: Matrix, joined: Matrix) -> Matrix:
+    count = np.diff(graph.indptr)
+    share = np.where(count > 0, SMOOTHING, 0.0)
+    around = sparse.diags_array(share / np.maximum(count, 1)) @ graph
+    return sparse.csr_array((sparse.diags_array(1 - share) + around) @ joined)
+
+
+def _joined(matrix: Any) -> Matrix:
+    """Return ones where the matrix couples two different points."""
+    graph = sparse.coo_array(matrix)
+    apart = (graph.row != graph.col) & (graph.data != 0)
+    ones = np.ones(int(apart.sum()))
+    return sparse.csr_array(sparse.coo_array((ones, (graph.row[apart], graph.col[apart])), shape=graph.shape))
+
+
+def _short(matrix: Any) -> Matrix:
+    result = sparse.csr_array(matrix)
+    result.indices, result.indptr = result.indices.astype(np.int32), result.indptr.astype(np.int32)
+    return result
