@@ -1,7 +1,7 @@
 """What a competent reader of the paper would write, minimising the very energy that the solver minimises.
 
-Each takes the problem as the solver built it (normalised tracks, cameras, weights λ, Laplacian) and the solver's own start,
-whose cost is not charged to it, and runs until the energy is at most `target`, or until its time is up:
+Each takes the problem as the solver built it (normalised tracks, cameras, weights λ, Laplacian) and shapes to start from, whose cost
+is not charged to it, and runs until the energy is at most `target`, or until its time is up:
 
     gradient_descent       the paper's iteration: gradient of eq. 9, exact line search, new L1 weights in every iteration
     conjugate_gradients    SciPy's CG with a Jacobi preconditioner on the explicit sparse normal equations, inside the

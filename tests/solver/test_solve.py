@@ -105,6 +105,6 @@ def test_overflow_is_an_error_not_a_result() -> None:
     _, rotations, tracks, mesh = scene()
     points = tracks.points.copy()
     points[0, 0] = 1e39
-    settings = Settings(precision="float32")
+    settings = Settings(precision="float32", prior="smooth")
     with pytest.raises(NotFinite, match="float64"):
         solve(Tracks.from_arrays(points), mesh, cameras=cameras_of(rotations), settings=settings)
