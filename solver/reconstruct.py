@@ -152,8 +152,8 @@ def _with_the_rest(
     confidence[:, part.kept] = problem.confidence
     whole = replace(whole, confidence=confidence)
     stiffer = stiffness(problem.weights, outliers) if outliers > SPOILED else 1.0
-    state = draw_the_rest(part, whole, covariance, state, stiffer=stiffer)
     seldom, never = 1 - len(part.kept) / confidence.shape[1], float((confidence == 0).all(axis=0).mean())
+    whole, state = draw_the_rest(part, whole, covariance, state, stiffer=stiffer)
     reason = (
         f"{seldom:.1%} of the points were seen in fewer than {SELDOM:.0%} of the frames ({never:.1%} in none): drawn along the "
         "surface, then moved to what was seen of them."

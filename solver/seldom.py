@@ -13,7 +13,7 @@ it takes every point by itself. Therefore in two steps, from the shapes of the p
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,7 @@ from pliant.solver.normalise import Normalised
 from pliant.solver.parallel import over_ranges
 from pliant.solver.records import MIN_POINTS, Floats, Mesh
 from pliant.solver.state import Problem, State
+from pliant.solver.trim import GROSS
 from scipy import linalg, sparse
 from scipy.sparse.linalg import splu
 
@@ -42,6 +43,8 @@ LOOSE = 1e-6
 
 ROUNDING = 1e-10
 """Share added to the diagonal of K, against rounding."""
+
+TINY = float(np.finfo(np.float64).tiny)
 
 ROUNDS = 3
 """Reweightings of the deviations."""
@@ -76,8 +79,8 @@ def often_seen(normalised: Normalised, mesh: Mesh | None) -> OftenSeen | None:
 
 def draw_the_rest(
     part: OftenSeen, problem: Problem, covariance: ShapeCovariance, state: State, *, stiffer: float = 1.0
-) -> State:
-    """Return the state of all points, its energy, counts and cameras those of the points kept.
+) -> tuple[Problem, State]:
+    """Return the problem without gross outliers and the state of all points, its energy and counts those of the points of the part.
 
     Parameters
     ----------
@@ -90,23 +93,23 @@ def draw_the_rest(
     state : State
         Of the points of the part.
     stiffer : float
-        Factor on λ1, against outliers.
+        Factor on λ1 of a first fit that shows gross outliers; 1 if there are none.
     """
     shapes = np.zeros((len(problem.points), 3, problem.points.shape[2]))
     shapes[:, :, part.kept] = state.shapes
     seen = np.flatnonzero((problem.confidence > 0).any(axis=0))
     energy = part.pull if problem.laplacian is None else sparse.vstack([problem.laplacian.matrix, part.pull])
     close_surface(shapes, part.kept, energy)
-    seldom = np.setdiff1d(seen, part.kept)
-    if len(seldom) > 0:
-        _meet_what_was_seen(problem, covariance, shapes, seldom, state.translations, stiffer)
+    confidence = problem.confidence.copy()
+    kriging = Kriging.of(problem, covariance, state.translations)
+    _meet_what_was_seen(kriging, shapes, confidence, np.setdiff1d(seen, part.kept), stiffer=stiffer)
+    problem = replace(problem, confidence=confidence)
     if len(seen) < problem.points.shape[2]:
         close_surface(shapes, seen, energy)
     whole = init(problem, shapes.astype(problem.points.dtype), state.translations)
-    return State(
-        whole.shapes, whole.translations, whole.omega, whole.rank, state.objective, whole.residual, state.reweighting,
-        state.iterations,
-    )  # fmt: skip
+    return problem, replace(
+        whole, objective=state.objective, reweighting=state.reweighting, iterations=state.iterations
+    )
 
 
 def close_surface(shapes: Floats, known: NDArray[np.intp], energy: Matrix) -> None:
@@ -130,47 +133,66 @@ def close_surface(shapes: Floats, known: NDArray[np.intp], energy: Matrix) -> No
     shapes[:, :, unknown] = drawn.T.reshape(shapes.shape[0], 3, len(unknown))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Kriging:
+    """The conditional mean of one point's path, given what was seen of it and a trend."""
+
+    problem: Problem
+    translations: Floats
+
+    reach: Floats
+    """Σ Πᵀ: what an observation, frame and image axis, says of the path, shape `(3F, 2F)`."""
+
+    image: Floats
+    """Π Σ Πᵀ, shape `(2F, 2F)`."""
+
+    @classmethod
+    def of(cls, problem: Problem, covariance: ShapeCovariance, translations: Floats) -> Kriging:
+        """Multiply the covariances out, once for all points."""
+        frames, rows = len(problem.points), problem.projections.astype(np.float64)
+        each = covariance.over_frames() + covariance.axes()[1][:, None, None]
+        reach = np.einsum("gic,cfg->fcgi", rows, each).reshape(3 * frames, 2 * frames)
+        image = np.einsum("fic,fcm->fim", rows, reach.reshape(frames, 3, -1)).reshape(2 * frames, 2 * frames)
+        return cls(problem, translations, reach, image)
+
+    def left(self, point: int, path: Floats) -> Floats:
+        """Return the residuals of a path `(F, 3, 1)`, shape `(F, 2, 1)`."""
+        image = np.matmul(self.problem.projections, path) + self.translations[:, :, None]
+        return np.asarray(self.problem.points[:, :, point : point + 1] - image, dtype=np.float64)
+
+    def moved(self, point: int, confidence: Floats, trend: Floats, *, stiffer: float) -> Floats:
+        """Return the path, `(F, 3, 1)`, of the trend and the observations of some confidence `(F, 1)`, λ1 times `stiffer`."""
+        weights = self.problem.weights
+        there = np.repeat(confidence[:, 0] > 0, 2)
+        if not there.any():
+            return trend
+        off, path = self.left(point, trend).reshape(-1)[there], trend
+        for _ in range(ROUNDS):
+            omega = loss_weights(
+                self.left(point, path), confidence, loss=self.problem.loss, scale=weights.robust_scale
+            ).reshape(-1)[there]
+            matrix = self.image[np.ix_(there, there)]
+            matrix[np.diag_indices_from(matrix)] *= 1 + ROUNDING
+            matrix[np.diag_indices_from(matrix)] += weights.temporal * stiffer / np.maximum(omega, TINY)
+            path = trend + (self.reach[:, there] @ linalg.solve(matrix, off, assume_a="pos")).reshape(trend.shape)
+        return path
+
+
 def _meet_what_was_seen(
-    problem: Problem,
-    covariance: ShapeCovariance,
-    shapes: Floats,
-    points: NDArray[np.intp],
-    translations: Floats,
-    stiffer: float,
+    kriging: Kriging, shapes: Floats, confidence: Floats, points: NDArray[np.intp], *, stiffer: float
 ) -> None:
-    """Add to some points of the shapes, in place, the deviation that their observations ask for."""
-    frames = len(shapes)
-    rows = problem.projections.astype(np.float64)
-    over_frames, extents = covariance.over_frames(), covariance.axes()[1]
-    # Σ Πᵀ: what an observation, frame and image axis, says of the path, coordinate by coordinate
-    reach = np.einsum("gic,cfg->fcgi", rows, over_frames + extents[:, None, None]).reshape(3 * frames, 2 * frames)
-    image = np.einsum("fic,fcm->fim", rows, reach.reshape(frames, 3, -1)).reshape(2 * frames, 2 * frames)
-    weights = problem.weights
-    strength = weights.temporal * stiffer
+    """Move some points of the shapes to their observations, in place; gross outliers lose their confidence, in place, too."""
 
     def work(start: int, stop: int) -> None:
         for point in points[start:stop]:
             one = slice(point, point + 1)
-            confidence = problem.confidence[:, one]
-            there = np.repeat(confidence[:, 0] > 0, 2)
             trend = shapes[:, :, one].copy()
-            off = np.asarray(_left(problem, trend, translations, one).reshape(-1)[there], dtype=np.float64)
-            for _ in range(ROUNDS):
-                left = _left(problem, shapes[:, :, one], translations, one)
-                omega = loss_weights(left, confidence, loss=problem.loss, scale=weights.robust_scale).reshape(-1)[there]
-                matrix = image[np.ix_(there, there)]
-                matrix[np.diag_indices_from(matrix)] *= 1 + ROUNDING
-                matrix[np.diag_indices_from(matrix)] += strength / np.maximum(omega, np.finfo(float).tiny)
-                deviation = reach[:, there] @ linalg.solve(matrix, off, assume_a="pos")
-                shapes[:, :, one] = trend + deviation.reshape(frames, 3, 1)
+            if stiffer > 1:
+                stiff = kriging.moved(point, confidence[:, one], trend, stiffer=stiffer)
+                confidence[np.hypot(*kriging.left(point, stiff)[:, :, 0].T) > GROSS, point] = 0
+            shapes[:, :, one] = kriging.moved(point, confidence[:, one], trend, stiffer=1.0)
 
     over_ranges(work, len(points), smallest=64)
-
-
-def _left(problem: Problem, shapes: Floats, translations: Floats, one: slice) -> Floats:
-    """Return the residuals of one point, shape `(F, 2, 1)`."""
-    image = np.matmul(problem.projections, shapes) + translations[:, :, None]
-    return np.asarray(problem.points[:, :, one] - image, dtype=np.float64)
 
 
 def _differences(mesh: Mesh) -> Matrix:

@@ -67,6 +67,20 @@ def test_what_was_seen_of_a_seldom_seen_point_is_met_and_helps() -> None:
     assert errors[1] < 0.9 * errors[0]
 
 
+def test_outliers_of_seldom_seen_points_are_left_out_too() -> None:
+    shown = tuple(range(0, 16, 5))
+    tracks = seen_but(HOLE, shown=shown[:3])
+    random, visible = np.random.default_rng(5), np.asarray(tracks.visible) > 0
+    points, wrong = np.array(tracks.points), visible & (random.random(visible.shape) < 0.1)
+    points[wrong] += random.choice([-1, 1], (int(wrong.sum()), 2)) * np.abs(TRUE).max()
+    found = solve(Tracks.from_arrays(points, visible), MADE.mesh, cameras=CAMERAS)
+    in_hole = np.zeros_like(wrong)
+    in_hole[:, HOLE] = True
+    assert (wrong & in_hole).sum() >= 3
+    assert (found.weights[wrong & in_hole] == 0).mean() > 0.6
+    assert (found.weights[visible & ~wrong & in_hole] > 0).mean() > 0.9
+
+
 def test_a_patch_that_hangs_on_an_edge_does_not_fly_off() -> None:
     far = np.flatnonzero(TRUE[0, :, 1] < np.quantile(TRUE[0, :, 1], 0.3)).tolist()
     found = solve(seen_but(far), MADE.mesh, cameras=CAMERAS)
