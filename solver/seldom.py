@@ -100,7 +100,7 @@ def draw_the_rest(
     seen = np.flatnonzero((problem.confidence > 0).any(axis=0))
     energy = part.pull if problem.laplacian is None else sparse.vstack([problem.laplacian.matrix, part.pull])
     close_surface(shapes, part.kept, energy)
-    confidence = problem.confidence.copy()
+    confidence = problem.confidence.astype(np.float64)
     kriging = Kriging.of(problem, covariance, state.translations)
     _meet_what_was_seen(kriging, shapes, confidence, np.setdiff1d(seen, part.kept), stiffer=stiffer)
     problem = replace(problem, confidence=confidence)
