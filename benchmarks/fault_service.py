@@ -20,7 +20,7 @@ from benchmarks.long_jobs import LONG
 
 @fault("kill -9 the API in mid upload")
 def api_uploading(house: House) -> Told:
-    sequence = face(60, 60_000)  # 57 MB, above the SDK's threshold
+    sequence = face(60, 40_000)  # 38 MB, above the SDK's threshold
     began: list[int] = []
     whole, killed = Rest.pieces, 0.0
 
