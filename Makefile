@@ -34,8 +34,12 @@ page: $(PAGE)
 demo: $(STAMP) $(PAGE)
 	$(BIN)/pliant demo $(DEMO)
 
+# PROCESSES=2 shares the test files out between two processes: half of them wait for real servers, the others compute.
+PROCESSES ?= 1
+SHARED := $(if $(filter-out 1,$(PROCESSES)),-n $(PROCESSES) --dist loadfile)
+
 test: $(STAMP) $(PAGE)
-	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest $(TESTS)
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest $(SHARED) $(TESTS)
 
 # mypy reads the folders under their import names, so it gets a tree of links that has them.
 build/typed/pliant:
