@@ -32,8 +32,12 @@ from scipy.spatial.transform import Rotation
 LEARNED_FRAMES = 360
 """Longer sequences are learned from this many of their frames, evenly spread: the cost grows with F³."""
 
-ROUNDS = 2
-"""Refinements of the rotations, each followed by one of the covariance."""
+ROUNDS = 5
+"""Refinements of rotations and covariance, each with a fresh memory of the curvature. Expectation maximisation between them would undo
+a part, for it keeps modes and random walk apart, which L-BFGS does not."""
+
+SETTLING = 30
+"""Rounds of expectation maximisation after the last refinement, without annealing."""
 
 STEADY = 0.01
 """Weight of the camera's unsteadiness: less is needed once the covariance is known."""
@@ -41,8 +45,14 @@ STEADY = 0.01
 TURNS = 60
 """L-BFGS iterations of one refinement of the rotations."""
 
+LEAST_NOISE = 1e-12
+"""What is left of σ² where it lies at its floor, which the likelihood adds again."""
+
 ZOOM_FRAMES = 60
 """Frames on which it is decided whether the camera zooms."""
+
+ZOOM_ROUNDS = 2
+"""Refinements on which it is decided."""
 
 ZOOM_GAIN = 0.08
 """Scales are adopted where they gain more than this in the energy: the logarithm of the number of points that a surface is worth
@@ -107,7 +117,12 @@ def learn(
         unscaled, before, np.ones(len(used)) if zoom is None else zoom, with_scales=zoom is not None,
         rounds=ROUNDS if turning else 0, should_stop=should_stop,
     )  # fmt: skip
-    covariance = found.covariance if len(used) == frames else found.covariance.stretched(used, frames)
+    covariance = found.covariance
+    if turning:
+        pairs = found.rotations[:, :2] * found.scales[:, None, None]
+        covariance = improve(covariance, unscaled, pairs, iterations=SETTLING)
+    if len(used) < frames:
+        covariance = covariance.stretched(used, frames)
     if not turning:
         return estimate, covariance
     turns = Rotation.from_matrix(found.rotations @ before.transpose(0, 2, 1)).as_rotvec()
@@ -139,8 +154,6 @@ def refined(
         if should_stop is not None and should_stop():
             break
         found = _turn(gram, found, with_scales=with_scales)
-        pairs = found.rotations[:, :2] * found.scales[:, None, None]
-        found = replace(found, covariance=improve(found.covariance, gram, pairs, iterations=15))
     return found
 
 
@@ -154,7 +167,7 @@ def _zoom(gram: Floats, rotations: Floats, should_stop: Callable[[], bool] | Non
     part, given, none = _of_frames(gram, used), rotations[used], np.ones(len(used))
 
     def energies(scales: Floats, *, with_scales: bool) -> Learned:
-        return refined(part, given, scales, with_scales=with_scales, rounds=ROUNDS, should_stop=should_stop)
+        return refined(part, given, scales, with_scales=with_scales, rounds=ZOOM_ROUNDS, should_stop=should_stop)
 
     fixed = energies(none, with_scales=False)
     runs = [energies(scales, with_scales=True) for scales in (none, rigid_scales(part, given))]
@@ -200,7 +213,7 @@ def _turn(gram: Floats, found: Learned, *, with_scales: bool) -> Learned:
     started = Motion(
         np.zeros((frames, 3)), np.log(found.scales), covariance.modes,
         _lower(covariance.extent), _lower(covariance.play),
-        0.5 * np.log([covariance.noise, covariance.drift]),
+        0.5 * np.log([max(covariance.noise - scene.noise_floor**2, LEAST_NOISE), covariance.drift]),
     )  # fmt: skip
     moved, energy = fit(scene, started, iterations=TURNS, turning=True)
     extent, play, noise, drift = covariances_of(scene, moved)
