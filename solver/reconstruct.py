@@ -32,6 +32,7 @@ from pliant.solver.records import (
 )  # fmt: skip
 from pliant.solver.seldom import SELDOM, OftenSeen, draw_the_rest, often_seen
 from pliant.solver.settings import Settings
+from pliant.solver.sheet import is_flat
 from pliant.solver.state import Problem, State
 from pliant.solver.trim import SPOILED, stiffness, without_outliers
 
@@ -82,7 +83,9 @@ def solve(
     estimate = _cameras(normalised, cameras, settings, on_step=on_step, should_stop=should_stop)
     covariance = None
     if settings.gaussian:
-        turning = cameras is None and settings.refine_rotations
+        # The sides of a thin sheet hang on little; what completion puts in the place of outliers is enough to turn them over.
+        spoiled_sheet = estimate.outliers > SPOILED and is_flat(estimate.gram)
+        turning = cameras is None and settings.refine_rotations and not spoiled_sheet
         estimate, covariance = learn(
             estimate.gram,
             estimate,

@@ -112,3 +112,13 @@ def test_a_stop_returns_the_best_so_far(flag: gallery.Sequence) -> None:
 
 def test_orthography_as_set_keeps_the_scales(flag: gallery.Sequence) -> None:
     assert (solve(flag.tracks, settings=Settings(camera="orthographic")).camera.scales == 1).all()
+
+
+def test_a_spoiled_sheet_keeps_the_sides_that_were_found_for_it() -> None:
+    """What stands in for outliers is enough to turn a sheet over: its cameras are not refined with the shapes."""
+    film = gallery.flag(24, 300)
+    spoiled = gallery.corrupt(film, outliers=0.05, hidden=0.2, noise=0.01, seed=0).tracks
+    found, clean = solve(spoiled, film.mesh), solve(film.tracks, film.mesh)
+    assert "Then refined together" not in found.choices.reasons["rotations"]
+    assert "Then refined together" in clean.choices.reasons["rotations"]
+    assert metrics.e3d_frame(found.shapes, film.shapes) < 0.3
