@@ -24,6 +24,7 @@ def test_the_example_by_keyboard_alone(page: Page) -> None:
                 return
         pytest.fail(f"the Tab key does not reach {name!r}")
 
+    page.get_by_role("button", name="breathing sphere").wait_for()  # the examples come with an answer of the service
     tab_to("breathing sphere")
     page.keyboard.press("Enter")
     expect(page.get_by_role("button", name="Reconstruct")).to_be_focused()
