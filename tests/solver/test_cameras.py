@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from camera_errors import degrees_apart
 from pliant.solver import KnownCamera, Settings, Tracks, gallery
 from pliant.solver.cameras import estimate_cameras, given_cameras
 from pliant.solver.completion import complete
@@ -12,12 +13,9 @@ from pliant.solver.metric_upgrade import upgrade
 from pliant.solver.normalise import normalise
 from pliant.solver.race import carried
 from pliant.solver.rotation import (
-    MIRROR,
-    angles_between,
     exponential,
     left_jacobian,
     logarithm,
-    nearest,
     start_at_identity,
 )
 from pliant.solver.steadiness import SCALE_FLOOR, TURN_FLOOR, unevenness, unsteadiness
@@ -36,23 +34,13 @@ def view(shapes: np.ndarray, rotations: np.ndarray) -> np.ndarray:
     return np.einsum("fij,fpj->fpi", rotations[:, :2], np.broadcast_to(shapes, (len(rotations), *shapes.shape[-2:])))
 
 
-def error(found: np.ndarray, truth: np.ndarray) -> float:
-    """Mean angle in degrees, one world rotation and the depth mirror free."""
-    errors = []
-    for mirror in (np.eye(3), MIRROR):
-        turned = mirror @ found @ mirror
-        world = nearest(np.einsum("fji,fjk->ik", turned, truth))
-        errors.append(float(np.degrees(angles_between(turned @ world, truth).mean())))
-    return min(errors)
-
-
 RIGID = np.random.default_rng(3).normal(size=(60, 3)) * [1.0, 0.8, 0.5]
 CAMERA = turning(20, 40)
 
 
 def test_a_rigid_scene_is_exact() -> None:
     found = estimate_cameras(normalise(Tracks.from_arrays(view(RIGID, CAMERA) * 7 + 3)), Settings())
-    assert error(found.rotations, CAMERA) < 0.1
+    assert degrees_apart(found.rotations, CAMERA) < 0.1
     np.testing.assert_allclose(found.rotations[0], np.eye(3), atol=1e-12)
     np.testing.assert_allclose(found.scales, 1.0, atol=1e-3)
     np.testing.assert_allclose(found.translations, 0.0, atol=1e-12)
@@ -66,7 +54,7 @@ def test_a_low_rank_scene_needs_its_own_k() -> None:
     play = 0.3 * np.sin(np.linspace(0, 9, 60))[:, None, None]
     tracks = view(RIGID + play * random.normal(size=RIGID.shape), camera).transpose(0, 2, 1).reshape(120, -1)
     centred = tracks - tracks.mean(axis=1, keepdims=True)
-    own, rigid = (error(upgrade(centred @ centred.T, size).rotations, camera) for size in (2, 1))
+    own, rigid = (degrees_apart(upgrade(centred @ centred.T, size).rotations, camera) for size in (2, 1))
     assert own < 1.5
     assert rigid > 1.5 * own
 
@@ -91,7 +79,7 @@ def test_outliers_and_hidden_points_hardly_matter() -> None:
     visible = random.random(points.shape[:2]) > 0.3
     found = estimate_cameras(normalise(Tracks.from_arrays(points, visible)), Settings())
     assert np.isfinite(found.rotations).all()
-    assert error(found.rotations, CAMERA) < 3
+    assert degrees_apart(found.rotations, CAMERA) < 3
 
 
 def test_a_still_camera_is_said() -> None:
@@ -167,9 +155,9 @@ def test_corrections_are_carried_to_the_frames_between() -> None:
     world = exponential(np.array([0.3, -2.0, 0.4]))
     drift = np.linspace(0, 0.3, 41)[:, None] * np.array([0.0, 1.0, 0.0])
     found = carried(truth @ exponential(-drift), (truth @ world)[used], used)
-    assert error(found[used], truth[used]) < 1e-6
-    assert error(found, truth) < 0.01
-    assert error(truth @ exponential(-drift), truth) > 3
+    assert degrees_apart(found[used], truth[used]) < 1e-6
+    assert degrees_apart(found, truth) < 0.01
+    assert degrees_apart(truth @ exponential(-drift), truth) > 3
 
 
 def test_a_dancer_does_not_make_the_camera_dance() -> None:
@@ -183,7 +171,7 @@ def test_a_dancer_does_not_make_the_camera_dance() -> None:
     normalised = normalise(Tracks.from_arrays(view(shapes, camera)))
     rough = estimate_cameras(normalised, Settings(refine_rotations=False)).rotations
     refined = estimate_cameras(normalised, Settings())
-    assert error(refined.rotations, camera) < 0.5 * error(rough, camera)
+    assert degrees_apart(refined.rotations, camera) < 0.5 * degrees_apart(rough, camera)
     assert unsteadiness(refined.rotations)[0] < unsteadiness(rough)[0]
     assert refined.reasons["rotations"].startswith("Refined by variable projection")
 

@@ -1,0 +1,16 @@
+"""How far found cameras are from the true ones."""
+
+from __future__ import annotations
+
+import numpy as np
+from pliant.solver.rotation import MIRROR, angles_between, nearest
+
+
+def degrees_apart(found: np.ndarray, truth: np.ndarray) -> float:
+    """Return the mean angle in degrees, one world rotation and the depth mirror free."""
+    errors = []
+    for mirror in (np.eye(3), MIRROR):
+        turned = mirror @ found @ mirror
+        world = nearest(np.einsum("fji,fjk->ik", turned, truth))
+        errors.append(float(np.degrees(angles_between(turned @ world, truth).mean())))
+    return min(errors)
