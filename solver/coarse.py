@@ -61,7 +61,7 @@ class Coarse:
 
 def build_coarse(operator: Operator) -> Coarse | None:
     """Return the correction for this reweighting, or None where the mean weights do."""
-    if operator.quadratic is None:
+    if operator.quadratic is None or not operator.quadratic.bands.any():  # or a prior of no weight
         return None
     mean = operator.weights.mean(axis=2, dtype=np.float64)
     unlike = float((operator.weights < UNLIKE * mean[:, :, None]).mean())
@@ -103,7 +103,7 @@ def _free_modes(operator: Operator, limit: float) -> tuple[tuple[Floats, Floats,
     for directions, values in operator.quadratic.loosest(MOST):
         free = values < limit
         modes.append(np.ascontiguousarray(directions[:, free]))
-        held.append(np.maximum(values[free], 1e-12 * limit))
+        held.append(np.maximum(values[free], 1e-9 * limit))
     return (modes[0], modes[1], modes[2]), held
 
 

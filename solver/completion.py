@@ -13,8 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from pliant.solver.errors import InvalidInput
 from pliant.solver.normalise import Normalised
-from pliant.solver.records import Floats
+from pliant.solver.records import MIN_POINTS, Floats
 
 SAMPLE = 600
 """Points that the basis is fitted to."""
@@ -77,9 +78,20 @@ def complete(normalised: Normalised, *, seed: int = 0) -> Completed:
         Points (F, P, 2) in normalised units with their visibility.
     seed : int
         Of the sample of points and of the held-out entries.
+
+    Raises
+    ------
+    InvalidInput
+        Hardly any point is seen in two frames.
     """
     random = np.random.default_rng(seed)
     chosen = choose_points(normalised.visible, random)
+    again = int(((normalised.visible > 0).sum(axis=0) >= 2).sum())
+    if again < MIN_POINTS:
+        raise InvalidInput(
+            "too_little_seen", field="visibility", expected=f"at least {MIN_POINTS} points that are seen in two frames or more",
+            got=f"{again}", hint="Check that the visibility is not inverted, and that a point keeps its place from frame to frame.",
+        )  # fmt: skip
     points, weight = normalised.points[:, chosen], normalised.visible[:, chosen]
     basis, spread, scale = fit_basis(points, weight, random)
     outliers = fill(points, weight, basis, spread, scale)[1]

@@ -23,7 +23,7 @@ from pliant.solver.covariance import (
     improve,
     random_walk,
 )
-from pliant.solver.likelihood import LOWER, Motion, Scene, cameras_of, covariances_of, fit
+from pliant.solver.likelihood import Motion, Scene, cameras_of, covariances_of, fit, root_of
 from pliant.solver.records import Floats, read_only
 from pliant.solver.rotation import angles_between, exponential
 from pliant.solver.zoom import rigid_scales
@@ -223,7 +223,7 @@ def _turn(gram: Floats, found: Learned, *, with_scales: bool) -> Learned:
     )  # fmt: skip
     started = Motion(
         np.zeros((frames, 3)), np.log(found.scales), covariance.modes,
-        _lower(covariance.extent), _lower(covariance.play),
+        root_of(covariance.extent), root_of(covariance.play),
         0.5 * np.log([max(covariance.noise - scene.noise_floor**2, LEAST_NOISE), covariance.drift]),
     )  # fmt: skip
     moved, energy = fit(scene, started, iterations=TURNS, turning=True)
@@ -234,11 +234,6 @@ def _turn(gram: Floats, found: Learned, *, with_scales: bool) -> Learned:
         covariance, extent=extent, play=play / size, modes=moved.modes * np.sqrt(size), drift=drift * size, noise=noise
     )
     return Learned(*cameras_of(scene, moved), better, energy)
-
-
-def _lower(matrix: Floats) -> Floats:
-    """Return the lower triangle of a root, shape `(6,)`."""
-    return np.asarray(np.linalg.cholesky(matrix)[LOWER], dtype=np.float64)
 
 
 def _between(used: NDArray[np.intp], turns: Floats, frames: int) -> Floats:

@@ -142,7 +142,7 @@ def start(scene: Scene, scales: Floats, *, num_modes: int = NUM_MODES) -> Motion
     count = min(num_modes, frames // 2)
     modes = vectors[:, ::-1][:, :count] * np.sqrt(np.maximum(values[::-1][:count], 1e-12))
     return Motion(
-        np.zeros((frames, 3)), np.log(scales), modes, np.linalg.cholesky(extent)[LOWER], np.eye(3)[LOWER],
+        np.zeros((frames, 3)), np.log(scales), modes, root_of(extent), np.eye(3)[LOWER],
         0.5 * np.log(variance * np.array([0.05, 0.2])),
     )  # fmt: skip
 
@@ -161,6 +161,7 @@ def covariances_of(scene: Scene, motion: Motion) -> tuple[Floats, Floats, float,
     return root0 @ root0.T, root1 @ root1.T, float(noise) + scene.noise_floor**2, float(drift)
 
 
+@np.errstate(over="ignore", invalid="ignore")  # a line search may try a step far too long: that energy is `UNLIKELY`
 def energy(scene: Scene, motion: Motion) -> tuple[float, Motion]:
     """Return E with the penalties on modes, turns and scales, and its gradient, analytic in every parameter.
 
@@ -179,7 +180,7 @@ def energy(scene: Scene, motion: Motion) -> tuple[float, Motion]:
     covariance = rows0 @ rows.T + deform * wide
     covariance[np.diag_indices(2 * frames)] += noise + scene.noise_floor**2
     inverse, log_det = _invert(covariance)
-    if inverse is None:
+    if inverse is None or not np.isfinite(log_det):
         return UNLIKELY, Motion.unflat(np.zeros_like(motion.flat()), frames)
     explained = inverse @ scene.gram
     value = 0.5 * (log_det + float(np.trace(explained))) / frames
@@ -223,6 +224,16 @@ def fit(scene: Scene, motion: Motion, *, iterations: int, turning: bool) -> tupl
         objective, given[held:], jac=True, method="L-BFGS-B", options={"maxiter": iterations, "maxcor": 20}
     )
     return Motion.unflat(np.concatenate([given[:held], np.asarray(found.x)]), frames), float(found.fun)
+
+
+def root_of(matrix: Floats) -> Floats:
+    """Return the lower triangle of a root of a covariance, shape `(6,)`; one without extent along an axis gets hardly any."""
+    try:
+        return np.asarray(np.linalg.cholesky(matrix)[LOWER], dtype=np.float64)
+    except np.linalg.LinAlgError:
+        values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
+        values = np.maximum(values, max(1e-9 * float(values[-1]), 1e-12))
+        return np.asarray(np.linalg.cholesky((vectors * values) @ vectors.T)[LOWER], dtype=np.float64)
 
 
 def _root(lower: Floats) -> Floats:

@@ -39,6 +39,8 @@ SHEET_FRAMES = 60
 MODES, NOISE, STEADY = 4, 1e-3, 0.03
 """Modes, noise floor and weight of the camera's unsteadiness. With many modes every choice of sides is explained in the end."""
 
+TINY = float(np.finfo(np.float64).tiny)
+
 SMALL_TILT = 1e-3
 """Weight of mean log 1/cos θ: of the planes that explain the singular values equally well, the least tilted."""
 
@@ -162,6 +164,7 @@ def poses(gram: Floats) -> tuple[Floats, Floats]:
 
     def uneven(values: Floats) -> float:
         large, small = np.moveaxis(np.linalg.svd(factor @ _lower(values), compute_uv=False), -1, 0)
+        large = np.maximum(large, 1e-9 * max(float(large.max()), TINY))
         tilt = np.log(large / np.maximum(small, 1e-9 * large))
         return float(np.mean(np.log(large) ** 2) + SMALL_TILT * np.mean(tilt))
 
@@ -169,6 +172,7 @@ def poses(gram: Floats) -> tuple[Floats, Floats]:
     runs = [minimize(uneven, one, method="Nelder-Mead", options={"maxiter": 2000, "xatol": 1e-6}) for one in begun]
     found = min(runs, key=lambda run: float(run.fun)).x
     left, values, right = np.linalg.svd(factor @ _lower(found))
+    values = np.maximum(values, 1e-9 * max(float(values.max()), TINY))
     cosine = values[:, 1] / values[:, 0]
     across = np.sqrt(np.maximum(1 - cosine**2, 0.0))[:, None] * left[:, :, 1]
     flat = (left * np.stack([np.ones_like(cosine), cosine], axis=1)[:, None]) @ right
