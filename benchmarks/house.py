@@ -129,8 +129,14 @@ class House:
 
     def kill(self, role: str, number: signal.Signals = signal.SIGKILL) -> int:
         """Signal one process of a role, waiting until there is one; return its id."""
-        self.until(lambda: self.look()[role], f"there is a {role}")
-        pid = self.look()[role][0]
+        seen: list[int] = []
+
+        def there() -> bool:
+            seen[:] = self.look()[role]  # one look: at the next one it may be gone
+            return bool(seen)
+
+        self.until(there, f"there is a {role}")
+        pid = seen[0]
         os.kill(pid, number)
         return pid
 
