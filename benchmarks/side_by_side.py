@@ -114,7 +114,7 @@ def prepare(tracks: Tracks, mesh: Mesh | None, cameras: KnownCamera, settings: S
     """Build the solver's problem and its start, normalised units."""
     still = np.zeros((tracks.num_frames, 2))
     scales = np.ones(tracks.num_frames) if cameras.scales is None else cameras.scales
-    estimate = CameraEstimate(cameras.rotations, scales, still, 0, {}, ())
+    estimate = CameraEstimate(cameras.rotations, scales, still, 0, np.zeros((0, 0)), np.zeros((len(scales), 0, 2)))
     problem, _ = build_problem(normalise(tracks), estimate, mesh, settings)
     return problem, uniform_solution(problem, still)
 

@@ -42,6 +42,9 @@ class CameraEstimate:
     gram: Floats
     """W Wᵀ / P of the completed tracks, shape `(2F, 2F)`, normalised units; empty where nothing asks for it."""
 
+    sample: Floats
+    """Some points of the completed tracks, centred, shape `(F, S, 2)`, normalised units; empty where nothing asks for it."""
+
     outliers: float = 0.0
     """Share of the seen entries that completion replaced as gross outliers."""
 
@@ -101,7 +104,8 @@ def estimate_cameras(
     tell(Step("cameras", SHARE))
     reasons = {"basis_size": _why(ran, best, settings), "scales": scale_reason, "rotations": refined}
     return CameraEstimate(
-        rotations, scales, completed.translations, best.basis_size, completed.gram, completed.outliers, reasons,
+        rotations, scales, completed.translations, best.basis_size, completed.gram, completed.sample,
+        completed.outliers, reasons,
         _warnings(rotations),
     )  # fmt: skip
 
@@ -146,7 +150,14 @@ def given_cameras(normalised: Normalised, known: KnownCamera, settings: Settings
     else:
         scales, reason = np.ones(frames), "Rotations were given; orthography has no scales."
     return CameraEstimate(
-        known.rotations, scales, completed.translations, 0, completed.gram, completed.outliers, {"camera": reason}
+        known.rotations,
+        scales,
+        completed.translations,
+        0,
+        completed.gram,
+        completed.sample,
+        completed.outliers,
+        {"camera": reason},
     )
 
 

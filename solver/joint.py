@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 from pliant.solver.cameras import CameraEstimate
 from pliant.solver.covariance import (
     FLATTEST,
-    ITERATIONS,
+    MOST_MODES,
     NOISE_FLOOR,
-    WARM,
     ShapeCovariance,
-    begin,
     improve,
+    learned,
     random_walk,
 )
 from pliant.solver.likelihood import Motion, Scene, cameras_of, covariances_of, fit, root_of
+from pliant.solver.mode_count import modes_supported
 from pliant.solver.records import Floats, read_only
 from pliant.solver.rotation import angles_between, exponential
 from pliant.solver.zoom import rigid_scales
@@ -85,7 +85,6 @@ class Learned:
 
 
 def learn(
-    gram: Floats,
     estimate: CameraEstimate,
     shown: NDArray[np.bool_],
     *,
@@ -97,10 +96,8 @@ def learn(
 
     Parameters
     ----------
-    gram : array, shape (2F, 2F)
-        W Wᵀ / P of centred, complete tracks, normalised units.
     estimate : CameraEstimate
-        Where to start; its translations are kept.
+        Where to start, with the Gram matrix and the sample of the completed tracks; its translations are kept.
     shown : array, shape (F,)
         Which frames show enough to learn from; the others are taken to lie between them.
     turning : bool
@@ -113,21 +110,23 @@ def learn(
     frames = len(estimate.rotations)
     used = _some(np.flatnonzero(shown), LEARNED_FRAMES)
     start = np.asarray(estimate.scales)
-    unscaled = _of_frames(gram / np.outer(np.repeat(start, 2), np.repeat(start, 2)), used)
+    unscaled = _of_frames(estimate.gram / np.outer(np.repeat(start, 2), np.repeat(start, 2)), used)
     before = np.asarray(estimate.rotations)[used]
+    most = modes_supported((estimate.sample / start[:, None, None])[used], before[:, :2])
     zoom, why = None, None
     if turning and zooming and (start == 1).all():
-        zoom, why = _zoom(unscaled, before, should_stop)
+        zoom, why = _zoom(unscaled, before, most, should_stop)
     found = refined(
         unscaled, before, np.ones(len(used)) if zoom is None else zoom, with_scales=zoom is not None,
-        rounds=ROUNDS if turning else 0, should_stop=should_stop,
+        rounds=ROUNDS if turning else 0, most=most, should_stop=should_stop,
     )  # fmt: skip
     covariance = found.covariance
     if turning:
         pairs = found.rotations[:, :2] * found.scales[:, None, None]
-        covariance = improve(covariance, unscaled, pairs, iterations=SETTLING)
+        covariance = improve(covariance, unscaled, pairs, iterations=SETTLING, most=most)
     if len(used) < frames:
         covariance = covariance.stretched(used, frames)
+    estimate = replace(estimate, reasons={**estimate.reasons, "modes": _why(covariance, most)})
     if not turning:
         return estimate, covariance
     turns = Rotation.from_matrix(found.rotations @ before.transpose(0, 2, 1)).as_rotvec()
@@ -149,11 +148,12 @@ def refined(
     *,
     with_scales: bool,
     rounds: int,
+    most: int = MOST_MODES,
     should_stop: Callable[[], bool] | None = None,
 ) -> Learned:
     """Return cameras and covariance after rounds in which one is refined for the other; scales stay 1 without `with_scales`."""
     pairs = rotations[:, :2] * scales[:, None, None]
-    covariance = improve(begin(gram, pairs), gram, pairs, iterations=ITERATIONS, warm=WARM)
+    covariance = learned(gram, pairs, most=most)
     found = Learned(rotations, scales, covariance, np.inf)
     for _ in range(rounds):
         if should_stop is not None and should_stop():
@@ -162,7 +162,9 @@ def refined(
     return found
 
 
-def _zoom(gram: Floats, rotations: Floats, should_stop: Callable[[], bool] | None) -> tuple[Floats | None, str]:
+def _zoom(
+    gram: Floats, rotations: Floats, most: int, should_stop: Callable[[], bool] | None
+) -> tuple[Floats | None, str]:
     """Return scales to start from, or None where those found gain no more than chance, and a sentence.
 
     Measured on some frames. Scales are free from two starts, 1 and those of a rigid shape: deformation that passes for a zoom ends in
@@ -172,21 +174,30 @@ def _zoom(gram: Floats, rotations: Floats, should_stop: Callable[[], bool] | Non
     part, given, none = _of_frames(gram, used), rotations[used], np.ones(len(used))
 
     def energies(scales: Floats, *, with_scales: bool) -> Learned:
-        return refined(part, given, scales, with_scales=with_scales, rounds=ZOOM_ROUNDS, should_stop=should_stop)
+        return refined(
+            part, given, scales, with_scales=with_scales, rounds=ZOOM_ROUNDS, most=most, should_stop=should_stop
+        )
 
     fixed = energies(none, with_scales=False)
     runs = [energies(scales, with_scales=True) for scales in (none, rigid_scales(part, given))]
     best = min(runs, key=lambda run: run.energy)
-    gain, least, most = fixed.energy - best.energy, float(best.scales.min()), float(best.scales.max())
+    gain, least, largest = fixed.energy - best.energy, float(best.scales.min()), float(best.scales.max())
     if not (gain > ZOOM_GAIN * _unsteady(np.log(best.scales)) and np.log(best.scales).std() > ZOOM_LEAST):
         return None, (
-            f"Every scale is 1: free ones, from {least:.3f} to {most:.3f}, would gain {gain:.3f} in the logarithm of the "
+            f"Every scale is 1: free ones, from {least:.3f} to {largest:.3f}, would gain {gain:.3f} in the logarithm of the "
             "likelihood, no more than deformation alone does."
         )
     logs = _between(used, np.log(best.scales)[:, None], len(rotations))[:, 0]
     return np.exp(logs - logs.mean()), (
-        f"Scales from {least:.3f} to {most:.3f} gain {gain:.3f} in the logarithm of the likelihood, per point and frame."
+        f"Scales from {least:.3f} to {largest:.3f} gain {gain:.3f} in the logarithm of the likelihood, per point and frame."
     )
+
+
+def _why(covariance: ShapeCovariance, most: int) -> str:
+    told = f"{covariance.modes.shape[1]} modes of deformation, noise of {covariance.noise**0.5:.2g} RMS radii"
+    if most == MOST_MODES:
+        return f"{told}."
+    return f"{told}; more than {most} modes, learned from some points, do not make the others more probable."
 
 
 def _unsteady(logs: Floats) -> float:

@@ -87,7 +87,6 @@ def solve(
         spoiled_sheet = estimate.outliers > SPOILED and is_flat(estimate.gram)
         turning = cameras is None and settings.refine_rotations and not spoiled_sheet
         estimate, covariance = learn(
-            estimate.gram,
             estimate,
             telling_frames(normalised.visible),
             turning=turning,

@@ -54,6 +54,9 @@ BENDING_SHARE = 0.3
 SCALES = (1e-3, 1e-2)
 """Range of the robust scale that follows the noise."""
 
+MOST = 0.1
+"""Its upper end with the Gaussian prior."""
+
 
 def choose_weights(
     normalised: Normalised,
@@ -134,7 +137,7 @@ def _from_covariance(covariance: ShapeCovariance, settings: Settings) -> tuple[W
     |r| + (σ / 2√2) xᵀQx is what to minimise; Gaussian ones make it r² + σ² xᵀQx.
     """
     sigma = max(covariance.noise**0.5, FINEST)
-    scale = float(np.clip(sigma, *SCALES))
+    scale = float(np.clip(sigma, SCALES[0], MOST))
     strength = sigma / 8**0.5 if settings.loss == "l1" else sigma**2
     chosen = replace(PAPER, temporal=strength, spatial=0.0, robust_scale=scale)
     return chosen, (

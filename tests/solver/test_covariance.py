@@ -135,12 +135,19 @@ def test_a_stop_leaves_the_rotations_of_the_start(face: gallery.Sequence) -> Non
     pairs = np.asarray(face.rotations)[:, :2]
     points = face.tracks.points - face.tracks.points.mean(axis=1, keepdims=True)
     rows = points.transpose(0, 2, 1).reshape(48, -1) / points.std()
-    estimate = CameraEstimate(np.asarray(face.rotations), np.ones(24), np.zeros((24, 2)), 1, rows @ rows.T / 400)
+    estimate = CameraEstimate(
+        np.asarray(face.rotations),
+        np.ones(24),
+        np.zeros((24, 2)),
+        1,
+        rows @ rows.T / 400,
+        rows.reshape(24, 2, -1).transpose(0, 2, 1),
+    )
     shown = np.ones(24, dtype=bool)
-    stopped, _ = learn(estimate.gram, estimate, shown, turning=True, should_stop=lambda: True)
+    stopped, _ = learn(estimate, shown, turning=True, should_stop=lambda: True)
     np.testing.assert_allclose(
         stopped.rotations, np.asarray(face.rotations) @ np.asarray(face.rotations)[0].T, atol=1e-12
     )
-    moved, covariance = learn(estimate.gram, estimate, shown, turning=True)
+    moved, covariance = learn(estimate, shown, turning=True)
     assert np.abs(moved.rotations - stopped.rotations).max() > 1e-5
     assert covariance.likelihood < improve(begin(estimate.gram, pairs), estimate.gram, pairs, iterations=5).likelihood

@@ -56,7 +56,9 @@ def small_problem(
     visible = np.where(random.random(points.shape[:2]) < hidden, 0.0, random.uniform(0.5, 1, points.shape[:2]))
     options = {"temporal_weight": 0.05, "spatial_weight": 0.02, "robust_scale": 0.03, **settings}
     normalised = normalise(Tracks.from_arrays(points, visible))
-    estimate = CameraEstimate(rotations, np.ones(frames), np.zeros((frames, 2)), 1, {}, ())
+    estimate = CameraEstimate(
+        rotations, np.ones(frames), np.zeros((frames, 2)), 1, np.zeros((0, 0)), np.zeros((frames, 0, 2))
+    )
     return build_problem(normalised, estimate, mesh, Settings(**options))[0]
 
 

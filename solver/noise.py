@@ -1,0 +1,42 @@
+"""How strong white noise is, from the Gram matrix of the tracks alone: before there are cameras or shapes."""
+
+from __future__ import annotations
+
+from math import comb
+
+import numpy as np
+from pliant.solver.records import Floats
+
+RANK = 1e-9
+"""Median eigenvalue over the largest from which there are more points than rows of W."""
+
+
+def roughness(gram: Floats) -> float:
+    """Return the median over frames of the tracks' mean squared third difference, as the variance of white noise that would leave it.
+
+    An upper estimate: what moves unsteadily counts as noise. Short sequences use lower differences.
+    """
+    frames = len(gram) // 2
+    order = min(3, frames - 1)
+    differences = np.diff(np.eye(frames), n=order, axis=0)
+    squared = [
+        np.einsum("df,fg,dg->d", differences, gram[axis::2, axis::2], differences, optimize=True) for axis in (0, 1)
+    ]
+    return float(np.median(np.mean(squared, axis=0))) / comb(2 * order, order)
+
+
+def typical_roughness(points: Floats) -> float:
+    """Return the same from complete tracks `(F, P, 2)` themselves, as a standard deviation: the median does not mind a few wrong ones."""
+    order = min(3, len(points) - 1)
+    size = np.abs(np.diff(points, n=order, axis=0))
+    return 1.4826 * float(np.median(size)) / float(comb(2 * order, order)) ** 0.5
+
+
+def white_noise(gram: Floats) -> float:
+    """Return σ² from the median eigenvalue of W Wᵀ / P `(2F, 2F)`, which no motion of low rank raises, but noise does.
+
+    Too few points leave it 0 whatever the noise; then it is the roughness, if there is a sequence of frames to tell it from.
+    """
+    values = np.linalg.eigvalsh(gram)
+    median = float(values[len(values) // 2])
+    return median if median > RANK * float(values[-1]) else roughness(gram)
