@@ -29,7 +29,7 @@ def typical_roughness(points: Floats) -> float:
     """Return the same from complete tracks `(F, P, 2)` themselves, as a standard deviation: the median does not mind a few wrong ones."""
     order = min(3, len(points) - 1)
     size = np.abs(np.diff(points, n=order, axis=0))
-    return 1.4826 * float(np.median(size)) / float(comb(2 * order, order)) ** 0.5
+    return 1.4826 * float(np.median(size)) / float(np.sqrt(comb(2 * order, order)))
 
 
 def white_noise(gram: Floats) -> float:
