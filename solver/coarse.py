@@ -34,6 +34,9 @@ UNLIKE = 0.1
 ENOUGH = 0.002
 """Share of unlike weights below which the mean weights do."""
 
+RIDGE = 1e-10
+"""Of the trace, added to N_p: one heavy observation beside a prior of next to no weight is singular to rounding."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Coarse:
@@ -61,7 +64,7 @@ class Coarse:
 
 def build_coarse(operator: Operator) -> Coarse | None:
     """Return the correction for this reweighting, or None where the mean weights do."""
-    if operator.quadratic is None or not operator.quadratic.bands.any():  # or a prior of no weight
+    if operator.quadratic is None:
         return None
     mean = operator.weights.mean(axis=2, dtype=np.float64)
     unlike = float((operator.weights < UNLIKE * mean[:, :, None]).mean())
@@ -86,7 +89,8 @@ def build_coarse(operator: Operator) -> Coarse | None:
             normal = np.zeros((high - low, size, size))
             normal[:, upper[0], upper[1]] = flat
             normal[:, upper[1], upper[0]] = flat
-            inverses[low:high] = np.linalg.inv(normal + prior)
+            normal += prior + RIDGE * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(size)
+            inverses[low:high] = np.linalg.inv(normal)
 
     over_ranges(work, points, smallest=BLOCK)
     return Coarse(modes, inverses)
