@@ -34,9 +34,6 @@ UNLIKE = 0.1
 ENOUGH = 0.002
 """Share of unlike weights below which the mean weights do."""
 
-RIDGE = 1e-10
-"""Of the trace, added to N_p: one heavy observation beside a prior of next to no weight is singular to rounding."""
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Coarse:
@@ -89,8 +86,7 @@ def build_coarse(operator: Operator) -> Coarse | None:
             normal = np.zeros((high - low, size, size))
             normal[:, upper[0], upper[1]] = flat
             normal[:, upper[1], upper[0]] = flat
-            normal += prior + RIDGE * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(size)
-            inverses[low:high] = np.linalg.inv(normal)
+            inverses[low:high] = np.linalg.inv(normal + prior)
 
     over_ranges(work, points, smallest=BLOCK)
     return Coarse(modes, inverses)
