@@ -23,9 +23,9 @@ from pliant.solver.covariance import (
     random_walk,
 )
 from pliant.solver.likelihood import Motion, Scene, cameras_of, covariances_of, fit, root_of
-from pliant.solver.mode_count import modes_supported
 from pliant.solver.records import Floats, read_only
 from pliant.solver.rotation import angles_between, exponential
+from pliant.solver.support import Support, supported
 from pliant.solver.zoom import rigid_scales
 from scipy.spatial.transform import Rotation
 
@@ -112,21 +112,21 @@ def learn(
     start = np.asarray(estimate.scales)
     unscaled = _of_frames(estimate.gram / np.outer(np.repeat(start, 2), np.repeat(start, 2)), used)
     before = np.asarray(estimate.rotations)[used]
-    most = modes_supported((estimate.sample / start[:, None, None])[used], before[:, :2])
+    support = supported((estimate.sample / start[:, None, None])[used], before[:, :2])
     zoom, why = None, None
     if turning and zooming and (start == 1).all():
-        zoom, why = _zoom(unscaled, before, most, should_stop)
+        zoom, why = _zoom(unscaled, before, support, should_stop)
     found = refined(
         unscaled, before, np.ones(len(used)) if zoom is None else zoom, with_scales=zoom is not None,
-        rounds=ROUNDS if turning else 0, most=most, should_stop=should_stop,
+        rounds=ROUNDS if turning else 0, support=support, should_stop=should_stop,
     )  # fmt: skip
     covariance = found.covariance
     if turning:
         pairs = found.rotations[:, :2] * found.scales[:, None, None]
-        covariance = improve(covariance, unscaled, pairs, iterations=SETTLING, most=most)
+        covariance = improve(covariance, unscaled, pairs, iterations=SETTLING, most=support.most)
     if len(used) < frames:
         covariance = covariance.stretched(used, frames)
-    estimate = replace(estimate, reasons={**estimate.reasons, "modes": _why(covariance, most)})
+    estimate = replace(estimate, reasons={**estimate.reasons, "modes": _why(covariance, support.most)})
     if not turning:
         return estimate, covariance
     turns = Rotation.from_matrix(found.rotations @ before.transpose(0, 2, 1)).as_rotvec()
@@ -148,12 +148,12 @@ def refined(
     *,
     with_scales: bool,
     rounds: int,
-    most: int = MOST_MODES,
+    support: Support,
     should_stop: Callable[[], bool] | None = None,
 ) -> Learned:
     """Return cameras and covariance after rounds in which one is refined for the other; scales stay 1 without `with_scales`."""
     pairs = rotations[:, :2] * scales[:, None, None]
-    covariance = learned(gram, pairs, most=most)
+    covariance = learned(gram, pairs, most=support.most, noisy=support.noisy)
     found = Learned(rotations, scales, covariance, np.inf)
     for _ in range(rounds):
         if should_stop is not None and should_stop():
@@ -163,7 +163,7 @@ def refined(
 
 
 def _zoom(
-    gram: Floats, rotations: Floats, most: int, should_stop: Callable[[], bool] | None
+    gram: Floats, rotations: Floats, support: Support, should_stop: Callable[[], bool] | None
 ) -> tuple[Floats | None, str]:
     """Return scales to start from, or None where those found gain no more than chance, and a sentence.
 
@@ -175,7 +175,7 @@ def _zoom(
 
     def energies(scales: Floats, *, with_scales: bool) -> Learned:
         return refined(
-            part, given, scales, with_scales=with_scales, rounds=ZOOM_ROUNDS, most=most, should_stop=should_stop
+            part, given, scales, with_scales=with_scales, rounds=ZOOM_ROUNDS, support=support, should_stop=should_stop
         )
 
     fixed = energies(none, with_scales=False)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from pliant.solver import KnownCamera, Settings, gallery, metrics, solve
-from pliant.solver.covariance import MOST_MODES, QUIET, WARM, begin, improve, learned
+from pliant.solver.covariance import QUIET, WARM, begin, improve, learned
 from pliant.solver.likelihood import STEADINESS
-from pliant.solver.mode_count import FEWEST, modes_supported
 from pliant.solver.noise import roughness, typical_roughness, white_noise
 from pliant.solver.race import binding
 from pliant.solver.rotation import exponential
+from pliant.solver.support import FEWEST, Support, supported
 
 FRAMES = 30
 SIGMA = 0.08
@@ -83,23 +83,28 @@ def test_strong_noise_is_learned_though_a_small_start_misses_it() -> None:
     gram = gram_of(tracks(500, modes=2, sigma=SIGMA))
     small = improve(begin(gram, PAIRS, noise=QUIET), gram, PAIRS, iterations=60, warm=WARM)
     assert small.noise**0.5 < SIGMA / 3
-    assert learned(gram, PAIRS, most=8).noise ** 0.5 == pytest.approx(SIGMA, rel=0.15)
+    assert learned(gram, PAIRS, most=8, noisy=True).noise ** 0.5 == pytest.approx(SIGMA, rel=0.15)
 
 
 def test_fine_deformation_is_not_learned_as_noise() -> None:
     assert learned(gram_of(tracks(500, modes=6, sigma=0.0)), PAIRS).noise ** 0.5 < 1e-3
 
 
-@pytest.mark.parametrize("points", [40, 400])
-def test_as_many_modes_are_taken_as_other_points_confirm(points: int) -> None:
-    assert modes_supported(tracks(points, modes=0, sigma=SIGMA), PAIRS) == 0
-    assert modes_supported(tracks(points, modes=2, sigma=SIGMA), PAIRS) == 2
-    assert modes_supported(tracks(points, modes=8, sigma=0.02), PAIRS) == 8
+def test_as_many_modes_are_taken_as_other_points_confirm() -> None:
+    few = [supported(tracks(40, modes=modes, sigma=SIGMA), PAIRS) for modes in (0, 2)]
+    assert [each.most for each in few] == [0, 2]
+    assert all(each.noisy for each in few)
+    assert supported(tracks(40, modes=8, sigma=0.02), PAIRS).most == 8
+
+
+def test_many_points_confirm_at_least_the_modes_there_are() -> None:
+    assert supported(tracks(400, modes=2, sigma=SIGMA), PAIRS).most >= 2
+    assert supported(tracks(400, modes=8, sigma=0.02), PAIRS).most >= 8
 
 
 def test_without_noise_or_with_hardly_a_point_nothing_is_judged() -> None:
-    assert modes_supported(tracks(40, modes=2, sigma=0.0), PAIRS) == MOST_MODES
-    assert modes_supported(tracks(FEWEST - 1, modes=2, sigma=SIGMA), PAIRS) == MOST_MODES
+    assert supported(tracks(40, modes=2, sigma=0.0), PAIRS) == Support()
+    assert supported(tracks(FEWEST - 1, modes=2, sigma=SIGMA), PAIRS) == Support()
 
 
 @pytest.mark.parametrize("points", [40, 400])
