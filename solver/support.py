@@ -70,18 +70,24 @@ def supported(sample: Floats, pairs: Floats) -> Support:
     )
     enough = min(float(quiet.min()), float(noisy.min())) + GAIN
     better = noisy if noisy.min() <= enough else quiet
-    return Support(COUNTS[int(np.flatnonzero(better <= enough)[-1])], better is noisy)
+    return Support(_counts(len(used))[int(np.flatnonzero(better <= enough)[-1])], better is noisy)
+
+
+def _counts(frames: int) -> list[int]:
+    """Return those of `COUNTS` that differ, for there are fewer modes than frames."""
+    return [count for count in COUNTS[:-1] if count < frames - 1] + [MOST_MODES]
 
 
 def _judged(points: Floats, other: Floats, pairs: Floats, *, noisy: bool) -> Floats:
-    """Return the negative logarithm of the likelihood of other points, per point and frame, for each of `COUNTS`.
+    """Return the negative logarithm of the likelihood of other points, per point and frame, for each count of modes.
 
     The tenth of the other points that is least probable does not count: what completion left of gross outliers.
     """
     frames = len(pairs)
     gram = points @ points.T / points.shape[1]
-    energies = np.full(len(COUNTS), np.inf)
-    for index, most in enumerate(COUNTS):
+    counts = _counts(frames)
+    energies = np.full(len(counts), np.inf)
+    for index, most in enumerate(counts):
         covariance = learned(gram, pairs, most=most, noisy=noisy, iterations=ROUNDS)
         factor = linalg.cho_factor(covariance.of_image(pairs), lower=True)
         log_det = 2 * float(np.log(np.diag(factor[0])).sum())
