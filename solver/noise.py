@@ -1,4 +1,4 @@
-"""How strong white noise is, from the Gram matrix of the tracks alone: before there are cameras or shapes."""
+"""How strong white noise is, from the tracks alone: before there are cameras or shapes."""
 
 from __future__ import annotations
 
@@ -9,6 +9,11 @@ from pliant.solver.records import Floats
 
 RANK = 1e-9
 """Median eigenvalue over the largest from which there are more points than rows of W."""
+
+
+def magnified(order: int) -> float:
+    """Return by how much differences of that order over frames magnify the standard deviation of white noise."""
+    return float(np.sqrt(comb(2 * order, order)))
 
 
 def roughness(gram: Floats) -> float:
@@ -22,14 +27,17 @@ def roughness(gram: Floats) -> float:
     squared = [
         np.einsum("df,fg,dg->d", differences, gram[axis::2, axis::2], differences, optimize=True) for axis in (0, 1)
     ]
-    return float(np.median(np.mean(squared, axis=0))) / comb(2 * order, order)
+    return float(np.median(np.mean(squared, axis=0))) / magnified(order) ** 2
 
 
 def typical_roughness(points: Floats) -> float:
-    """Return the same from complete tracks `(F, P, 2)` themselves, as a standard deviation: the median does not mind a few wrong ones."""
+    """Return the standard deviation of white noise that would leave the median third difference of complete tracks `(F, P, 2)`.
+
+    Unlike `roughness` it does not mind a few wrong points.
+    """
     order = min(3, len(points) - 1)
     size = np.abs(np.diff(points, n=order, axis=0))
-    return 1.4826 * float(np.median(size)) / float(np.sqrt(comb(2 * order, order)))
+    return 1.4826 * float(np.median(size)) / magnified(order)
 
 
 def white_noise(gram: Floats) -> float:

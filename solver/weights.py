@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.covariance import ShapeCovariance
 from pliant.solver.laplacian import Laplacian
+from pliant.solver.noise import magnified
 from pliant.solver.normalise import Normalised
 from pliant.solver.settings import Settings
 from pliant.solver.state import Weights
@@ -54,8 +55,8 @@ BENDING_SHARE = 0.3
 SCALES = (1e-3, 1e-2)
 """Range of the robust scale that follows the noise."""
 
-MOST = 0.1
-"""Its upper end with the Gaussian prior."""
+LARGEST_SCALE = 0.1
+"""Largest robust scale with the Gaussian prior, from whose fit gross outliers have been left out."""
 
 
 def choose_weights(
@@ -126,8 +127,7 @@ def roughness_of(normalised: Normalised) -> Roughness:
         return Roughness(0.0, 0.0)
     seen = differences[whole]
     typical = 1.4826 * float(np.median(seen))
-    norm = {1: 2.0, 2: 6.0, 3: 20.0}[order] ** 0.5
-    return Roughness(typical / norm, float((seen.max(axis=1) > max(FAR * typical, FAR_AT_LEAST)).mean()))
+    return Roughness(typical / magnified(order), float((seen.max(axis=1) > max(FAR * typical, FAR_AT_LEAST)).mean()))
 
 
 def _from_covariance(covariance: ShapeCovariance, settings: Settings) -> tuple[Weights, str]:
@@ -137,7 +137,7 @@ def _from_covariance(covariance: ShapeCovariance, settings: Settings) -> tuple[W
     |r| + (σ / 2√2) xᵀQx is what to minimise; Gaussian ones make it r² + σ² xᵀQx.
     """
     sigma = max(covariance.noise**0.5, FINEST)
-    scale = float(np.clip(sigma, SCALES[0], MOST))
+    scale = float(np.clip(sigma, SCALES[0], LARGEST_SCALE))
     strength = sigma / 8**0.5 if settings.loss == "l1" else sigma**2
     chosen = replace(PAPER, temporal=strength, spatial=0.0, robust_scale=scale)
     return chosen, (

@@ -64,8 +64,7 @@ def rigid_scales(gram: Floats, rotations: Floats, *, rounds: int = 30) -> Floats
         hit = np.einsum("fij,fij->f", pair, cross)
         size = np.einsum("fij,jk,fik->f", pair, shape_gram, pair)
         scales = np.maximum(hit, 1e-3 * size) / np.maximum(size, np.finfo(float).tiny)
-        scales = np.clip(
-            scales, 1e-2 * np.median(scales) + 1e-12, 1e2 * np.median(scales) + 1e-12
-        )  # a frame that shows nothing
+        typical = np.median(scales)  # a frame that shows nothing has no scale
+        scales = np.clip(scales, 1e-2 * typical + 1e-12, 1e2 * typical + 1e-12)
         scales = np.asarray(scales / np.exp(np.log(scales).mean()))
     return scales
