@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from pliant.solver.completion import Completed, complete
 from pliant.solver.metric_upgrade import Upgrade, upgrade
 from pliant.solver.normalise import Normalised
-from pliant.solver.race import CANDIDATES, Candidate, carried, frames_used, gram_of, held, race
+from pliant.solver.race import CANDIDATES, Candidate, carried, depth, frames_used, gram_of, held, race
 from pliant.solver.records import Floats, KnownCamera, Step, read_only
 from pliant.solver.rotation import angles_between, start_at_identity
 from pliant.solver.settings import Settings
@@ -21,6 +21,14 @@ SHARE = 0.3
 
 HARDLY = np.radians(10.0)
 """Largest turn between any frame and the first below which the user is warned."""
+
+NEARLY = 0.05
+"""Energy, after the first heat, above the lowest up to which a factorization's own cameras are a start for the refinement with the
+shapes. Measured: the false one that flattens a shark is .10 above, one that bends a face .34; true ones up to .05."""
+
+TOO_DEEP = 4.0
+"""Mean squared depth of the closed form, normalised units, from which cameras are no start: they hardly turn. Measured: a horse seen
+from its short side 1.8, false cameras of ten faces 144."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,6 +52,9 @@ class CameraEstimate:
 
     sample: Floats
     """Some points of the completed tracks, centred, shape `(F, S, 2)`, normalised units; empty where nothing asks for it."""
+
+    rivals: tuple[tuple[int, Floats], ...] = ()
+    """K and rotations `(F, 3, 3)`, not refined, of the factorizations that are about as probable."""
 
     outliers: float = 0.0
     """Share of the seen entries that completion replaced as gross outliers."""
@@ -96,18 +107,44 @@ def estimate_cameras(
     own = next(each for each in upgrades if each.basis_size == best.basis_size)
     tell(Step("cameras", 0.8 * SHARE))
     rotations, refined = _everywhere(own.rotations, best, used, settings)
+    rivals: tuple[tuple[int, Floats], ...] = ()
     if settings.refine_rotations and is_flat(gram):
         rotations, sheet = on_its_sides(gram, rotations, should_stop=should_stop)
         refined = f"{refined} {sheet}"
+    elif settings.refine_rotations:
+        rivals = _rivals(upgrades, ran, part, used)
     read_only(rotations)
     read_only(scales)
     tell(Step("cameras", SHARE))
     reasons = {"basis_size": _why(ran, best, settings), "scales": scale_reason, "rotations": refined}
     return CameraEstimate(
         rotations, scales, completed.translations, best.basis_size, completed.gram, completed.sample,
-        completed.outliers, reasons,
-        _warnings(rotations),
+        rivals, completed.outliers, reasons, _warnings(rotations),
     )  # fmt: skip
+
+
+def restarted(estimate: CameraEstimate, size: int, rotations: Floats) -> CameraEstimate:
+    """Return the estimate with the rotations of the factorization with K = `size`, as they came."""
+    known = estimate.reasons.get("basis_size", "")
+    why = f"{known} With the shapes, the rotations of K = {size} as they came lead to more probable motion."
+    return replace(
+        estimate,
+        rotations=rotations,
+        basis_size=size,
+        reasons={**estimate.reasons, "basis_size": why.strip()},
+        warnings=_warnings(rotations),
+    )
+
+
+def _rivals(upgrades: list[Upgrade], ran: list[Candidate], gram: Floats, used: slice) -> tuple[tuple[int, Floats], ...]:
+    """Return K and rotations of the factorizations that the first heat led to nearly the lowest energy, if not far too deep."""
+    lowest = min(candidate.energy for candidate in ran)
+    near = {each.basis_size for each in ran if not each.steadied and each.energy <= lowest + NEARLY}
+    return tuple(
+        (each.basis_size, each.rotations)
+        for each in upgrades
+        if each.basis_size in near and depth(gram, each.rotations[used]) < TOO_DEEP
+    )
 
 
 def _everywhere(before: Floats, best: Candidate, used: slice, settings: Settings) -> tuple[Floats, str]:
@@ -156,8 +193,8 @@ def given_cameras(normalised: Normalised, known: KnownCamera, settings: Settings
         0,
         completed.gram,
         completed.sample,
-        completed.outliers,
-        {"camera": reason},
+        outliers=completed.outliers,
+        reasons={"camera": reason},
     )
 
 

@@ -43,6 +43,9 @@ WARM = 1e-2
 """The floor of τ at the first round from scratch, whence it falls to `DRIFT_FLOOR`: annealing. A mode that was given up too early
 comes back only slowly. Measured: known cameras, horse .069 → .024, talking face .074 → .022, speaking head .017 → .0002."""
 
+FREED = 0.3
+"""Standard deviation, normalised units, that mean positions get as a mode."""
+
 FLATTEST = 1e-3
 """Least variance of deformation along an axis, beside a mean of 1: keeps A₁ invertible."""
 
@@ -134,10 +137,12 @@ def walk_bands(num_frames: int) -> tuple[Floats, float]:
     return bands, float(np.trace(linalg.solveh_banded(upper, np.eye(num_frames)))) / num_frames
 
 
-def learned(
-    gram: Floats, pairs: Floats, *, most: int = MOST_MODES, noisy: bool = False, iterations: int | None = None
-) -> ShapeCovariance:
-    """Return the covariance that expectation maximisation finds from scratch.
+def learned(gram: Floats, pairs: Floats, *, most: int = MOST_MODES, noisy: bool = False) -> ShapeCovariance:
+    """Return the most probable of the covariances that expectation maximisation finds from scratch in two ways.
+
+    Annealed, and then once more without, from a start whose mean positions may also be a mode: annealing that has taken the turn
+    of an object for deformation does not find back otherwise. Or never annealed. Neither is best for all: measured, known cameras,
+    99 frames of faces seen in one sweep of 60°, error .192 annealed, .030 not; a horse of 48 frames .009 and .314. The likelihood tells.
 
     Parameters
     ----------
@@ -147,12 +152,32 @@ def learned(
         Columns of L at most.
     noisy : bool
         Begin with all that is rough in the tracks as noise, not with hardly any.
-    iterations : int, optional
-        Rounds; None chooses them by the number of frames.
     """
-    rounds = iterations or min(ITERATIONS, max(FEWEST, FRAMES // len(pairs)))
-    noise = max(roughness(gram), QUIET) if noisy else QUIET
-    return improve(begin(gram, pairs, noise=noise, most=most), gram, pairs, iterations=rounds, warm=WARM, most=most)
+    rounds = min(ITERATIONS, max(FEWEST, FRAMES // len(pairs)))
+    warm = freed(annealed(gram, pairs, most=most, noisy=noisy, iterations=rounds))
+    runs = (
+        improve(warm, gram, pairs, iterations=rounds // 2, most=most),
+        improve(_scratch(gram, pairs, most, noisy=noisy), gram, pairs, iterations=rounds, most=most),
+    )
+    return min(runs, key=lambda run: run.likelihood)
+
+
+def annealed(
+    gram: Floats, pairs: Floats, *, most: int = MOST_MODES, noisy: bool = False, iterations: int
+) -> ShapeCovariance:
+    """Return the covariance that so many annealed rounds find from scratch."""
+    start = _scratch(gram, pairs, most, noisy=noisy)
+    return improve(start, gram, pairs, iterations=iterations, warm=WARM, most=most)
+
+
+def freed(covariance: ShapeCovariance) -> ShapeCovariance:
+    """Return the same with one more mode, that of mean positions: how much of them is deformation is open anew."""
+    constant = np.full((len(covariance.modes), 1), FREED)
+    return replace(covariance, modes=np.hstack([covariance.modes, constant]))
+
+
+def _scratch(gram: Floats, pairs: Floats, most: int, *, noisy: bool) -> ShapeCovariance:
+    return begin(gram, pairs, noise=max(roughness(gram), QUIET) if noisy else QUIET, most=most)
 
 
 def begin(gram: Floats, pairs: Floats, *, noise: float = QUIET, most: int = MOST_MODES) -> ShapeCovariance:

@@ -12,13 +12,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.solver.cameras import CameraEstimate
+from pliant.solver import coefficients
+from pliant.solver.cameras import CameraEstimate, restarted
 from pliant.solver.covariance import (
     FLATTEST,
     MOST_MODES,
     NOISE_FLOOR,
     ShapeCovariance,
-    improve,
     learned,
     random_walk,
 )
@@ -36,9 +36,6 @@ ROUNDS = 5
 """Refinements of rotations and covariance, each with a fresh memory of the curvature. Expectation maximisation between them would undo
 a part, for it keeps modes and random walk apart, which L-BFGS does not."""
 
-SETTLING = 30
-"""Rounds of expectation maximisation after the last refinement, without annealing."""
-
 STEADY = 0.01
 """Weight of the camera's unsteadiness: less is needed once the covariance is known."""
 
@@ -47,6 +44,9 @@ TURNS = 60
 
 LEAST_NOISE = 1e-12
 """What is left of σ² where it lies at its floor, which the likelihood adds again."""
+
+START_FRAMES, START_ROUNDS = 40, 2
+"""Frames and refinements on which it is decided from which cameras to start."""
 
 ZOOM_FRAMES = 60
 """Frames on which it is decided whether the camera zooms."""
@@ -111,8 +111,10 @@ def learn(
     used = _some(np.flatnonzero(shown), LEARNED_FRAMES)
     start = np.asarray(estimate.scales)
     unscaled = _of_frames(estimate.gram / np.outer(np.repeat(start, 2), np.repeat(start, 2)), used)
+    support = supported((estimate.sample / start[:, None, None])[used], np.asarray(estimate.rotations)[used, :2])
+    if turning and estimate.rivals:
+        estimate = _started(estimate, unscaled, used, support, should_stop)
     before = np.asarray(estimate.rotations)[used]
-    support = supported((estimate.sample / start[:, None, None])[used], before[:, :2])
     zoom, why = None, None
     if turning and zooming and (start == 1).all():
         zoom, why = _zoom(unscaled, before, support, should_stop)
@@ -120,10 +122,13 @@ def learn(
         unscaled, before, np.ones(len(used)) if zoom is None else zoom, with_scales=zoom is not None,
         rounds=ROUNDS if turning else 0, support=support, should_stop=should_stop,
     )  # fmt: skip
+    if turning and support == Support() and coefficients.telling(found.covariance, estimate.sample.shape[1]):
+        found = _coupled(unscaled, found, with_scales=zoom is not None, should_stop=should_stop)
     covariance = found.covariance
-    if turning:
+    if np.isfinite(found.energy):
+        # From scratch: what the way to these cameras has left in the modes is worth less than it makes the tracks more probable.
         pairs = found.rotations[:, :2] * found.scales[:, None, None]
-        covariance = improve(covariance, unscaled, pairs, iterations=SETTLING, most=support.most)
+        covariance = learned(unscaled, pairs, most=support.most, noisy=support.noisy)
     if len(used) < frames:
         covariance = covariance.stretched(used, frames)
     estimate = replace(estimate, reasons={**estimate.reasons, "modes": _why(covariance, support.most)})
@@ -160,6 +165,34 @@ def refined(
             break
         found = _turn(gram, found, with_scales=with_scales)
     return found
+
+
+def _started(
+    estimate: CameraEstimate,
+    gram: Floats,
+    used: NDArray[np.intp],
+    support: Support,
+    should_stop: Callable[[], bool] | None,
+) -> CameraEstimate:
+    """Return the estimate with those rotations, its own or a rival's, from which refinement makes some frames most probable.
+
+    The race explains deformation by smooth modes and moves cameras by degrees for it; refinement with the shapes hardly moves them
+    back, for every mode has to move with them. Measured on a horse seen by a swinging camera: error .14 from the race's cameras, .012 from
+    those of the factorization.
+    """
+    some = _some(np.arange(len(used)), START_FRAMES)
+    part, ones = _of_frames(gram, some), np.ones(len(some))
+    best, lowest = estimate, np.inf
+    for start in (estimate, *(restarted(estimate, size, rotations) for size, rotations in estimate.rivals)):
+        if should_stop is not None and should_stop():
+            break
+        given = np.asarray(start.rotations)[used[some]]
+        found = refined(
+            part, given, ones, with_scales=False, rounds=START_ROUNDS, support=support, should_stop=should_stop
+        )
+        if found.energy < lowest:
+            best, lowest = start, found.energy
+    return best
 
 
 def _zoom(
@@ -228,10 +261,7 @@ def telling_frames(visible: Floats) -> NDArray[np.bool_]:
 def _turn(gram: Floats, found: Learned, *, with_scales: bool) -> Learned:
     """Return cameras and covariance of higher likelihood."""
     frames, covariance = len(found.rotations), found.covariance
-    scene = Scene(
-        gram, found.rotations, with_scales=with_scales, walk=random_walk(frames), steadiness=STEADY,
-        noise_floor=NOISE_FLOOR**0.5, smoothness=0.0,
-    )  # fmt: skip
+    scene = _scene(gram, found.rotations, with_scales=with_scales)
     started = Motion(
         np.zeros((frames, 3)), np.log(found.scales), covariance.modes,
         root_of(covariance.extent), root_of(covariance.play),
@@ -245,6 +275,26 @@ def _turn(gram: Floats, found: Learned, *, with_scales: bool) -> Learned:
         covariance, extent=extent, play=play / size, modes=moved.modes * np.sqrt(size), drift=drift * size, noise=noise
     )
     return Learned(*cameras_of(scene, moved), better, energy)
+
+
+def _coupled(gram: Floats, found: Learned, *, with_scales: bool, should_stop: Callable[[], bool] | None) -> Learned:
+    """Return cameras found with modes that have axes of their own (`pliant.solver.coefficients`), refined, if that is more probable.
+
+    Measured: without the comparison, 150 frames of an animated head seen in one sweep go from .0007 to .017.
+    """
+    scene = _scene(gram, found.rotations, with_scales=with_scales)
+    rotations, scales = coefficients.refined(scene, found.scales, found.covariance, should_stop=should_stop)
+    again = refined(
+        gram, rotations, scales, with_scales=with_scales, rounds=START_ROUNDS, support=Support(), should_stop=should_stop
+    )  # fmt: skip
+    return again if again.energy < found.energy else found
+
+
+def _scene(gram: Floats, rotations: Floats, *, with_scales: bool) -> Scene:
+    return Scene(
+        gram, rotations, with_scales=with_scales, walk=random_walk(len(rotations)), steadiness=STEADY,
+        noise_floor=NOISE_FLOOR**0.5, smoothness=0.0,
+    )  # fmt: skip
 
 
 def _between(used: NDArray[np.intp], turns: Floats, frames: int) -> Floats:

@@ -179,7 +179,7 @@ def energy(scene: Scene, motion: Motion) -> tuple[float, Motion]:
     deform = rows1 @ rows.T
     covariance = rows0 @ rows.T + deform * wide
     covariance[np.diag_indices(2 * frames)] += noise + scene.noise_floor**2
-    inverse, log_det = _invert(covariance)
+    inverse, log_det = inverted(covariance)
     if inverse is None or not np.isfinite(log_det):
         return UNLIKELY, Motion.unflat(np.zeros_like(motion.flat()), frames)
     explained = inverse @ scene.gram
@@ -228,12 +228,17 @@ def fit(scene: Scene, motion: Motion, *, iterations: int, turning: bool) -> tupl
 
 def root_of(matrix: Floats) -> Floats:
     """Return the lower triangle of a root of a covariance, shape `(6,)`; one without extent along an axis gets hardly any."""
+    return root_matrix(matrix)[LOWER]
+
+
+def root_matrix(matrix: Floats) -> Floats:
+    """Return the same as a lower triangular matrix, shape `(3, 3)`."""
     try:
-        return np.asarray(np.linalg.cholesky(matrix)[LOWER], dtype=np.float64)
+        return np.asarray(np.linalg.cholesky(matrix), dtype=np.float64)
     except np.linalg.LinAlgError:
         values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
         values = np.maximum(values, max(1e-9 * float(values[-1]), 1e-12))
-        return np.asarray(np.linalg.cholesky((vectors * values) @ vectors.T)[LOWER], dtype=np.float64)
+        return np.asarray(np.linalg.cholesky((vectors * values) @ vectors.T), dtype=np.float64)
 
 
 def _root(lower: Floats) -> Floats:
@@ -251,7 +256,7 @@ def _roughness(values: Floats, weight: float) -> tuple[float, Floats]:
     return 0.5 * weight * float((steps**2).sum()), gradient
 
 
-def _invert(matrix: Floats) -> tuple[Floats | None, float]:
+def inverted(matrix: Floats) -> tuple[Floats | None, float]:
     """Return inverse and log-determinant of a positive definite matrix, or None where rounding left it indefinite."""
     factor, failed = lapack.dpotrf(matrix, lower=1)
     if failed:

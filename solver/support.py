@@ -14,7 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from pliant.solver.covariance import MOST_MODES, learned
+from pliant.solver.covariance import MOST_MODES, annealed
 from pliant.solver.likelihood import NOISE_FLOOR
 from pliant.solver.noise import typical_roughness
 from pliant.solver.records import Floats
@@ -88,7 +88,7 @@ def _judged(points: Floats, other: Floats, pairs: Floats, *, noisy: bool) -> Flo
     counts = _counts(frames)
     energies = np.full(len(counts), np.inf)
     for index, most in enumerate(counts):
-        covariance = learned(gram, pairs, most=most, noisy=noisy, iterations=ROUNDS)
+        covariance = annealed(gram, pairs, most=most, noisy=noisy, iterations=ROUNDS)
         factor = linalg.cho_factor(covariance.of_image(pairs), lower=True)
         log_det = 2 * float(np.log(np.diag(factor[0])).sum())
         each = np.sort((other * linalg.cho_solve(factor, other)).sum(axis=0))

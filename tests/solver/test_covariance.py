@@ -8,7 +8,18 @@ import numpy as np
 import pytest
 from pliant.solver import KnownCamera, Settings, gallery, metrics, solve
 from pliant.solver.cameras import CameraEstimate
-from pliant.solver.covariance import DRIFT_FLOOR, ShapeCovariance, begin, improve, random_walk
+from pliant.solver.covariance import (
+    DRIFT_FLOOR,
+    FREED,
+    ITERATIONS,
+    ShapeCovariance,
+    annealed,
+    begin,
+    freed,
+    improve,
+    learned,
+    random_walk,
+)
 from pliant.solver.joint import learn, telling_frames
 from pliant.solver.rotation import exponential
 
@@ -53,6 +64,32 @@ def test_what_the_points_were_drawn_from_is_found() -> None:
     ):
         assert np.linalg.norm(mine - known) < 0.2 * np.linalg.norm(known)
     assert np.linalg.norm(found.over_frames()) > 0.8 * np.linalg.norm(truth.over_frames())
+
+
+@pytest.mark.parametrize("most", [2, 64])
+def test_learned_is_the_more_probable_of_two_ways(most: int) -> None:
+    _, pairs, gram = drawn(300)
+    found = learned(gram, pairs, most=most)
+    cold = improve(begin(gram, pairs, most=most), gram, pairs, iterations=ITERATIONS, most=most)
+    warm = improve(
+        freed(annealed(gram, pairs, most=most, iterations=ITERATIONS)),
+        gram,
+        pairs,
+        iterations=ITERATIONS // 2,
+        most=most,
+    )
+    assert found.likelihood == min(cold.likelihood, warm.likelihood)
+    assert cold.likelihood != warm.likelihood
+    assert found.modes.shape[1] <= most
+
+
+def test_mean_positions_freed_are_one_more_mode_and_nothing_else() -> None:
+    truth, _, _ = drawn(10)
+    free = freed(truth)
+    np.testing.assert_array_equal(free.modes[:, :-1], truth.modes)
+    np.testing.assert_allclose(free.over_frames() - truth.over_frames(), FREED**2)
+    assert free.extent is truth.extent
+    assert (free.drift, free.noise) == (truth.drift, truth.noise)
 
 
 def test_precisions_are_the_inverse_of_the_covariance() -> None:
