@@ -26,7 +26,8 @@ from pliant.solver.likelihood import Motion, Scene, cameras_of, covariances_of, 
 from pliant.solver.records import Floats, read_only
 from pliant.solver.rotation import angles_between, exponential
 from pliant.solver.support import Support, supported
-from pliant.solver.zoom import rigid_scales
+from pliant.solver.trim import SPOILED
+from pliant.solver.zoom import WIDEST, rigid_scales
 from scipy.spatial.transform import Rotation
 
 LEARNED_FRAMES = 360
@@ -111,7 +112,11 @@ def learn(
     used = _some(np.flatnonzero(shown), LEARNED_FRAMES)
     start = np.asarray(estimate.scales)
     unscaled = _of_frames(estimate.gram / np.outer(np.repeat(start, 2), np.repeat(start, 2)), used)
-    support = supported((estimate.sample / start[:, None, None])[used], np.asarray(estimate.rotations)[used, :2])
+    support = supported(
+        (estimate.sample / start[:, None, None])[used],
+        np.asarray(estimate.rotations)[used, :2],
+        spoiled=estimate.outliers > SPOILED,
+    )
     if turning and estimate.rivals:
         estimate = _started(estimate, unscaled, used, support, should_stop)
     before = np.asarray(estimate.rotations)[used]
@@ -215,6 +220,11 @@ def _zoom(
     runs = [energies(scales, with_scales=True) for scales in (none, rigid_scales(part, given))]
     best = min(runs, key=lambda run: run.energy)
     gain, least, largest = fixed.energy - best.energy, float(best.scales.min()), float(best.scales.max())
+    if np.log(best.scales).std() > WIDEST:
+        return (
+            None,
+            f"Every scale is 1: those found, from {least:.3f} to {largest:.3f}, are wider apart than any camera's.",
+        )
     if not (gain > ZOOM_GAIN * _unsteady(np.log(best.scales)) and np.log(best.scales).std() > ZOOM_LEAST):
         return None, (
             f"Every scale is 1: free ones, from {least:.3f} to {largest:.3f}, would gain {gain:.3f} in the logarithm of the "

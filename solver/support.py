@@ -47,8 +47,8 @@ class Support:
     """Whether to begin with all that is rough in the tracks as noise."""
 
 
-def supported(sample: Floats, pairs: Floats) -> Support:
-    """Return what the sample supports: all modes where there is no noise to mistake for one.
+def supported(sample: Floats, pairs: Floats, *, spoiled: bool = False) -> Support:
+    """Return what the sample supports: all modes where there is neither noise nor what is left of outliers to mistake for one.
 
     Parameters
     ----------
@@ -56,9 +56,11 @@ def supported(sample: Floats, pairs: Floats) -> Support:
         Some points of centred, complete tracks, normalised units.
     pairs : array, shape (F, 2, 3)
         s_f times the first two rows of R_f.
+    spoiled : bool
+        Outliers were found: some that were not are still in the sample.
     """
     frames, count = sample.shape[:2]
-    if count < FEWEST or typical_roughness(sample) < NOISE_FLOOR:
+    if count < FEWEST or not (spoiled or typical_roughness(sample) >= NOISE_FLOOR):
         return Support()
     used = np.unique(np.linspace(0, frames - 1, min(frames, JUDGED_FRAMES)).round().astype(np.intp))
     rows = sample[used].transpose(0, 2, 1).reshape(2 * len(used), count)

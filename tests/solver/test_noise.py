@@ -107,6 +107,12 @@ def test_without_noise_or_with_hardly_a_point_nothing_is_judged() -> None:
     assert supported(tracks(FEWEST - 1, modes=2, sigma=SIGMA), PAIRS) == Support()
 
 
+def test_where_outliers_were_found_modes_are_judged_without_noise_as_well() -> None:
+    sample = tracks(40, modes=2, sigma=0.0)
+    assert supported(sample, PAIRS).most == Support().most
+    assert 2 <= supported(sample, PAIRS, spoiled=True).most < Support().most
+
+
 @pytest.mark.parametrize("points", [40, 400])
 @pytest.mark.parametrize("known", [True, False])
 def test_the_default_stands_strong_noise_better_than_the_papers_prior(known: bool, points: int) -> None:

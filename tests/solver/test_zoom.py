@@ -33,6 +33,15 @@ def test_a_camera_that_does_not_zoom_has_scales_of_one(name: str) -> None:
     assert found.choices.reasons["scales"].startswith("Every scale is 1")
 
 
+def test_scales_wider_apart_than_any_cameras_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    film = gallery.face(24, 300, scale_change=0.1)
+    for module in ("zoom", "joint"):  # neither the rigid scales nor those found with the shapes
+        monkeypatch.setattr(f"pliant.solver.{module}.WIDEST", 0.02)
+    found = solve(film.tracks)
+    assert (found.camera.scales == 1).all()
+    assert "wider apart than any camera's" in found.choices.reasons["scales"]
+
+
 def test_rigid_scales_are_exact_for_a_rigid_shape() -> None:
     random = np.random.default_rng(0)
     shape = random.normal(size=(3, 50))
