@@ -108,15 +108,16 @@ def learn(
     should_stop : callable, optional
         Asked between refinements; once it says True, the best so far is returned.
     """
-    frames = len(estimate.rotations)
+    frames, spoiled = len(estimate.rotations), estimate.outliers > SPOILED
     used = _some(np.flatnonzero(shown), LEARNED_FRAMES)
     start = np.asarray(estimate.scales)
     unscaled = _of_frames(estimate.gram / np.outer(np.repeat(start, 2), np.repeat(start, 2)), used)
-    support = supported(
-        (estimate.sample / start[:, None, None])[used],
-        np.asarray(estimate.rotations)[used, :2],
-        spoiled=estimate.outliers > SPOILED,
-    )
+    sample = (estimate.sample / start[:, None, None])[used]
+    support = supported(sample, np.asarray(estimate.rotations)[used, :2])
+    if (
+        spoiled
+    ):  # few modes would let the cameras follow the deformation; what is left of outliers is judged for the shapes
+        support = replace(support, most=MOST_MODES)
     if turning and estimate.rivals:
         estimate = _started(estimate, unscaled, used, support, should_stop)
     before = np.asarray(estimate.rotations)[used]
@@ -130,9 +131,10 @@ def learn(
     if turning and support == Support() and coefficients.telling(found.covariance, estimate.sample.shape[1]):
         found = _coupled(unscaled, found, with_scales=zoom is not None, should_stop=should_stop)
     covariance = found.covariance
-    if np.isfinite(found.energy):
+    if spoiled or np.isfinite(found.energy):
         # From scratch: what the way to these cameras has left in the modes is worth less than it makes the tracks more probable.
         pairs = found.rotations[:, :2] * found.scales[:, None, None]
+        support = supported(sample, pairs, spoiled=True) if spoiled else support
         covariance = learned(unscaled, pairs, most=support.most, noisy=support.noisy)
     if len(used) < frames:
         covariance = covariance.stretched(used, frames)
