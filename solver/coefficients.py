@@ -24,9 +24,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from pliant.solver.covariance import ShapeCovariance
-from pliant.solver.likelihood import UNLIKELY, Scene, inverted, root_matrix
+from pliant.solver.likelihood import UNLIKELY, Scene, cameras_of, inverted, root_matrix
 from pliant.solver.records import Floats
-from pliant.solver.rotation import exponential, left_jacobian, vee
+from pliant.solver.rotation import left_jacobian, vee
 from pliant.solver.steadiness import unevenness, unsteadiness
 from scipy.optimize import minimize
 
@@ -97,13 +97,6 @@ def begin(scene: Scene, scales: Floats, covariance: ShapeCovariance) -> Basis:
     root[-3:, -3:] = root_matrix(covariance.extent)
     noise = max(covariance.noise - scene.noise_floor**2, scene.noise_floor**4)
     return Basis(np.zeros((frames, 3)), np.log(scales), weights, root, 0.5 * np.log([noise, covariance.drift]))
-
-
-def cameras_of(scene: Scene, basis: Basis) -> tuple[Floats, Floats]:
-    """Return rotations (F, 3, 3) and scales (F,), mean logarithm 0."""
-    rotations = exponential(basis.turns) @ scene.rotations
-    logs = basis.log_scales - basis.log_scales.mean() if scene.with_scales else np.zeros(len(rotations))
-    return rotations, np.exp(logs)
 
 
 @np.errstate(over="ignore", invalid="ignore")  # a line search may try a step far too long: that energy is `UNLIKELY`

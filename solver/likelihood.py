@@ -20,6 +20,7 @@ and a talking face nods with its jaw. What binds the cameras is in
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from pliant.solver.records import Floats
@@ -147,7 +148,19 @@ def start(scene: Scene, scales: Floats, *, num_modes: int = NUM_MODES) -> Motion
     )  # fmt: skip
 
 
-def cameras_of(scene: Scene, motion: Motion) -> tuple[Floats, Floats]:
+class Moved(Protocol):
+    """Parameters that move cameras."""
+
+    @property
+    def turns(self) -> Floats:
+        """Rotation vectors, shape `(F, 3)`."""
+
+    @property
+    def log_scales(self) -> Floats:
+        """Shape `(F,)`."""
+
+
+def cameras_of(scene: Scene, motion: Moved) -> tuple[Floats, Floats]:
     """Return rotations (F, 3, 3) and scales (F,), mean logarithm 0."""
     rotations = exponential(motion.turns) @ scene.rotations
     logs = motion.log_scales - motion.log_scales.mean() if scene.with_scales else np.zeros(len(rotations))

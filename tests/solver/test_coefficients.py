@@ -13,13 +13,12 @@ from pliant.solver.coefficients import (
     QUIET,
     Basis,
     begin,
-    cameras_of,
     energy,
     refined,
     telling,
 )
 from pliant.solver.covariance import ShapeCovariance, random_walk
-from pliant.solver.likelihood import Scene
+from pliant.solver.likelihood import Scene, cameras_of
 from pliant.solver.rotation import angles_between, exponential, nearest
 from pliant.solver.support import Support
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from pliant.solver import Settings, gallery
+from pliant.solver import Settings, gallery, joint
 from pliant.solver.cameras import TOO_DEEP, CameraEstimate, estimate_cameras, restarted
+from pliant.solver.covariance import MOST_MODES
 from pliant.solver.joint import learn
 from pliant.solver.normalise import normalise
 from pliant.solver.race import depth
 from pliant.solver.rotation import angles_between, exponential, nearest
+from pliant.solver.support import Support
 
 FRAMES = 16
 
@@ -56,6 +58,34 @@ def test_it_starts_from_the_cameras_that_lead_to_more_probable_ones(
     assert np.degrees(angles_between(found.rotations @ common, true)).mean() < 0.1
     assert found.basis_size == (7 if better == "rival" else 1)
     assert ("K = 7 as they came" in found.reasons.get("basis_size", "")) == (better == "rival")
+
+
+@pytest.mark.parametrize("outliers", [0.0, 0.1])
+def test_where_outliers_were_found_cameras_keep_all_modes_and_shapes_those_confirmed(
+    outliers: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    random, time = np.random.default_rng(2), np.linspace(0, 1, FRAMES)
+    true = exponential(time[:, None] * np.array([0.3, 1.0, 0.1]))
+    mode = 0.3 * np.cos(np.pi * time)  # slow, or the tracks would be taken for noisy ones
+    shapes = mode[:, None, None] * random.normal(size=(3, 40)) + random.normal(size=(3, 40))
+    tracks = np.einsum("fij,fjp->fpi", true[:, :2], shapes)
+    wrong = random.random((FRAMES, 40)) < 0.02
+    tracks[wrong] += random.normal(0, 0.1, (wrong.sum(), 2))
+    rows = tracks.transpose(0, 2, 1).reshape(2 * FRAMES, -1)
+    estimate = CameraEstimate(
+        true, np.ones(FRAMES), np.zeros((FRAMES, 2)), 1, rows @ rows.T / 40, tracks, outliers=outliers
+    )
+    asked: list[int] = []
+    refined = joint.refined
+
+    def spied(*given: object, support: Support, **more: object) -> object:
+        asked.append(support.most)
+        return refined(*given, support=support, **more)  # type: ignore[arg-type]
+
+    monkeypatch.setattr("pliant.solver.joint.refined", spied)
+    _, covariance = learn(estimate, np.ones(FRAMES, dtype=bool), turning=True)
+    assert set(asked) == {MOST_MODES}
+    assert (covariance.modes.shape[1] <= 4) == (outliers > 0)
 
 
 def test_a_rival_that_hardly_turns_is_warned_of() -> None:
