@@ -34,8 +34,8 @@ page: $(PAGE)
 demo: $(STAMP) $(PAGE)
 	$(BIN)/pliant demo $(DEMO)
 
-# PROCESSES=2 shares the test files out between two processes: half of them wait for real servers, the others compute.
-PROCESSES ?= 1
+# Two processes share the test files out: half of them wait for real servers, the others compute. PROCESSES=1: one after the other.
+PROCESSES ?= 2
 SHARED := $(if $(filter-out 1,$(PROCESSES)),-n $(PROCESSES) --dist loadfile)
 
 test: $(STAMP) $(PAGE)
