@@ -113,10 +113,9 @@ def learn(
     start = np.asarray(estimate.scales)
     unscaled = _of_frames(estimate.gram / np.outer(np.repeat(start, 2), np.repeat(start, 2)), used)
     sample = (estimate.sample / start[:, None, None])[used]
-    support = supported(sample, np.asarray(estimate.rotations)[used, :2])
-    if (
-        spoiled
-    ):  # few modes would let the cameras follow the deformation; what is left of outliers is judged for the shapes
+    support = supported(sample, np.asarray(estimate.rotations)[used, :2], spoiled=spoiled and not turning)
+    if spoiled and turning:
+        # Few modes would let the cameras follow the deformation; what is left of outliers is judged for the shapes.
         support = replace(support, most=MOST_MODES)
     if turning and estimate.rivals:
         estimate = _started(estimate, unscaled, used, support, should_stop)
@@ -131,7 +130,7 @@ def learn(
     if turning and support == Support() and coefficients.telling(found.covariance, estimate.sample.shape[1]):
         found = _coupled(unscaled, found, with_scales=zoom is not None, should_stop=should_stop)
     covariance = found.covariance
-    if spoiled or np.isfinite(found.energy):
+    if np.isfinite(found.energy):
         # From scratch: what the way to these cameras has left in the modes is worth less than it makes the tracks more probable.
         pairs = found.rotations[:, :2] * found.scales[:, None, None]
         support = supported(sample, pairs, spoiled=True) if spoiled else support
