@@ -87,7 +87,7 @@ def complete(normalised: Normalised, *, seed: int = 0) -> Completed:
     """
     random = np.random.default_rng(seed)
     chosen = choose_points(normalised.visible, random)
-    again = int(((normalised.visible > 0).sum(axis=0) >= 2).sum())
+    again = seen_again(normalised.visible)
     if again < MIN_POINTS:
         raise InvalidInput(
             "too_little_seen", field="visibility", expected=f"at least {MIN_POINTS} points that are seen in two frames or more",
@@ -99,6 +99,11 @@ def complete(normalised: Normalised, *, seed: int = 0) -> Completed:
     clean = outliers == 0.0 and bool((normalised.visible > 0).all())
     gram, translations, sample = _carry(normalised, None if clean else basis, spread, scale, chosen)
     return Completed(gram, sample, translations, 0 if clean else basis.shape[2], outliers)
+
+
+def seen_again(visible: Floats) -> int:
+    """Return how many points are seen in two frames or more."""
+    return int(((visible > 0).sum(axis=0) >= 2).sum())
 
 
 def choose_points(visible: Floats, random: np.random.Generator) -> NDArray[np.intp]:

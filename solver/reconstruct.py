@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pliant.solver.cameras import CameraEstimate, estimate_cameras, given_cameras
 from pliant.solver.closed_form import pseudo_inverse, uniform_solution
+from pliant.solver.completion import seen_again
 from pliant.solver.covariance import ShapeCovariance
 from pliant.solver.energy import residuals
 from pliant.solver.errors import InvalidInput
@@ -18,6 +19,7 @@ from pliant.solver.loss import largest_weight
 from pliant.solver.normalise import Normalised, normalise
 from pliant.solver.problem import build_problem, with_bending
 from pliant.solver.records import (
+    MIN_POINTS,
     Camera,
     Choices,
     Floats,
@@ -80,31 +82,26 @@ def solve(
     tell = on_step if on_step is not None else _silent
     began = time.perf_counter()
     normalised = normalise(tracks)
-    estimate = _cameras(normalised, cameras, settings, on_step=on_step, should_stop=should_stop)
-    covariance = None
-    if settings.gaussian:
-        # The sides of a thin sheet hang on little; what completion puts in the place of outliers is enough to turn them over.
-        spoiled_sheet = estimate.outliers > SPOILED and is_flat(estimate.gram)
-        turning = cameras is None and settings.refine_rotations and not spoiled_sheet
-        estimate, covariance = learn(
-            estimate,
-            telling_frames(normalised.visible),
-            turning=turning,
-            zooming=settings.camera == "scaled_orthographic",
-            should_stop=should_stop,
-        )
+    estimate, covariance = _learned(normalised, cameras, settings, on_step=on_step, should_stop=should_stop)
     tell(Step("cameras", CAMERA_SHARE, max_reweightings=settings.max_reweightings))
     seconds = {"cameras": time.perf_counter() - began}
 
     began = time.perf_counter()
-    part = None if covariance is None or settings.temporal_weight == 0 else often_seen(normalised, mesh)
-    if part is None:
-        problem, choices = build_problem(normalised, estimate, mesh, settings, covariance)
-    else:
-        problem, choices = build_problem(part.normalised, estimate, part.mesh, settings, covariance)
-    problem, choices, state = with_bending(problem, choices, _start(problem, estimate, settings), settings)
-    if estimate.outliers > SPOILED:
-        problem, choices, state = _trimmed(problem, choices, state, estimate.outliers, should_stop)
+    start, outliers = _initialised(normalised, estimate, covariance, mesh, settings), estimate.outliers
+    if outliers > SPOILED and _resists(start.problem):
+        start = _trimmed(start, outliers, should_stop)
+        cleaned = _cleaned(tracks, start)
+        if cleaned is not None and not (should_stop is not None and should_stop()):
+            again = time.perf_counter()
+            estimate, covariance = _learned(
+                cleaned, cameras, settings, on_step=None, should_stop=should_stop, outliers=outliers
+            )
+            seconds["cameras"] += time.perf_counter() - again
+            began += time.perf_counter() - again
+            normalised = cleaned
+            start = _initialised(normalised, estimate, covariance, mesh, settings)
+        start = _told_of_outliers(start, tracks, outliers)
+    part, problem, choices, state = start.part, start.problem, start.choices, start.state
     tell(_told("initialise", state, settings, normalised.unit))
     seconds["initialise"] = time.perf_counter() - began
 
@@ -112,12 +109,15 @@ def solve(
     history, outcome = _loop(problem, state, settings, normalised.unit, tell, should_stop)
     if part is not None and covariance is not None:
         whole, _ = build_problem(normalised, estimate, mesh, settings, covariance)
-        problem, choices, history[-1] = _with_the_rest(
-            part, whole, covariance, problem, choices, history[-1], estimate.outliers
-        )
+        problem, choices, history[-1] = _with_the_rest(part, whole, covariance, problem, choices, history[-1], outliers)
     seconds["shapes"] = time.perf_counter() - began
 
     began = time.perf_counter()
+    if normalised.visible is not tracks.visible:  # outliers are reported, not hidden
+        normalised = _as_given(normalised, tracks)
+        problem = replace(
+            problem, points=np.ascontiguousarray(normalised.points.transpose(0, 2, 1), dtype=problem.points.dtype)
+        )
     solution = finish(
         problem, history, outcome, normalised=normalised, estimate=estimate, choices=choices, seconds=seconds
     )
@@ -126,18 +126,101 @@ def solve(
     return solution
 
 
-def _trimmed(
-    problem: Problem, choices: Choices, state: State, outliers: float, should_stop: Callable[[], bool] | None
-) -> tuple[Problem, Choices, State]:
-    """Return the same without gross outliers, and the reason; the paper's prior keeps them, and so does one of no weight."""
-    if problem.quadratic is None or problem.weights.temporal == 0:
-        return problem, choices, state
-    kept, state = without_outliers(problem, state, outliers, should_stop=should_stop)
-    share = 1 - np.count_nonzero(kept.confidence) / np.count_nonzero(problem.confidence)
+@dataclass(frozen=True, slots=True, eq=False)
+class _Start:
+    """Where the loop begins."""
+
+    part: OftenSeen | None
+    """The points that the problem is of; None: all of them."""
+
+    problem: Problem
+    choices: Choices
+    state: State
+
+
+def _learned(
+    normalised: Normalised,
+    cameras: KnownCamera | None,
+    settings: Settings,
+    *,
+    on_step: Callable[[Step], None] | None,
+    should_stop: Callable[[], bool] | None,
+    outliers: float = 0.0,
+) -> tuple[CameraEstimate, ShapeCovariance | None]:
+    """Return the cameras, and the covariance of the shapes if that is the prior; `outliers`: their share before some were hidden."""
+    estimate = _cameras(normalised, cameras, settings, on_step=on_step, should_stop=should_stop)
+    estimate = replace(estimate, outliers=max(estimate.outliers, outliers))
+    if not settings.gaussian:
+        return estimate, None
+    # The sides of a thin sheet hang on little; what completion puts in the place of outliers is enough to turn them over.
+    spoiled_sheet = estimate.outliers > SPOILED and is_flat(estimate.gram)
+    return learn(
+        estimate,
+        telling_frames(normalised.visible),
+        turning=cameras is None and settings.refine_rotations and not spoiled_sheet,
+        zooming=settings.camera == "scaled_orthographic",
+        should_stop=should_stop,
+    )
+
+
+def _initialised(
+    normalised: Normalised,
+    estimate: CameraEstimate,
+    covariance: ShapeCovariance | None,
+    mesh: Mesh | None,
+    settings: Settings,
+) -> _Start:
+    part = None if covariance is None or settings.temporal_weight == 0 else often_seen(normalised, mesh)
+    if part is None:
+        problem, choices = build_problem(normalised, estimate, mesh, settings, covariance)
+    else:
+        problem, choices = build_problem(part.normalised, estimate, part.mesh, settings, covariance)
+    return _Start(part, *with_bending(problem, choices, _start(problem, estimate, settings), settings))
+
+
+def _resists(problem: Problem) -> bool:
+    """Whether outliers are taken out; the paper's prior keeps them, and so does one of no weight."""
+    return problem.quadratic is not None and problem.weights.temporal > 0
+
+
+def _trimmed(start: _Start, outliers: float, should_stop: Callable[[], bool] | None) -> _Start:
+    kept, state = without_outliers(start.problem, start.state, outliers, should_stop=should_stop)
+    return replace(start, problem=kept, state=state)
+
+
+def _cleaned(tracks: Tracks, start: _Start) -> Normalised | None:
+    """Return the tracks with what was left out hidden, to begin anew from; None if nothing was, or too little would be left.
+
+    What a camera's estimate puts in the place of an outlier that it has not recognised bends everything after it. Measured, faces
+    with 10 % outliers: 10 frames .072 → .059, 99 frames .028 → .017.
+    """
+    visible = _kept(tracks, start)
+    if (visible == tracks.visible).all() or seen_again(visible) < MIN_POINTS:
+        return None
+    return normalise(Tracks.from_arrays(tracks.points, visible))
+
+
+def _kept(tracks: Tracks, start: _Start) -> Floats:
+    """Return the confidence of the tracks without what was left out, shape `(F, P)`."""
+    visible = np.array(tracks.visible)
+    points = slice(None) if start.part is None else start.part.kept
+    visible[:, points] = np.where(start.problem.confidence > 0, visible[:, points], 0.0)
+    return visible
+
+
+def _told_of_outliers(start: _Start, tracks: Tracks, outliers: float) -> _Start:
+    share = 1 - np.count_nonzero(_kept(tracks, start)) / np.count_nonzero(tracks.visible)
     reason = (
         f"{share:.1%} of what was seen is left out as gross outliers; {outliers:.1%} looked like it before the fit."
     )
-    return kept, replace(choices, reasons={**choices.reasons, "outliers": reason}), state
+    choices = replace(start.choices, reasons={**start.choices.reasons, "outliers": reason})
+    return replace(start, choices=choices)
+
+
+def _as_given(normalised: Normalised, tracks: Tracks) -> Normalised:
+    """Return all that was given in the units and about the centroids of what is left of it."""
+    points = (tracks.points - normalised.centroid[:, None]) / normalised.unit
+    return replace(normalised, points=np.where(tracks.visible[..., None] > 0, points, 0.0), visible=tracks.visible)
 
 
 def _with_the_rest(

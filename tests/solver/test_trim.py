@@ -27,6 +27,22 @@ def test_what_is_left_out_is_what_was_spoiled(cameras: KnownCamera | None) -> No
     assert float(said.group(1)) == pytest.approx(100 * left_out.mean(), abs=0.06)
 
 
+@pytest.mark.parametrize("cameras", [CAMERAS, None], ids=["known", "estimated"])
+def test_it_is_as_if_somebody_had_hidden_them(cameras: KnownCamera | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = solve(SPOILED, cameras=cameras)
+    hidden = solve(Tracks.from_arrays(SPOILED.points, found.weights > 0), cameras=cameras)
+    error, least = (metrics.e3d_frame(each.shapes, MADE.shapes) for each in (found, hidden))
+    assert error < 1.1 * least + 1e-3
+    assert "outliers" not in hidden.choices.reasons
+    far = np.linalg.norm(np.asarray(SPOILED.points) - np.asarray(MADE.tracks.points), axis=2) > found.choices.unit
+    assert (found.residuals[far] > 0.5 * found.choices.unit).all(), "they are reported all the same"
+    with monkeypatch.context() as patch:
+        patch.setattr("pliant.solver.reconstruct.MIN_POINTS", 10_000)  # too little would be left to begin anew from
+        once = solve(SPOILED, cameras=cameras)
+    assert (once.weights == 0).mean() == pytest.approx(0.1, abs=0.03)
+    assert metrics.e3d_frame(once.shapes, MADE.shapes) > error - 1e-3
+
+
 def test_clean_tracks_and_the_published_prior_keep_everything() -> None:
     clean = solve(MADE.tracks, cameras=CAMERAS)
     assert "outliers" not in clean.choices.reasons
