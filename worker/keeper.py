@@ -150,6 +150,7 @@ class Keeper:
                 self._say(id, f"Lost its worker; it is {after.job.status.value} now.")
                 if after.job.status is Status.QUEUED:
                     self.jobs.queue.push(id, fresh, front=True)  # it has waited before
+                self._remove_unwanted(id)
 
     def _queue_forgotten(self, gap: float) -> None:
         """Queue what the queue has lost, and what was held back until fewer of its owner's jobs run.
@@ -243,10 +244,14 @@ class Keeper:
             return
         page = self.jobs.page(limit=LARGEST_PAGE, statuses=badly)
         for id in [job.id for job in page.jobs if job.id not in self._cleaned]:
-            for key, _ in self.jobs.blobs.list(f"jobs/{id}/"):
-                if self._wanted(key) is False:
-                    self.jobs.blobs.delete(key)
+            self._remove_unwanted(id)
         self._cleaned, self._ended = {job.id for job in page.jobs}, ended
+
+    def _remove_unwanted(self, id: str) -> None:
+        """Remove what a job's dead attempts have stored."""
+        for key, _ in self.jobs.blobs.list(f"jobs/{id}/"):
+            if self._wanted(key) is False:
+                self.jobs.blobs.delete(key)
 
     def _sweep(self) -> None:
         """Remove files that belong to no job: of submissions that died before their record, of attempts that were killed."""

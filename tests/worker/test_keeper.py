@@ -174,6 +174,18 @@ def test_what_a_killed_attempt_had_uploaded_is_removed(
     assert [key for key, _ in world.jobs.blobs.list("jobs/")] == [world.jobs.records.get(id).inputs]
 
 
+def test_what_an_attempt_had_uploaded_is_removed_when_its_worker_is_lost(
+    world: World, submit: Callable[[World], str], tmp_path: Path
+) -> None:
+    id = submit(world)
+    half = f"jobs/{id}/{world.claim(id)}/artifacts/shapes.npz"
+    world.jobs.blobs.put(half, tmp_path / "some-inputs.npz")
+    world.pass_seconds(31)
+    assert world.jobs.get(id).status is Status.QUEUED
+    assert [key for key, _ in world.jobs.blobs.list("jobs/")] == [world.jobs.records.get(id).inputs]
+    assert findings(world.jobs, settle=0) == []
+
+
 def test_a_store_that_is_away_is_waited_for(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     calls = []
 
