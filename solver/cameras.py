@@ -59,6 +59,9 @@ class CameraEstimate:
     outliers: float = 0.0
     """Share of the seen entries that completion replaced as gross outliers."""
 
+    rank: int = 0
+    """Columns of the basis that filled the holes; 0 when nothing was filled."""
+
     reasons: dict[str, str] = field(default_factory=dict)
     """One sentence for each choice."""
 
@@ -72,6 +75,7 @@ def estimate_cameras(
     *,
     on_step: Callable[[Step], None] | None = None,
     should_stop: Callable[[], bool] | None = None,
+    rank: int = 0,
 ) -> CameraEstimate:
     """Return the cameras of the tracks, without anything known about the shapes.
 
@@ -85,9 +89,11 @@ def estimate_cameras(
         Told after completion and after every factorization; fractions run from 0 to `SHARE`.
     should_stop : callable, optional
         Asked between units of work; once it says True, the best cameras so far are returned.
+    rank : int
+        Of the completion, as an earlier estimate from these tracks had it; 0 chooses it.
     """
     tell = on_step if on_step is not None else _silent
-    completed = complete(normalised, seed=settings.seed)
+    completed = complete(normalised, seed=settings.seed, rank=rank)
     tell(Step("cameras", 0.4 * SHARE))
     scales, scale_reason = rigid_evidence(completed.gram, settings)
     gram = completed.gram / np.outer(np.repeat(scales, 2), np.repeat(scales, 2))
@@ -119,7 +125,7 @@ def estimate_cameras(
     reasons = {"basis_size": _why(ran, best, settings), "scales": scale_reason, "rotations": refined}
     return CameraEstimate(
         rotations, scales, completed.translations, best.basis_size, completed.gram, completed.sample,
-        rivals, completed.outliers, reasons, _warnings(rotations),
+        rivals, completed.outliers, completed.rank, reasons, _warnings(rotations),
     )  # fmt: skip
 
 
@@ -164,7 +170,7 @@ def _thinned(full: Upgrade, used: slice) -> Upgrade:
     return Upgrade(full.basis_size, full.rotations[used], full.scales[used], full.residual)
 
 
-def given_cameras(normalised: Normalised, known: KnownCamera, settings: Settings) -> CameraEstimate:
+def given_cameras(normalised: Normalised, known: KnownCamera, settings: Settings, *, rank: int = 0) -> CameraEstimate:
     """Return given cameras as an estimate; scales that are not given are estimated if the camera model has them.
 
     They are then those with which one rigid shape explains the tracks best: Σ_f ‖W_f − s_f R_f S‖². Shrinking them all gains
@@ -172,13 +178,14 @@ def given_cameras(normalised: Normalised, known: KnownCamera, settings: Settings
 
     Where scales are known, the prior does not ask for the tracks' Gram matrix, and translations are found with the shapes, the tracks
     are not completed: that could take longer than the shapes. Measured with half of the points hidden: shapes the same to four digits.
+    `rank` is as for `estimate_cameras`.
     """
     frames = len(known.rotations)
     exact = known.scales is not None or settings.camera == "orthographic"
     if exact and not settings.gaussian and settings.method != "pseudo_inverse":
         completed = Completed(np.zeros((0, 0)), np.zeros((frames, 0, 2)), np.zeros((frames, 2)), 0, 0.0)
     else:
-        completed = complete(normalised, seed=settings.seed)
+        completed = complete(normalised, seed=settings.seed, rank=rank)
     if known.scales is not None:
         scales, reason = np.array(known.scales), "Rotations and scales were given."
     elif settings.camera == "scaled_orthographic":
@@ -194,6 +201,7 @@ def given_cameras(normalised: Normalised, known: KnownCamera, settings: Settings
         completed.gram,
         completed.sample,
         outliers=completed.outliers,
+        rank=completed.rank,
         reasons={"camera": reason},
     )
 

@@ -70,7 +70,7 @@ class Completed:
     """Share of the seen entries of the sample that was replaced."""
 
 
-def complete(normalised: Normalised, *, seed: int = 0) -> Completed:
+def complete(normalised: Normalised, *, seed: int = 0, rank: int = 0) -> Completed:
     """Fill hidden entries, replace gross outliers, and return the Gram matrix of the result.
 
     Parameters
@@ -79,6 +79,8 @@ def complete(normalised: Normalised, *, seed: int = 0) -> Completed:
         Points (F, P, 2) in normalised units with their visibility.
     seed : int
         Of the sample of points and of the held-out entries.
+    rank : int
+        Columns of the basis as an earlier completion of these tracks chose them; 0 chooses them.
 
     Raises
     ------
@@ -94,7 +96,7 @@ def complete(normalised: Normalised, *, seed: int = 0) -> Completed:
             got=f"{again}", hint="Check that the visibility is not inverted, and that a point keeps its place from frame to frame.",
         )  # fmt: skip
     points, weight = normalised.points[:, chosen], normalised.visible[:, chosen]
-    basis, spread, scale = fit_basis(points, weight, random)
+    basis, spread, scale = fit_basis(points, weight, random, rank)
     outliers = fill(points, weight, basis, spread, scale)[1]
     clean = outliers == 0.0 and bool((normalised.visible > 0).all())
     gram, translations, sample = _carry(normalised, None if clean else basis, spread, scale, chosen)
@@ -118,10 +120,12 @@ def choose_points(visible: Floats, random: np.random.Generator) -> NDArray[np.in
     return np.sort(np.concatenate([half, rest]))
 
 
-def fit_basis(points: Floats, weight: Floats, random: np.random.Generator) -> tuple[Floats, Floats, float]:
+def fit_basis(
+    points: Floats, weight: Floats, random: np.random.Generator, given: int = 0
+) -> tuple[Floats, Floats, float]:
     """Return the basis (F, 2, r), last column the translation, the spread of its coefficients, and that of the residuals.
 
-    The rank is the one that predicts held-out entries best; a larger one must do so by more than 2 %.
+    The rank is the one that is given, or that predicts held-out entries best; a larger one must do so by more than 2 %.
     """
     frames, count = weight.shape
     held = (random.random(weight.shape) < HELD_OUT) & (weight > 0)
@@ -137,9 +141,11 @@ def fit_basis(points: Floats, weight: Floats, random: np.random.Generator) -> tu
         if not hidden and not gross(points, weight, predict(basis, coefficients), scale).any():
             return basis, spread, scale
         error = _typical(_lengths(points - predict(basis, coefficients)), held & (weight > 0))
-        if error < 0.98 * best_error:
+        if error < 0.98 * best_error or rank <= given:
             best_error, best_rank, best = error, rank, basis
         elif rank > 2 * best_rank:
+            break
+        if rank == given:
             break
     if not np.isfinite(best_error):
         best = _widen(np.zeros((frames, 2, 0)), points, weight, start, min(3, min(2 * frames, count) - 1))

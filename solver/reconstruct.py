@@ -94,7 +94,7 @@ def solve(
         if cleaned is not None and not (should_stop is not None and should_stop()):
             again = time.perf_counter()
             estimate, covariance = _learned(
-                cleaned, cameras, settings, on_step=None, should_stop=should_stop, outliers=outliers
+                cleaned, cameras, settings, on_step=None, should_stop=should_stop, before=estimate
             )
             seconds["cameras"] += time.perf_counter() - again
             began += time.perf_counter() - again
@@ -145,11 +145,16 @@ def _learned(
     *,
     on_step: Callable[[Step], None] | None,
     should_stop: Callable[[], bool] | None,
-    outliers: float = 0.0,
+    before: CameraEstimate | None = None,
 ) -> tuple[CameraEstimate, ShapeCovariance | None]:
-    """Return the cameras, and the covariance of the shapes if that is the prior; `outliers`: their share before some were hidden."""
-    estimate = _cameras(normalised, cameras, settings, on_step=on_step, should_stop=should_stop)
-    estimate = replace(estimate, outliers=max(estimate.outliers, outliers))
+    """Return the cameras, and the covariance of the shapes if that is the prior; `before`: as they were with outliers."""
+    rank = 0 if before is None else before.rank
+    if cameras is not None:
+        estimate = given_cameras(normalised, cameras, settings, rank=rank)
+    else:
+        estimate = estimate_cameras(normalised, settings, on_step=on_step, should_stop=should_stop, rank=rank)
+    if before is not None:
+        estimate = replace(estimate, outliers=max(estimate.outliers, before.outliers))
     if not settings.gaussian:
         return estimate, None
     # The sides of a thin sheet hang on little; what completion puts in the place of outliers is enough to turn them over.
@@ -311,19 +316,6 @@ def _start(problem: Problem, estimate: CameraEstimate, settings: Settings) -> St
     if settings.method == "pseudo_inverse":
         return init(problem, pseudo_inverse(problem, translations), translations)
     return init(problem, uniform_solution(problem, translations), translations)
-
-
-def _cameras(
-    normalised: Normalised,
-    known: KnownCamera | None,
-    settings: Settings,
-    *,
-    on_step: Callable[[Step], None] | None,
-    should_stop: Callable[[], bool] | None,
-) -> CameraEstimate:
-    if known is None:
-        return estimate_cameras(normalised, settings, on_step=on_step, should_stop=should_stop)
-    return given_cameras(normalised, known, settings)
 
 
 def _check_fit(tracks: Tracks, mesh: Mesh | None, cameras: KnownCamera | None) -> None:

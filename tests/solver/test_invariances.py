@@ -15,9 +15,9 @@ from pliant.solver import Camera, KnownCamera, Mesh, Settings, Solution, Tracks,
 CLOSE = 2e-4
 """Relative difference that conjugate gradients, stopped at a reduction and not at the exact answer, may leave."""
 
-LEARNED = 4e-3
+LEARNED = 2e-3
 """A covariance is learned from completed tracks, and which entries are held out to choose the completion's rank is drawn anew
-for other orders of points and frames: .003 where outliers were found, for then it is completed twice."""
+for other orders of points and frames."""
 
 TIGHT: dict[str, object] = {"tolerance": 1e-7, "max_reweightings": 400}
 
