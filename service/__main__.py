@@ -5,9 +5,9 @@ from __future__ import annotations
 import logging
 import os
 import signal
+import socket
 import sys
 from collections.abc import Callable
-from types import FrameType
 
 import uvicorn
 from fastapi import FastAPI
@@ -29,16 +29,20 @@ STOP_WITHIN = 10
 
 
 class Server(uvicorn.Server):
-    """A server that tells the application when it is asked to stop, so that streams without end can end."""
+    """A server that tells the application when it stops, so that streams without end can end.
+
+    It tells it on the event loop. From within the signal's handler, which runs between any two steps of a stream, a stream
+    could be told after it had looked whether the end has come and before it waited: it would wait on, and be cut off.
+    """
 
     def __init__(self, config: uvicorn.Config, *, on_stop: Callable[[], None]) -> None:
         super().__init__(config)
         self._on_stop = on_stop
 
-    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """See uvicorn; called once for each signal."""
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """See uvicorn; called once, when it was asked to stop."""
         self._on_stop()
-        super().handle_exit(sig, frame)
+        await super().shutdown(sockets)
 
 
 def stop_streams(app: FastAPI) -> None:

@@ -120,16 +120,19 @@ def test_a_log_is_what_the_attempts_said_line_by_line(running: Running, http: ht
 
 
 @pytest.fixture
-def process(valkey_url: str, tmp_path: Path) -> Iterator[tuple[subprocess.Popen[bytes], str, Path]]:
-    """The service as a process of its own, as `pliant up` starts it."""
+def process(
+    valkey_url: str, tmp_path: Path, request: pytest.FixtureRequest
+) -> Iterator[tuple[subprocess.Popen[bytes], str, Path]]:
+    """The service as a process of its own, as `pliant up` starts it; or begun as the test asks."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     settings = Settings(data=tmp_path, redis_url=valkey_url, queue=f"stop-{os.getpid()}")
     env = {**os.environ, **settings.to_environment(), "PLIANT_HOST": "127.0.0.1", "PLIANT_PORT": str(port)}
+    begin = getattr(request, "param", ("-m", "pliant.service"))
     log = tmp_path / "service.log"
     with log.open("wb") as errors:
-        started = subprocess.Popen([sys.executable, "-m", "pliant.service"], env=env, stdout=errors, stderr=errors)
+        started = subprocess.Popen([sys.executable, *begin], env=env, stdout=errors, stderr=errors)
     url = f"http://127.0.0.1:{port}"
 
     def answers() -> bool:
@@ -175,3 +178,33 @@ def test_sigterm_ends_streams_and_waits_at_once_and_cleanly(
     assert {name: at - told < 3 for name, at in ended.items()} == {"stream": True, "wait": True}
     assert gone - told < 5
     assert log.read_text() == "", "neither a traceback nor chatter"
+
+
+STOPPED_BETWEEN_LOOK_AND_WAIT = """
+import os, signal
+from pliant.service import follow
+from pliant.service.__main__ import main
+
+look = follow._Watcher.newer
+
+def newer(watcher, last):
+    os.kill(os.getpid(), signal.SIGTERM)
+    follow._Watcher.newer = look
+    return look(watcher, last)
+
+follow._Watcher.newer = newer
+raise SystemExit(main())
+"""
+
+
+@pytest.mark.parametrize("process", [("-c", STOPPED_BETWEEN_LOOK_AND_WAIT)], indirect=True, ids=["between"])
+def test_a_stream_that_has_just_looked_whether_to_end_is_told_all_the_same(
+    process: tuple[subprocess.Popen[bytes], str, Path],
+) -> None:
+    service, url, log = process
+    with httpx.Client(base_url=url, timeout=60) as http:
+        job = submit(http)
+        # What is not told is cut off when the time of grace is over, and reading it raises.
+        assert http.get(f"/v1/jobs/{job.id}/events").text.endswith("\n\n")
+    assert service.wait(20) == 0
+    assert log.read_text() == "", "nothing was cancelled"
