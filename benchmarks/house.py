@@ -18,7 +18,6 @@ from pliant.service.incoming import Incoming
 from pliant.worker.audit import findings
 from pliant.worker.errors import StoreUnavailable
 from pliant.worker.jobs import Jobs
-from pliant.worker.keeper import DEAD_AGE, TIDY_EVERY
 from pliant.worker.processes import die_with_parent
 from pliant.worker.settings import Settings
 
@@ -29,8 +28,6 @@ SOON = {
 """Settings under which faults are noticed within seconds."""
 
 PATIENT = Policy(first_contact=60, shortest_pause=0.05, longest_pause=0.5)
-SETTLED = DEAD_AGE.total_seconds() + 2 * TIDY_EVERY
-"""Seconds after which even the working files of a worker that could not ask whose they are have been removed."""
 
 ROLES = {"service": b"pliant.service", "worker": b"pliant.worker\0work", "keeper": b"pliant.worker\0keep"}
 
@@ -172,7 +169,7 @@ class House:
         self.until(lambda: self.jobs.get(id).status.final, f"job {id} ends", seconds=seconds)
         return self.jobs.get(id)
 
-    def misfits(self, *, seconds: float = SETTLED) -> list[str]:
+    def misfits(self, *, seconds: float = 60.0) -> list[str]:
         """Say what was lost, doubled, half-written or left over, once everything has had time to settle."""
         deadline = time.monotonic() + seconds
         while True:

@@ -27,7 +27,7 @@ from pliant.worker.jobs import Jobs
 from pliant.worker.problems import problem_of, timed_out
 from pliant.worker.records import Stored
 from pliant.worker.settings import Settings
-from pliant.worker.watch import patiently
+from pliant.worker.watch import Patience
 
 if TYPE_CHECKING:
     from pliant.worker.run import Finished
@@ -136,7 +136,7 @@ class Attempt:
 
         with contextlib.suppress(StoreUnavailable):
             self._flush()
-        kept = patiently(lambda: self.jobs.records.update(self.id, change), seconds=PATIENCE)
+        kept = Patience(PATIENCE).ask(lambda: self.jobs.records.update(self.id, change))
         if kept.prefix is None:
             self.jobs.blobs.delete(self.prefix)
 

@@ -27,7 +27,7 @@ from pliant.worker.processes import die_with_parent
 from pliant.worker.queue import FUNCTION, Queue, alive_key
 from pliant.worker.records import Records
 from pliant.worker.settings import Settings
-from pliant.worker.watch import Watch, settle
+from pliant.worker.watch import Patience, Watch, settle
 from rq import Queue as RqQueue
 from rq import Worker
 from rq.exceptions import StopRequested
@@ -192,17 +192,19 @@ class PliantWorker(Worker):
         self._bury(watch, job, status=status, peak=usage.ru_maxrss * RSS_UNIT)
 
     def _bury(self, watch: Watch, job: RqJob, *, status: int, peak: int) -> None:
-        patience = 60.0 if self._stop_by is None else 2.0
+        patience = Patience(60.0 if self._stop_by is None else 2.0)
         try:
             settled = settle(watch, status=status, peak=peak, patience=patience)
             if settled is not None and settled.job.status is Status.QUEUED:
-                self._deliveries.push(watch.id, settled.token, front=True)  # it has waited before
-            self._deliveries.remove(job.id)
+                fresh = settled.token
+                patience.ask(lambda: self._deliveries.push(watch.id, fresh, front=True))  # it has waited before
+            patience.ask(lambda: self._deliveries.remove(job.id))
         except StoreUnavailable as error:
             logger.warning("job %s: %s; the keeper will look after it", watch.id, error)
         finally:
-            if not self._elsewhere(watch):
-                clean_up(self._settings, watch.token)
+            with suppress(StoreUnavailable):  # then the keeper clears what is left
+                if not patience.ask(lambda: self._elsewhere(watch)):
+                    clean_up(self._settings, watch.token)
 
     def _elsewhere(self, watch: Watch) -> bool:
         """Tell whether another worker is at this very attempt: ours was a second delivery, and the working files are not ours."""
@@ -210,6 +212,4 @@ class PliantWorker(Worker):
             held = self._records.get(watch.id)
         except UnknownJob:
             return False
-        except StoreUnavailable:
-            return True  # the keeper clears what is left
         return held.token == watch.token and held.worker != watch.worker and held.job.status in ACTIVE

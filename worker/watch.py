@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from enum import StrEnum
+from typing import TypeVar
 
 from pliant.client.schemas import Problem, Status
 from pliant.worker import lifecycle
@@ -24,6 +25,32 @@ logger = logging.getLogger(__name__)
 
 BEAT = 1.0
 """Seconds between signs of life; each also tells how the job stands."""
+
+
+Answer = TypeVar("Answer")
+
+
+class Patience:
+    """How long one still waits for a store that does not answer: one span of time for all that is asked within it."""
+
+    def __init__(self, seconds: float) -> None:
+        self._until = time.monotonic() + seconds
+
+    def ask(self, call: Callable[[], Answer]) -> Answer:
+        """Repeat what is asked or told until the store answers or the time is over; try once at least.
+
+        Raises
+        ------
+        StoreUnavailable
+            The store did not answer.
+        """
+        while True:
+            try:
+                return call()
+            except StoreUnavailable:
+                if time.monotonic() > self._until:
+                    raise
+                time.sleep(0.5)
 
 
 class Reason(StrEnum):
@@ -94,7 +121,7 @@ class Watch:
             self._cancelled = now
 
 
-def settle(watch: Watch, *, status: int, peak: int, patience: float) -> Stored | None:
+def settle(watch: Watch, *, status: int, peak: int, patience: Patience) -> Stored | None:
     """Write the record's last word for a horse that ended without one; one that spoke is left alone.
 
     Returns the record if there was something to write. The job's log has the reason and the end of the horse's own output
@@ -106,8 +133,8 @@ def settle(watch: Watch, *, status: int, peak: int, patience: float) -> Stored |
         As `os.wait4` returns it.
     peak : int
         The horse's largest resident size, bytes.
-    patience : float
-        Seconds to wait for a store that does not answer.
+    patience : Patience
+        With a store that does not answer.
 
     Raises
     ------
@@ -125,23 +152,11 @@ def settle(watch: Watch, *, status: int, peak: int, patience: float) -> Stored |
         return watch.records.update(watch.id, change)
 
     try:
-        settled = patiently(speak, seconds=patience)
+        settled = patience.ask(speak)
     except (StaleAttempt, UnknownJob):
         return None
     logger.warning("job %s: %s", watch.id, sentence)
     return settled
-
-
-def patiently(call: Callable[[], Stored], *, seconds: float) -> Stored:
-    """Repeat a write until the store answers, for a while."""
-    deadline = time.monotonic() + seconds
-    while True:
-        try:
-            return call()
-        except StoreUnavailable:
-            if time.monotonic() > deadline:
-                raise
-            time.sleep(0.5)
 
 
 def _verdict(watch: Watch, *, status: int, peak: int) -> Callable[[Stored], Stored]:

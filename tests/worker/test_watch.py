@@ -21,7 +21,7 @@ from pliant.worker.problems import how_it_ended, out_of_memory, problem_of, time
 from pliant.worker.processes import OomKills
 from pliant.worker.progress import SHARES, Teller
 from pliant.worker.records import Change, Records, Stored
-from pliant.worker.watch import Reason, Watch, patiently, settle
+from pliant.worker.watch import Patience, Reason, Watch, settle
 
 NOW = datetime(2030, 1, 1, tzinfo=UTC)
 KILLED = int(signal.SIGKILL)
@@ -52,7 +52,7 @@ def test_a_cancelled_attempt_is_killed_after_its_grace(jobs: Jobs, running: Call
     for time[0] in (0.5, 1.5, 4.0, 4.5):
         found.append(watch.must_end(stop_by=None))
     assert found == [None, None, None, Reason.CANCELLED], "noticed at the beat of 1.5 s, killed 3 s later"
-    after = settle(watch, status=KILLED, peak=0, patience=0)
+    after = settle(watch, status=KILLED, peak=0, patience=Patience(0))
     assert after is not None
     assert (after.job.status, after.job.error) == (Status.CANCELLED, None)
 
@@ -64,7 +64,7 @@ def test_an_attempt_that_ignores_its_time_limit_is_killed(running: Callable[...,
     assert watch.must_end(stop_by=None) is None
     time[0] = 13.0
     assert watch.must_end(stop_by=None) is Reason.TIMED_OUT
-    after = settle(watch, status=KILLED, peak=0, patience=0)
+    after = settle(watch, status=KILLED, peak=0, patience=Patience(0))
     assert after is not None
     assert after.job.error is not None
     assert (after.job.error.code, "10 s" in after.job.error.detail) == ("timed_out", True)
@@ -83,21 +83,21 @@ def test_a_worker_that_stops_puts_the_job_back_however_often(jobs: Jobs, running
     assert watch.must_end(stop_by=2.0) is None
     time[0] = 2.0
     assert watch.must_end(stop_by=2.0) is Reason.STOPPING
-    after = settle(watch, status=KILLED, peak=0, patience=0)
+    after = settle(watch, status=KILLED, peak=0, patience=Patience(0))
     assert after is not None
     assert (after.job.status, after.job.attempt, after.worker) == (Status.QUEUED, 1, None)
     assert after.token != watch.token
     assert watch.must_end(stop_by=2.0) is Reason.STOPPING
     time[0] = 3.0
     assert watch.must_end(stop_by=2.0) is Reason.STALE
-    assert settle(watch, status=KILLED, peak=0, patience=0) is None
+    assert settle(watch, status=KILLED, peak=0, patience=Patience(0)) is None
 
 
 def test_a_horse_that_is_killed_while_its_worker_stops_is_put_back(running: Callable[..., Watch]) -> None:
     for status, expected in ((KILLED, Status.QUEUED), (int(signal.SIGSEGV), Status.FAILED)):
         watch = running([0.0])
         assert watch.must_end(stop_by=100.0) is None
-        after = settle(watch, status=status, peak=0, patience=0)
+        after = settle(watch, status=status, peak=0, patience=Patience(0))
         assert after is not None
         assert after.job.status is expected
 
@@ -109,7 +109,7 @@ def test_an_attempt_that_lost_its_job_is_killed_at_once(jobs: Jobs, running: Cal
     jobs.records.update(watch.id, lambda held: lifecycle.stop(held, token=watch.token, now=NOW, retention=0))
     jobs.delete(watch.id)
     assert watch.must_end(stop_by=None) is Reason.STALE
-    assert settle(watch, status=KILLED, peak=0, patience=0) is None
+    assert settle(watch, status=KILLED, peak=0, patience=Patience(0)) is None
 
 
 def test_a_watch_outlasts_its_store(running: Callable[..., Watch], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -124,14 +124,14 @@ def test_a_watch_outlasts_its_store(running: Callable[..., Watch], monkeypatch: 
         assert watch.must_end(stop_by=None) is None
     monkeypatch.setattr(type(watch.records), "get", away)
     with pytest.raises(StoreUnavailable, match="try again"):
-        settle(watch, status=KILLED, peak=0, patience=0)
+        settle(watch, status=KILLED, peak=0, patience=Patience(0))
 
 
 def test_a_silent_death_is_told_from_one_for_want_of_memory(
     jobs: Jobs, running: Callable[..., Watch], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def code(watch: Watch, status: int, peak: int = 0) -> str:
-        after = settle(watch, status=status, peak=peak, patience=0)
+        after = settle(watch, status=status, peak=peak, patience=Patience(0))
         assert after is not None
         assert after.job.error is not None
         assert after.job.error.retryable
@@ -146,7 +146,9 @@ def test_a_silent_death_is_told_from_one_for_want_of_memory(
     assert code(starved, KILLED) == "out_of_memory"
     assert code(segfault, int(signal.SIGSEGV)) == "worker_lost", "the kernel kills the hungry with SIGKILL"
     jobs.records.update(quiet.id, lambda held: held.model_copy(update={"worker": "another"}))
-    assert settle(quiet, status=KILLED, peak=0, patience=0) is None, "a second delivery must not end the first"
+    assert settle(quiet, status=KILLED, peak=0, patience=Patience(0)) is None, (
+        "a second delivery must not end the first"
+    )
 
 
 def test_kernel_counters_are_whole_numbers_that_do_not_fall() -> None:
@@ -168,7 +170,7 @@ def test_patience_repeats_until_the_store_answers(jobs: Jobs, running: Callable[
             raise error
         return jobs.records.get(watch.id)
 
-    assert patiently(call, seconds=10) == jobs.records.get(watch.id)  # type: ignore[arg-type]
+    assert Patience(10).ask(call) == jobs.records.get(watch.id)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -254,6 +256,6 @@ def test_the_log_is_whole_before_the_record_is_final(
         return update(self, id, change)
 
     monkeypatch.setattr(type(jobs.records), "update", seen)
-    assert settle(watch, status=KILLED, peak=0, patience=0) is not None
+    assert settle(watch, status=KILLED, peak=0, patience=Patience(0)) is not None
     assert "SIGKILL" in logged[0]
     assert logged[1:] == ["Segmentation fault"] == jobs.records.log(watch.id)[1:]
