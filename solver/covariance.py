@@ -15,6 +15,7 @@ makes everything a matter of the 2F×2F Gram matrix W Wᵀ / P and independent o
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -153,11 +154,11 @@ def learned(gram: Floats, pairs: Floats, *, most: int = MOST_MODES, noisy: bool 
     noisy : bool
         Begin with all that is rough in the tracks as noise, not with hardly any.
     """
-    rounds = min(ITERATIONS, max(FEWEST, FRAMES // len(pairs)))
-    warm = freed(annealed(gram, pairs, most=most, noisy=noisy, iterations=rounds))
+    count = min(ITERATIONS, max(FEWEST, FRAMES // len(pairs)))
+    warm = freed(annealed(gram, pairs, most=most, noisy=noisy, iterations=count))
     runs = (
-        improve(warm, gram, pairs, iterations=rounds // 2, most=most),
-        improve(_scratch(gram, pairs, most, noisy=noisy), gram, pairs, iterations=rounds, most=most),
+        improve(warm, gram, pairs, iterations=count // 2, most=most),
+        improve(scratch(gram, pairs, most, noisy=noisy), gram, pairs, iterations=count, most=most),
     )
     return min(runs, key=lambda run: run.likelihood)
 
@@ -166,7 +167,7 @@ def annealed(
     gram: Floats, pairs: Floats, *, most: int = MOST_MODES, noisy: bool = False, iterations: int
 ) -> ShapeCovariance:
     """Return the covariance that so many annealed rounds find from scratch."""
-    start = _scratch(gram, pairs, most, noisy=noisy)
+    start = scratch(gram, pairs, most, noisy=noisy)
     return improve(start, gram, pairs, iterations=iterations, warm=WARM, most=most)
 
 
@@ -176,7 +177,8 @@ def freed(covariance: ShapeCovariance) -> ShapeCovariance:
     return replace(covariance, modes=np.hstack([covariance.modes, constant]))
 
 
-def _scratch(gram: Floats, pairs: Floats, most: int, *, noisy: bool) -> ShapeCovariance:
+def scratch(gram: Floats, pairs: Floats, most: int, *, noisy: bool) -> ShapeCovariance:
+    """Return a covariance to start from (`begin`), with the noise that `learned` says."""
     return begin(gram, pairs, noise=max(roughness(gram), QUIET) if noisy else QUIET, most=most)
 
 
@@ -223,6 +225,17 @@ def improve(
     """Return the covariance after rounds of expectation maximisation, with a floor of τ that falls from `warm` to `DRIFT_FLOOR`.
 
     At a constant floor no round makes the tracks less probable.
+    """
+    floors = np.geomspace(warm, DRIFT_FLOOR, iterations)
+    for better in rounds(covariance, gram, pairs, floors=floors, most=most):
+        covariance = better
+    return covariance
+
+
+def rounds(
+    covariance: ShapeCovariance, gram: Floats, pairs: Floats, *, floors: Floats, most: int = MOST_MODES
+) -> Iterator[ShapeCovariance]:
+    """Yield the covariance after every round of expectation maximisation, each with its floor of τ.
 
     With V = ΠΣΠᵀ + σ²I and K = V⁻¹(G − V)V⁻¹ every second moment of the posterior is a contraction of K: for a component with
     covariance D and image ΠD, E[xxᵀ] = D + (ΠD)ᵀ K (ΠD). Modes and drift are then the probabilistic principal components
@@ -230,7 +243,7 @@ def improve(
     """
     frames = len(pairs)
     rows = pairs.reshape(2 * frames, 3)
-    for floor in np.geomspace(warm, DRIFT_FLOOR, iterations):
+    for floor in floors:
         over_frames = covariance.over_frames()
         wide = np.repeat(np.repeat(over_frames, 2, axis=0), 2, axis=1)
         by_extent, by_play = rows @ covariance.extent, rows @ covariance.play
@@ -253,7 +266,7 @@ def improve(
             noise=max(covariance.noise * (1 + covariance.noise * float(np.trace(surplus)) / (2 * frames)), NOISE_FLOOR),
             likelihood=0.5 * (log_det + float(np.trace(explained))) / frames,
         )
-    return covariance
+        yield covariance
 
 
 def _split(over_frames: Floats, floor: float, most: int) -> tuple[Floats, float]:

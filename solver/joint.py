@@ -22,6 +22,7 @@ from pliant.solver.covariance import (
     learned,
     random_walk,
 )
+from pliant.solver.early import learned_in_time
 from pliant.solver.likelihood import Motion, Scene, cameras_of, covariances_of, fit, root_of
 from pliant.solver.records import Floats, read_only
 from pliant.solver.rotation import angles_between, exponential
@@ -123,29 +124,31 @@ def learn(
     zoom, why = None, None
     if turning and zooming and (start == 1).all():
         zoom, why = _zoom(unscaled, before, support, should_stop)
-    found = refined(
-        unscaled, before, np.ones(len(used)) if zoom is None else zoom, with_scales=zoom is not None,
-        rounds=ROUNDS if turning else 0, support=support, should_stop=should_stop,
-    )  # fmt: skip
-    if turning and support == Support() and coefficients.telling(found.covariance, estimate.sample.shape[1]):
-        found = _coupled(unscaled, found, with_scales=zoom is not None, should_stop=should_stop)
-    covariance = found.covariance
-    if np.isfinite(found.energy):
-        # From scratch: what the way to these cameras has left in the modes is worth less than it makes the tracks more probable.
-        pairs = found.rotations[:, :2] * found.scales[:, None, None]
-        support = supported(sample, pairs, spoiled=True) if spoiled else support
-        covariance = learned(unscaled, pairs, most=support.most, noisy=support.noisy)
+    rotations, scales = before, np.ones(len(used))
+    if turning:
+        found = refined(
+            unscaled, before, scales if zoom is None else zoom, with_scales=zoom is not None,
+            rounds=ROUNDS, support=support, should_stop=should_stop,
+        )  # fmt: skip
+        if support == Support() and coefficients.telling(found.covariance, estimate.sample.shape[1]):
+            found = _coupled(unscaled, found, with_scales=zoom is not None, should_stop=should_stop)
+        rotations, scales = found.rotations, found.scales
+    pairs = rotations[:, :2] * scales[:, None, None]
+    if spoiled and turning:
+        support = supported(sample, pairs, spoiled=True)
+    # From scratch: what the way to these cameras has left in the modes is worth less than it makes the tracks more probable.
+    covariance, modes = learned_in_time(sample, unscaled, pairs, support)
     if len(used) < frames:
         covariance = covariance.stretched(used, frames)
-    estimate = replace(estimate, reasons={**estimate.reasons, "modes": _why(covariance, support.most)})
+    estimate = replace(estimate, reasons={**estimate.reasons, "modes": modes})
     if not turning:
         return estimate, covariance
-    turns = Rotation.from_matrix(found.rotations @ before.transpose(0, 2, 1)).as_rotvec()
+    turns = Rotation.from_matrix(rotations @ before.transpose(0, 2, 1)).as_rotvec()
     whole = exponential(_between(used, turns, frames)) @ estimate.rotations
     if why is not None:
         estimate = replace(estimate, reasons={**estimate.reasons, "scales": why})
     if zoom is not None:
-        logs = _between(used, np.log(found.scales)[:, None], frames)[:, 0]
+        logs = _between(used, np.log(scales)[:, None], frames)[:, 0]
         scales = np.exp(logs - logs.mean())
         read_only(scales)
         estimate = replace(estimate, scales=scales)
@@ -235,13 +238,6 @@ def _zoom(
     return np.exp(logs - logs.mean()), (
         f"Scales from {least:.3f} to {largest:.3f} gain {gain:.3f} in the logarithm of the likelihood, per point and frame."
     )
-
-
-def _why(covariance: ShapeCovariance, most: int) -> str:
-    told = f"{covariance.modes.shape[1]} modes of deformation, noise of {covariance.noise**0.5:.2g} RMS radii"
-    if most == MOST_MODES:
-        return f"{told}."
-    return f"{told}; more than {most} modes, learned from some points, do not make the others more probable."
 
 
 def _unsteady(logs: Floats) -> float:

@@ -14,7 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from pliant.solver.covariance import MOST_MODES, annealed
+from pliant.solver.covariance import MOST_MODES, ShapeCovariance, annealed
 from pliant.solver.likelihood import NOISE_FLOOR
 from pliant.solver.noise import typical_roughness
 from pliant.solver.records import Floats
@@ -81,18 +81,22 @@ def _counts(frames: int) -> list[int]:
 
 
 def _judged(points: Floats, other: Floats, pairs: Floats, *, noisy: bool) -> Floats:
-    """Return the negative logarithm of the likelihood of other points, per point and frame, for each count of modes.
-
-    The tenth of the other points that is least probable does not count: what completion left of gross outliers.
-    """
+    """Return how improbable other points are for each count of modes."""
     frames = len(pairs)
     gram = points @ points.T / points.shape[1]
     counts = _counts(frames)
     energies = np.full(len(counts), np.inf)
     for index, most in enumerate(counts):
-        covariance = annealed(gram, pairs, most=most, noisy=noisy, iterations=ROUNDS)
-        factor = linalg.cho_factor(covariance.of_image(pairs), lower=True)
-        log_det = 2 * float(np.log(np.diag(factor[0])).sum())
-        each = np.sort((other * linalg.cho_solve(factor, other)).sum(axis=0))
-        energies[index] = 0.5 * (log_det + float(each[: -(-9 * len(each) // 10)].mean())) / frames
+        energies[index] = improbability(annealed(gram, pairs, most=most, noisy=noisy, iterations=ROUNDS), pairs, other)
     return energies
+
+
+def improbability(covariance: ShapeCovariance, pairs: Floats, other: Floats) -> float:
+    """Return the negative logarithm of the likelihood of points that were not learned from, per point and frame.
+
+    The tenth of them that is least probable does not count: what completion left of gross outliers.
+    """
+    factor = linalg.cho_factor(covariance.of_image(pairs), lower=True)
+    log_det = 2 * float(np.log(np.diag(factor[0])).sum())
+    each = np.sort((other * linalg.cho_solve(factor, other)).sum(axis=0))
+    return 0.5 * (log_det + float(each[: -(-9 * len(each) // 10)].mean())) / len(pairs)
