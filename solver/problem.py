@@ -69,7 +69,8 @@ def with_bending(
     """Return the same with λ2 from the shapes so far, if the prior is Gaussian and nobody set it."""
     if problem.quadratic is None or problem.laplacian is None or settings.spatial_weight is not None:
         return problem, choices, state
-    weight = bending_weight(problem.weights.temporal, problem.laplacian, state.shapes)
+    modes = problem.quadratic.modes[0].shape[1]
+    weight = bending_weight(problem.weights.temporal, problem.laplacian, state.shapes, modes)
     problem = replace(problem, weights=replace(problem.weights, spatial=weight))
     reason = f"{choices.reasons['weights']} λ2 = {weight:.2g} as the surface bends."
     choices = replace(choices, spatial_weight=weight, reasons={**choices.reasons, "weights": reason})

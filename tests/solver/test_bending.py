@@ -7,6 +7,7 @@ import pytest
 from pliant.solver import bending
 from pliant.solver.bending import add_bending, bends_of, frames_together
 from pliant.solver.laplacian import build_laplacian
+from pliant.solver.weights import bending_weight
 from waving_sheet import sheet, triangulated
 
 
@@ -36,3 +37,16 @@ def test_rounding_to_the_precision_there_is_changes_nothing() -> None:
 @pytest.mark.parametrize(("frames", "together"), [(1, 1), (3, 1), (10, 3), (32, 8), (800, 8)])
 def test_a_few_frames_leave_something_for_every_thread(frames: int, together: int) -> None:
     assert frames_together(frames) == together
+
+
+def test_the_weight_of_bending_follows_the_surface_and_the_modes() -> None:
+    laplacian = build_laplacian(triangulated(np.arange(42).reshape(6, 7)), "uniform")
+    assert laplacian is not None
+    shapes = np.random.default_rng(3).standard_normal((20, 3, 42))
+    whole = bending_weight(0.5, laplacian, shapes, 10)
+    assert bending_weight(0.5, laplacian, shapes, 15) == whole, (
+        "half as many modes as frames are all the bending there is"
+    )
+    assert bending_weight(0.5, laplacian, shapes, 5) == pytest.approx(whole / 2)
+    assert bending_weight(0.5, laplacian, 3 * shapes, 10) == pytest.approx(whole / 9)
+    assert bending_weight(1.0, laplacian, shapes, 10) == pytest.approx(2 * whole)
