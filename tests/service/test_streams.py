@@ -43,7 +43,8 @@ def test_a_listener_who_leaves_is_forgotten(restless: Running) -> None:
     with httpx.Client(base_url=restless.url, timeout=10) as http:
         job = submit(http, name="left")
         with http.stream("GET", f"/v1/jobs/{job.id}/events") as answer:
-            next(answer.iter_lines())
+            lines = answer.iter_lines()  # kept: an iterator that is dropped closes the connection
+            next(lines)
             until(lambda: service.followers.watched == 1)
         until(lambda: service.followers.watched == 0)
 
