@@ -59,12 +59,10 @@ def test_the_list_follows_a_running_job_that_is_not_shown(
     page: Page, url: str, finished: str, long_job: Callable[[str], str]
 ) -> None:
     page.goto(f"{url}/#job={finished}")
-    long_job("a job beside it")
+    with page.expect_request(re.compile(r"/events$"), timeout=DONE):
+        long_job("a job beside it")
     row = page.get_by_role("link", name="a job beside it")
-    asked: list[str] = []
-    page.on("request", lambda request: asked.append(request.url))
     expect(row).to_contain_text(re.compile(r"Running, \d+"), timeout=DONE)
-    until(lambda: any(address.endswith("/events") for address in asked))
     # With the list itself kept away, it is the events that move the bar.
     page.route(re.compile(r"/v1/jobs\?"), lambda route: route.abort())
     before = float(row.get_by_role("progressbar", include_hidden=True).get_attribute("value") or 0)
