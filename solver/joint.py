@@ -22,7 +22,7 @@ from pliant.solver.covariance import (
     learned,
     random_walk,
 )
-from pliant.solver.early import learned_in_time
+from pliant.solver.early import described, learned_in_time
 from pliant.solver.likelihood import Motion, Scene, cameras_of, covariances_of, fit, root_of
 from pliant.solver.records import Floats, read_only
 from pliant.solver.rotation import angles_between, exponential
@@ -124,7 +124,7 @@ def learn(
     zoom, why = None, None
     if turning and zooming and (start == 1).all():
         zoom, why = _zoom(unscaled, before, support, should_stop)
-    rotations, scales = before, np.ones(len(used))
+    rotations, scales, found = before, np.ones(len(used)), None
     if turning:
         found = refined(
             unscaled, before, scales if zoom is None else zoom, with_scales=zoom is not None,
@@ -133,11 +133,14 @@ def learn(
         if support == Support() and coefficients.telling(found.covariance, estimate.sample.shape[1]):
             found = _coupled(unscaled, found, with_scales=zoom is not None, should_stop=should_stop)
         rotations, scales = found.rotations, found.scales
-    pairs = rotations[:, :2] * scales[:, None, None]
-    if spoiled and turning:
-        support = supported(sample, pairs, spoiled=True)
-    # From scratch: what the way to these cameras has left in the modes is worth less than it makes the tracks more probable.
-    covariance, modes = learned_in_time(sample, unscaled, pairs, support)
+    if found is not None and not np.isfinite(found.energy):  # stopped
+        covariance, modes = found.covariance, described(found.covariance)
+    else:
+        # From scratch: what the way to these cameras has left in the modes is worth less than it makes the tracks more probable.
+        pairs = rotations[:, :2] * scales[:, None, None]
+        if spoiled and turning:
+            support = supported(sample, pairs, spoiled=True)
+        covariance, modes = learned_in_time(sample, unscaled, pairs, support, should_stop=should_stop)
     if len(used) < frames:
         covariance = covariance.stretched(used, frames)
     estimate = replace(estimate, reasons={**estimate.reasons, "modes": modes})

@@ -7,7 +7,7 @@ import pytest
 from camera_errors import degrees_apart
 from pliant.solver import KnownCamera, Settings, Tracks, gallery
 from pliant.solver.cameras import estimate_cameras, given_cameras
-from pliant.solver.completion import complete
+from pliant.solver.completion import RANKS, complete
 from pliant.solver.likelihood import Motion, Scene, energy, start
 from pliant.solver.metric_upgrade import upgrade
 from pliant.solver.normalise import normalise
@@ -184,5 +184,11 @@ def test_a_body_that_hides_its_back_is_completed(frames: int, points: int, most:
     whole = view(body.shapes, body.rotations) * body.scales[:, None, None] / normalised.unit
     rows = (whole - whole.mean(axis=1, keepdims=True)).transpose(0, 2, 1).reshape(2 * frames, -1)
     truth = rows @ rows.T / points
-    missed = np.linalg.norm(complete(normalised).gram - truth) / np.linalg.norm(truth)
+    found = complete(normalised)
+    missed = np.linalg.norm(found.gram - truth) / np.linalg.norm(truth)
     assert 0.01 < missed < most
+    np.testing.assert_array_equal(
+        complete(normalised, rank=found.rank).gram, found.gram
+    )  # the rank that was chosen is kept
+    smaller = complete(normalised, rank=RANKS[0])
+    assert smaller.rank == RANKS[0] < found.rank

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from pliant.solver import early
@@ -68,3 +70,16 @@ def test_fewer_modes_are_said() -> None:
     images = drawn(200, modes=2, drift=1e-6)
     _, why = learned_in_time(images, gram_of(images), PAIRS, Support(most=4))
     assert why.endswith("more than 4 modes, learned from some points, do not make the others more probable.")
+
+
+def test_a_stop_ends_the_judging(monkeypatch: pytest.MonkeyPatch) -> None:
+    images = drawn(30, modes=12, drift=0.03)
+    judged: list[float] = []
+
+    def counted(*given: Any) -> float:
+        judged.append(improbability(*given))
+        return judged[-1]
+
+    monkeypatch.setattr(early, "improbability", counted)
+    learned_in_time(images, gram_of(images), PAIRS, Support(), should_stop=lambda: True)
+    assert len(judged) == 2 * early.FOLDS, "one round of either way"
