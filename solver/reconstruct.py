@@ -36,7 +36,7 @@ from pliant.solver.seldom import SELDOM, OftenSeen, draw_the_rest, often_seen
 from pliant.solver.settings import Settings
 from pliant.solver.sheet import is_flat
 from pliant.solver.state import Problem, State
-from pliant.solver.trim import SPOILED, stiffness, without_outliers
+from pliant.solver.trim import SPOILED, without_outliers
 
 CAMERA_SHARE = 0.3
 """Share of the whole that progress gives to the cameras."""
@@ -241,9 +241,8 @@ def _with_the_rest(
     confidence = whole.confidence.copy()
     confidence[:, part.kept] = problem.confidence
     whole = replace(whole, confidence=confidence)
-    stiffer = stiffness(problem.weights, outliers) if outliers > SPOILED else 1.0
     seldom, never = 1 - len(part.kept) / confidence.shape[1], float((confidence == 0).all(axis=0).mean())
-    whole, state = draw_the_rest(part, whole, covariance, state, stiffer=stiffer)
+    whole, state = draw_the_rest(part, whole, covariance, state, spoiled=outliers > SPOILED)
     reason = (
         f"{seldom:.1%} of the points were seen in fewer than {SELDOM:.0%} of the frames ({never:.1%} in none): drawn along the "
         "surface, then moved to what was seen of them."

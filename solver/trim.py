@@ -34,7 +34,7 @@ FAR = 8.0
 """nor anything within this many robust standard deviations."""
 
 
-def stiffness(weights: Weights, outliers: float) -> float:
+def _stiffness(weights: Weights, outliers: float) -> float:
     """Return how many times stiffer than for the noise a fit must be that such a share of outliers does not bend."""
     return max(STIFF * outliers / weights.temporal, 1.0)
 
@@ -55,7 +55,7 @@ def without_outliers(
     """
     assert problem.quadratic is not None
     weights = problem.weights
-    stiffer = stiffness(weights, outliers)
+    stiffer = _stiffness(weights, outliers)
     stiff = replace(
         problem,
         weights=replace(weights, temporal=weights.temporal * stiffer, spatial=weights.spatial * stiffer),
