@@ -5,6 +5,7 @@
     python -m benchmarks.accuracy --data DIR --only face --corruptions all
     python -m benchmarks.accuracy --data DIR --plan        the whole table, part by part (see plan.py)
     python -m benchmarks.accuracy --tables                  print what has been measured so far, and the aims beside it
+    python -m benchmarks.accuracy --tables --into FILE      write all of it, in every metric, as a page of Markdown
     python -m benchmarks.accuracy --gate                    small gallery sequences against the committed baseline
 
 Every finished cell is a line of JSON in `--results`, with the commit that it was measured at; a second run skips what is there, or,
@@ -15,7 +16,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 
@@ -32,6 +33,8 @@ from benchmarks.tables import METRICS, clean_table, corruption_table, cost_table
 SLOW = 10.0
 """Seconds; three trials instead of five where a run takes longer."""
 
+VISIBILITIES = {"file": "Points hidden as the files state", "all": "Every point taken as seen"}
+
 
 def main() -> int:
     """Measure what is missing, then print the tables."""
@@ -43,7 +46,10 @@ def main() -> int:
             measure_all(argparse.Namespace(**{**vars(options), **asdict(part)}))
     elif not options.tables:
         measure_all(options)
-    print_tables(options)
+    if options.into is not None:
+        options.into.write_text(page(options))
+    else:
+        print("\n" + tables(options, options.visibility, options.metrics))
     return 0
 
 
@@ -100,23 +106,40 @@ def keys(case: Case, options: argparse.Namespace) -> Iterator[Key]:
                     )  # fmt: skip
 
 
-def print_tables(options: argparse.Namespace) -> None:
-    """Print Markdown for the rows that the options select."""
+def page(options: argparse.Namespace) -> str:
+    """Return all that has been measured, in every metric, as a page of Markdown."""
+    head = (
+        "# Accuracy, cell by cell\n\n"
+        "Written by `python -m benchmarks.accuracy --tables --into FILE` from the cells that `--data DIR --plan` measures; not by hand. "
+        "`true` and `estimated` say whose cameras; `default` is what a job gets that sets nothing. Corrupted: mean ± standard deviation "
+        "over the trials that the column of that name counts at most; – was not measured, or has no truth to compare with. "
+        "Metrics are defined in `solver/metrics.py`."
+    )
+    sections = [f"## {title}\n\n{tables(options, name, METRICS)}" for name, title in VISIBILITIES.items()]
+    return "\n\n".join([head, *sections]) + "\n"
+
+
+def tables(options: argparse.Namespace, visibility: str, metrics: Iterable[str]) -> str:
+    """Return Markdown for the rows that the options select."""
     rows = [
         row
         for row in read_rows(options.results).values()
         if wanted(row["case"], options.only) and row["settings"] == options.settings
-        and row["visibility"] == options.visibility and row["cameras"] in options.cameras and row["method"] in options.methods
+        and row["visibility"] == visibility and row["cameras"] in options.cameras and row["method"] in options.methods
     ]  # fmt: skip
-    for metric in options.metrics:
-        print(f"\n### {metric}, clean\n\n{clean_table(rows, metric)}")
-        for cameras in options.cameras:
-            if any(row["corruption"] != "clean" and row["cameras"] == cameras for row in rows):
-                print(f"\n### {metric}, corrupted, {cameras} cameras\n\n{corruption_table(rows, metric, cameras)}")
+    parts = []
+    for metric in metrics:
+        parts.append(f"### {metric}, clean\n\n{clean_table(rows, metric)}")
+        parts += [
+            f"### {metric}, corrupted, {cameras} cameras\n\n{corruption_table(rows, metric, cameras)}"
+            for cameras in options.cameras
+            if any(row["corruption"] != "clean" and row["cameras"] == cameras for row in rows)
+        ]
     commits = sorted({str(row.get("commit", "unknown")) for row in rows})
-    print(f"\n### Aims\n\n{aims_table(rows)}\n\n{len(rows)} cells, measured at {', '.join(commits) or '–'}")
+    parts.append(f"### Aims\n\n{aims_table(rows)}\n\n{len(rows)} cells, measured at {', '.join(commits) or '–'}")
     if {"true", "estimated"} <= set(options.cameras):
-        print(f"\n### e3d_frame, estimated over true cameras, clean\n\n{cost_table(rows, 'e3d_frame')}")
+        parts.append(f"### e3d_frame, estimated over true cameras, clean\n\n{cost_table(rows, 'e3d_frame')}")
+    return "\n\n".join(parts)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -127,7 +150,9 @@ def _parser() -> argparse.ArgumentParser:
 
     parser.add_argument("--data", type=Path, help="directory of sequences; the gallery when not given")
     parser.add_argument("--points", type=int, help="thin every sequence to so many points, keeping a mesh")
-    parser.add_argument("--visibility", choices=("file", "all"), default="file", help="all: take hidden points as seen")
+    parser.add_argument(
+        "--visibility", choices=list(VISIBILITIES), default="file", help="all: take hidden points as seen"
+    )
     parser.add_argument("--only", type=words, default=[], help="sequences whose name holds one of these words")
     parser.add_argument("--methods", type=words, default=list(METHODS))
     parser.add_argument("--cameras", type=words, default=["true", "estimated"])
@@ -139,6 +164,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--plan", action="store_true", help="the whole table of the recorded sequences; needs --data")
     parser.add_argument("--remeasure", action="store_true", help="measure cells of other commits anew")
     parser.add_argument("--tables", action="store_true", help="measure nothing")
+    parser.add_argument("--into", type=Path, help="write a page of every metric into this file instead of printing")
     parser.add_argument("--gate", action="store_true", help="exit 1 if a small sequence got worse than the baseline")
     parser.add_argument("--update-baseline", action="store_true", help="write the baseline anew")
     return parser

@@ -14,6 +14,8 @@ from benchmarks.cells import METHODS
 CORRUPTED = ("facescan10_rot90", "facescan99_rot30", "aura_anim_rot45", "akhter_drink")
 FACES = ("facescan10_rot90", "facescan99_rot30", "ict_beat_9k_rot30", "aura_anim_rot45")
 THINNED = 1_000
+SEEN = 700
+"""Points of the table that takes every point as seen, as those who published figures on these sequences do."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -22,6 +24,7 @@ class Part:
 
     only: tuple[str, ...] = ()
     points: int | None = None
+    visibility: str = "file"
     corruptions: tuple[str, ...] = ("clean",)
     cameras: tuple[str, ...] = ("true", "estimated")
     methods: tuple[str, ...] = field(default=tuple(METHODS))
@@ -30,6 +33,7 @@ class Part:
 
 PARTS = (
     Part(points=THINNED),
+    Part(points=SEEN, visibility="all", methods=("temporal", "robust", "default")),
     Part(methods=("default",)),
     Part(only=FACES, corruptions=("outliers 10",), cameras=("estimated",), methods=("default",), trials=1),
     Part(only=CORRUPTED, points=THINNED, corruptions=("all",)),

@@ -55,6 +55,11 @@ def test_accuracy_measures_once_and_resumes(tmp_path):
     assert "| tiny, 5 × 60 | outliers 6 % | 2 |" in first.stdout
     assert f"{len(rows)} cells, measured at {rows[0]['commit']}" in first.stdout
     assert "### e3d_frame, estimated over true cameras, clean" in first.stdout
+    page = tmp_path / "page.md"
+    assert run(*arguments, "--tables", "--into", page).stdout == ""
+    for metric in rows[0]["metrics"]:
+        assert f"### {metric}, clean" in page.read_text()
+    assert "## Every point taken as seen\n\n### e3d_frame, clean\n\n(nothing measured)" in page.read_text()
     kept = results.read_text()
     results.write_text(kept[:-40])  # the last line was cut off by an interruption
     again = run(*arguments)
