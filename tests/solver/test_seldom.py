@@ -72,6 +72,18 @@ def test_what_was_seen_of_a_seldom_seen_point_is_met_and_helps() -> None:
     assert errors[1] < 0.9 * errors[0]
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+def test_two_noisy_looks_from_one_side_do_not_send_a_point_off_in_depth(seed: int) -> None:
+    """They hardly tell how deep it is; of points that may be anywhere in the body the error would be three times that of no look."""
+    noise = np.random.default_rng(seed).normal(size=MADE.tracks.points.shape) * 0.02 * np.abs(TRUE).max()
+    errors = []
+    for shown in ((), (0, 1)):
+        tracks = seen_but(HOLE, shown=shown)
+        found = solve(Tracks.from_arrays(tracks.points + noise, tracks.visible), MADE.mesh, cameras=CAMERAS)
+        errors.append(np.linalg.norm((found.shapes - TRUE)[:, HOLE]))
+    assert errors[1] < 1.7 * errors[0]
+
+
 @pytest.mark.parametrize("seed", [5, 6])
 def test_outliers_of_seldom_seen_points_cost_hardly_more_than_not_seeing_them(seed: int) -> None:
     """Of three observations of a point one or two may be outliers: a fit to all of them would lose the good ones."""
@@ -97,13 +109,14 @@ def test_the_worst_of_the_observations_goes_first_and_the_rest_is_judged_without
     random = np.random.default_rng(seed)
     frames = 6
     root = random.normal(size=(2 * frames, 2 * frames))
-    expected = root @ root.T / 50 + 0.01 * np.eye(2 * frames)
+    image, scatter = root @ root.T / 50, 0.01
+    expected = image + scatter * np.eye(2 * frames)
     off = random.multivariate_normal(np.zeros(2 * frames), expected).reshape(frames, 2)
     off[random.random(frames) < 0.3] += 3.0
     confidence = (random.random((frames, 1)) < 0.8).astype(float)
     path = np.zeros((frames, 3, 1))
     problem = SimpleNamespace(points=off[:, :, None], projections=np.zeros((frames, 2, 3)))
-    kriging = Kriging(problem, np.zeros((frames, 2)), np.zeros((18, 12)), np.zeros((12, 12)), expected)  # type: ignore[arg-type]
+    kriging = Kriging(problem, np.zeros((frames, 2)), np.zeros((18, 12)), image, scatter)  # type: ignore[arg-type]
     left = np.flatnonzero(confidence[:, 0] > 0).tolist()
     while left:
         doubt = []
