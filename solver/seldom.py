@@ -6,9 +6,9 @@ it takes every point by itself. Therefore in two steps, from the shapes of the p
 
 - the surface is closed: among all positions of the others, those of least ‖A X‖² + μ Σ ‖x_i − x_j‖², the second sum over edges: a thin
   plate through their neighbours, under a little tension, for a plate alone that hangs on an edge goes on at its slope without end;
-- what was seen of a point, if anything, moves it off the plate. The deviation of its path has the learned covariance Σ, but for its mean
-  position, which is near the plate and not just anywhere in the body. So it is, with K = ΠΣΠᵀ + diag(λ1/ω) over its observations r, the
-  conditional mean Σ Πᵀ K⁻¹ r: kriging, the plate for its trend (Cressie, Statistics for Spatial Data, 1993, section 3.4). It meets
+- what was seen of a point, if anything, moves it off the plate. About its mean position its path has the learned covariance; the mean is
+  near the plate and not just anywhere in the body. With Σ for both, and K = ΠΣΠᵀ + diag(λ1/ω) over its observations r, it is moved by
+  the conditional mean Σ Πᵀ K⁻¹ r: kriging, the plate for its trend (Cressie, Statistics for Spatial Data, 1993, section 3.4). It meets
   what was seen and follows the modes of the body elsewhere.
 
 Where the tracks have gross outliers, those of such a point are found first, one after the other: the observation that is the least
@@ -56,14 +56,15 @@ ROUNDS = 3
 
 DOUBT = 5.0
 """Standard deviations beyond which an observation does not belong to the others of its point, if it is further than `GROSS` from where
-they expect it. Measured: animated head, 6 % outliers, three draws: .0729, .0690, .0585 with a fit to all of them, .0580, .0561, .0552
-without those in doubt; at 3.5 .0621, at 8 the same."""
+they expect it. Measured, 6 % outliers, known cameras, three draws: animated head .103, .095, .103 with a fit to all of them, .068, .057,
+.056 without those in doubt; galloping horse .248, .273, .350, and .058, .061, .058. At 6 head .059, .057, .056, horse .058, .064, .065."""
 
 NEAR = 0.1
-"""Share of the body's squared extents by which a mean position is expected off the plate. With all of them the little that was seen of a
-point may put its depth anywhere, as far as noise carries it. Measured, known cameras, noise of .01, all against this share: galloping
-horse .103 → .081, animated head .0742 → .0653, speaking head .0313 → .0282, dancer .152 → .148; clean the same. .03 is as good, but on
-the head (.072). Outliers are found alike with .005 to .1."""
+"""Share of the variance of the body's mean positions that a point's has off the plate. With all of it the little that was seen of a
+point may put its depth anywhere, as far as noise carries it. Measured, all against this share: noise of .01, known cameras, galloping
+horse .104 → .072, animated head .0741 → .0655, speaking head .0313 → .0282, dancer .152 → .150; clean, estimated cameras, .0562 → .0537,
+.0519 → .0524, .0221 → .0222, .124 → .122. With .3 noise costs horse .083 and head .067, with .03 .072 and .072. What the modes hold of the
+mean counts as such: estimated cameras leave much of it to them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -169,7 +170,10 @@ class Kriging:
     def of(cls, problem: Problem, covariance: ShapeCovariance, translations: Floats) -> Kriging:
         """Multiply the covariances out, once for all points."""
         frames, rows = len(problem.points), problem.projections.astype(np.float64)
-        each = covariance.over_frames() + NEAR * covariance.axes()[1][:, None, None]
+        moving = covariance.over_frames()
+        near = NEAR * (moving.mean() + covariance.axes()[1])
+        moving = moving - moving.mean(axis=0) - moving.mean(axis=1)[:, None] + moving.mean()  # about a path's mean
+        each = moving + near[:, None, None]
         reach = np.einsum("gic,cfg->fcgi", rows, each).reshape(3 * frames, 2 * frames)
         image = np.einsum("fic,fcm->fim", rows, reach.reshape(frames, 3, -1)).reshape(2 * frames, 2 * frames)
         return cls(problem, translations, reach, image, max(covariance.noise, (GROSS / 3) ** 2))
