@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from pliant.solver import KnownCamera, Mesh, Settings, Tracks, gallery, metrics, solve
+from pliant.solver.covariance import ShapeCovariance
 from pliant.solver.normalise import normalise
 from pliant.solver.seldom import DOUBT, LOOSE, SELDOM, Kriging, close_surface, often_seen
 from pliant.solver.trim import GROSS
@@ -82,6 +83,25 @@ def test_two_noisy_looks_from_one_side_do_not_send_a_point_off_in_depth(seed: in
         found = solve(Tracks.from_arrays(tracks.points + noise, tracks.visible), MADE.mesh, cameras=CAMERAS)
         errors.append(np.linalg.norm((found.shapes - TRUE)[:, HOLE]))
     assert errors[1] < 1.7 * errors[0]
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+def test_a_mode_that_never_changes_says_what_a_wider_extent_says(seed: int) -> None:
+    """Where the cameras are estimated too, learning leaves to the modes what belongs to the mean positions, or the other way round."""
+    random = np.random.default_rng(seed)
+    frames, share = int(random.integers(3, 12)), random.uniform(0.2, 2)
+    root, modes = random.normal(size=(3, 3)), random.normal(size=(frames, 2))
+    play = root @ root.T + 0.1 * np.eye(3)
+    extent = np.diag(random.uniform(0.1, 1, 3))
+    mode = np.full((frames, 1), share**0.5)
+    problem = SimpleNamespace(points=np.zeros((frames, 2, 1)), projections=random.normal(size=(frames, 2, 3)))
+    one, other = (
+        Kriging.of(problem, ShapeCovariance(a, play, m, 1e-3, 1e-4, 0.0), np.zeros((frames, 2)))  # type: ignore[arg-type]
+        for a, m in ((extent, np.hstack([modes, mode])), (extent + share * play, modes))
+    )
+    for name in ("reach", "image"):
+        expected = getattr(one, name)
+        np.testing.assert_allclose(getattr(other, name), expected, atol=1e-9 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("seed", [5, 6])
