@@ -50,8 +50,9 @@ LEAST_NOISE = 1e-12
 START_FRAMES, START_ROUNDS = 40, 2
 """Frames and refinements on which it is decided from which cameras to start."""
 
-ZOOM_FRAMES = 60
-"""Frames on which it is decided whether the camera zooms."""
+ZOOM_FRAMES = 120
+"""Frames on which it is decided whether the camera zooms. Few of many say less: of a mocap without any zoom, 1,102 frames with outliers,
+hidden points and noise, 60 frames gain .050 to .054 with scales, 120 gain .022, 180 lose."""
 
 ZOOM_ROUNDS = 2
 """Refinements on which it is decided."""
