@@ -113,7 +113,7 @@ def page(options: argparse.Namespace) -> str:
         "Written by `python -m benchmarks.accuracy --tables --into FILE` from the cells that `--data DIR --plan` measures; not by hand. "
         "`true` and `estimated` say whose cameras; `default` is what a job gets that sets nothing. Corrupted: mean ± standard deviation "
         "over the trials that the column of that name counts at most; – was not measured, or has no truth to compare with. "
-        "Metrics are defined in `solver/metrics.py`."
+        "Metrics are defined in `solver/evaluation/metrics.py`."
     )
     sections = [f"## {title}\n\n{tables(options, name, METRICS)}" for name, title in VISIBILITIES.items()]
     return "\n\n".join([head, *sections]) + "\n"

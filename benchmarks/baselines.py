@@ -17,10 +17,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from pliant.solver.energy import objective, residuals
-from pliant.solver.loss import loss_weights
-from pliant.solver.state import Problem
-from pliant.solver.temporal import differences
+from pliant.solver.energy.objective import objective, residuals
+from pliant.solver.energy.problem import Problem
+from pliant.solver.energy.robust_loss import loss_weights
+from pliant.solver.operators.finite_differences import differences
 from scipy import sparse
 from scipy.sparse.linalg import LinearOperator, cg, splu
 

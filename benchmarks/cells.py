@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 from pliant.solver import Settings, solve
+from pliant.solver.evaluation.metrics import evaluate
 from pliant.solver.gallery import corrupt_tracks
-from pliant.solver.metrics import evaluate
 
 from benchmarks.commit import commit
 from benchmarks.sequences import Case

@@ -29,8 +29,8 @@ from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
-from pliant.client.options import Options
-from pliant.client.schemas import Artifact, Interpretation, Job, Problem, Status
+from pliant.schemas.job import Artifact, Interpretation, Job, Problem, Status
+from pliant.schemas.options import Options
 
 CLIENTS = ("pyodm", "replicate", "pliant")
 SIZE = 24_000_000

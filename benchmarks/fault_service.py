@@ -10,7 +10,7 @@ import tempfile
 import time
 
 from pliant.client import Job, Status
-from pliant.client.parts import Rest
+from pliant.client.multipart import Rest
 from pliant.solver.gallery import face
 
 from benchmarks.fault_list import LARGE, SHORT, Told, cancelled, fault, said, submitted
@@ -138,7 +138,7 @@ def stopped(house: House) -> Told:
 def second(house: House) -> Told:
     id = submitted(house, options={"max_reweightings": 30})
     began = time.monotonic()
-    command = [sys.executable, "-m", "pliant.client.cli", "up", "--port", "0", "--data", str(house.settings.data)]
+    command = [sys.executable, "-m", "pliant.cli", "up", "--port", "0", "--data", str(house.settings.data)]
     ran = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
     seconds = time.monotonic() - began
     assert (ran.returncode, "already used" in ran.stderr) == (6, True), ran.stderr

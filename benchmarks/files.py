@@ -16,8 +16,8 @@ import tracemalloc
 from pathlib import Path
 
 import numpy as np
-from pliant.client.options import Options
-from pliant.client.schemas import Interpretation
+from pliant.schemas.job import Interpretation
+from pliant.schemas.options import Options
 from pliant.solver import Camera, Choices, Outcome, Solution, Trace
 from pliant.solver.gallery import face
 from pliant.worker.artifacts.kinds import kinds_for

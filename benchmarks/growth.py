@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
-from pliant.solver.parallel import available_cores
+from pliant.solver.threads import available_cores
 
 from benchmarks.apart import Measured, apart
 from benchmarks.side_by_side import Ours, Workload, run_ours

@@ -14,11 +14,11 @@ from functools import partial
 from pathlib import Path
 
 from pliant.client import Client, Job, Policy
-from pliant.service.incoming import Incoming
-from pliant.worker.audit import findings
+from pliant.service.spool import Incoming
 from pliant.worker.errors import StoreUnavailable
-from pliant.worker.jobs import Jobs
-from pliant.worker.processes import die_with_parent
+from pliant.worker.jobs.service import Jobs
+from pliant.worker.maintenance.fsck import findings
+from pliant.worker.processes.containment import die_with_parent
 from pliant.worker.settings import Settings
 
 SOON = {
@@ -73,7 +73,7 @@ class House:
 
     def start(self) -> None:
         """Start it; while the children of a killed one still hold the port or the directory, again, as a service manager does."""
-        command = [sys.executable, "-m", "pliant.client.cli", "up", "--json", "--port", str(self.port)]
+        command = [sys.executable, "-m", "pliant.cli", "up", "--json", "--port", str(self.port)]
         command += ["--data", str(self.folder / "data"), "--workers", str(self.workers)]
         environment = {**{k: v for k, v in os.environ.items() if not k.startswith("PLIANT_")}, **self.environment}
         self.folder.mkdir(parents=True, exist_ok=True)

@@ -37,7 +37,7 @@ MOST_BYTES = 320_000
 def service() -> Iterator[str]:
     """Run `pliant up` on a free port and an empty directory; yield its address."""
     with tempfile.TemporaryDirectory(prefix="pliant-page-") as data:
-        command = [sys.executable, "-m", "pliant.client.cli", "up", "--port", "0", "--json", "--data", data]
+        command = [sys.executable, "-m", "pliant.cli", "up", "--port", "0", "--json", "--data", data]
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as up:
             assert up.stdout is not None
             said = ""

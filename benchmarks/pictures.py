@@ -20,9 +20,9 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 from pliant.solver import Mesh, Settings, Solution, Tracks, solve
-from pliant.solver.alignment import align, frobenius, procrustes
+from pliant.solver.evaluation.alignment import align, frobenius, procrustes
+from pliant.solver.evaluation.metrics import e3d_sequence
 from pliant.solver.gallery import corrupt_tracks
-from pliant.solver.metrics import e3d_sequence
 
 from benchmarks.cells import parse_settings
 from benchmarks.raster import draw_mesh, draw_points

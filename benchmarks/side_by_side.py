@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 from pliant.solver import KnownCamera, Mesh, Settings, Solution, Tracks, solve
-from pliant.solver.cameras import CameraEstimate
-from pliant.solver.closed_form import pseudo_inverse, uniform_solution
+from pliant.solver.cameras.estimation import CameraEstimate
+from pliant.solver.energy.problem import Problem
+from pliant.solver.evaluation.metrics import e3d_frame
 from pliant.solver.gallery import corrupt_tracks, face
-from pliant.solver.metrics import e3d_frame
-from pliant.solver.normalise import normalise
-from pliant.solver.problem import build_problem
-from pliant.solver.state import Problem
+from pliant.solver.shapes.initialization import pseudo_inverse, uniform_solution
+from pliant.solver.shapes.setup import build_problem
+from pliant.solver.tracks.normalization import normalise
 
 from benchmarks import baselines
 from benchmarks.apart import Measured, Stopwatch, apart

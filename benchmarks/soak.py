@@ -20,16 +20,16 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from pliant.client.options import Options
-from pliant.client.schemas import Interpretation, Job, Status
+from pliant.schemas.job import Interpretation, Job, Status
+from pliant.schemas.options import Options
 from pliant.solver import gallery
-from pliant.worker.audit import findings
 from pliant.worker.errors import NotAllowedNow, StoreUnavailable
 from pliant.worker.formats import Inputs, save_inputs
-from pliant.worker.jobs import Jobs
+from pliant.worker.jobs.service import Jobs
+from pliant.worker.maintenance.fsck import findings
+from pliant.worker.processes.supervisor import Supervisor, valkey_child, worker_children
+from pliant.worker.processes.valkey import Valkey
 from pliant.worker.settings import Settings
-from pliant.worker.supervisor import Supervisor, valkey_child, worker_children
-from pliant.worker.valkey import Valkey
 
 FAULTS = ("kill horse", "kill worker", "stop worker for 5 s", "kill keeper", "kill Valkey", "SIGTERM worker", "cancel")
 OUTAGE = "Valkey hangs for 30 s"

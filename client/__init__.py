@@ -1,7 +1,7 @@
 """The wire contract, the SDK and the command line.
 
 ``from pliant.client import Client`` is the usual beginning. Names are looked up when first used, so that whoever needs only
-the wire contract (`pliant.client.schemas`) does not load NumPy and httpx.
+the wire contract (`pliant.schemas.job`) does not load NumPy and httpx.
 """
 
 if __name__ != "pliant.client":
@@ -11,8 +11,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from pliant.client.async_client import AsyncClient
     from pliant.client.async_remote import AsyncRemoteJob, AsyncResult
-    from pliant.client.asynchronous import AsyncClient
+    from pliant.client.client import Client
     from pliant.client.errors import (
         BadArgument,
         CorruptDownload,
@@ -33,10 +34,9 @@ if TYPE_CHECKING:
         UnexpectedAnswer,
         Unreachable,
     )
-    from pliant.client.options import Options
-    from pliant.client.policy import Policy
     from pliant.client.remote import RemoteJob, Result
-    from pliant.client.schemas import (
+    from pliant.client.retry import Policy
+    from pliant.schemas.job import (
         Artifact,
         Interpretation,
         Job,
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
         ServiceLimits,
         Status,
     )
-    from pliant.client.sync import Client
+    from pliant.schemas.options import Options
 
 _HOMES = {
     "errors": (
@@ -53,15 +53,18 @@ _HOMES = {
         "NotAuthorized", "NotFound", "NotGenuine", "NotLoaded", "PliantError", "Refused", "ServiceFailed", "TimeIsUp", "TooManyRequests",
         "UnexpectedAnswer", "Unreachable",
     ),
-    "options": ("Options",),
-    "policy": ("Policy",),
-    "schemas": ("Artifact", "Interpretation", "Job", "Problem", "Progress", "ServiceLimits", "Status"),
-    "asynchronous": ("AsyncClient",),
+    "retry": ("Policy",),
+    "async_client": ("AsyncClient",),
     "async_remote": ("AsyncRemoteJob", "AsyncResult"),
-    "sync": ("Client",),
+    "client": ("Client",),
     "remote": ("RemoteJob", "Result"),
 }  # fmt: skip
-_HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
+_HOME_OF = {name: f"pliant.client.{module}" for module, names in _HOMES.items() for name in names} | {
+    "Options": "pliant.schemas.options",
+    **dict.fromkeys(
+        ("Artifact", "Interpretation", "Job", "Problem", "Progress", "ServiceLimits", "Status"), "pliant.schemas.job"
+    ),
+}
 
 __all__ = [  # noqa: RUF022 - by use, not by alphabet
     "Client", "RemoteJob", "Result", "AsyncClient", "AsyncRemoteJob", "AsyncResult", "Policy", "Options",
@@ -75,7 +78,7 @@ __all__ = [  # noqa: RUF022 - by use, not by alphabet
 def __getattr__(name: str) -> object:
     if name not in _HOME_OF:
         raise AttributeError(f"module 'pliant.client' has no attribute {name!r}")
-    return getattr(import_module(f"pliant.client.{_HOME_OF[name]}"), name)
+    return getattr(import_module(_HOME_OF[name]), name)
 
 
 def __dir__() -> list[str]:

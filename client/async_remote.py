@@ -6,13 +6,13 @@ from collections.abc import AsyncIterator, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
-from pliant.client.parts import OnBytes
+from pliant.client.multipart import OnBytes
+from pliant.client.operations import OnJob
 from pliant.client.result import ANIMATION, LOADED, Reconstruction, copied
-from pliant.client.schemas import Job, Status
-from pliant.client.verbs import OnJob
+from pliant.schemas.job import Job, Status
 
 if TYPE_CHECKING:
-    from pliant.client.asynchronous import AsyncClient
+    from pliant.client.async_client import AsyncClient
 
 
 class AsyncRemoteJob:

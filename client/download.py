@@ -8,11 +8,11 @@ from pathlib import Path
 
 import httpx
 from pliant.client.errors import CorruptDownload
-from pliant.client.exchange import opened, pause_or_raise
 from pliant.client.flow import Call, Do, Flow, Head, Pull
-from pliant.client.parts import OnBytes
-from pliant.client.policy import Attempts
-from pliant.client.schemas import Artifact
+from pliant.client.multipart import OnBytes
+from pliant.client.retry import Attempts
+from pliant.client.transport import opened, pause_or_raise
+from pliant.schemas.job import Artifact
 
 
 def download(

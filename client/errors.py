@@ -29,7 +29,7 @@ from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
 from http import HTTPStatus
 
-from pliant.client.schemas import Job, Problem
+from pliant.schemas.job import Job, Problem
 from pydantic import ValidationError
 
 PROBLEM_TYPE = "application/problem+json"

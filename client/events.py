@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import httpx
 from pliant.client.errors import UnexpectedAnswer
-from pliant.client.exchange import opened, pause_or_raise, record
 from pliant.client.flow import Call, Emit, Flow, Pause, Pull
-from pliant.client.policy import Attempts
-from pliant.client.schemas import Job, Progress
+from pliant.client.retry import Attempts
+from pliant.client.transport import opened, pause_or_raise, record
+from pliant.schemas.job import Job, Progress
 from pydantic import ValidationError
 
 MEDIA_TYPE = "text/event-stream"

@@ -1,7 +1,7 @@
 """What a conversation with the service is made of, for the synchronous and the asynchronous client alike.
 
 A conversation ("flow") is a generator that yields what it wants done (open a call, pull the next bytes, pause …)
-and is sent what came of it. It does no input or output itself: `pliant.client.sync` and `pliant.client.asynchronous`
+and is sent what came of it. It does no input or output itself: `pliant.client.client` and `pliant.client.async_client`
 each drive flows in a few lines. So retries, deadlines and resumption are decided in one place, and tested without a network.
 """
 
@@ -11,7 +11,7 @@ from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
-from pliant.client.parts import Form, Rest
+from pliant.client.multipart import Form, Rest
 
 T = TypeVar("T")
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from pliant.client.schemas import Job, Progress, Status
+from pliant.schemas.job import Job, Progress, Status
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -11,7 +11,7 @@ from typing import Any
 import httpx
 from pliant.client.errors import BadArgument
 from pliant.client.flow import Call
-from pliant.client.parts import Rest
+from pliant.client.multipart import Rest
 
 CONNECT_TIMEOUT = 10.0
 """Seconds for a connection to come about."""

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 from pliant.client.errors import NotLoaded
-from pliant.client.schemas import Job
+from pliant.schemas.job import Job
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

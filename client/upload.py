@@ -13,11 +13,11 @@ from pathlib import Path
 import httpx
 from pliant.client.download import sha256
 from pliant.client.errors import NotFound, Refused, error_from
-from pliant.client.exchange import opened, parse, pause_or_raise, rest
 from pliant.client.flow import Call, Do, Flow, Open, Pause
-from pliant.client.parts import Form, Rest
-from pliant.client.policy import Attempts
-from pliant.client.schemas import Upload
+from pliant.client.multipart import Form, Rest
+from pliant.client.retry import Attempts
+from pliant.client.transport import opened, parse, pause_or_raise, rest
+from pliant.schemas.job import Upload
 
 LARGE = 32 * 2**20
 """Bytes of a submission's files together above which they are sent ahead."""

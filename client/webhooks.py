@@ -15,7 +15,7 @@ import time
 from collections.abc import Mapping
 
 from pliant.client.errors import BadArgument, NotGenuine
-from pliant.client.schemas import Job
+from pliant.schemas.job import Job
 from pydantic import ValidationError
 
 PREFIX = "whsec_"

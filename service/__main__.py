@@ -14,7 +14,7 @@ from fastapi import FastAPI
 from pliant.service.app import create_app
 from pliant.service.settings import InvalidServiceSetting, ServiceSettings
 from pliant.worker.errors import InvalidSetting, StoreUnavailable
-from pliant.worker.jobs import Jobs
+from pliant.worker.jobs.service import Jobs
 from pliant.worker.settings import Settings
 from pliant.worker.tokens import Tokens
 

@@ -8,24 +8,24 @@ from importlib.metadata import version
 
 import anyio
 from fastapi import FastAPI
-from pliant.service import describe, problems
-from pliant.service.auth import Authentication
-from pliant.service.core import Service
-from pliant.service.follow import Followers
-from pliant.service.guard import EVERY_ANSWER, OriginGuard, SecurityHeaders
-from pliant.service.incoming import Incoming
-from pliant.service.linger import LingeringClose
+from pliant.service import openapi, problems
+from pliant.service.dependencies import Service
+from pliant.service.event_stream import Followers
 from pliant.service.metrics import Counting, Requests
+from pliant.service.middleware.auth import Authentication
+from pliant.service.middleware.lingering_close import LingeringClose
+from pliant.service.middleware.origin import EVERY_ANSWER, OriginGuard, SecurityHeaders
+from pliant.service.middleware.rate_limit import RateLimit
 from pliant.service.page import mount_page
-from pliant.service.rates import RateLimit
-from pliant.service.routes import about, artifacts, events, examples, inspection, jobs, metrics, uploads
+from pliant.service.routes import artifacts, events, examples, inspection, jobs, meta, metrics, uploads
 from pliant.service.settings import ServiceSettings
-from pliant.service.turns import Turns
+from pliant.service.spool import Incoming
+from pliant.service.upload_locks import Turns
 from pliant.worker import errors
 from pliant.worker.formats import InvalidInput, Limits
-from pliant.worker.jobs import Jobs
+from pliant.worker.jobs.service import Jobs
 from pliant.worker.tokens import Tokens
-from pliant.worker.uploads import Uploads
+from pliant.worker.uploads.service import Uploads
 from starlette.middleware import Middleware
 from starlette.middleware.cors import CORSMiddleware
 from starlette.requests import ClientDisconnect
@@ -93,8 +93,8 @@ def create_app(
 
     app = FastAPI(
         title="Pliant",
-        summary=describe.SUMMARY,
-        description=describe.DESCRIPTION,
+        summary=openapi.SUMMARY,
+        description=openapi.DESCRIPTION,
         version=version("pliant"),
         lifespan=lifespan,
         middleware=middleware(settings, tokens, requests),
@@ -102,10 +102,10 @@ def create_app(
         redoc_url=None,
     )
     problems.install(app, STATUS_OF, careful=EVERY_ANSWER)
-    for each in (jobs, inspection, uploads, artifacts, events, about, metrics, examples):
+    for each in (jobs, inspection, uploads, artifacts, events, meta, metrics, examples):
         app.include_router(each.router)
     mount_page(app)
-    app.openapi = lambda: describe.document(app)  # type: ignore[method-assign]
+    app.openapi = lambda: openapi.document(app)  # type: ignore[method-assign]
     return app
 
 

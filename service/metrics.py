@@ -11,9 +11,9 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from datetime import UTC, datetime
 
-from pliant.client.schemas import Status
+from pliant.schemas.job import Status
 from pliant.worker.errors import StoreUnavailable
-from pliant.worker.jobs import Jobs
+from pliant.worker.jobs.service import Jobs
 from pliant.worker.records import RUN_SECONDS
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 

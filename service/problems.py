@@ -15,7 +15,7 @@ from typing import Any
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import Response
-from pliant.client.schemas import Problem
+from pliant.schemas.job import Problem
 from pydantic import ValidationError
 from starlette.exceptions import HTTPException
 

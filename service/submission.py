@@ -6,17 +6,17 @@ import json
 from pathlib import Path
 from typing import Any
 
-from pliant.client.options import Options
-from pliant.client.schemas import Interpretation, Job
-from pliant.service.forms import File, Form, FormRules
+from pliant.schemas.job import Interpretation, Job
+from pliant.schemas.options import Options
+from pliant.service.multipart import File, Form, FormRules
 from pliant.service.problems import Refusal, from_validation
 from pliant.service.settings import ServiceSettings
 from pliant.worker.artifacts import kinds_for
 from pliant.worker.errors import Conflict, UnknownUpload
 from pliant.worker.formats import Limits, store_inputs
-from pliant.worker.jobs import Jobs
-from pliant.worker.uploads import Uploads
-from pliant.worker.webhooks import parse_webhook
+from pliant.worker.jobs.service import Jobs
+from pliant.worker.uploads.service import Uploads
+from pliant.worker.webhooks.message import parse_webhook
 from pydantic import ValidationError
 
 FILES = frozenset({"tracks", "mesh", "ground_truth", "rotations"})

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from pliant.solver.errors import InvalidInput, InvalidSettings, NotFinite, SolverError
-    from pliant.solver.parallel import threads_limited
     from pliant.solver.reconstruct import solve
     from pliant.solver.records import Camera, Choices, KnownCamera, Mesh, Outcome, Solution, Step, Trace, Tracks
     from pliant.solver.settings import Settings
+    from pliant.solver.threads import threads_limited
 
 _HOMES = {
     "errors": (
@@ -24,7 +24,7 @@ _HOMES = {
         "NotFinite",
         "SolverError",
     ),
-    "parallel": ("threads_limited",),
+    "threads": ("threads_limited",),
     "reconstruct": ("solve",),
     "records": (
         "Camera",

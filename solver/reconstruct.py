@@ -7,17 +7,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from pliant.solver.cameras import CameraEstimate, estimate_cameras, given_cameras
-from pliant.solver.closed_form import pseudo_inverse, uniform_solution
-from pliant.solver.completion import seen_again
-from pliant.solver.covariance import ShapeCovariance
-from pliant.solver.energy import residuals
+from pliant.solver.cameras.estimation import CameraEstimate, estimate_cameras, given_cameras
+from pliant.solver.cameras.joint_refinement import learn, telling_frames
+from pliant.solver.cameras.planar_ambiguity import is_flat
+from pliant.solver.energy.objective import residuals
+from pliant.solver.energy.problem import Problem
+from pliant.solver.energy.robust_loss import largest_weight
 from pliant.solver.errors import InvalidInput
-from pliant.solver.iteration import init, no_higher, step, terminate
-from pliant.solver.joint import learn, telling_frames
-from pliant.solver.loss import largest_weight
-from pliant.solver.normalise import Normalised, normalise
-from pliant.solver.problem import build_problem, with_bending
+from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.records import (
     MIN_POINTS,
     Camera,
@@ -32,11 +29,16 @@ from pliant.solver.records import (
     Tracks,
     read_only,
 )  # fmt: skip
-from pliant.solver.seldom import SELDOM, OftenSeen, draw_the_rest, often_seen
 from pliant.solver.settings import Settings
-from pliant.solver.sheet import is_flat
-from pliant.solver.state import Problem, State
-from pliant.solver.trim import SPOILED, without_outliers
+from pliant.solver.shapes.initialization import pseudo_inverse, uniform_solution
+from pliant.solver.shapes.irls import init, no_higher, step, terminate
+from pliant.solver.shapes.outlier_rejection import without_outliers
+from pliant.solver.shapes.setup import build_problem, with_bending
+from pliant.solver.shapes.sparsely_observed import SELDOM, OftenSeen, draw_the_rest, often_seen
+from pliant.solver.shapes.state import State
+from pliant.solver.tracks.completion import seen_again
+from pliant.solver.tracks.noise import SPOILED
+from pliant.solver.tracks.normalization import Normalised, normalise
 
 CAMERA_SHARE = 0.3
 """Share of the whole that progress gives to the cameras."""

@@ -16,7 +16,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 @pytest.fixture(scope="session")
 def service_url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """Address of a running service; its jobs compute with one thread, so that their arrays can be compared bit for bit."""
-    from pliant.client.cli.demo import running
+    from pliant.cli.demo import running
 
     with running(tmp_path_factory.mktemp("service"), threads=1) as url:
         yield url

@@ -6,18 +6,23 @@ import ast
 import subprocess
 import sys
 import tomllib
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parent.parent
-FOLDERS = ("solver", "worker", "service", "client")
+FOLDERS = ("pliant", "schemas", "solver", "tracking", "worker", "service", "client", "cli")
+FOLDERS = tuple(folder for folder in FOLDERS if (ROOT / folder).is_dir())
 ALLOWED = {
+    "pliant": {"client", "solver"},
+    "schemas": {"schemas"},
     "solver": {"solver"},
-    "worker": {"worker", "solver", "client"},
-    "service": {"service", "worker", "client"},
-    "client": {"client"},
-    "client/cli": {"client", "worker", "service", "solver"},
+    "tracking": {"tracking", "schemas", "solver"},
+    "worker": {"worker", "solver", "tracking", "schemas"},
+    "service": {"service", "worker", "schemas"},
+    "client": {"client", "schemas"},
+    "cli": {"cli", "client", "worker", "service", "solver", "tracking", "schemas"},
 }
 AT_HOME = {
     "redis": {"worker"},
@@ -26,17 +31,20 @@ AT_HOME = {
     "obstore": {"worker"},
     "fastapi": {"service"},
     "starlette": {"service"},
-    "uvicorn": {"service", "client/cli"},
-    "typer": {"client/cli"},
-    "rich": {"client/cli", "client"},
-    "httpx": {"client", "client/cli", "worker"},
+    "uvicorn": {"service", "cli"},
+    "typer": {"cli"},
+    "rich": {"cli", "client"},
+    "httpx": {"client", "cli", "worker"},
     "scipy": {"solver", "worker"},
+    "cv2": {"tracking"},
+    "clarabel": {"solver"},
 }
+MOST_FILES = 16
+CROWDED = {"client": 20}
 
 
 def home_of(path: Path) -> str:
-    parts = path.relative_to(ROOT).parts
-    return "client/cli" if parts[:2] == ("client", "cli") else parts[0]
+    return path.relative_to(ROOT).parts[0]
 
 
 def imports_of(path: Path) -> list[tuple[str, bool]]:
@@ -62,26 +70,75 @@ def test_imports_follow_the_arrows(path: Path) -> None:
         name = module.split(".")
         if name[0] == "pliant" and len(name) > 1:
             assert name[1] in ALLOWED[home], f"{home} may not import {module}"
-            if home == "client/cli" and name[1] != "client":
+            if home == "cli" and name[1] not in {"cli", "client", "schemas"}:
                 assert not at_top, f"the command line imports {module} inside its functions only"
-            assert name[:3] != ["pliant", "client", "cli"] or home == "client/cli", "nobody imports the command line"
+            if home != "tracking" and name[1] == "tracking":
+                assert not at_top, f"{module} needs an extra: import it inside a function"
         elif name[0] in AT_HOME:
             assert home in AT_HOME[name[0]], f"{name[0]} is not at home in {home}"
         elif home == "solver":
-            assert name[0] in sys.stdlib_module_names | {"numpy"}, f"the solver uses numpy and scipy only, not {module}"
+            assert name[0] in sys.stdlib_module_names | {"numpy"}, f"the solver does not use {module}"
+
+
+def run_time_imports(path: Path) -> set[str]:
+    """Return the modules of Pliant that a file imports when it runs; those for type checkers alone do not count."""
+    tree = ast.parse(path.read_text())
+    for node in ast.walk(tree):
+        if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
+            node.body = []
+    found: set[str] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module is not None:
+            found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+    return {name for name in found if name.startswith("pliant.")}
+
+
+def rooms_below(folder: Path) -> dict[str, set[str]]:
+    """Return for each file and subfolder of a folder which of its siblings it imports."""
+    package = "pliant." + ".".join(folder.relative_to(ROOT).parts)
+    rooms: dict[str, set[str]] = {}
+    for path in sorted(folder.rglob("*.py")):
+        inside = path.relative_to(folder).parts
+        if inside[0] in {"__init__.py", "__main__.py"} or "node_modules" in inside:
+            continue
+        room = inside[0].removesuffix(".py")
+        imported = {
+            name[len(package) + 1 :].split(".")[0] for name in run_time_imports(path) if name.startswith(package + ".")
+        }
+        rooms.setdefault(room, set()).update(imported - {room})
+    return {room: {other for other in imported if other in rooms} for room, imported in rooms.items()}
+
+
+PACKAGES = sorted({path.parent for path in SOURCES if path.parent != ROOT / "pliant"})
+
+
+@pytest.mark.parametrize("folder", PACKAGES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_no_arrow_between_rooms_runs_back(folder: Path) -> None:
+    try:
+        tuple(TopologicalSorter(rooms_below(folder)).static_order())
+    except CycleError as error:
+        pytest.fail(f"imports run in a circle: {' -> '.join(error.args[1])}")
+
+
+@pytest.mark.parametrize("folder", PACKAGES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_a_room_holds_few_files(folder: Path) -> None:
+    files = [path.name for path in folder.glob("*.py")]
+    assert len(files) <= CROWDED.get(folder.name, MOST_FILES), f"{len(files)} Python files side by side: {files}"
 
 
 def test_every_code_folder_is_packaged() -> None:
     declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
     on_disk = {
-        "pliant." + ".".join(path.parent.relative_to(ROOT).parts)
+        ".".join(dict.fromkeys(("pliant", *path.parent.relative_to(ROOT).parts)))
         for folder in FOLDERS
         for path in (ROOT / folder).rglob("*.py")
     }
     assert set(declared) == on_disk
 
 
-@pytest.mark.parametrize("folder", FOLDERS)
+@pytest.mark.parametrize("folder", sorted({*FOLDERS} - {"pliant"}))
 def test_a_folder_is_not_importable_under_its_bare_name(folder: str) -> None:
     ran = subprocess.run(
         [sys.executable, "-c", f"import {folder}"], cwd=ROOT, capture_output=True, text=True, check=False

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pliant.client.cli.exits import Exit
+from pliant.cli.exits import Exit
 from pliant.solver.gallery import face
 
 ROOT = Path(__file__).parents[1]
@@ -152,7 +152,7 @@ def run(command: list[str], folder: Path, url: str, *, given: str | None = None)
 
 
 def test_every_command_and_exit_code_is_documented() -> None:
-    from pliant.client.cli import app
+    from pliant.cli import app
 
     text = (ROOT / "docs" / "cli.md").read_text()
     commands = {command.name for command in app.registered_commands}

@@ -11,20 +11,20 @@ import signal
 import sys
 from types import FrameType
 
-from pliant.worker.audit import findings
-from pliant.worker.connection import BLOCK_WITHIN, connect
 from pliant.worker.errors import WorkerError
-from pliant.worker.jobs import Jobs
-from pliant.worker.keeper import Keeper
-from pliant.worker.postman import Postman
-from pliant.worker.queue import RedisQueue
-from pliant.worker.redis_records import RedisRecords
-from pliant.worker.rq_worker import PliantWorker
+from pliant.worker.execution.rq_worker import PliantWorker
+from pliant.worker.jobs.service import Jobs
+from pliant.worker.maintenance.fsck import findings
+from pliant.worker.maintenance.reconciler import Keeper
 from pliant.worker.settings import NUMERICAL_THREADS, Settings
+from pliant.worker.store.connection import BLOCK_WITHIN, connect
+from pliant.worker.store.queue import RedisQueue
+from pliant.worker.store.redis import RedisRecords
+from pliant.worker.webhooks.sender import Postman
 
 USAGE = "usage: python -m pliant.worker [work|keep|audit]"
 
-PRELOADED = ("pliant.worker.formats.canonical", "pliant.worker.run")
+PRELOADED = ("pliant.worker.formats.canonical", "pliant.worker.execution.pipeline")
 
 WATCH_ANSWERS_WITHIN = 2.0
 """Seconds a sign of life may take: the watcher must go on watching when the store hangs."""

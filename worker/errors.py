@@ -27,7 +27,7 @@ Every one carries a stable `code`, a whole sentence (`str(error)`) and whether t
 
 from __future__ import annotations
 
-from pliant.client.schemas import Status
+from pliant.schemas.job import Status
 
 
 class WorkerError(Exception):

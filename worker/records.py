@@ -1,7 +1,7 @@
 """Job records: what is stored of a job, and the store that keeps it, as an interface.
 
 The record is the only truth about a job; RQ merely carries its token to a worker. Every change is a compare-and-set
-on the record's version, and every change an attempt makes checks the attempt's token first (`pliant.worker.lifecycle`).
+on the record's version, and every change an attempt makes checks the attempt's token first (`pliant.worker.jobs.lifecycle`).
 An attempt whose job was taken away can therefore write nothing.
 """
 
@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Sequence
 from datetime import UTC, datetime
 from typing import NamedTuple
 
-from pliant.client.schemas import Job, Status
+from pliant.schemas.job import Job, Status
 from pydantic import BaseModel, ConfigDict
 
 EVENTS_KEPT = 256

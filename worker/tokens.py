@@ -16,10 +16,10 @@ from enum import StrEnum
 from typing import Any
 
 import redis
-from pliant.worker.connection import connect, reachable
 from pliant.worker.errors import InvalidRequest, UnknownToken
 from pliant.worker.records import utc_now
 from pliant.worker.settings import Settings
+from pliant.worker.store.connection import connect, reachable
 from pydantic import BaseModel, ConfigDict
 
 PREFIX = "pliant_"

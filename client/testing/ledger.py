@@ -14,9 +14,9 @@ from datetime import UTC, datetime
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.client.options import Options
-from pliant.client.schemas import Artifact, Interpretation, Job, Problem, Progress, Status
 from pliant.client.testing.reading import Refusal
+from pliant.schemas.job import Artifact, Interpretation, Job, Problem, Progress, Status
+from pliant.schemas.options import Options
 
 
 @dataclass(kw_only=True)

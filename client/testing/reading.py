@@ -12,9 +12,9 @@ from typing import cast
 import httpx
 import numpy as np
 from numpy.typing import NDArray
-from pliant.client.options import Options
 from pliant.client.testing.refusal import Refusal as Refusal
 from pliant.client.testing.uploads import Uploads
+from pliant.schemas.options import Options
 from pydantic import ValidationError
 
 

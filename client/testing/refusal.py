@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from pliant.client.schemas import Problem
+from pliant.schemas.job import Problem
 
 
 class Refusal(Exception):

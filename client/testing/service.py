@@ -12,11 +12,11 @@ import httpx
 import numpy as np
 from numpy.typing import NDArray
 from pliant.client.errors import PROBLEM_TYPE
-from pliant.client.options import Options
-from pliant.client.schemas import JobPage, Problem, ServiceLimits, Status
 from pliant.client.testing.ledger import Entry, Ledger, understood
 from pliant.client.testing.reading import Refusal, inputs_of, options_of, tracks_of
 from pliant.client.testing.uploads import Uploads
+from pliant.schemas.job import JobPage, Problem, ServiceLimits, Status
+from pliant.schemas.options import Options
 
 Reconstruct = Callable[[NDArray[np.float64], Options], NDArray[np.float64]]
 """From points (F, P, 2) and options to shapes (F, P, 3)."""

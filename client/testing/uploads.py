@@ -7,8 +7,8 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from pliant.client.schemas import Upload
 from pliant.client.testing.refusal import Refusal
+from pliant.schemas.job import Upload
 
 
 @dataclass

@@ -7,9 +7,9 @@ from typing import Annotated
 
 from fastapi import APIRouter, Path, Request
 from fastapi.responses import Response, StreamingResponse
-from pliant.client.schemas import Artifact
-from pliant.service.core import Mine
-from pliant.service.describe import problems
+from pliant.schemas.job import Artifact
+from pliant.service.dependencies import Mine
+from pliant.service.openapi import problems
 from pliant.service.problems import Refusal
 from pliant.service.ranges import decide
 from pliant.service.routes.jobs import Id

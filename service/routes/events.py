@@ -10,8 +10,8 @@ from typing import Annotated
 from anyio import to_thread
 from fastapi import APIRouter, Header, Request
 from fastapi.responses import PlainTextResponse, Response, StreamingResponse
-from pliant.service.core import Core, Mine
-from pliant.service.describe import problems
+from pliant.service.dependencies import Core, Mine
+from pliant.service.openapi import problems
 from pliant.service.routes.jobs import Id
 from pliant.worker.errors import WorkerError
 from pliant.worker.records import Event

@@ -6,8 +6,8 @@ from typing import Annotated
 
 from fastapi import APIRouter, Path, Request
 from fastapi.responses import Response
-from pliant.client.schemas import Record
-from pliant.service.describe import problems
+from pliant.schemas.job import Record
+from pliant.service.openapi import problems
 from pliant.worker.examples import EXAMPLES, example_file
 
 router = APIRouter(prefix="/v1/examples", tags=["about"])

@@ -6,15 +6,15 @@ from pathlib import Path
 
 from anyio import to_thread
 from fastapi import APIRouter, Request
-from pliant.client.schemas import Inspection
-from pliant.service.core import Bound, Core, MyUploads
-from pliant.service.describe import SUBMIT_BODY, problems
-from pliant.service.forms import Form, receive_form
+from pliant.schemas.job import Inspection
+from pliant.service.dependencies import Bound, Core, MyUploads
+from pliant.service.multipart import Form, receive_form
+from pliant.service.openapi import SUBMIT_BODY, problems
 from pliant.service.sample import sample_of
 from pliant.service.submission import form_rules, parse_options, read_form, with_uploads
 from pliant.worker.formats import Limits, load_inputs
-from pliant.worker.formats.apart import LARGE
-from pliant.worker.uploads import Uploads
+from pliant.worker.formats.isolated_reader import LARGE
+from pliant.worker.uploads.service import Uploads
 
 router = APIRouter(prefix="/v1/inspect", tags=["jobs"])
 

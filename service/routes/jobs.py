@@ -7,12 +7,12 @@ from typing import Annotated
 
 from anyio import to_thread
 from fastapi import APIRouter, Header, Path, Query, Request, Response
-from pliant.client.schemas import Job, JobPage, Status
-from pliant.service.core import Bound, Bounds, Core, Mine, Service, my_uploads
-from pliant.service.describe import JOB_EXAMPLE, SUBMIT_BODY, problems
-from pliant.service.forms import receive_form
+from pliant.schemas.job import Job, JobPage, Status
+from pliant.service.dependencies import Bound, Bounds, Core, Mine, Service, my_uploads
+from pliant.service.multipart import receive_form
+from pliant.service.openapi import JOB_EXAMPLE, SUBMIT_BODY, problems
 from pliant.service.submission import accept, form_rules
-from pliant.worker.jobs import LARGEST_PAGE, Jobs
+from pliant.worker.jobs.service import LARGEST_PAGE, Jobs
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 

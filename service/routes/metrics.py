@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from fastapi import APIRouter
 from fastapi.responses import PlainTextResponse, Response
-from pliant.service.core import Core
-from pliant.service.describe import problems
+from pliant.service.dependencies import Core
 from pliant.service.metrics import MEDIA_TYPE, exposition
+from pliant.service.openapi import problems
 
 router = APIRouter(tags=["about"])
 

@@ -20,13 +20,13 @@ from typing import Annotated
 import anyio
 from anyio import to_thread
 from fastapi import APIRouter, Header, Path, Request, Response
-from pliant.client.schemas import Upload
-from pliant.service.core import Bounds, Core, MyUploads, Service, bounds_of
-from pliant.service.describe import problems
-from pliant.service.forms import batches
+from pliant.schemas.job import Upload
+from pliant.service.dependencies import Bounds, Core, MyUploads, Service, bounds_of
+from pliant.service.multipart import batches
+from pliant.service.openapi import problems
 from pliant.service.problems import Refusal
 from pliant.worker.errors import OffsetMismatch
-from pliant.worker.uploads import Room, Uploads, Writer
+from pliant.worker.uploads.service import Room, Uploads, Writer
 
 router = APIRouter(prefix="/v1/uploads", tags=["uploads"])
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 import yaml
-from pliant.client.cli import app
+from pliant.cli import app
 from pliant.worker.settings import VARIABLES
 from typer.main import get_command
 

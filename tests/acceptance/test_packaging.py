@@ -63,8 +63,8 @@ def test_the_installed_wheel_gives_a_working_command(archives: tuple[Path, Path]
         cwd=tmp_path,
     )
     program = (
-        f"import sys; sys.path.insert(0, {str(target)!r}); import pliant.client.cli, pliant.solver as s, pliant.service;"
-        f"assert s.__file__.startswith({str(target)!r}), s.__file__; sys.argv = ['pliant', '--version']; pliant.client.cli.main()"
+        f"import sys; sys.path.insert(0, {str(target)!r}); import pliant.cli, pliant.solver as s, pliant.service;"
+        f"assert s.__file__.startswith({str(target)!r}), s.__file__; sys.argv = ['pliant', '--version']; pliant.cli.main()"
     )
     # -S and the dependencies by hand keep the editable installation's import hook out.
     sites = [path for path in sys.path if path.endswith("site-packages")]

@@ -14,17 +14,17 @@ from typing import IO, Any
 import httpx
 import numpy as np
 import pytest
-from pliant.client.cli.demo import GOOD, judge, running
+from pliant.cli.demo import GOOD, judge, running
 from pliant.solver.gallery import corrupt, face
-from pliant.worker.jobs import Jobs
+from pliant.worker.jobs.service import Jobs
+from pliant.worker.processes.valkey import Valkey
 from pliant.worker.settings import Settings
-from pliant.worker.valkey import Valkey
 
 ENVIRONMENT = {name: value for name, value in os.environ.items() if not name.startswith("PLIANT_")}
 
 
 def pliant(*arguments: object, folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "pliant.client.cli", *map(str, arguments)]
+    command = [sys.executable, "-m", "pliant.cli", *map(str, arguments)]
     return subprocess.run(
         command,
         cwd=folder,
@@ -42,7 +42,7 @@ def arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 def test_the_demonstration_ends_with_files_that_play_and_an_honest_verdict(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "pliant.client.cli", "demo", "--small", "--keep", "--json"]
+    command = [sys.executable, "-m", "pliant.cli", "demo", "--small", "--keep", "--json"]
     process = subprocess.Popen(command, cwd=tmp_path, env=ENVIRONMENT, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     said = document(process.stdout)
@@ -82,7 +82,7 @@ def document(stream: IO[str]) -> dict[str, Any]:
 def test_work_serves_a_queue_until_it_is_told_to_stop(tmp_path: Path) -> None:
     valkey = Valkey.claim(tmp_path)
     server = valkey.start()
-    command = [sys.executable, "-m", "pliant.client.cli", "work", "--data", str(tmp_path), "--workers", "1", "--json"]
+    command = [sys.executable, "-m", "pliant.cli", "work", "--data", str(tmp_path), "--workers", "1", "--json"]
     process = subprocess.Popen(command, env=ENVIRONMENT, stdout=subprocess.PIPE, text=True)
     try:
         assert process.stdout is not None

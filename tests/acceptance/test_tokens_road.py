@@ -19,12 +19,12 @@ import numpy as np
 import pytest
 from browsing import Browsing, why_not
 from long_jobs import long_request
+from pliant.cli.demo import announced
+from pliant.cli.exits import Exit
 from pliant.client import AsyncClient, Client, NotAuthorized
-from pliant.client.cli.demo import announced
-from pliant.client.cli.exits import Exit
 from pliant.client.webhooks import new_secret, verified
 
-PLIANT = [sys.executable, "-m", "pliant.client.cli"]
+PLIANT = [sys.executable, "-m", "pliant.cli"]
 CLEAN = {name: value for name, value in os.environ.items() if not name.startswith("PLIANT_")}
 
 

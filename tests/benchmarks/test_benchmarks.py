@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from pliant.solver import KnownCamera, Mesh, Settings, solve
 from pliant.solver.gallery import corrupt, face, sphere
-from pliant.solver.normalise import normalise
+from pliant.solver.tracks.normalization import normalise
 
 ROOT = Path(__file__).parent.parent.parent
 

@@ -59,10 +59,10 @@ def test_both_clients_have_the_same_verbs_with_the_same_parameters(one: type, ot
 @pytest.mark.parametrize(
     ("module", "spared"),
     [
-        ("pliant.client.schemas", {"numpy", "httpx", "typer", "rich"}),
+        ("pliant.schemas.job", {"numpy", "httpx", "typer", "rich"}),
         ("pliant.client", {"numpy", "httpx", "pydantic", "typer", "rich", "matplotlib"}),
-        ("pliant.client.sync", {"typer", "scipy", "matplotlib", "fastapi", "redis", "rq", "pliant.solver", "pliant.worker"}),
-        ("pliant.client.cli", {"numpy", "scipy", "httpx", "pydantic", "fastapi", "redis", "rq", "pliant.solver", "pliant.worker"}),
+        ("pliant.client.client", {"typer", "scipy", "matplotlib", "fastapi", "redis", "rq", "pliant.solver", "pliant.worker"}),
+        ("pliant.cli", {"numpy", "scipy", "httpx", "pydantic", "fastapi", "redis", "rq", "pliant.solver", "pliant.worker"}),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )  # fmt: skip

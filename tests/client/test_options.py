@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import pytest
-from pliant.client.options import SOLVER_FIELDS, Options
+from pliant.schemas.options import SOLVER_FIELDS, Options
 from pliant.solver import Settings
 
 

@@ -10,7 +10,7 @@ import httpx
 import numpy as np
 import pytest
 from pliant.client import BadArgument, Client, NotLoaded, Options
-from pliant.client.parts import Form, array_part, checked_options, mesh_part, tracks_file
+from pliant.client.multipart import Form, array_part, checked_options, mesh_part, tracks_file
 from pliant.client.testing import FakeService
 from pliant.client.testing.reading import multipart
 

@@ -4,8 +4,8 @@ import json
 from datetime import UTC, datetime
 
 import pytest
-from pliant.client.options import Options
-from pliant.client.schemas import Interpretation, Job, Status
+from pliant.schemas.job import Interpretation, Job, Status
+from pliant.schemas.options import Options
 from pydantic import ValidationError
 
 

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pliant.cli.demo import announced
 from pliant.client import Client, Job, Policy, Status
-from pliant.client.cli.demo import announced
 from pliant.solver.gallery import face
 
 PATIENT = Policy(shortest_pause=0.1, longest_pause=0.5)
@@ -32,7 +32,7 @@ class Installation:
 
     def start(self) -> str:
         """Start it, again and again as a service manager does: the children of a killed one may hold the port for a moment."""
-        command = [sys.executable, "-m", "pliant.client.cli", "up", "--json", "--port", str(self.port)]
+        command = [sys.executable, "-m", "pliant.cli", "up", "--json", "--port", str(self.port)]
         deadline = time.monotonic() + 60
         while time.monotonic() < deadline:
             with (self.folder / "log").open("ab") as log:

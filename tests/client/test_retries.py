@@ -20,10 +20,10 @@ from pliant.client import (
 )
 from pliant.client import drive as driving
 from pliant.client.errors import seconds_of
-from pliant.client.exchange import record
 from pliant.client.flow import Call
-from pliant.client.schemas import Job
 from pliant.client.testing import FakeService
+from pliant.client.transport import record
+from pliant.schemas.job import Job
 
 POINTS = np.random.default_rng(0).normal(size=(4, 9, 2))
 

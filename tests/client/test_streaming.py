@@ -13,9 +13,9 @@ import pytest
 from pliant.client import AsyncClient, Client
 from pliant.client.download import download
 from pliant.client.drive import arun, run
-from pliant.client.policy import Attempts, Contact, Policy
-from pliant.client.schemas import Artifact
+from pliant.client.retry import Attempts, Contact, Policy
 from pliant.client.testing import FakeService
+from pliant.schemas.job import Artifact
 
 SIZE = 64 * 2**20
 ROOM = 4 * 2**20

@@ -13,7 +13,7 @@ import httpx
 import numpy as np
 import pytest
 from pliant.client import AsyncClient, Client, InvalidRequest, NotAllowedNow, Policy, Unreachable
-from pliant.client.parts import Rest
+from pliant.client.multipart import Rest
 from pliant.client.testing import FakeService
 
 PATIENT = Policy(shortest_pause=0.01, longest_pause=0.05)

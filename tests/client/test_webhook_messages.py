@@ -8,11 +8,11 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 from pliant.client import AsyncClient, BadArgument, Client, NotGenuine
-from pliant.client.options import Options
-from pliant.client.schemas import Interpretation, Job, Status
 from pliant.client.testing import FakeService
 from pliant.client.webhooks import new_secret, verified
-from pliant.worker.webhooks import message, parse_webhook, signed
+from pliant.schemas.job import Interpretation, Job, Status
+from pliant.schemas.options import Options
+from pliant.worker.webhooks.message import message, parse_webhook, signed
 
 NOW = 1_900_000_000
 SECRET = new_secret()

@@ -25,7 +25,7 @@ def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     command = [
         sys.executable,
         "-m",
-        "pliant.client.cli",
+        "pliant.cli",
         "up",
         "--port",
         "0",

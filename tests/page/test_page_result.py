@@ -115,7 +115,7 @@ def test_the_code_shown_makes_the_same_job(
     if language == "Python":
         command = [sys.executable, "-c", code]
     else:
-        program = f'pliant() {{ {sys.executable} -m pliant.client.cli "$@"; }}\n' + code.split("\n\n")[0]
+        program = f'pliant() {{ {sys.executable} -m pliant.cli "$@"; }}\n' + code.split("\n\n")[0]
         command = ["bash", "-c", program]
     ran = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=90, check=False)
     assert ran.returncode == 0, ran.stderr

@@ -14,10 +14,10 @@ import uvicorn
 from pliant.service.app import create_app
 from pliant.service.settings import ServiceSettings
 from pliant.worker.formats import Limits
-from pliant.worker.jobs import Jobs
+from pliant.worker.jobs.service import Jobs
+from pliant.worker.processes.valkey import Valkey
 from pliant.worker.settings import Settings
 from pliant.worker.tokens import Tokens
-from pliant.worker.valkey import Valkey
 from serving import Running, Serve, until
 
 

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import httpx
 import pytest
-from pliant.client.schemas import Status
+from pliant.schemas.job import Status
 from pliant.service.app import STATUS_OF
-from pliant.service.incoming import Incoming
 from pliant.service.settings import MB, InvalidServiceSetting, ServiceSettings
+from pliant.service.spool import Incoming
 from pliant.worker import errors
 from serving import Running, Serve, finish, submit, until
 
@@ -149,7 +149,7 @@ def test_every_error_of_the_worker_has_a_status() -> None:
 def test_while_the_store_hangs_everybody_is_told_soon_and_the_process_counts_as_alive(
     serve: Serve, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pliant.worker.connection.ANSWER_WITHIN", 2.0)
+    monkeypatch.setattr("pliant.worker.store.connection.ANSWER_WITHIN", 2.0)
     with socket.create_server(("127.0.0.1", 0), backlog=200) as deaf:  # the kernel accepts for it
         running = serve(redis_url=f"redis://127.0.0.1:{deaf.getsockname()[1]}")
         answers: list[int] = []

@@ -21,7 +21,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "support"))  # where pytest f
 from attack_files import ATTACKS, Attack
 from crafting import CANARY, HONEST
 from peaks import Watched, descendants, watched
-from pliant.client.cli.demo import running
+from pliant.cli.demo import running
 
 ROOT = Path(__file__).parents[2]
 DOCUMENT = ROOT / "docs" / "attacks.md"

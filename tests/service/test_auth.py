@@ -13,14 +13,14 @@ import httpx
 import numpy as np
 import pytest
 from pliant.client import AsyncClient, Client, NotAuthorized, NotFound
-from pliant.client.schemas import Job
+from pliant.schemas.job import Job
 from pliant.service import __main__ as process
 from pliant.service.app import create_app
-from pliant.service.auth import is_public, needed
+from pliant.service.middleware.auth import is_public, needed
 from pliant.service.settings import InvalidServiceSetting, ServiceSettings
-from pliant.worker.connection import connect
-from pliant.worker.jobs import Jobs
+from pliant.worker.jobs.service import Jobs
 from pliant.worker.settings import Settings
+from pliant.worker.store.connection import connect
 from pliant.worker.tokens import Scope, Tokens
 from serving import Running, Serve, finish, form, submit, tracks
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import httpx
 import pytest
-from pliant.service.guard import EVERY_ANSWER
+from pliant.service.middleware.origin import EVERY_ANSWER
 from serving import Running, Serve, finish, submit, until
 from starlette.requests import Request
 from starlette.responses import Response

@@ -5,7 +5,7 @@ from __future__ import annotations
 import httpx
 import numpy as np
 import pytest
-from pliant.client.schemas import Interpretation
+from pliant.schemas.job import Interpretation
 from serving import Running, form, npz, tracks
 
 POINTS = np.random.default_rng(1).normal(size=(6, 12, 2)) * 100

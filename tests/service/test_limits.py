@@ -8,8 +8,8 @@ import time
 import httpx
 import pytest
 from pliant.client import Client, TooManyRequests
-from pliant.client.policy import Policy
-from pliant.service.rates import MOST_CLIENTS, Rates, _who
+from pliant.client.retry import Policy
+from pliant.service.middleware.rate_limit import MOST_CLIENTS, Rates, _who
 from pliant.service.settings import USUAL_RATE, InvalidServiceSetting, ServiceSettings
 from pliant.worker.tokens import Scope
 from serving import Running, Serve, claim, form, submit, tracks

@@ -8,10 +8,10 @@ from typing import Any
 
 from pliant.service import metrics
 from pliant.service.app import create_app
-from pliant.service.auth import is_public, needed
+from pliant.service.middleware.auth import is_public, needed
 from pliant.service.settings import ServiceSettings
 from pliant.service.submission import FILES, TEXTS, UPLOADS
-from pliant.worker.jobs import Jobs
+from pliant.worker.jobs.service import Jobs
 from pliant.worker.settings import VARIABLES, Settings
 from pliant.worker.tokens import Tokens
 

@@ -6,9 +6,9 @@ from datetime import timedelta
 from pathlib import Path
 
 import httpx
-from pliant.client.schemas import Problem, Status
+from pliant.schemas.job import Problem, Status
 from pliant.service.metrics import Histogram, Requests, exposition
-from pliant.worker import lifecycle
+from pliant.worker.jobs import lifecycle
 from pliant.worker.tokens import Scope
 from prometheus_client.parser import text_string_to_metric_families
 from serving import NOW, Running, Serve, claim, finish, submit

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from hypothesis.errors import Unsatisfiable
 from pliant.service.app import create_app
 from pliant.service.settings import ServiceSettings
-from pliant.worker.jobs import Jobs
+from pliant.worker.jobs.service import Jobs
 from pliant.worker.settings import Settings
 from pliant.worker.tokens import Scope, Tokens
 from schemathesis.checks import not_a_server_error

@@ -62,7 +62,7 @@ def test_a_stream_ends_when_its_token_does(serve: Serve, how: str, monkeypatch: 
                 running.tokens.revoke(token.id)
             else:
                 later = utc_now() + timedelta(hours=2)
-                monkeypatch.setattr("pliant.service.auth.utc_now", lambda: later)
+                monkeypatch.setattr("pliant.service.middleware.auth.utc_now", lambda: later)
             begun = time.monotonic()
             rest = list(lines)
         assert time.monotonic() - begun < 5

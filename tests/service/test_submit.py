@@ -11,7 +11,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from pliant.client.schemas import Job, Problem, Status
+from pliant.schemas.job import Job, Problem, Status
 from pliant.worker.formats import Limits, load_inputs
 from serving import Running, Serve, claim, form, heard, npz, submit, tracks, until
 
@@ -300,7 +300,7 @@ def test_the_way_a_body_is_cut_does_not_matter(http: httpx.Client) -> None:
 
 
 def test_the_fingerprint_is_of_names_and_contents() -> None:
-    from pliant.service.forms import File, Form
+    from pliant.service.multipart import File, Form
 
     def made(**texts: str) -> str:
         return Form({"tracks": File(Path("x"), 1, hashlib.sha256(b"x").hexdigest())}, texts).fingerprint

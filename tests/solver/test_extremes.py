@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from pliant.solver import InvalidInput, KnownCamera, Mesh, Settings, Solution, Tracks, gallery, metrics, solve
+from pliant.solver import InvalidInput, KnownCamera, Mesh, Settings, Solution, Tracks, gallery, solve
+from pliant.solver.evaluation import metrics
 
 METHODS = ("pseudo_inverse", "temporal", "spatio_temporal", "robust")
 MADE = gallery.face(12, 120, degrees=45, mesh="triangles")

@@ -6,7 +6,8 @@ There, e3d of a sequence with outliers: pseudo-inverse .5084, temporal .1835, wi
 from __future__ import annotations
 
 import pytest
-from pliant.solver import KnownCamera, Settings, gallery, metrics, solve
+from pliant.solver import KnownCamera, Settings, gallery, solve
+from pliant.solver.evaluation import metrics
 
 FACE = gallery.face(24, 400)
 

@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from pliant.solver import Camera, KnownCamera, Mesh, Settings, Solution, Tracks, gallery, metrics, solve
+from pliant.solver import Camera, KnownCamera, Mesh, Settings, Solution, Tracks, gallery, solve
+from pliant.solver.evaluation import metrics
 
 CLOSE = 2e-4
 """Relative difference that conjugate gradients, stopped at a reduction and not at the exact answer, may leave."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from pliant.solver.rotation import MIRROR, angles_between, nearest
+from pliant.solver.model.so3 import MIRROR, angles_between, nearest
 
 
 def degrees_apart(found: np.ndarray, truth: np.ndarray) -> float:

@@ -28,8 +28,8 @@ sys.path.insert(0, str(Path(__file__).parent))
 from attack_files import HDF5, HEADERS, MAT5, MESHES, TEXT, ZIPS
 from crafting import BINARY, GFACES, HONEST, OBJ_POINTS, archive, glb, gltf, mat5, ply, png
 from pliant.solver import InvalidInput
-from pliant.worker.formats.arrays import read_npy, read_npz
-from pliant.worker.formats.parsers import PARSERS, parse
+from pliant.worker.formats.reading.arrays import read_npy, read_npz
+from pliant.worker.formats.reading.parsers import PARSERS, parse
 from pliant.worker.formats.records import Arrays, Limits
 
 SMALL = Limits(max_bytes=4 << 20, max_points=5000, max_faces=20_000, max_members=16)

@@ -6,12 +6,12 @@ from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
-from pliant.worker import lifecycle
-from pliant.worker.blobs import Blobs
-from pliant.worker.jobs import Jobs
-from pliant.worker.keeper import Keeper
-from pliant.worker.memory import MemoryQueue, MemoryRecords
+from pliant.worker.jobs import lifecycle
+from pliant.worker.jobs.service import Jobs
+from pliant.worker.maintenance.reconciler import Keeper
 from pliant.worker.settings import Settings
+from pliant.worker.store.blobs import Blobs
+from pliant.worker.store.memory import MemoryQueue, MemoryRecords
 
 
 class World:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from pliant.client.options import Options
-from pliant.client.schemas import Interpretation
+from pliant.schemas.job import Interpretation
+from pliant.schemas.options import Options
 from pliant.solver import Camera, Choices, Mesh, Outcome, Solution, Trace, Tracks
 from pliant.worker.formats import GroundTruth, Inputs
 

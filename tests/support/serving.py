@@ -17,10 +17,10 @@ import httpx
 import numpy as np
 import uvicorn
 from fastapi import FastAPI
-from pliant.client.schemas import Artifact, Job
+from pliant.schemas.job import Artifact, Job
 from pliant.service.settings import ServiceSettings
-from pliant.worker import lifecycle
-from pliant.worker.jobs import Jobs
+from pliant.worker.jobs import lifecycle
+from pliant.worker.jobs.service import Jobs
 from pliant.worker.tokens import Scope, Tokens
 
 NOW = datetime(2026, 5, 4, 9, 30, tzinfo=UTC)

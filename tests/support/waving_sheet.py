@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 from pliant.solver import KnownCamera, Mesh, Settings, Tracks
-from pliant.solver.cameras import CameraEstimate
-from pliant.solver.normalise import normalise
-from pliant.solver.problem import build_problem
-from pliant.solver.state import Problem
+from pliant.solver.cameras.estimation import CameraEstimate
+from pliant.solver.energy.problem import Problem
+from pliant.solver.shapes.setup import build_problem
+from pliant.solver.tracks.normalization import normalise
 
 
 def turning(num_frames: int, degrees: float) -> np.ndarray:

@@ -8,15 +8,15 @@ from collections.abc import Callable
 from pathlib import Path
 
 from long_jobs import LONG, long_sequence
-from pliant.client.options import Options
-from pliant.client.schemas import Interpretation, Job, Status
+from pliant.schemas.job import Interpretation, Job, Status
+from pliant.schemas.options import Options
 from pliant.solver import KnownCamera, Mesh, Tracks, gallery
-from pliant.worker.audit import findings
 from pliant.worker.formats import GroundTruth, Inputs, save_inputs
-from pliant.worker.jobs import Jobs
+from pliant.worker.jobs.service import Jobs
+from pliant.worker.maintenance.fsck import findings
+from pliant.worker.processes.supervisor import Child, Supervisor, valkey_child, worker_children
+from pliant.worker.processes.valkey import Valkey
 from pliant.worker.settings import Settings
-from pliant.worker.supervisor import Child, Supervisor, valkey_child, worker_children
-from pliant.worker.valkey import Valkey
 
 SHORT = Options(max_reweightings=3)
 

@@ -14,16 +14,16 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from pliant.client.options import Options
-from pliant.client.schemas import Interpretation, Job
-from pliant.worker.blobs import Blobs
-from pliant.worker.connection import connect
-from pliant.worker.jobs import Jobs
-from pliant.worker.memory import MemoryQueue, MemoryRecords
-from pliant.worker.queue import RedisQueue
-from pliant.worker.redis_records import RedisRecords
+from pliant.schemas.job import Interpretation, Job
+from pliant.schemas.options import Options
+from pliant.worker.jobs.service import Jobs
+from pliant.worker.processes.valkey import Valkey
 from pliant.worker.settings import Settings
-from pliant.worker.valkey import Valkey
+from pliant.worker.store.blobs import Blobs
+from pliant.worker.store.connection import connect
+from pliant.worker.store.memory import MemoryQueue, MemoryRecords
+from pliant.worker.store.queue import RedisQueue
+from pliant.worker.store.redis import RedisRecords
 from worker_house import make_inputs, make_long_inputs
 
 NANIO = shutil.which("nanio", path=f"{sysconfig.get_path('scripts')}:{Path(sys.executable).parent}")

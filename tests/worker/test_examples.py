@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pliant.client.options import Options
+from pliant.schemas.options import Options
 from pliant.worker.errors import UnknownExample
 from pliant.worker.examples import EXAMPLES, example_file
 from pliant.worker.formats import read_inputs

@@ -5,9 +5,9 @@ import secrets
 from datetime import UTC, datetime, timedelta
 
 import pytest
-from pliant.worker.connection import connect
 from pliant.worker.errors import InvalidRequest, StoreUnavailable, UnknownToken
 from pliant.worker.settings import Settings
+from pliant.worker.store.connection import connect
 from pliant.worker.tokens import Scope, Token, Tokens, parse_duration
 
 

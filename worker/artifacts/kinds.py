@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from typing import IO, Any
 
 import numpy as np
-from pliant.client.options import Options, Output
+from pliant.schemas.options import Options, Output
 from pliant.solver import InvalidInput
-from pliant.worker import preview
-from pliant.worker.artifacts import matlab, usd
+from pliant.worker.artifacts import matlab, preview, usd
 from pliant.worker.artifacts.animation import animate
 from pliant.worker.artifacts.colours import linear
 from pliant.worker.artifacts.frames_zip import OnProgress, write_obj_zip, write_ply_zip

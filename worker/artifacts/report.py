@@ -11,7 +11,7 @@ from dataclasses import asdict
 from importlib.metadata import version
 from typing import Any
 
-from pliant.client.options import Options
+from pliant.schemas.options import Options
 from pliant.solver import Solution
 from pliant.worker.formats import Inputs
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from pliant.client.options import Options
+from pliant.schemas.options import Options
 from pliant.solver import Solution
-from pliant.solver.metrics import point_errors
+from pliant.solver.evaluation.metrics import point_errors
 from pliant.worker.artifacts.colours import Painting
 from pliant.worker.artifacts.geometry import Floats, Ints, upright
 from pliant.worker.formats import Inputs

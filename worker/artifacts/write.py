@@ -10,8 +10,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
 
-from pliant.client.options import Options
-from pliant.client.schemas import Artifact
+from pliant.schemas.job import Artifact
+from pliant.schemas.options import Options
 from pliant.solver import Solution
 from pliant.worker.artifacts.frames_zip import OnProgress
 from pliant.worker.artifacts.kinds import Kind, kinds_for

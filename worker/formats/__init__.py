@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from pliant.solver import InvalidInput
-    from pliant.worker.formats.apart import store_inputs
     from pliant.worker.formats.canonical import load_inputs, save_inputs
     from pliant.worker.formats.errors import AmbiguousInput
+    from pliant.worker.formats.isolated_reader import store_inputs
     from pliant.worker.formats.read import read_inputs
     from pliant.worker.formats.records import GroundTruth, Inputs, Limits
 
@@ -23,7 +23,7 @@ _HOME_OF = {
     "load_inputs": "pliant.worker.formats.canonical",
     "read_inputs": "pliant.worker.formats.read",
     "save_inputs": "pliant.worker.formats.canonical",
-    "store_inputs": "pliant.worker.formats.apart",
+    "store_inputs": "pliant.worker.formats.isolated_reader",
 }
 
 __all__ = [

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.client.schemas import Interpretation
+from pliant.schemas.job import Interpretation
 from pliant.solver import KnownCamera, Mesh, Tracks
-from pliant.worker.formats.arrays import read_file
 from pliant.worker.formats.errors import damaged
+from pliant.worker.formats.reading.arrays import read_file
 from pliant.worker.formats.records import Arrays, GroundTruth, Inputs, Limits, Selection
 
 VERSION = 1

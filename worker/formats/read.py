@@ -7,19 +7,19 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.client.options import Options
-from pliant.client.schemas import Interpretation
+from pliant.schemas.job import Interpretation
+from pliant.schemas.options import Options
 from pliant.solver import InvalidInput, Mesh, Tracks
-from pliant.worker.formats.contain import read_arrays
-from pliant.worker.formats.dialects import KNOWN
 from pliant.worker.formats.errors import refusal, too_large
-from pliant.worker.formats.interpret import Understood, understand
+from pliant.worker.formats.ground_truth import read_rotations, read_truth
+from pliant.worker.formats.meshes.surface import read_surface, whole_grid
+from pliant.worker.formats.meshes.triangulation import triangulate
+from pliant.worker.formats.reading.containers import read_arrays
 from pliant.worker.formats.records import FARTHEST, GroundTruth, Inputs, Limits, Selection
-from pliant.worker.formats.selection import chosen_frames, hide_seldom_seen
-from pliant.worker.formats.surface import read_surface, whole_grid
-from pliant.worker.formats.thinning import thin
-from pliant.worker.formats.triangulate import triangulate
-from pliant.worker.formats.truth import read_rotations, read_truth
+from pliant.worker.formats.tracks.decimation import thin
+from pliant.worker.formats.tracks.interpretation import Understood, understand
+from pliant.worker.formats.tracks.selection import chosen_frames, hide_seldom_seen
+from pliant.worker.formats.tracks.tracker_formats import KNOWN
 
 LISTED = 1000
 """Most left-out points that the interpretation lists by number."""

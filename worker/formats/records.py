@@ -11,7 +11,7 @@ from pliant.solver import KnownCamera, Mesh, Tracks
 from pliant.worker.formats.errors import refusal
 
 if TYPE_CHECKING:  # a contained child needs none of it
-    from pliant.client.schemas import Interpretation
+    from pliant.schemas.job import Interpretation
 
 Arrays = dict[str, NDArray[np.generic]]
 """Named arrays as a file holds them, not yet interpreted; members of nested structures have dotted names."""

@@ -1,4 +1,4 @@
-// The wire contract, as the page reads it. client/schemas.py is where it is defined.
+// The wire contract, as the page reads it. schemas/job.py is where it is defined.
 
 export type Status = "queued" | "running" | "cancelling" | "succeeded" | "failed" | "cancelled";
 

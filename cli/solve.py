@@ -1,0 +1,124 @@
+"""`pliant solve` and `pliant inspect`: files in, files out, in this very process."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from pliant.cli.session import GroundTruth, Json, Mesh, OptionPairs, Rotations, Tracks, parse_options
+from pliant.cli.show import err, metrics_table, out, print_json, understood
+
+if TYPE_CHECKING:
+    from pliant.schemas.job import Interpretation
+    from pliant.worker.execution.pipeline import Finished
+
+Threads = Annotated[
+    int | None,
+    typer.Option("--threads", help="Threads to use; all cores if not given.", min=1),
+]
+
+
+def solve(
+    ctx: typer.Context,
+    tracks: Tracks,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the files.", show_default=False)],
+    mesh: Mesh = None,
+    ground_truth: GroundTruth = None,
+    rotations: Rotations = None,
+    option: OptionPairs = None,
+    threads: Threads = None,
+    as_json: Json = False,
+) -> None:
+    """Reconstruct without a service: the same code, the same files."""
+    ctx.obj.json = as_json
+    from pliant.worker.settings import NUMERICAL_THREADS
+
+    # Read by the numerical libraries when they are loaded, which is after this; the solver has threads of its own.
+    os.environ.update(dict.fromkeys(NUMERICAL_THREADS, "1"))
+    from pliant.client.multipart import checked_options
+    from pliant.client.progress import progress_bar
+    from pliant.solver import threads_limited
+    from pliant.worker.execution.pipeline import reconstruct
+    from pliant.worker.formats import read_inputs
+
+    options = checked_options(parse_options(option))
+    inputs = read_inputs(
+        tracks=tracks, mesh=file_or_word(mesh), ground_truth=ground_truth, rotations=rotations, options=options
+    )
+    if not as_json:
+        show_understood(inputs.interpretation)
+    with progress_bar() as bar, threads_limited(threads):
+        done = reconstruct(inputs, options, output, on_progress=bar.on_step, should_stop=None)
+    show_finished(done, output, as_json=as_json)
+
+
+def inspect(
+    ctx: typer.Context,
+    file: Annotated[Path, typer.Argument(help="Track file.", show_default=False)],
+    mesh: Mesh = None,
+    ground_truth: GroundTruth = None,
+    rotations: Rotations = None,
+    option: OptionPairs = None,
+    url: Annotated[
+        str, typer.Option("--url", help="Ask this service instead of this installation.", metavar="URL")
+    ] = "",
+    as_json: Json = False,
+) -> None:
+    """Say how a track file is understood, without solving anything."""
+    ctx.obj.json = as_json
+    options = parse_options(option)
+    if url == "":
+        from pliant.client.multipart import checked_options
+        from pliant.worker.formats import read_inputs
+
+        said = read_inputs(
+            tracks=file,
+            mesh=file_or_word(mesh),
+            ground_truth=ground_truth,
+            rotations=rotations,
+            options=checked_options(options),
+        ).interpretation
+    else:
+        with ctx.obj.client(url, as_json=as_json) as client:
+            said = client.inspect(file, mesh=mesh, ground_truth=ground_truth, rotations=rotations, options=options)
+    if as_json:
+        print_json(said.model_dump(mode="json"))
+    else:
+        show_understood(said)
+
+
+def show_finished(done: Finished, output: Path, *, as_json: bool) -> None:
+    """Show how a reconstruction ended, and where its files are."""
+    if as_json:
+        print_json(
+            {
+                "outcome": done.outcome, "sentence": done.sentence, "metrics": done.metrics, "warnings": list(done.warnings),
+                "files": {artifact.name: str(output / artifact.name) for artifact in done.artifacts},
+            }
+        )  # fmt: skip
+        return
+    screen = out()
+    for warning in done.warnings:
+        err().print(f"[yellow]warning[/yellow] {warning}")
+    screen.print(done.sentence, markup=False)
+    screen.print(metrics_table(done.metrics))
+    for artifact in done.artifacts:
+        screen.print(f"{output / artifact.name}  {artifact.bytes / 1e6:.2f} MB", markup=False)
+
+
+def file_or_word(mesh: str | None) -> Path | str | None:
+    """Tell the name of a mesh file from a grid size or `none`."""
+    return Path(mesh) if mesh is not None and Path(mesh).is_file() else mesh
+
+
+def show_understood(interpretation: Interpretation) -> None:
+    """Show how inputs were read."""
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table.grid(padding=(0, 2))
+    for name, words in understood(interpretation):
+        table.add_row(Text(name, "dim"), Text(words))
+    out().print(table)

@@ -1,0 +1,154 @@
+"""`pliant token`: who may use the service. Works on the store itself, so it is for those who run the service, not for its users."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from pliant.cli.session import Json
+from pliant.cli.show import err, out, print_json
+from pliant.cli.up import Data, chosen
+
+if TYPE_CHECKING:
+    from pliant.worker.tokens import Token, Tokens
+
+MB = 2**20
+
+app = typer.Typer(name="token", help="Make, list and revoke the tokens of a service.", no_args_is_help=True)
+
+TokenId = Annotated[str, typer.Argument(help="Id of the token, as `pliant token list` shows it.", show_default=False)]
+
+
+@app.command()
+def create(
+    ctx: typer.Context,
+    name: Annotated[str, typer.Argument(help="Who will use it, or what for.", show_default=False)],
+    scope: Annotated[
+        list[str] | None,
+        typer.Option("--scope", help="read, submit or admin; again for more.", show_default="read and submit"),
+    ] = None,
+    expires: Annotated[
+        str | None, typer.Option("--expires", help="How long it is valid, e.g. 12h, 90d, 52w.", show_default="for ever")
+    ] = None,
+    sharing: Annotated[
+        str | None,
+        typer.Option(
+            "--sharing", help="Id of a token whose jobs the new one works with, e.g. to replace it.", metavar="ID"
+        ),
+    ] = None,
+    max_body_mb: Annotated[
+        int | None, typer.Option(help="Largest body of one request.", min=1, show_default="the service's")
+    ] = None,
+    max_queued: Annotated[
+        int | None, typer.Option(help="Jobs that may wait at once.", min=1, show_default="the service's")
+    ] = None,
+    max_running: Annotated[
+        int | None, typer.Option(help="Jobs that are worked on at once.", min=1, show_default="the service's")
+    ] = None,
+    requests_per_minute: Annotated[
+        int | None, typer.Option(help="Requests in a minute.", min=1, show_default="the service's")
+    ] = None,
+    data: Data = None,
+    as_json: Json = False,
+) -> None:
+    """Make a token and print it, once: only its SHA-256 is kept."""
+    ctx.obj.json = as_json
+    from pliant.worker.tokens import parse_duration
+
+    lasting = None if expires is None else parse_duration(expires)
+    with store(data) as tokens:
+        token, text = tokens.create(
+            name,
+            scopes=scopes_of(scope or ["read", "submit"]),
+            expires=lasting,
+            sharing=sharing,
+            max_body_bytes=None if max_body_mb is None else max_body_mb * MB,
+            max_queued=max_queued,
+            max_running=max_running,
+            requests_per_minute=requests_per_minute,
+        )
+    if as_json:
+        print_json({**shown(token), "token": text})
+        return
+    print(text)
+    until = "never expires" if token.expires_at is None else f"expires {token.expires_at:%Y-%m-%d %H:%M} UTC"
+    err().print(
+        f"Token {token.id} for {token.name}: {', '.join(token.scopes)}; {until}. It is shown this once; "
+        "its user puts it into PLIANT_TOKEN.",
+        markup=False,
+    )
+
+
+@app.command(name="list")
+def list_tokens(ctx: typer.Context, data: Data = None, as_json: Json = False) -> None:
+    """List the tokens: ids and names, never the tokens themselves."""
+    ctx.obj.json = as_json
+    with store(data) as tokens:
+        found = tokens.all()
+    if as_json:
+        print_json([shown(token) for token in found])
+        return
+    from rich.table import Table
+
+    table = Table("id", "name", "scopes", "made", "expires", "jobs of")
+    now = datetime.now(UTC)
+    for token in found:
+        expires = "never" if token.expires_at is None else f"{token.expires_at:%Y-%m-%d %H:%M}"
+        table.add_row(
+            token.id,
+            token.name,
+            ", ".join(token.scopes),
+            f"{token.created_at:%Y-%m-%d %H:%M}",
+            f"{expires} (over)" if token.expired(now) else expires,
+            "everybody" if token.sees_all else token.owner,
+        )
+    out().print(table)
+
+
+@app.command()
+def revoke(ctx: typer.Context, id: TokenId, data: Data = None, as_json: Json = False) -> None:  # noqa: A002
+    """Make a token worthless, from the next request on. Its jobs stay: `admin` sees them, and who shares them."""
+    ctx.obj.json = as_json
+    with store(data) as tokens:
+        token = tokens.revoke(id)
+    if as_json:
+        print_json(shown(token))
+    else:
+        err().print(f"Token {token.id} ({token.name}) is revoked.", markup=False)
+
+
+def shown(token: Token) -> dict[str, Any]:
+    """Return what scripts get of a token."""
+    return token.model_dump(mode="json", exclude={"sha256"}, exclude_none=True)
+
+
+def scopes_of(words: list[str]) -> list[Any]:
+    """Read the scopes.
+
+    Raises
+    ------
+    BadArgument
+        A word is none.
+    """
+    from pliant.client.errors import BadArgument
+    from pliant.worker.tokens import Scope
+
+    unknown = [word for word in words if word not in set(Scope)]
+    if unknown:
+        raise BadArgument(f"--scope: expected {', '.join(Scope)}, got {unknown[0]!r}.")
+    return [Scope(word) for word in words]
+
+
+@contextmanager
+def store(data: Path | None) -> Iterator[Tokens]:
+    """Give the tokens of an installation, whether its service runs or not."""
+    from pliant.worker.processes.valkey import attended
+    from pliant.worker.tokens import Tokens
+
+    settings = chosen(data, None)
+    with attended(settings):
+        yield Tokens.open(settings)

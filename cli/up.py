@@ -1,0 +1,185 @@
+"""`pliant up` and `pliant work`: the processes of an installation, started and kept running in one terminal."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+from pliant.cli.session import Json
+from pliant.cli.show import err, out, print_json
+
+if TYPE_CHECKING:
+    from pliant.worker.processes.supervisor import Child
+    from pliant.worker.settings import Settings
+
+READY_WITHIN = 120.0
+"""Seconds until every part must answer; the first start compiles Python's caches."""
+
+ANYWHERE = {"0.0.0.0": "127.0.0.1", "::": "::1", "": "127.0.0.1"}  # noqa: S104 - translated, not bound
+"""What to call when the service listens on every address."""
+
+Data = Annotated[
+    Path | None,
+    typer.Option("--data", envvar="PLIANT_DATA", help="Directory for jobs and files.", show_default="pliant-data"),
+]
+Workers = Annotated[
+    int | None, typer.Option("--workers", envvar="PLIANT_WORKERS", help="Jobs worked on at once.", min=1, show_default="1")
+]  # fmt: skip
+
+
+def up(
+    ctx: typer.Context,
+    host: Annotated[str, typer.Option("--host", envvar="PLIANT_HOST", help="Address to listen on.")] = "127.0.0.1",
+    port: Annotated[
+        int, typer.Option("--port", envvar="PLIANT_PORT", help="Port to listen on; 0: a free one.", min=0, max=65535)
+    ] = 8000,
+    data: Data = None,
+    workers: Workers = None,
+    auth: Annotated[
+        Literal["auto", "required", "off"],
+        typer.Option("--auth", envvar="PLIANT_AUTH", help="Ask for tokens; auto: not on the loopback address."),
+    ] = "auto",
+    as_json: Json = False,
+) -> None:
+    """Run everything: service, page, queue and workers. One Ctrl-C stops it all.
+
+    Without PLIANT_REDIS_URL a Valkey server is run as well, its data in the data directory.
+    """
+    ctx.obj.json = as_json
+    from pliant.worker.processes.supervisor import Supervisor, valkey_child, worker_children
+    from pliant.worker.processes.valkey import Valkey
+
+    settings = chosen(data, workers)
+    port = taken(host, port)
+    url = address(host, port)
+    with ExitStack() as held:
+        children: list[Child] = []
+        if settings.redis_url is None:
+            valkey = Valkey.claim(settings.data)
+            held.callback(valkey.release)
+            children.append(valkey_child(valkey))
+        children += [*worker_children(settings), service_child(settings, host, port, url, auth=auth)]
+
+        def announce() -> None:
+            if as_json:
+                print_json({"url": url, "data": str(settings.data.absolute()), "workers": settings.workers})
+                sys.stdout.flush()
+                return
+            screen = out()
+            screen.print(f"[bold green]Pliant is ready[/]  {url}")
+            screen.print(
+                f"[dim]data in {settings.data.absolute()}, {settings.workers} worker(s); Ctrl-C stops everything[/]"
+            )
+
+        Supervisor(children).run(on_started=announce)
+    if not as_json:
+        err().print("Stopped.")
+
+
+def work(ctx: typer.Context, data: Data = None, workers: Workers = None, as_json: Json = False) -> None:
+    """Run workers alone, for a service that runs elsewhere with the same PLIANT_REDIS_URL and PLIANT_BLOB_URL."""
+    ctx.obj.json = as_json
+    from pliant.worker.processes.supervisor import Supervisor, worker_children
+
+    settings = chosen(data, workers)
+
+    def announce() -> None:
+        if as_json:
+            print_json({"workers": settings.workers, "queue": settings.queue})
+            sys.stdout.flush()
+            return
+        err().print(f"{settings.workers} worker(s) of queue {settings.queue}; Ctrl-C stops them.")
+
+    Supervisor(worker_children(settings)).run(on_started=announce)
+
+
+def chosen(data: Path | None, workers: int | None) -> Settings:
+    """Return the settings: the command line first, then the environment."""
+    from pliant.worker.settings import Settings as WorkerSettings
+
+    settings = WorkerSettings.from_environment(os.environ)
+    if data is not None:
+        settings = replace(settings, data=data)
+    if workers is not None:
+        settings = replace(settings, workers=workers)
+    return settings
+
+
+def taken(host: str, port: int) -> int:
+    """Return the port if it can be had, or a free one for 0.
+
+    Raises
+    ------
+    BadArgument
+        Somebody else has it, or the address is not this machine's.
+    """
+    from pliant.client.errors import BadArgument
+
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.socket(family) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, port))
+        except (OSError, OverflowError) as fault:
+            raise BadArgument(
+                f"Cannot listen on {host} port {port}: {fault}. Give another one: --port 0 takes a free port."
+            ) from fault
+        chosen_port: int = probe.getsockname()[1]
+        return chosen_port
+
+
+def address(host: str, port: int) -> str:
+    """Return where the service can be reached from this machine."""
+    name = ANYWHERE.get(host, host)
+    return f"http://[{name}]:{port}" if ":" in name else f"http://{name}:{port}"
+
+
+def service_child(settings: Settings, host: str, port: int, url: str, *, auth: str) -> Child:
+    """Return the API process as a child that counts as started once all parts answer."""
+    from pliant.worker.processes.supervisor import Child
+
+    env = {**settings.to_environment(), "PLIANT_HOST": host, "PLIANT_PORT": str(port), "PLIANT_AUTH": auth}
+    command = [sys.executable, "-m", "pliant.service"]
+    return Child(name="service", argv=command, env=env, ready=until_ready(url), grace=15.0)
+
+
+def until_ready(url: str) -> Callable[[subprocess.Popen[bytes]], None]:
+    """Return a function that waits until the service says that all its parts are there.
+
+    Raises
+    ------
+    Unreachable
+        The process ended, or is not ready in time.
+    """
+
+    def wait(process: subprocess.Popen[bytes]) -> None:
+        from pliant.client.client import Client
+        from pliant.client.errors import PliantError, Unreachable
+
+        deadline = time.monotonic() + READY_WITHIN
+        said = "it did not answer"
+        with Client(url, token=os.environ.get("PLIANT_TOKEN") or None) as client:
+            while time.monotonic() < deadline:
+                if process.poll() is not None:
+                    raise Unreachable(
+                        f"The service ended with code {process.returncode}; its last lines above say why."
+                    )
+                try:
+                    client.ready(timeout=1)
+                except PliantError as fault:
+                    said = str(fault)
+                    time.sleep(0.1)
+                else:
+                    return
+        raise Unreachable(f"The service is not ready after {READY_WITHIN:g} s: {said}")
+
+    return wait

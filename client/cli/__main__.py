@@ -1,8 +1,0 @@
-"""`python -m pliant.client.cli` is `pliant`."""
-
-from __future__ import annotations
-
-from pliant.client.cli import main
-
-if __name__ == "__main__":
-    main()

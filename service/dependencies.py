@@ -1,0 +1,99 @@
+"""What every route works with: one record, made by `create_app` and handed down through the request."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Annotated
+
+import anyio
+from fastapi import Depends, Request
+from pliant.service.event_stream import Followers
+from pliant.service.metrics import Requests
+from pliant.service.settings import ServiceSettings
+from pliant.service.spool import Incoming
+from pliant.service.upload_locks import Turns
+from pliant.worker.formats import Limits
+from pliant.worker.jobs.service import Jobs
+from pliant.worker.tokens import Token
+from pliant.worker.uploads.service import Uploads
+
+
+@dataclass(frozen=True)
+class Service:
+    """The parts that outlive a request."""
+
+    jobs: Jobs
+    """Everybody's jobs; a route takes `Mine` instead."""
+    settings: ServiceSettings
+    limits: Limits
+    """What the readers accept."""
+    incoming: Incoming
+    followers: Followers
+    uploads: Uploads
+    """Everybody's uploads; a route takes `MyUploads` instead."""
+    turns: Turns
+    requests: Requests
+    """What has been counted of them."""
+    parsing: anyio.CapacityLimiter
+    """Holds the number of inputs that are in memory at once."""
+
+
+def service_of(request: Request) -> Service:
+    """Return the record of the application that answers this request."""
+    service = request.app.state.service
+    assert isinstance(service, Service)
+    return service
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """What the one who asks may use: the limits of his token, the service's where it has none. 0 means any number."""
+
+    max_body_bytes: int
+    max_upload_bytes: int
+    max_queued: int
+    max_running: int
+    requests_per_minute: int
+
+
+def bounds_of(request: Request) -> Bounds:
+    """Return the limits of the request's token."""
+    service, token = service_of(request), request.scope.get("pliant.token")
+    settings = service.settings
+    assert token is None or isinstance(token, Token)
+    most = float("inf") if token is None or token.max_body_bytes is None else token.max_body_bytes
+
+    def own(name: str, usual: int) -> int:
+        said = getattr(token, name, None)
+        return usual if said is None else int(said)
+
+    return Bounds(
+        max_body_bytes=int(min(most, settings.max_body_bytes)),
+        max_upload_bytes=int(min(most, service.limits.max_bytes)),
+        max_queued=own("max_queued", settings.max_queued),
+        max_running=own("max_running", service.jobs.settings.max_running),
+        requests_per_minute=settings.rate_of(None if token is None else token.requests_per_minute),
+    )
+
+
+def mine(request: Request) -> Jobs:
+    """Return the jobs that the request's token may see: its own, or everybody's where tokens are off."""
+    owner = request.scope.get("pliant.owner")
+    token = request.scope.get("pliant.token")
+    return replace(
+        service_of(request).jobs,
+        owner=owner,
+        max_queued=bounds_of(request).max_queued,
+        max_running=None if token is None else token.max_running,
+    )
+
+
+def my_uploads(request: Request) -> Uploads:
+    """Return the uploads of the request's token, or everybody's where tokens are off."""
+    return service_of(request).uploads.of(request.scope.get("pliant.owner") or "")
+
+
+Core = Annotated[Service, Depends(service_of)]
+Mine = Annotated[Jobs, Depends(mine)]
+MyUploads = Annotated[Uploads, Depends(my_uploads)]
+Bound = Annotated[Bounds, Depends(bounds_of)]

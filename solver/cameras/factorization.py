@@ -1,0 +1,172 @@
+"""From the Gram matrix of the tracks to rotations: the prior-free factorization.
+
+A rank-3K factor of W, W ≈ Π B with Π (2F×3K), is fixed only up to an invertible matrix. Three columns G (3K×3) of it are
+enough for the cameras: Π_f G = c_f R_f, two rows of a rotation times a coefficient. Hence, with Q = G Gᵀ,
+
+    π_f1ᵀ Q π_f1 = π_f2ᵀ Q π_f2,    π_f1ᵀ Q π_f2 = 0        for every frame f,
+
+linear in Q. Many Q satisfy them when K > 1; the one of least trace on the cone of positive semidefinite matrices has rank 3
+in practice (Dai, Li, He, "A simple prior-free method for non-rigid structure-from-motion factorization", 2012). K = 1 is
+Tomasi and Kanade's metric upgrade. The factor of Q is then refined on the constraints themselves, which are nonlinear in G.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pliant.solver.model.so3 import from_rows, start_at_identity
+from pliant.solver.records import Floats
+from scipy.optimize import minimize
+
+Upper = tuple[NDArray[np.intp], NDArray[np.intp]]
+
+TRACE_WEIGHT = 1e-3
+"""μ of ½‖A(Q) − b‖²/F + μ tr Q; small, for the constraints come first."""
+
+ROUNDS = 300
+"""Rounds of the alternating direction method; the factor's refinement makes more of them useless."""
+
+SOFTENING = 0.05
+"""Keeps frames whose coefficient c_f passes through zero from dominating the scale-free residual."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Upgrade:
+    """What a factorization with one K says about the cameras."""
+
+    basis_size: int
+    """K."""
+
+    rotations: Floats
+    """Shape `(F, 3, 3)`, first one the identity."""
+
+    scales: Floats
+    """|c_f|, shape `(F,)`, mean of the logarithm 0; the camera's scale only as far as the first basis shape is constant."""
+
+    residual: float
+    """Root mean square departure of c_f R_f from orthonormal rows of equal length, relative to c_f²."""
+
+
+def upgrade(gram: Floats, basis_size: int) -> Upgrade:
+    """Return the cameras that a rank-3K factorization of the tracks gives.
+
+    Parameters
+    ----------
+    gram : shape (2F, 2F)
+        W Wᵀ of centred, complete tracks.
+    basis_size : int
+        K, with 3K ≤ 2F.
+    """
+    factor = leading_factor(gram, 3 * basis_size)
+    if basis_size == 1:  # the answer is unique: columns of equal length, so that little rotation is not shrunk to none
+        factor = factor / np.maximum(np.sqrt((factor**2).mean(axis=(0, 1))), 1e-6)
+    corrective = refine_factor(factor, least_trace_factor(factor, 0.0 if basis_size == 1 else TRACE_WEIGHT))
+    rows = continue_signs(factor @ corrective)
+    lengths = np.sqrt(np.maximum((rows**2).sum(axis=(1, 2)) / 2, np.finfo(float).tiny))
+    scales = np.exp(np.log(lengths) - np.log(lengths).mean())
+    residual = float(np.sqrt(_orthonormality(corrective.ravel(), factor)[0]))
+    return Upgrade(basis_size, start_at_identity(from_rows(rows)), scales, residual)
+
+
+def leading_factor(gram: Floats, rank: int) -> Floats:
+    """Return Π of rank at most `rank` with Π Πᵀ ≈ gram, per frame: shape `(F, 2, rank)`, mean row length 1."""
+    values, vectors = np.linalg.eigh(gram)
+    rank = min(rank, len(gram))
+    positive = np.maximum(values[::-1][:rank], 1e-14 * max(float(values[-1]), np.finfo(float).tiny))
+    factor = (vectors[:, ::-1][:, :rank] * np.sqrt(positive)).reshape(len(gram) // 2, 2, rank)
+    return np.asarray(factor / np.sqrt((factor**2).sum() / len(gram)))
+
+
+def least_trace_factor(factor: Floats, trace_weight: float = TRACE_WEIGHT) -> Floats:
+    """Return G (n×3) of the Q ⪰ 0 of least trace that meets the orthonormality constraints, by ADMM.
+
+    Minimises ½‖A(Q) − b‖²/F + μ tr Q over symmetric Q ⪰ 0: the quadratic part by a solve in the n(n+1)/2 coordinates of Q
+    with a matrix inverted once, the rest by shrinking eigenvalues. The last row of A fixes the mean of c_f² at 1.
+    """
+    size = factor.shape[2]
+    rows, columns = np.triu_indices(size)
+    upper = (rows.astype(np.intp), columns.astype(np.intp))
+    stretch = np.where(upper[0] == upper[1], 1.0, np.sqrt(2.0))
+    normal, right = _normal_equations(factor, upper, stretch)
+    penalty = 0.3 * float(np.trace(normal)) / len(normal)
+    inverse = np.linalg.inv(normal + penalty * np.eye(len(normal)))
+    copy = np.zeros(len(normal))
+    dual = np.zeros(len(normal))
+    for _ in range(ROUNDS):
+        solved = inverse @ (right + penalty * (copy - dual))
+        values, vectors = np.linalg.eigh(_unfold(solved + dual, upper, stretch, size))
+        values = np.maximum(values - trace_weight / penalty, 0.0)
+        copy = ((vectors * values) @ vectors.T)[upper] * stretch
+        dual += solved - copy
+    values, vectors = np.linalg.eigh(_unfold(copy, upper, stretch, size))
+    return np.asarray(vectors[:, -3:] * np.sqrt(np.maximum(values[-3:], 1e-4 * max(float(values[-1]), 1e-9))))
+
+
+def _normal_equations(factor: Floats, upper: Upper, stretch: Floats) -> tuple[Floats, Floats]:
+    """Return AᵀA/F and Aᵀb/F in the coordinates where ⟨Q, Q'⟩ is the plain inner product of upper triangles."""
+    first, second = factor[:, 0], factor[:, 1]
+    i, j = upper
+
+    def outer(a: Floats, b: Floats) -> Floats:
+        return (a[:, i] * b[:, j] + a[:, j] * b[:, i]) * (stretch / 2)
+
+    along, across = outer(first, first), outer(second, second)
+    rows = np.concatenate([along - across, 2 * outer(first, second)])
+    mean = (along + across).mean(axis=0) / 2
+    frames = len(factor)
+    gauge = 25.0  # stiff enough that the mean of c_f² is 1 to a fraction of a percent
+    return rows.T @ rows / frames + gauge * np.outer(mean, mean), gauge * mean
+
+
+def _unfold(coordinates: Floats, upper: Upper, stretch: Floats, size: int) -> Floats:
+    matrix = np.zeros((size, size))
+    matrix[upper] = coordinates / stretch
+    return np.asarray(matrix + np.triu(matrix, 1).T)
+
+
+def refine_factor(factor: Floats, start: Floats) -> Floats:
+    """Return G that minimises the scale-free departure from orthonormality, from `start`, by L-BFGS."""
+    found = minimize(
+        _orthonormality, start.ravel(), args=(factor,), jac=True, method="L-BFGS-B", options={"maxiter": 500}
+    )
+    return np.asarray(found.x).reshape(start.shape)
+
+
+def _orthonormality(flat: Floats, factor: Floats) -> tuple[float, Floats]:
+    """Return mean_f ((a−b)² + 4c²) / ((a+b)² + ε m²) and its gradient in G.
+
+    a, b, c are the entries of the 2×2 Gram matrix of Π_f G, and m the mean of a + b. It does not change when G is scaled.
+    """
+    corrective = flat.reshape(-1, 3)
+    rows = factor @ corrective
+    a, b = (rows[:, 0] ** 2).sum(axis=1), (rows[:, 1] ** 2).sum(axis=1)
+    c = (rows[:, 0] * rows[:, 1]).sum(axis=1)
+    total, count = a + b, len(rows)
+    mean = total.mean()
+    departure = (a - b) ** 2 + 4 * c**2
+    size = total**2 + SOFTENING * mean**2
+    by_size = -departure / size**2
+    by_total = 2 * total * by_size + 2 * SOFTENING * mean * by_size.sum() / count
+    slope = 2 * (a - b) / size
+    by_rows = np.stack(
+        [
+            2 * (slope + by_total)[:, None] * rows[:, 0] + (8 * c / size)[:, None] * rows[:, 1],
+            2 * (by_total - slope)[:, None] * rows[:, 1] + (8 * c / size)[:, None] * rows[:, 0],
+        ],
+        axis=1,
+    )
+    gradient = np.einsum("fri,frj->ij", factor, by_rows) / count
+    return float((departure / size).mean()), gradient.ravel()
+
+
+def continue_signs(rows: Floats) -> Floats:
+    """Return the rows with the sign of each frame that turns least from the frame before.
+
+    c_f R_f and (−c_f)(−R_f) are the same rows, so a factorization leaves one sign a frame open; −R_f differs from R_f by half
+    a turn about the viewing direction, which no camera makes between two frames.
+    """
+    agree = np.sign((rows[1:] * rows[:-1]).sum(axis=(1, 2)))
+    agree[agree == 0] = 1.0
+    return np.asarray(rows * np.concatenate([[1.0], np.cumprod(agree)])[:, None, None])

@@ -1,0 +1,45 @@
+"""The low-rank prior: shapes of all frames should be mixtures of few.
+
+With G = X Xᵀ / P the F×F Gram matrix of the frames (X as F×3P) and g_i its eigenvalues, the penalty is
+
+    λ3 P Σ_i φ(g_i),    φ(g) = g/δ  for g ≤ δ,   1 + log(g/δ)  above,
+
+a reweighted nuclear norm in one formula: φ is concave and smooth, so that tr φ(G) lies below its tangent tr φ'(G₀) G, a
+quadratic in X with the F×F matrix φ'(G₀). Below the floor δ all modes cost the same, so the quadratic is a multiple of the
+identity minus one term for each mode above it: an eigenproblem of size F and no more work per point than the kept modes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from pliant.solver.energy.problem import Array
+from pliant.solver.operators.normal_equations import RankTerm
+from pliant.solver.records import Floats
+from scipy import linalg
+
+
+def frame_gram(shapes: Array) -> Floats:
+    """Return X Xᵀ / P over frames, shape `(F, F)`."""
+    flat = shapes.reshape(len(shapes), -1)
+    gram: Floats = (flat @ flat.T).astype(np.float64) / shapes.shape[2]
+    return gram
+
+
+def rank_penalty(shapes: Array, weight: float, floor: float) -> float:
+    """Return λ3 P Σ φ(g_i)."""
+    if weight == 0:
+        return 0.0
+    values = np.maximum(linalg.eigvalsh(frame_gram(shapes)), 0.0)
+    ratio = values / floor
+    total = float(np.sum(np.where(ratio <= 1, ratio, 1 + np.log(np.maximum(ratio, 1)))))
+    return weight * total * int(shapes.shape[2])
+
+
+def rank_term(shapes: Array, weight: float, floor: float) -> RankTerm | None:
+    """Return the quadratic that touches the penalty at these shapes and lies above it elsewhere."""
+    if weight == 0:
+        return None
+    values, vectors = linalg.eigh(frame_gram(shapes))
+    kept = values > floor
+    level = weight / floor
+    return RankTerm(level, vectors[:, kept], level * (1 - floor / values[kept]))

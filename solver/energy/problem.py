@@ -1,0 +1,52 @@
+"""One energy to minimise: the record that a solve starts from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pliant.solver.operators.gauss_markov import PathPrior
+from pliant.solver.operators.mesh_laplacian import Laplacian
+from pliant.solver.records import Floats
+
+Array = NDArray[np.floating]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Weights:
+    """Every number of the energy, chosen; dimensionless, in normalised units."""
+
+    temporal: float
+    """λ1."""
+    spatial: float
+    """λ2; 0 without a mesh."""
+    low_rank: float
+    """λ3; 0 for the paper's prior."""
+    robust_scale: float
+    """ε of the smoothed L1 or δ of Huber."""
+    order: int
+    """Order of H."""
+    rank_floor: float = 0.0
+    """δ of the low-rank prior: variance of a mode, per point, below which it counts as noise."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Problem:
+    """One energy to minimise, normalised units."""
+
+    points: Array
+    """Centred tracks, shape `(F, 2, P)`."""
+    confidence: Array
+    """v, shape `(F, P)`."""
+    projections: Array
+    """s_f times the first two rows of R_f, shape `(F, 2, 3)`."""
+    loss: str
+    weights: Weights
+    bands: Floats
+    """λ1 times the bands of HᵀH, shape `(order + 1, F)`; 0 with a Gaussian prior, which has its own."""
+    laplacian: Laplacian | None
+    axes: Floats
+    """B (3×3): shapes are B X in the world. The identity but for the Gaussian prior, which has axes of its own."""
+    quadratic: PathPrior | None = None
+    """λ1 times the inverse covariance over frames of each coordinate: the Gaussian prior."""

@@ -1,0 +1,156 @@
+"""Error metrics, each under one exact name, because the literature mixes them and the numbers do not compare.
+
+With S the reconstruction and G the ground truth, both centred in every frame:
+
+=========================  =============================================================================================
+`e3d_sequence`             one Q in O(3) for the whole sequence, no scale; mean over frames of ‖S_f Qᵀ − G_f‖_F / ‖G_f‖_F
+`e3d_frame`                a rotation per frame and one mirror for the sequence; the same mean
+`e3d_frame_similarity`     rotation, mirror and scale free in every frame; the same mean. Kumar et al. (2018, 2019) and
+                           later dense papers print numbers that reproduce with this one
+`e3d_mocap`                Akhter et al. (2011), Gotardo and Martinez (2011): one Q in O(3);
+                           `1/(σ F P) Σ_fp ‖Q s_fp − g_fp‖` with `σ = 1/(3F) Σ_f (σ_fx + σ_fy + σ_fz)`, the population
+                           standard deviations of the true coordinates
+`reprojection_median`,     of `‖w_fp − c_f R_f s_fp − t_f‖` over the visible entries (the RMS weighted with confidence),
+`reprojection_rms`         in the tracks' unit
+`rotation_degrees`         mean angle between estimated and true rotations after one alignment of the world axes
+=========================  =============================================================================================
+
+A low `e3d_frame_similarity` beside a high `e3d_sequence` means frames that flip or drift: look at both.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pliant.solver.errors import InvalidInput
+from pliant.solver.evaluation.alignment import MIRROR, Aligned, Kind, align, procrustes
+from pliant.solver.records import Floats, Solution, Tracks
+
+
+class Reprojection(NamedTuple):
+    """How far the projected shapes lie from the visible tracks, the tracks' unit."""
+
+    median: float
+    """Median length of the residual."""
+
+    rms: float
+    """Root of the mean squared length, weighted with the confidence."""
+
+
+def e3d_sequence(shapes: ArrayLike, truth: ArrayLike) -> float:
+    """Relative error after one orthogonal matrix for the whole sequence, see the table above."""
+    return float(align(shapes, truth, kind="sequence").relative.mean())
+
+
+def e3d_frame(shapes: ArrayLike, truth: ArrayLike) -> float:
+    """Relative error after a rotation per frame and one mirror, see the table above."""
+    return float(align(shapes, truth, kind="frame").relative.mean())
+
+
+def e3d_frame_similarity(shapes: ArrayLike, truth: ArrayLike) -> float:
+    """Relative error after a similarity per frame, see the table above."""
+    return float(align(shapes, truth, kind="frame_similarity").relative.mean())
+
+
+def e3d_mocap(shapes: ArrayLike, truth: ArrayLike) -> float:
+    """Akhter's error: mean point distance over mean per-frame, per-axis spread, see the table above."""
+    return _mocap(align(shapes, truth, kind="sequence"))
+
+
+def frame_errors(shapes: ArrayLike, truth: ArrayLike, *, kind: Kind = "frame") -> Floats:
+    """Relative error of every frame, shape `(F,)`; its mean is the metric of that kind."""
+    return align(shapes, truth, kind=kind).relative
+
+
+def point_errors(shapes: ArrayLike, truth: ArrayLike, *, kind: Kind = "frame") -> Floats:
+    """Distance of every point from its true place, shape `(F, P)`, the truth's unit."""
+    return align(shapes, truth, kind=kind).distances
+
+
+def reprojection(tracks: Tracks, solution: Solution) -> Reprojection:
+    """Residual of the visible observations.
+
+    Recomputed from shapes and camera, so that it checks `Solution.residuals` instead of repeating them. Frames or
+    points that nobody saw do not count; with nothing visible both values would have no meaning, which `Tracks` refuses.
+    """
+    camera = solution.camera
+    projected = solution.shapes @ camera.rotations[:, :2].transpose(0, 2, 1)
+    projected = camera.scales[:, None, None] * projected + camera.translations[:, None]
+    squared = np.square(tracks.points - projected).sum(axis=2)
+    median = np.median(np.sqrt(squared[tracks.visible > 0]))
+    return Reprojection(float(median), float(np.sqrt(np.average(squared, weights=tracks.visible))))
+
+
+def rotation_degrees(rotations: ArrayLike, truth: ArrayLike) -> float:
+    """Mean angle between two camera paths, degrees, after the world axes of one are turned onto the other's.
+
+    Orthographic views do not fix the sign of depth: a path `R_f` and its mirror `J R_f J`, `J = diag(1, 1, −1)`, fit
+    equally well, so the better of the two counts.
+
+    Parameters
+    ----------
+    rotations, truth : array_like, shape (F, 3, 3)
+        Camera from world.
+
+    Raises
+    ------
+    InvalidInput
+        The two differ in shape or are not `(F, 3, 3)`.
+    """
+    ours, true = np.asarray(rotations, dtype=np.float64), np.asarray(truth, dtype=np.float64)
+    if true.ndim != 3 or true.shape[1:] != (3, 3) or ours.shape != true.shape:
+        raise InvalidInput(
+            "wrong_shape", field="ground_truth.rotations", expected=f"(frames, 3, 3) like {ours.shape}",
+            got=str(true.shape), hint="Give one full rotation matrix for every frame.",
+        )  # fmt: skip
+    return min(_mean_angle(ours, true), _mean_angle(MIRROR @ ours @ MIRROR, true))
+
+
+def evaluate(
+    solution: Solution,
+    tracks: Tracks,
+    truth: ArrayLike | None = None,
+    true_rotations: ArrayLike | None = None,
+) -> dict[str, float]:
+    """Every metric that the inputs allow, by its documented name.
+
+    Parameters
+    ----------
+    solution, tracks
+        What came out, and what went in.
+    truth : array_like, shape (F, P, 3), optional
+        Ground truth shapes, the tracks' unit, in the axes of one world. Where truth is known only in each frame's own
+        camera axes, the metrics per frame hold and the two for the whole sequence mean nothing.
+    true_rotations : array_like, shape (F, 3, 3), optional
+        Ground truth cameras.
+
+    Raises
+    ------
+    InvalidInput
+        Ground truth of the wrong shape, not finite, or without extent.
+    """
+    fit = reprojection(tracks, solution)
+    values = {"reprojection_median": fit.median, "reprojection_rms": fit.rms}
+    if truth is not None:
+        whole = align(solution.shapes, truth, kind="sequence")
+        values["e3d_sequence"] = float(whole.relative.mean())
+        values["e3d_frame"] = e3d_frame(solution.shapes, truth)
+        values["e3d_frame_similarity"] = e3d_frame_similarity(solution.shapes, truth)
+        values["e3d_mocap"] = _mocap(whole)
+    if true_rotations is not None:
+        values["rotation_degrees"] = rotation_degrees(solution.camera.rotations, true_rotations)
+    return values
+
+
+def _mocap(aligned: Aligned) -> float:
+    return float(aligned.distances.mean() / aligned.truth.std(axis=1).mean())
+
+
+def _mean_angle(ours: Floats, true: Floats) -> float:
+    turn = procrustes(np.einsum("fji,fjk->ik", ours, true), proper=True)
+    left_over = (ours @ turn).transpose(0, 2, 1) @ true
+    sine = np.linalg.norm(left_over - left_over.transpose(0, 2, 1), axis=(1, 2)) / np.sqrt(8.0)
+    cosine = (np.trace(left_over, axis1=1, axis2=2) - 1) / 2
+    return float(np.degrees(np.arctan2(sine, cosine)).mean())

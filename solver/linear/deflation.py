@@ -1,0 +1,113 @@
+"""A coarse correction for points that are not like the others: few modes, every point's own weights.
+
+A preconditioner with one weight a frame believes that every point was seen as well as the mean one. Where a point is hidden,
+or an outlier has lost its weight, only the prior holds it, and the Gaussian prior hardly holds the modes of large variance: along
+them the mean weights are wrong by orders of magnitude, and conjugate gradients would crawl. These modes are few. On their span
+U (per coordinate, F×m) the equations are solved exactly for every point by itself,
+
+    N_p = Σ_fi ω_fip u_fi u_fiᵀ + λ1 UᵀQU,    u_fi = U_fᵀ R_fiᵀ,
+
+and the result is added to what the mean weights give.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pliant.solver.operators.normal_equations import Operator
+from pliant.solver.records import Floats
+from pliant.solver.threads import over_ranges
+
+Array = NDArray[np.floating]
+
+MOST = 12
+"""Modes of a coordinate at most: memory grows with the square."""
+
+HELD = 0.05
+"""A mode belongs to the coarse space where the prior's precision is below this times the mean weight."""
+
+UNLIKE = 0.1
+"""A weight below this times its frame's mean is unlike the others."""
+
+ENOUGH = 0.002
+"""Share of unlike weights below which the mean weights do."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Coarse:
+    """U and N⁻¹."""
+
+    modes: tuple[Floats, Floats, Floats]
+    """U of every coordinate, shape `(F, m_c)` each."""
+
+    inverses: Array
+    """N_p⁻¹, shape `(P, m, m)`, m the sum of all m_c."""
+
+    def add(self, r: Array, out: Array) -> None:
+        """Add U N⁻¹ Uᵀ r to `out`, both of shape `(F, 3, P)`."""
+        modes = [each.astype(r.dtype) for each in self.modes]
+        cuts = np.cumsum([0] + [each.shape[1] for each in modes])
+
+        def work(start: int, stop: int) -> None:
+            inner = np.concatenate([modes[c].T @ r[:, c, start:stop] for c in range(3)])
+            inner = np.matmul(self.inverses[start:stop], np.ascontiguousarray(inner.T)[:, :, None])[:, :, 0]
+            for c in range(3):
+                out[:, c, start:stop] += modes[c] @ inner[:, cuts[c] : cuts[c + 1]].T
+
+        over_ranges(work, r.shape[2], smallest=256)
+
+
+def build_coarse(operator: Operator) -> Coarse | None:
+    """Return the correction for this reweighting, or None where the mean weights do."""
+    if operator.quadratic is None:
+        return None
+    mean = operator.weights.mean(axis=2, dtype=np.float64)
+    unlike = float((operator.weights < UNLIKE * mean[:, :, None]).mean())
+    if unlike < ENOUGH:
+        return None
+    limit = HELD * float(mean.mean())
+    modes, held = _free_modes(operator, limit)
+    if sum(len(each) for each in held) == 0:
+        return None
+    seen = _seen(operator, modes)
+    size = seen.shape[2]
+    upper = np.triu_indices(size)
+    products = (seen[:, :, upper[0]] * seen[:, :, upper[1]]).reshape(-1, len(upper[0])).astype(operator.weights.dtype)
+    points = operator.weights.shape[2]
+    inverses = np.zeros((points, size, size), dtype=operator.weights.dtype)
+    prior = np.diag(np.concatenate(held))
+
+    def work(start: int, stop: int) -> None:
+        for low in range(start, stop, BLOCK):
+            high = min(low + BLOCK, stop)
+            flat = operator.weights[:, :, low:high].reshape(-1, high - low).T @ products
+            normal = np.zeros((high - low, size, size))
+            normal[:, upper[0], upper[1]] = flat
+            normal[:, upper[1], upper[0]] = flat
+            inverses[low:high] = np.linalg.inv(normal + prior)
+
+    over_ranges(work, points, smallest=BLOCK)
+    return Coarse(modes, inverses)
+
+
+BLOCK = 256
+"""Points worked on at once."""
+
+
+def _free_modes(operator: Operator, limit: float) -> tuple[tuple[Floats, Floats, Floats], list[Floats]]:
+    """Return for each coordinate the modes that the prior holds least, and how much it holds them."""
+    assert operator.quadratic is not None
+    modes, held = [], []
+    for directions, values in operator.quadratic.loosest(MOST):
+        free = values < limit
+        modes.append(np.ascontiguousarray(directions[:, free]))
+        held.append(np.maximum(values[free], 1e-9 * limit))
+    return (modes[0], modes[1], modes[2]), held
+
+
+def _seen(operator: Operator, modes: tuple[Floats, Floats, Floats]) -> Floats:
+    """Return u, the modes as the camera sees them, shape `(F, 2, m)`."""
+    cameras = operator.projections.astype(np.float64)
+    return np.concatenate([cameras[:, :, c, None] * modes[c][:, None, :] for c in range(3)], axis=2)

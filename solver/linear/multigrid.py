@@ -1,0 +1,71 @@
+"""The sum of block elimination on the points and on every coarser level: paths in time, smoothness along the surface."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from pliant.solver.linear import block_tridiagonal
+from pliant.solver.linear.conjugate_gradient import Linear
+from pliant.solver.operators.aggregation import Level, Matrix
+from pliant.solver.operators.bending import frames_together, turned, turned_back
+from pliant.solver.operators.normal_equations import Operator
+from pliant.solver.threads import SMALLEST, over_ranges
+
+Array = NDArray[np.floating]
+
+
+def build(operator: Operator) -> Linear:
+    """Factor every level once a reweighting; returns r ↦ Σ_l Π_l M_l⁻¹ Π_lᵀ r."""
+    assert operator.laplacian is not None
+    fine = block_tridiagonal.build(operator)
+    coarse: list[Coarser] = []
+    weights = operator.weights
+    for level in operator.laplacian.levels:
+        weights = _carried(level.mean, weights)
+        alike = replace(operator, weights=weights, laplacian=None)
+        inverse = block_tridiagonal.build(alike, operator.spatial_weight * level.bending)
+        coarse.append(Coarser(level, inverse))
+
+    def apply(r: Array, /, out: Array | None = None) -> Array:
+        result = fine(r, out=out)
+        _correct(coarse, r, result)
+        return result
+
+    return apply
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Coarser:
+    """A level and what inverts its blocks."""
+
+    level: Level
+    inverse: Linear
+
+
+def _correct(coarse: list[Coarser], r: Array, out: Array) -> None:
+    """Add to `out` what the levels make of the residual r."""
+    if not coarse:
+        return
+    first, *rest = coarse
+    residual = _carried(first.level.down, r)
+    correction = first.inverse(residual)
+    _correct(rest, residual, correction)
+    _carried(first.level.up, correction, onto=out)
+
+
+def _carried(matrix: Matrix, array: Array, onto: Array | None = None) -> Array:
+    """Return the matrix times every row of `(F, k, P)`, or add it to `onto`."""
+    frames, rows, points = array.shape
+    result = np.zeros((frames, rows, matrix.shape[0]), dtype=array.dtype) if onto is None else onto
+    together = frames_together(frames)
+
+    def work(start: int, stop: int) -> None:
+        for low in range(start * together, min(stop * together, frames), together):
+            part = slice(low, min(low + together, frames))
+            product = matrix @ turned(array[part].reshape(-1, points))
+            turned_back(product, result[part].reshape(-1, matrix.shape[0]))
+
+    over_ranges(work, -(-frames // together), smallest=max(1, SMALLEST // (together * rows * points)))
+    return result

@@ -1,0 +1,168 @@
+"""Preconditioners: sums of what inverts parts of the equations, in the frames and in the points no dearer than the equations.
+
+Where a frame is coupled to the next alone, every point's own path is inverted (`linear.block_tridiagonal`), with coarser surfaces
+beside it where bending counts (`linear.multigrid`), and with the modes of a Gaussian prior (`linear.woodbury`,
+`linear.deflation`). Elsewhere, which is with a rank term, second differences or no smoothness in time, one weight a frame has to do:
+then 𝒜 is the Sylvester operator X ↦ T X + λ2 X K, T the 3F×3F temporal part, diagonalised once a reweighting, K = AᵀA over points,
+nearly diagonal in the cosine basis on a grid.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pliant.solver.linear import block_tridiagonal, multigrid
+from pliant.solver.linear.conjugate_gradient import Linear
+from pliant.solver.linear.deflation import build_coarse
+from pliant.solver.linear.woodbury import MeanModes
+from pliant.solver.operators.normal_equations import Operator
+from pliant.solver.records import Floats, Ints
+from pliant.solver.threads import available_cores, over_ranges
+from scipy import fft, linalg
+
+Array = NDArray[np.floating]
+BLOCK = 1024
+"""Points a thread should have to work on, at least."""
+BENDS = 1.0
+"""Coarser levels are taken where bending is this much beside the slowest smoothness in time."""
+
+
+def temporal_matrix(operator: Operator) -> Floats:
+    """Return T, dense `(3F, 3F)`: every frame's data term with its mean weights, the stencil over frames, the rank term."""
+    frames = len(operator.projections)
+    cameras = operator.projections.astype(np.float64)
+    mean = operator.weights.mean(axis=2, dtype=np.float64)
+    blocks = np.einsum("fic,fi,fid->fcd", cameras, mean, cameras)
+    over_frames = np.zeros((frames, frames))
+    for k, band in enumerate(operator.bands):
+        index = np.arange(frames - k)
+        over_frames[index, index + k] = over_frames[index + k, index] = band[: frames - k]
+    if operator.rank is not None:
+        over_frames += operator.rank.matrix()
+    whole = np.kron(over_frames, np.eye(3)).reshape(frames, 3, frames, 3)
+    index = np.arange(frames)
+    whole[index, :, index, :] += blocks
+    if operator.quadratic is not None:
+        for axis, matrix in enumerate(operator.quadratic.matrices()):
+            whole[:, axis, :, axis] += matrix
+    return np.asarray(whole.reshape(3 * frames, 3 * frames), dtype=np.float64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Diagonalised:
+    """T = V diag(values) Vᵀ."""
+
+    vectors: Array
+    values: Floats
+
+    @classmethod
+    def of(cls, operator: Operator, kind: np.dtype[np.floating]) -> Diagonalised:
+        """Diagonalise the temporal part; directions that nothing holds get a tiny positive value."""
+        values, vectors = linalg.eigh(temporal_matrix(operator))
+        return cls(vectors.astype(kind), np.maximum(values, 1e-10 * values[-1]))
+
+
+def build_preconditioner(operator: Operator) -> Linear:
+    """Return M⁻¹ for this reweighting's operator."""
+    paths = block_tridiagonal.fits(operator)
+    if not paths:
+        first = _alike(operator)
+    elif bends(operator):
+        first = multigrid.build(operator)
+    else:
+        first = block_tridiagonal.build(operator)
+    if operator.quadratic is None or operator.stencil[0].max() == 0:
+        return first
+    modes, coarse = MeanModes.of(operator) if paths else None, build_coarse(operator)
+
+    def sum_of(x: Array, /, out: Array | None = None) -> Array:
+        result = first(x, out=out)
+        for each in (modes, coarse):
+            if each is not None:
+                each.add(x, result)
+        return result
+
+    return sum_of
+
+
+def bends(operator: Operator) -> bool:
+    """Return whether bending counts beside what holds a path that moves slowly, which is its stiffness over F²."""
+    if operator.laplacian is None or operator.spatial_weight == 0:
+        return False
+    slow = float(operator.stencil[0].max()) / len(operator.projections) ** 2
+    return float(block_tridiagonal.stiffness_of_neighbours(operator).mean()) > BENDS * slow
+
+
+def _alike(operator: Operator) -> Linear:
+    """Return the inverse for one weight a frame."""
+    kind = operator.weights.dtype
+    laplacian = operator.laplacian
+    if laplacian is None or operator.spatial_weight == 0:
+        return _by_inverse(temporal_matrix(operator), kind)
+    temporal = Diagonalised.of(operator, kind)
+    if laplacian.grid is not None:
+        return lambda r, out=None: _by_cosines(r, temporal, laplacian.grid, operator.spatial_weight)  # noqa: ARG005
+    diagonal: Floats = (
+        operator.spatial_weight * np.asarray(laplacian.matrix.power(2).sum(axis=0), dtype=np.float64).ravel()
+    )
+    return lambda r, out=None: _by_point(r, temporal, diagonal)  # noqa: ARG005
+
+
+def _by_inverse(temporal: Floats, kind: np.dtype[np.floating]) -> Linear:
+    """Return the solution of T x_p = r_p for every point p: one product where a diagonalisation would need two."""
+    size = len(temporal)
+    temporal[np.diag_indices(size)] += 1e-12 * temporal.diagonal().max()
+    inverse = linalg.cho_solve(linalg.cho_factor(temporal, lower=True), np.eye(size))
+    symmetric = ((inverse + inverse.T) / 2).astype(kind)
+
+    def apply(x: Array, /, out: Array | None = None) -> Array:
+        result = np.zeros_like(x) if out is None else out
+        flat, into = x.reshape(size, -1), result.reshape(size, -1)
+
+        def work(start: int, stop: int) -> None:
+            into[:, start:stop] = symmetric @ flat[:, start:stop]
+
+        over_ranges(work, flat.shape[1], smallest=BLOCK)
+        return result
+
+    return apply
+
+
+def _by_point(r: Array, temporal: Diagonalised, shift: Floats) -> Array:
+    """Solve (T + shift_p I) x_p = r_p for every point p."""
+    flat = r.reshape(len(temporal.values), -1)
+    result = np.zeros_like(flat)
+    shifts = np.broadcast_to(shift, flat.shape[1])
+
+    def work(start: int, stop: int) -> None:
+        inner = temporal.vectors.T @ flat[:, start:stop]
+        inner /= (temporal.values[:, None] + shifts[start:stop]).astype(r.dtype)
+        result[:, start:stop] = temporal.vectors @ inner
+
+    over_ranges(work, flat.shape[1], smallest=BLOCK)
+    return result.reshape(r.shape)
+
+
+def _by_cosines(r: Array, temporal: Diagonalised, grid: Ints, weight: float) -> Array:
+    """Solve T X + λ2 X K = R on the bounding grid with reflecting borders, K diagonal in cosines."""
+    height, width = grid.shape
+    filled = grid >= 0
+    inner = temporal.vectors.T @ r.reshape(len(temporal.values), -1)
+    image = np.zeros((len(inner), height, width), dtype=r.dtype)
+    image[:, filled] = inner[:, grid[filled]]
+    image = fft.dctn(image, axes=(1, 2), norm="ortho", workers=available_cores(), overwrite_x=True)
+    shift = weight * stencil_symbol(height, width) ** 2
+    image /= (temporal.values[:, None, None] + shift).astype(r.dtype)
+    image = fft.idctn(image, axes=(1, 2), norm="ortho", workers=available_cores(), overwrite_x=True)
+    inner[:, grid[filled]] = image[:, filled]
+    return (temporal.vectors @ inner).reshape(r.shape)
+
+
+def stencil_symbol(height: int, width: int) -> Floats:
+    """Eigenvalues of the 8-direction stencil with reflecting borders, shape `(height, width)`, ≤ 0."""
+    down = np.cos(np.pi * np.arange(height) / height)[:, None]
+    right = np.cos(np.pi * np.arange(width) / width)[None, :]
+    symbol: Floats = 2 * down + 2 * right + 4 * down * right - 8
+    return symbol

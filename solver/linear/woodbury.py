@@ -1,0 +1,58 @@
+"""The modes of the Gaussian prior inside the preconditioner, with one weight a frame.
+
+Block elimination (`linear.block_tridiagonal`) inverts the chain of neighbours with every observation's own weight, N. The modes
+are missing: by Woodbury's identity (N − V Vᵀ)⁻¹ = N⁻¹ + N⁻¹V (I − VᵀN⁻¹V)⁻¹ VᵀN⁻¹. The second summand has one matrix Z Zᵀ for all points
+if the weights of a frame are their mean, and is added as such. Where they are not, `linear.deflation` mends it. Everything here is
+linear in the number of frames, but for the square of the modes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from pliant.solver.linear import block_tridiagonal
+from pliant.solver.operators.gauss_markov import over_blocks
+from pliant.solver.operators.normal_equations import Operator
+
+Array = NDArray[np.floating]
+
+LEAST = 1e-12
+"""Smallest eigenvalue of I − VᵀN⁻¹V that is believed: it is about the noise over the variance of a mode that nothing shows."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeanModes:
+    """Z, shape `(3F, k)`."""
+
+    along: Array
+
+    @classmethod
+    def of(cls, operator: Operator) -> MeanModes:
+        """Take the modes of an operator with a Gaussian prior."""
+        assert operator.quadratic is not None
+        frames, sizes = len(operator.projections), [each.shape[1] for each in operator.quadratic.modes]
+        cuts = np.cumsum([0, *sizes])
+        columns = np.zeros((frames, 3, cuts[-1]))
+        for axis, modes in enumerate(operator.quadratic.modes):
+            columns[:, axis, cuts[axis] : cuts[axis + 1]] = modes
+        mean = operator.weights.mean(axis=2, dtype=np.float64)
+        alike = replace(
+            operator,
+            projections=operator.projections.astype(np.float64),
+            weights=np.broadcast_to(mean[:, :, None], (frames, 2, cuts[-1])),
+            laplacian=None,
+        )
+        pushed = block_tridiagonal.build(alike)(columns).reshape(3 * frames, -1)
+        values, vectors = np.linalg.eigh(np.eye(cuts[-1]) - columns.reshape(3 * frames, -1).T @ pushed)
+        return cls((pushed @ (vectors / np.sqrt(np.maximum(values, LEAST)))).astype(operator.weights.dtype))
+
+    def add(self, r: Array, out: Array) -> None:
+        """Add Z Zᵀ r to `out`, both of shape `(F, 3, P)`."""
+        flat, into = r.reshape(len(self.along), -1), out.reshape(len(self.along), -1)
+
+        def work(span: slice) -> None:
+            into[:, span] += self.along @ (self.along.T @ flat[:, span])
+
+        over_blocks(work, flat.shape[1], rows=len(self.along))

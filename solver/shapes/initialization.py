@@ -1,0 +1,51 @@
+"""Shapes without iterations: the pseudo-inverse, and the smooth shapes for uniform weights."""
+
+from __future__ import annotations
+
+import numpy as np
+from pliant.solver.energy.problem import Array, Problem
+from pliant.solver.linear.conjugate_gradient import conjugate_gradient
+from pliant.solver.linear.preconditioner import build_preconditioner
+from pliant.solver.operators.normal_equations import Operator
+from pliant.solver.records import Floats
+from pliant.solver.shapes.irls import inner_precision
+
+EXACT, ROUGH, MOST = 1e-4, 0.1, 200
+"""Reduction of the residual where least squares are the answer, where they are but a start, and iterations at most."""
+
+DOUBT = 0.1
+"""Standard deviation of an image coordinate, normalised units, that the start assumes with a Gaussian prior."""
+
+
+def pseudo_inverse(problem: Problem, translations: Floats) -> Array:
+    """Return R†(W − t), frame by frame: flat shapes, each in its own image plane; hidden points at the centre.
+
+    Dai, Deng, He (2017), Fig. 1, first column: the shapes of least norm that explain the tracks.
+    """
+    target = (problem.points - translations[:, :, None]) * (problem.confidence > 0)[:, None]
+    inverse = np.linalg.pinv(problem.projections.astype(np.float64))
+    flat: Array = np.matmul(inverse, target).astype(problem.points.dtype)
+    return flat
+
+
+def uniform_solution(problem: Problem, translations: Floats) -> Array:
+    """Return the least-squares shapes if every observation weighed the same (eq. 5 when λ2 is 0).
+
+    min_S ‖W − R S‖² + λ1 ‖H S‖² + λ2 ‖A S‖²: the answer for least squares, and roughly a start for robust losses. With a
+    Gaussian prior the tracks are doubted first: shapes that followed an outlier would give it full weight, and the reweighting would
+    take long to leave it.
+    """
+    weights = np.array(np.broadcast_to(problem.confidence[:, None, :], problem.points.shape))
+    if problem.quadratic is not None and problem.weights.temporal > 0:
+        weights *= weights.dtype.type(problem.weights.temporal / DOUBT**2)
+    operator = Operator(
+        problem.projections, weights, problem.bands, problem.laplacian, problem.weights.spatial, None, problem.quadratic
+    )
+    target = problem.points - translations[:, :, None].astype(problem.points.dtype)
+    reduction = EXACT if problem.loss == "l2" else ROUGH
+    operator = operator.rounded(inner_precision(operator, reduction))
+    solved = conjugate_gradient(
+        operator.apply, operator.right_hand_side(target.astype(operator.weights.dtype)),
+        precondition=build_preconditioner(operator), reduction=reduction, max_iterations=MOST,
+    )  # fmt: skip
+    return solved.x.astype(problem.points.dtype)

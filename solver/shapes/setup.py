@@ -1,0 +1,91 @@
+"""From normalised tracks, cameras, mesh and settings to the one energy that is minimised."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from pliant.solver.cameras.estimation import CameraEstimate
+from pliant.solver.energy.hyperparameters import bending_weight, choose_weights, without_effect
+from pliant.solver.energy.problem import Problem
+from pliant.solver.model.shape_covariance import ShapeCovariance
+from pliant.solver.operators.finite_differences import difference_bands
+from pliant.solver.operators.mesh_laplacian import Laplacian, build_laplacian
+from pliant.solver.records import Choices, Mesh
+from pliant.solver.settings import Settings
+from pliant.solver.shapes.irls import init
+from pliant.solver.shapes.state import State
+from pliant.solver.tracks.normalization import Normalised
+
+
+def build_problem(
+    normalised: Normalised,
+    estimate: CameraEstimate,
+    mesh: Mesh | None,
+    settings: Settings,
+    covariance: ShapeCovariance | None = None,
+) -> tuple[Problem, Choices]:
+    """Choose what the settings leave open, and put the energy together; a covariance makes the prior Gaussian."""
+    # The Gaussian prior is a small difference of large numbers: single precision loses it where a fit is stiff.
+    kind = np.dtype(settings.precision if covariance is None else "float64")
+    laplacian = _laplacian(normalised, mesh, settings)
+    weights, noise, reasons = choose_weights(normalised, covariance, laplacian, settings)
+    frames = len(normalised.points)
+    bands = weights.temporal * difference_bands(frames, weights.order)
+    axes, quadratic = np.eye(3), None
+    if covariance is not None:
+        axes, precisions = covariance.precisions()
+        bands, quadratic = np.zeros_like(bands), precisions.scaled(weights.temporal)
+    projections = np.asarray(estimate.scales)[:, None, None] * np.asarray(estimate.rotations)[:, :2] @ axes
+    problem = Problem(
+        points=np.ascontiguousarray(normalised.points.transpose(0, 2, 1), dtype=kind),
+        confidence=normalised.visible.astype(kind),
+        projections=np.ascontiguousarray(projections, dtype=kind),
+        loss=settings.loss if settings.method == "robust" else "l2",
+        weights=weights,
+        bands=bands,
+        laplacian=laplacian if weights.spatial > 0 or covariance is not None else None,
+        axes=axes,
+        quadratic=quadratic,
+    )
+    choices = Choices(
+        basis_size=estimate.basis_size,
+        temporal_weight=weights.temporal,
+        spatial_weight=weights.spatial,
+        robust_scale=weights.robust_scale,
+        temporal_order=weights.order,
+        low_rank_weight=weights.low_rank,
+        laplacian=laplacian.name if laplacian is not None else "none",
+        unit=normalised.unit,
+        noise=noise * normalised.unit,
+        reasons={**estimate.reasons, **reasons},
+        warnings=(*estimate.warnings, *without_effect(settings)),
+    )
+    return problem, choices
+
+
+def with_bending(
+    problem: Problem, choices: Choices, state: State, settings: Settings
+) -> tuple[Problem, Choices, State]:
+    """Return the same with λ2 from the shapes so far, if the prior is Gaussian and nobody set it."""
+    if problem.quadratic is None or problem.laplacian is None or settings.spatial_weight is not None:
+        return problem, choices, state
+    modes = problem.quadratic.modes[0].shape[1]
+    weight = bending_weight(problem.weights.temporal, problem.laplacian, state.shapes, modes)
+    problem = replace(problem, weights=replace(problem.weights, spatial=weight))
+    reason = f"{choices.reasons['weights']} λ2 = {weight:.2g} as the surface bends."
+    choices = replace(choices, spatial_weight=weight, reasons={**choices.reasons, "weights": reason})
+    return problem, choices, init(problem, state.shapes, state.translations)
+
+
+def _laplacian(normalised: Normalised, mesh: Mesh | None, settings: Settings) -> Laplacian | None:
+    if settings.method in ("pseudo_inverse", "temporal"):
+        return None
+    return build_laplacian(mesh, settings.laplacian, _reference(normalised))
+
+
+def _reference(normalised: Normalised) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+    """Return each point's mean image position with depth 0, shape `(P, 3)`: geometry enough for cotangents."""
+    total = np.maximum(normalised.visible.sum(axis=0), np.finfo(float).tiny)
+    mean = np.einsum("fp,fpc->pc", normalised.visible, normalised.points) / total[:, None]
+    return np.concatenate([mean, np.zeros((len(mean), 1))], axis=1)

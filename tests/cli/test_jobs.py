@@ -1,0 +1,212 @@
+"""The commands that talk to a service, against the double: what they print, and how they end."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pliant.cli import app
+from pliant.cli.exits import Exit
+from pliant.cli.session import Session
+from pliant.client import Problem
+from pliant.client.testing import FakeService
+from typer.testing import CliRunner, Result
+
+FAULT = Problem(
+    title="Lost", status=500, code="worker_lost", detail="The worker vanished. Retry the job.", retryable=True
+)
+Run = Callable[..., Result]
+
+
+@pytest.fixture
+def service() -> FakeService:
+    return FakeService(looks=1)
+
+
+@pytest.fixture
+def run(service: FakeService, monkeypatch: pytest.MonkeyPatch) -> Run:
+    for name in ("PLIANT_URL", "PLIANT_TOKEN"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("COLUMNS", "200")
+
+    def run(*arguments: object) -> Result:
+        return CliRunner().invoke(app, [str(each) for each in arguments], obj=Session(transport=service))
+
+    return run
+
+
+@pytest.fixture
+def tracks(tmp_path: Path) -> Path:
+    path = tmp_path / "tracks.npz"
+    np.savez(path, tracks=np.random.default_rng(0).normal(size=(5, 12, 2)))
+    return path
+
+
+def submitted(run: Run, tracks: Path, *more: object) -> dict[str, Any]:
+    ran = run("submit", tracks, "--json", *more)
+    assert ran.exit_code == 0, ran.output
+    return json.loads(ran.stdout)
+
+
+def test_inspect_may_ask_a_service(run: Run, service: FakeService, tracks: Path) -> None:
+    ran = run("inspect", tracks, "--mesh", "3x4", "-O", "loss=huber", "--url", "http://pliant.test", "--json")
+    assert ran.exit_code == 0, ran.output
+    assert json.loads(ran.stdout)["num_points"] == 12
+    assert [request.url.path for request in service.requests] == ["/v1/inspect"]
+    assert "5 frames × 12 points" in run("inspect", tracks, "--url", "http://pliant.test").stdout
+    np.savez(tracks, tracks=np.ones((2, 9, 2)))
+    assert run("inspect", tracks, "--url", "http://pliant.test").exit_code == Exit.REFUSED
+
+
+def test_submit_wait_and_fetch_in_one_command(run: Run, tracks: Path, tmp_path: Path) -> None:
+    ran = run(
+        "submit", tracks, "--mesh", "3x4", "-O", "loss=huber", "-O", "fps=30", "-n", "take", "-o", tmp_path / "out"
+    )
+    assert ran.exit_code == 0, ran.output
+    assert "succeeded" in ran.stdout
+    assert "5 frames × 12 points" in ran.stdout
+    assert np.load(tmp_path / "out" / "shapes.npz")["shapes"].shape == (5, 12, 3)
+    assert (tmp_path / "out" / "shapes.glb").is_file()
+
+
+def test_options_reach_the_service(run: Run, tracks: Path) -> None:
+    job = submitted(run, tracks, "-O", "loss=huber", "-O", "fps=30", "-O", "basis_size=null", "--id", "mine")
+    assert (job["options"]["loss"], job["options"]["fps"], job["options"]["basis_size"]) == ("huber", 30.0, None)
+    assert job["id"] == "mine"
+
+
+def test_submit_without_waiting_says_how_to_follow(run: Run, tracks: Path) -> None:
+    ran = run("submit", tracks)
+    assert ran.exit_code == 0
+    assert "pliant watch" in ran.stderr
+    assert "queued" in ran.stdout
+
+
+def test_every_json_output_is_one_document(run: Run, tracks: Path, tmp_path: Path) -> None:
+    job = submitted(run, tracks)["id"]
+    assert json.loads(run("status", job, "--json").stdout)["id"] == job
+    assert json.loads(run("watch", job, "--json").stdout)["status"] == "succeeded"
+    assert json.loads(run("log", job, "--json").stdout)[-1] == run("log", job).stdout.splitlines()[-1] == "succeeded"
+    assert [each["id"] for each in json.loads(run("list", "--json").stdout)] == [job]
+    paths = json.loads(run("result", job, "-o", tmp_path / "r", "--json").stdout)
+    assert all(Path(path).is_file() for path in paths.values())
+    assert "properties" in json.loads(run("options", "--json").stdout)
+    assert json.loads(run("delete", job, "--json").stdout) == {"deleted": [job]}
+
+
+def test_list_shows_the_newest_first_and_filters(run: Run, tracks: Path) -> None:
+    ids = [submitted(run, tracks, "--id", f"job-{n}")["id"] for n in range(3)]
+    run("watch", ids[0])
+    rows = [line.split()[:2] for line in run("list").stdout.splitlines()[1:]]
+    assert rows == [["job-2", "queued"], ["job-1", "queued"], ["job-0", "succeeded"]]
+    assert [line.split()[0] for line in run("list", "-s", "succeeded").stdout.splitlines()[1:]] == ["job-0"]
+    assert len(run("list", "--limit", 2).stdout.splitlines()) == 3
+
+
+def test_result_can_fetch_one_file_alone(run: Run, tracks: Path, tmp_path: Path) -> None:
+    job = submitted(run, tracks)["id"]
+    run("watch", job)
+    ran = run("result", job, "-o", tmp_path / "some", "--only", "report.json")
+    assert ran.stdout.strip() == str(tmp_path / "some" / "report.json")
+    assert [path.name for path in (tmp_path / "some").iterdir()] == ["report.json"]
+
+
+def test_cancel_and_retry(run: Run, tracks: Path) -> None:
+    job = submitted(run, tracks)["id"]
+    assert "cancelled" in run("cancel", job).stdout
+    assert "queued" in run("retry", job).stdout
+
+
+def test_options_lists_every_option_with_its_values_and_asks_the_service_if_told(
+    run: Run, service: FakeService
+) -> None:
+    text = run("options").stdout
+    for words in ("temporal_weight", "l1 | l2 | huber", "number ≥ 0 ≤ 1e+06 or null", "boolean"):
+        assert words in text
+    assert service.requests == []
+    assert run("options", "--url", "http://pliant.test").stdout == text
+    assert len(service.requests) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (["status", "nobody"], Exit.NOT_FOUND, "There is no job nobody"),
+        (["status", "../x"], Exit.REFUSED, "Expected the id of a job"),
+        (["list", "-s", "done"], Exit.REFUSED, "expected one of queued, running"),
+        (["submit", "no-such-file.npz"], Exit.REFUSED, "got no file at no-such-file.npz"),
+        (["submit", "TRACKS", "-O", "loss"], Exit.REFUSED, "expected NAME=VALUE, got 'loss'"),
+        (["submit", "TRACKS", "-O", "los=l1"], Exit.REFUSED, "los: Extra inputs are not permitted"),
+        (["submit", "TRACKS", "-O", "loss=l3"], Exit.REFUSED, "loss: Input should be 'l1', 'l2' or 'huber', got 'l3'"),
+        (["submit", "TRACKS", "-m", "no.obj"], Exit.REFUSED, "mesh: expected a file"),
+        (["result", "JOB"], Exit.NOT_NOW, "there is no result yet"),
+        (["delete", "JOB"], Exit.NOT_NOW, "Cancel it first"),
+        (["retry", "JOB"], Exit.NOT_NOW, "Wait for it to end"),
+        (["submit"], Exit.USAGE, "Missing argument"),
+        (["frobnicate"], Exit.USAGE, "No such command"),
+        (["list", "--url", "nowhere"], Exit.REFUSED, "Expected the address of a service"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_every_fault_has_its_exit_code_and_sentence(
+    run: Run, tracks: Path, arguments: list[str], code: Exit, words: str
+) -> None:
+    job = submitted(run, tracks)["id"]
+    ran = run(*({"TRACKS": str(tracks), "JOB": job}.get(word, word) for word in arguments))
+    assert ran.exit_code == code
+    assert words in " ".join(ran.stderr.split())
+    assert ran.stdout == ""
+
+
+def test_a_failed_job_ends_with_1_and_its_sentence(tracks: Path) -> None:
+    session = Session(transport=FakeService(problem=FAULT))
+    ran = CliRunner().invoke(app, ["submit", str(tracks), "--wait"], obj=session)
+    assert ran.exit_code == Exit.FAILED
+    assert "The worker vanished. Retry the job." in ran.stderr
+    ran = CliRunner().invoke(app, ["submit", str(tracks), "--wait", "--json"], obj=session)
+    assert json.loads(ran.stderr)["code"] == "worker_lost"
+    assert json.loads(ran.stderr)["exit_code"] == 1
+
+
+def test_waiting_too_long_and_nobody_answering(tracks: Path) -> None:
+    endless = Session(transport=FakeService(looks=float("inf")))
+    ran = CliRunner().invoke(app, ["submit", str(tracks), "--wait", "--timeout", "0.3"], obj=endless)
+    assert ran.exit_code == Exit.TIME_IS_UP
+    ran = CliRunner().invoke(app, ["list", "--url", "http://127.0.0.1:9", "--json"])
+    assert ran.exit_code == Exit.UNREACHABLE
+    assert "pliant up" in json.loads(ran.stderr)["detail"]
+
+
+def test_the_token_comes_from_the_environment(tracks: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    session = Session(transport=FakeService(token="s3cret"))
+    ran = CliRunner().invoke(app, ["list"], obj=session)
+    assert ran.exit_code == Exit.NOT_NOW
+    monkeypatch.setenv("PLIANT_TOKEN", "s3cret")
+    assert CliRunner().invoke(app, ["list"], obj=session).exit_code == 0
+
+
+def test_ctrl_c_ends_with_130(tracks: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("pliant.client.client.Client.submit", interrupt)
+    ran = CliRunner().invoke(app, ["submit", str(tracks)], obj=Session(transport=FakeService()))
+    assert ran.exit_code == Exit.INTERRUPTED
+    assert "Interrupted" in ran.stderr
+
+
+def test_a_defect_keeps_its_traceback(tracks: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def break_down(*_: object, **__: object) -> None:
+        raise ZeroDivisionError("a defect")
+
+    monkeypatch.setattr("pliant.client.client.Client.list", break_down)
+    ran = CliRunner().invoke(app, ["list"], obj=Session(transport=FakeService()))
+    assert isinstance(ran.exception, ZeroDivisionError)
+
+
+def test_version(run: Run) -> None:
+    assert run("--version").stdout.startswith("pliant 0.")

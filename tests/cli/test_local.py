@@ -1,0 +1,178 @@
+"""What the commands that need no service decide: ports, addresses, verdicts, findings."""
+
+from __future__ import annotations
+
+import importlib
+import io
+import os
+import re
+import socket
+import subprocess
+import sys
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import pytest
+from pliant.cli.demo import GOOD, announced, judge
+from pliant.cli.session import Session, parse_options
+from pliant.cli.solve import file_or_word
+from pliant.client import BadArgument, Unreachable
+from pliant.client.testing import FakeService
+from pliant.worker.settings import NUMERICAL_THREADS
+
+doctor = importlib.import_module("pliant.cli.doctor")  # the name in the package is the command's
+up = importlib.import_module("pliant.cli.up")
+
+
+def test_options_are_json_where_they_can_be() -> None:
+    given = ["loss=l1", "fps=12.5", "basis_size=null", "refine_rotations=false", " seed = 3", "a=b=c"]
+    expected = {"loss": "l1", "fps": 12.5, "basis_size": None, "refine_rotations": False, "seed": 3, "a": "b=c"}
+    assert parse_options(given) == expected
+    assert parse_options(None) == {}
+
+
+def test_a_mesh_is_a_file_if_there_is_one(tmp_path: Path) -> None:
+    (tmp_path / "3x4").write_text("")
+    assert file_or_word(str(tmp_path / "3x4")) == tmp_path / "3x4"
+    assert file_or_word("3x4") == "3x4"
+    assert file_or_word(None) is None
+
+
+def test_a_port_that_is_taken_is_refused_and_0_finds_a_free_one() -> None:
+    with socket.socket() as holder:
+        holder.bind(("127.0.0.1", 0))
+        holder.listen()
+        port = holder.getsockname()[1]
+        with pytest.raises(BadArgument, match=rf"Cannot listen on 127\.0\.0\.1 port {port}.*--port 0"):
+            up.taken("127.0.0.1", port)
+        assert 0 < up.taken("127.0.0.1", 0) != port
+    with pytest.raises(BadArgument, match=r"Cannot listen on 192\.0\.2\.1"):
+        up.taken("192.0.2.1", 8000)
+
+
+@pytest.mark.parametrize(
+    ("host", "url"),
+    [
+        ("127.0.0.1", "http://127.0.0.1:80"),
+        ("0.0.0.0", "http://127.0.0.1:80"),
+        ("::", "http://[::1]:80"),
+        ("::1", "http://[::1]:80"),
+        ("host.example", "http://host.example:80"),
+    ],
+)
+def test_the_address_is_one_that_can_be_called_from_here(host: str, url: str) -> None:
+    assert up.address(host, 80) == url
+
+
+def test_the_command_line_comes_before_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PLIANT_WORKERS", "3")
+    monkeypatch.setenv("PLIANT_DATA", "there")
+    assert (up.chosen(None, None).workers, up.chosen(None, None).data) == (3, Path("there"))
+    assert (up.chosen(Path("here"), 5).workers, up.chosen(Path("here"), 5).data) == (5, Path("here"))
+
+
+def test_a_service_that_ends_instead_of_starting_is_reported() -> None:
+    process = subprocess.Popen([sys.executable, "-c", "raise SystemExit(7)"])
+    process.wait()
+    with pytest.raises(Unreachable, match="ended with code 7"):
+        up.until_ready("http://127.0.0.1:9")(process)
+
+
+def test_a_service_that_never_gets_ready_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(up, "READY_WITHIN", 0.3)
+    process = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+    try:
+        with pytest.raises(Unreachable, match=r"not ready after 0\.3 s: .*Connection refused"):
+            up.until_ready("http://127.0.0.1:9")(process)
+    finally:
+        process.kill()
+        process.wait()
+
+
+def test_the_demonstration_is_good_only_if_every_error_that_counts_is_there_and_small() -> None:
+    assert judge(GOOD)
+    assert judge({**GOOD, "reprojection_rms": 1e9})
+    assert not judge({})
+    for name, bound in GOOD.items():
+        assert not judge({**GOOD, name: 1.01 * bound})
+        assert not judge({**GOOD, name: float("nan")})
+
+
+def test_the_address_is_read_from_what_up_announces() -> None:
+    assert announced(io.StringIO('{\n  "url": "http://x",\n  "data": "d"\n}\n')) == "http://x"
+    assert announced(io.StringIO("")) is None
+
+
+def verdicts(findings: object) -> dict[str, str]:
+    return {finding.what: finding.verdict for finding in findings}  # type: ignore[attr-defined]
+
+
+def test_the_doctor_misses_packages(monkeypatch: pytest.MonkeyPatch) -> None:
+    def without(*absent: str):
+        def find(name: str) -> str:
+            if name in absent:
+                raise PackageNotFoundError(name)
+            return version(name)
+
+        return find
+
+    assert verdicts(doctor.check_packages())["packages"] == "good"
+    broken = list(doctor.check_packages(without("scipy", "matplotlib")))
+    assert verdicts(broken) == {"packages": "bad", "matplotlib": "note"}
+    assert broken[0].found == "missing: scipy"
+    monkeypatch.setattr(doctor, "OLDEST_PYTHON", (4, 0))
+    assert verdicts(doctor.check_python()) == {"Python": "bad"}
+
+
+def test_the_doctor_measures_and_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in NUMERICAL_THREADS:
+        monkeypatch.delenv(name, raising=False)
+    (blas,) = doctor.check_blas()
+    assert re.search(r"\d+ Gflop/s, \d+\.\d threads at work \(no variable limits them\)", blas.found)
+    monkeypatch.setenv("OMP_NUM_THREADS", "1000")
+    (blas,) = doctor.check_blas()
+    assert blas.verdict == "note"
+    assert "OMP_NUM_THREADS=1000" in blas.found
+    assert "lower the variable" in blas.advice
+    monkeypatch.delenv("PLIANT_WORKERS", raising=False)
+    assert verdicts(doctor.check_cores()) == {"cores": "good"}
+    monkeypatch.setenv("PLIANT_THREADS", "1000")
+    assert verdicts(doctor.check_cores()) == {"cores": "note"}
+
+
+def test_the_doctor_tries_the_storage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "ROOM", 1)
+    assert verdicts(doctor.check_storage(tmp_path / "not" / "yet")) == {"storage": "good"}
+    assert list(tmp_path.iterdir()) == []
+    monkeypatch.setattr(doctor, "ROOM", 1 << 60)
+    assert verdicts(doctor.check_storage(tmp_path)) == {"storage": "note"}
+    (tmp_path / "file").write_text("")
+    assert verdicts(doctor.check_storage(tmp_path / "file" / "data")) == {"storage": "bad"}
+
+
+def test_the_doctor_looks_for_the_queue(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("PLIANT_REDIS_URL", raising=False)
+    assert verdicts(doctor.check_valkey()) == {"queue": "good"}
+    with socket.socket() as server:
+        server.bind(("127.0.0.1", 0))
+        server.listen()
+        port = server.getsockname()[1]
+        monkeypatch.setenv("PLIANT_REDIS_URL", f"redis://:secret@127.0.0.1:{port}/0")
+        (found,) = doctor.check_valkey()
+        assert found.verdict == "good"
+        assert "secret" not in found.found
+        assert verdicts(doctor.check_port(port)) == {"port": "note"}
+    monkeypatch.setenv("PLIANT_REDIS_URL", f"unix://{tmp_path}/none.sock")
+    assert verdicts(doctor.check_valkey()) == {"queue": "bad"}
+    monkeypatch.delenv("PLIANT_REDIS_URL")
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert verdicts(doctor.check_valkey()) == {"queue": "bad"}
+
+
+def test_the_doctor_asks_the_service() -> None:
+    assert verdicts(doctor.check_service(Session(transport=FakeService()), "http://pliant.test")) == {"service": "good"}
+    assert verdicts(doctor.check_service(Session(transport=FakeService(token="t")), "http://pliant.test")) == {
+        "service": "note"
+    }
+    assert "PLIANT_TOKEN" not in os.environ

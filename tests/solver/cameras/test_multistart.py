@@ -1,0 +1,98 @@
+"""Cameras of several factorizations: which of them the refinement with the shapes may start from, and that it takes the better start."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pliant.solver import Settings, gallery
+from pliant.solver.cameras.estimation import TOO_DEEP, CameraEstimate, estimate_cameras, joint_refinement, restarted
+from pliant.solver.cameras.joint_refinement import learn
+from pliant.solver.cameras.multistart import depth
+from pliant.solver.model.model_order import Support
+from pliant.solver.model.shape_covariance import MOST_MODES
+from pliant.solver.model.so3 import angles_between, exponential, nearest
+from pliant.solver.tracks.normalization import normalise
+
+FRAMES = 16
+
+
+def test_rivals_are_cameras_of_their_own_and_not_far_too_deep() -> None:
+    face = gallery.face(24, 200)
+    found = estimate_cameras(normalise(face.tracks), Settings())
+    assert found.rivals
+    assert len({size for size, _ in found.rivals}) == len(found.rivals)
+    for _, rotations in found.rivals:
+        assert rotations.shape == (24, 3, 3)
+        assert depth(found.gram, rotations) < TOO_DEEP
+    assert not estimate_cameras(normalise(face.tracks), Settings(refine_rotations=False)).rivals
+
+
+def test_a_sheet_has_no_rivals_for_its_sides_are_chosen() -> None:
+    assert not estimate_cameras(normalise(gallery.flag(24, 400).tracks), Settings()).rivals
+
+
+def test_cameras_far_too_deep_are_no_rivals(monkeypatch: pytest.MonkeyPatch) -> None:
+    face = gallery.face(24, 200)
+    monkeypatch.setattr("pliant.solver.cameras.estimation.TOO_DEEP", 0.0)
+    assert not estimate_cameras(normalise(face.tracks), Settings()).rivals
+
+
+@pytest.mark.parametrize("better", ["own", "rival"])
+def test_it_starts_from_the_cameras_that_lead_to_more_probable_ones(
+    better: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "pliant.solver.model.full_mode_covariance.POINTS_PER_COEFFICIENT", np.inf
+    )  # it would mend either start
+    random, time = np.random.default_rng(2), np.linspace(0, 1, FRAMES)
+    true = exponential(np.stack([0.3 * np.sin(6 * time), np.sin(4 * time), 0.1 * time], axis=1))
+    modes = np.stack([0.2 * np.sin(2 * np.pi * time), 0.2 * np.sin(3 * np.pi * time)], axis=1)
+    shapes = np.einsum("fk,kcp->fcp", modes, random.normal(size=(2, 3, 300))) + random.normal(size=(3, 300))
+    tracks = np.einsum("fij,fjp->fpi", true[:, :2], shapes)
+    rows = tracks.transpose(0, 2, 1).reshape(2 * FRAMES, -1)
+    wrong = exponential(0.2 * np.stack([np.sin(5 * time + 1), np.cos(3 * time), np.sin(2 * time)], axis=1)) @ true
+    own, rival = (true, wrong) if better == "own" else (wrong, true)
+    estimate = CameraEstimate(
+        own, np.ones(FRAMES), np.zeros((FRAMES, 2)), 1, rows @ rows.T / 300, tracks, rivals=((7, rival),)
+    )
+    found, _ = learn(estimate, np.ones(FRAMES, dtype=bool), turning=True)
+    common = nearest(np.einsum("fij,fik->jk", found.rotations, true))
+    assert np.degrees(angles_between(found.rotations @ common, true)).mean() < 0.1
+    assert found.basis_size == (7 if better == "rival" else 1)
+    assert ("K = 7 as they came" in found.reasons.get("basis_size", "")) == (better == "rival")
+
+
+@pytest.mark.parametrize("outliers", [0.0, 0.1])
+def test_where_outliers_were_found_cameras_keep_all_modes_and_shapes_those_confirmed(
+    outliers: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    random, time = np.random.default_rng(2), np.linspace(0, 1, FRAMES)
+    true = exponential(time[:, None] * np.array([0.3, 1.0, 0.1]))
+    mode = 0.3 * np.cos(np.pi * time)  # slow, or the tracks would be taken for noisy ones
+    shapes = mode[:, None, None] * random.normal(size=(3, 40)) + random.normal(size=(3, 40))
+    tracks = np.einsum("fij,fjp->fpi", true[:, :2], shapes)
+    wrong = random.random((FRAMES, 40)) < 0.02
+    tracks[wrong] += random.normal(0, 0.1, (wrong.sum(), 2))
+    rows = tracks.transpose(0, 2, 1).reshape(2 * FRAMES, -1)
+    estimate = CameraEstimate(
+        true, np.ones(FRAMES), np.zeros((FRAMES, 2)), 1, rows @ rows.T / 40, tracks, outliers=outliers
+    )
+    asked: list[int] = []
+    refined = joint_refinement.refined
+
+    def spied(*given: object, support: Support, **more: object) -> object:
+        asked.append(support.most)
+        return refined(*given, support=support, **more)  # type: ignore[arg-type]
+
+    monkeypatch.setattr("pliant.solver.cameras.joint_refinement.refined", spied)
+    _, covariance = learn(estimate, np.ones(FRAMES, dtype=bool), turning=True)
+    assert set(asked) == {MOST_MODES}
+    assert (covariance.modes.shape[1] <= 4) == (outliers > 0)
+
+
+def test_a_rival_that_hardly_turns_is_warned_of() -> None:
+    still = np.broadcast_to(np.eye(3), (FRAMES, 3, 3))
+    turning = exponential(np.linspace(0, 1, FRAMES)[:, None] * np.array([0.0, 1.0, 0.0]))
+    own = CameraEstimate(turning, np.ones(FRAMES), np.zeros((FRAMES, 2)), 1, np.zeros((0, 0)), np.zeros((FRAMES, 0, 2)))
+    assert restarted(own, 3, still).warnings
+    assert not restarted(restarted(own, 3, still), 1, turning).warnings

@@ -1,0 +1,53 @@
+"""Scales: found where the camera zooms, exactly 1 where it does not, however the object deforms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pliant.solver import Settings, gallery, solve
+from pliant.solver.cameras.scale import rigid_scales
+from pliant.solver.evaluation import metrics
+
+
+def missed(found: np.ndarray, truth: np.ndarray) -> float:
+    """Standard deviation of the logarithm of the ratio."""
+    return float(np.std(np.log(found / truth)))
+
+
+@pytest.mark.parametrize(("frames", "points"), [(24, 400), (60, 300)])
+def test_a_zooming_camera_is_recovered(frames: int, points: int) -> None:
+    film = gallery.face(frames, points, scale_change=0.1)
+    found = solve(film.tracks)
+    plain = solve(film.tracks, settings=Settings(camera="orthographic"))
+    truth = np.asarray(film.scales)
+    assert missed(found.camera.scales, truth) < 0.4 * missed(np.ones(frames), truth)
+    assert np.log(found.camera.scales).mean() == pytest.approx(0, abs=1e-12)
+    assert metrics.e3d_frame(found.shapes, film.shapes) < 0.7 * metrics.e3d_frame(plain.shapes, film.shapes)
+    assert found.choices.reasons["scales"].startswith("Scales from")
+
+
+@pytest.mark.parametrize("name", ["face", "flag"])
+def test_a_camera_that_does_not_zoom_has_scales_of_one(name: str) -> None:
+    film = {"face": gallery.face, "flag": gallery.flag}[name](30, 300)
+    found = solve(film.tracks)
+    assert (found.camera.scales == 1).all()
+    assert found.choices.reasons["scales"].startswith("Every scale is 1")
+
+
+def test_scales_wider_apart_than_any_cameras_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    film = gallery.face(24, 300, scale_change=0.1)
+    for module in ("zoom", "joint"):  # neither the rigid scales nor those found with the shapes
+        monkeypatch.setattr(f"pliant.solver.{module}.WIDEST", 0.02)
+    found = solve(film.tracks)
+    assert (found.camera.scales == 1).all()
+    assert "wider apart than any camera's" in found.choices.reasons["scales"]
+
+
+def test_rigid_scales_are_exact_for_a_rigid_shape() -> None:
+    random = np.random.default_rng(0)
+    shape = random.normal(size=(3, 50))
+    scales = np.exp(random.normal(0, 0.1, 9))
+    scales /= np.exp(np.log(scales).mean())
+    rotations = np.linalg.qr(random.normal(size=(9, 3, 3)))[0]
+    rows = (scales[:, None, None] * rotations[:, :2] @ shape).reshape(18, 50)
+    np.testing.assert_allclose(rigid_scales(rows @ rows.T, rotations), scales, rtol=1e-4)

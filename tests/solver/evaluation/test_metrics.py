@@ -1,0 +1,176 @@
+"""Every metric against numbers that follow from its formula by hand."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from pliant.solver import InvalidInput, Tracks
+from pliant.solver.evaluation.alignment import MIRROR, align, procrustes
+from pliant.solver.evaluation.metrics import (
+    e3d_frame,
+    e3d_frame_similarity,
+    e3d_mocap,
+    e3d_sequence,
+    evaluate,
+    frame_errors,
+    point_errors,
+    reprojection,
+    rotation_degrees,
+)
+from scipy.spatial.transform import Rotation
+
+ALL = (e3d_sequence, e3d_frame, e3d_frame_similarity, e3d_mocap)
+random = np.random.default_rng(7)
+TRUTH = random.standard_normal((6, 30, 3))
+TURN = Rotation.from_euler("xyz", (20, -50, 110), degrees=True).as_matrix()
+TURNS = Rotation.random(6, rng=random).as_matrix()
+
+
+def solution_of(shapes, rotations=None, scales=None, translations=None):
+    frames = len(shapes)
+    camera = SimpleNamespace(
+        rotations=np.tile(np.eye(3), (frames, 1, 1)) if rotations is None else rotations,
+        scales=np.ones(frames) if scales is None else scales,
+        translations=np.zeros((frames, 2)) if translations is None else translations,
+    )
+    return SimpleNamespace(shapes=shapes, camera=camera)
+
+
+@pytest.mark.parametrize("metric", ALL)
+def test_identity_and_translation_cost_nothing(metric):
+    assert metric(TRUTH, TRUTH) == pytest.approx(0, abs=1e-14)
+    assert metric(TRUTH + random.standard_normal((6, 1, 3)), TRUTH) == pytest.approx(0, abs=1e-14)
+
+
+@pytest.mark.parametrize("metric", ALL)
+@pytest.mark.parametrize("mirror", [np.eye(3), MIRROR, -np.eye(3)])
+def test_one_orthogonal_matrix_for_the_sequence_is_always_free(metric, mirror):
+    assert metric(TRUTH @ (mirror @ TURN).T, TRUTH) == pytest.approx(0, abs=1e-13)
+
+
+def test_a_rotation_per_frame_is_free_only_in_the_metrics_per_frame():
+    turned = TRUTH @ TURNS.transpose(0, 2, 1)
+    assert e3d_frame(turned, TRUTH) == pytest.approx(0, abs=1e-13)
+    assert e3d_frame_similarity(turned, TRUTH) == pytest.approx(0, abs=1e-13)
+    assert e3d_sequence(turned, TRUTH) > 0.5
+    assert e3d_mocap(turned, TRUTH) > 0.5
+
+
+def test_mirroring_half_of_the_frames_is_free_only_with_a_mirror_per_frame():
+    flipped = TRUTH.copy()
+    flipped[::2] = flipped[::2] @ MIRROR
+    assert e3d_frame_similarity(flipped, TRUTH) == pytest.approx(0, abs=1e-13)
+    assert frame_errors(flipped, TRUTH, kind="frame_similarity").max() == pytest.approx(0, abs=1e-13)
+    # Half of the frames fit exactly and half are mirror images, whichever of the two the sequence's mirror is.
+    errors = np.sort(frame_errors(flipped, TRUTH))
+    assert errors[:3] == pytest.approx(0, abs=1e-13)
+    assert errors[3:].min() > 0.5
+    assert e3d_frame(flipped, TRUTH) == pytest.approx(errors[3:].sum() / 6)
+    assert e3d_sequence(flipped, TRUTH) > 0.5
+
+
+@pytest.mark.parametrize("metric", [e3d_sequence, e3d_frame])
+def test_scale_counts_one_to_one_unless_it_is_free(metric):
+    assert metric(1.25 * TRUTH, TRUTH) == pytest.approx(0.25)
+    assert metric(0.8 * TRUTH, TRUTH) == pytest.approx(0.2)
+    assert e3d_frame_similarity(1.25 * TRUTH, TRUTH) == pytest.approx(0, abs=1e-13)
+
+
+def test_similarity_error_is_the_sine_between_the_shapes():
+    # Truth along x, reconstruction along x with an orthogonal part of half its size: min over c of ‖c S − G‖/‖G‖ = sin(atan ½).
+    truth = np.zeros((3, 4, 3))
+    truth[:, :, 0] = (-1, -1, 1, 1)
+    ours = 3 * truth
+    ours[:, :, 1] = 1.5 * np.array((-1, 1, -1, 1))
+    assert e3d_frame_similarity(ours, truth) == pytest.approx(np.sin(np.arctan(0.5)))
+    assert align(ours, truth, kind="frame_similarity").scales == pytest.approx(
+        np.full(3, np.cos(np.arctan(0.5)) ** 2 / 3)
+    )
+
+
+def test_mocap_error_worked_by_hand():
+    # A square in the plane: x, y = ±1, z = 0. Population deviations are 1, 1 and 0, so σ = 2/3 in every frame.
+    square = np.array([(1, 1, 0), (1, -1, 0), (-1, 1, 0), (-1, -1, 0)], dtype=float)
+    truth = np.stack([square] * 3)
+    # ±h out of the plane, alternating: uncorrelated with x and y, so the best Q leaves it; every point is h off.
+    ours = truth.copy()
+    ours[:, :, 2] = 0.3 * np.array((1, -1, -1, 1))
+    assert e3d_mocap(ours, truth) == pytest.approx(0.3 / (2 / 3))
+    assert e3d_sequence(ours, truth) == pytest.approx(0.3 / np.sqrt(2))
+    assert point_errors(ours, truth, kind="sequence") == pytest.approx(np.full((3, 4), 0.3))
+
+
+def test_metrics_are_ordered_by_their_freedom():
+    ours = TRUTH @ TURN.T + 0.1 * random.standard_normal(TRUTH.shape)
+    assert 0.05 < e3d_frame_similarity(ours, TRUTH) < e3d_frame(ours, TRUTH) < e3d_sequence(ours, TRUTH) < 0.15
+
+
+def test_alignment_beats_any_other_rotation_nearby():
+    products = random.standard_normal((3, 3))
+    for proper in (False, True):
+        best = procrustes(products, proper=proper)
+        assert best @ best.T == pytest.approx(np.eye(3))
+        for nudge in Rotation.from_rotvec(0.05 * random.standard_normal((20, 3))).as_matrix():
+            assert np.sum(best * products) > np.sum((nudge @ best) * products)
+    assert np.linalg.det(procrustes(-np.eye(3), proper=True)) == pytest.approx(1)
+    assert procrustes(-np.eye(3)) == pytest.approx(-np.eye(3))
+
+
+def test_rotation_degrees_ignores_world_axes_and_the_mirror_but_not_an_error():
+    assert rotation_degrees(TURNS @ TURN, TURNS) == pytest.approx(0, abs=1e-10)
+    assert rotation_degrees(MIRROR @ TURNS @ TURN @ MIRROR, TURNS) == pytest.approx(0, abs=1e-10)
+    # A path that turns at 9° a frame instead of 10°: frame f of 5 is off by f − 2 degrees from the best common turn.
+    true, ours = (Rotation.from_euler("y", step * np.arange(5)[:, None], degrees=True).as_matrix() for step in (10, 9))
+    assert rotation_degrees(ours, true) == pytest.approx((2 + 1 + 0 + 1 + 2) / 5)
+
+
+def test_reprojection_weighs_with_confidence_and_skips_the_hidden():
+    shapes = np.zeros((3, 4, 3))
+    shapes[:, :, :2] = [(0, 0), (1, 0), (0, 1), (1, 1)]
+    scales, shift = np.array((1.0, 2.0, 0.5)), np.array([(5, 6)] * 3, dtype=float)
+    points = scales[:, None, None] * shapes[:, :, :2] + shift[:, None]
+    visible = np.ones((3, 4))
+    points[0, 0] += (3, 4)
+    points[1, 1] += (6, 8)
+    points[2, 2] += 1000
+    visible[1, 1], visible[2, 2] = 0.25, 0
+    fit = reprojection(Tracks.from_arrays(points, visible), solution_of(shapes, scales=scales, translations=shift))
+    assert fit.median == 0
+    assert fit.rms == pytest.approx(np.sqrt((25 + 0.25 * 100) / (10 + 0.25)))
+
+
+def test_evaluate_names_what_the_inputs_allow():
+    tracks = Tracks.from_arrays(TRUTH[..., :2])
+    rotations = np.tile(np.eye(3), (6, 1, 1))
+    fit = {"reprojection_median", "reprojection_rms"}
+    assert set(evaluate(solution_of(TRUTH), tracks)) == fit
+    shapes = {"e3d_sequence", "e3d_frame", "e3d_frame_similarity", "e3d_mocap"}
+    both = evaluate(solution_of(TRUTH), tracks, TRUTH, rotations)
+    assert set(both) == fit | shapes | {"rotation_degrees"}
+    assert max(both.values()) < 1e-12
+    off = evaluate(solution_of(TRUTH + 0.1 * random.standard_normal(TRUTH.shape)), tracks, TRUTH)
+    assert off["e3d_sequence"] == pytest.approx(0.1, rel=0.2)
+    assert off["reprojection_rms"] == pytest.approx(0.1 * np.sqrt(2), rel=0.2)
+
+
+@pytest.mark.parametrize(
+    ("ours", "truth", "code"),
+    [
+        (TRUTH, TRUTH[..., :2], "wrong_shape"),
+        (TRUTH, TRUTH[:5], "wrong_shape"),
+        (TRUTH, np.where(np.arange(3) == 1, np.nan, TRUTH), "not_finite"),
+        (np.full_like(TRUTH, np.inf), TRUTH, "not_finite"),
+        (TRUTH, np.ones_like(TRUTH), "no_extent"),
+    ],
+)
+def test_unusable_truth_is_refused(ours, truth, code):
+    with pytest.raises(InvalidInput) as caught:
+        align(ours, truth)
+    assert caught.value.code == code
+
+
+def test_rotations_of_another_shape_are_refused():
+    with pytest.raises(InvalidInput, match=r"expected \(frames, 3, 3\)"):
+        rotation_degrees(TURNS, TURNS[:, :2])

@@ -1,0 +1,193 @@
+"""The Gaussian shape prior: its mathematics, what it gains, and what it must not do."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pliant.solver import KnownCamera, Settings, gallery, solve
+from pliant.solver.cameras.estimation import CameraEstimate
+from pliant.solver.cameras.joint_refinement import learn, telling_frames
+from pliant.solver.evaluation import metrics
+from pliant.solver.model.shape_covariance import (
+    DRIFT_FLOOR,
+    FREED,
+    ITERATIONS,
+    ShapeCovariance,
+    annealed,
+    begin,
+    freed,
+    improve,
+    learned,
+    random_walk,
+)
+from pliant.solver.model.so3 import exponential
+
+FRAMES = 14
+
+
+def drawn(points: int = 4000, noise: float = 1e-4) -> tuple[ShapeCovariance, np.ndarray, np.ndarray]:
+    """A covariance, cameras that turn, and the Gram matrix of points drawn from it."""
+    random = np.random.default_rng(5)
+    time = np.linspace(0, 1, FRAMES)
+    modes = np.stack([0.2 * np.sin(2 * np.pi * time), 0.1 * np.cos(5 * time)], axis=1)
+    play = np.diag([0.5, 1.0, 1.5])
+    truth = ShapeCovariance(np.diag([0.2, 0.4, 0.6]), play, modes, 1e-4, noise, np.inf)
+    angles = np.stack([0.3 * np.sin(7 * time), 1.2 * np.sin(4 * time), 0.2 * time], axis=1)
+    pairs = exponential(angles)[:, :2]
+    frames = np.linalg.cholesky(truth.over_frames())
+    middle = random.standard_normal((points, 3)) @ np.sqrt(truth.extent)
+    deform = np.einsum("fg,pgc->fpc", frames, random.standard_normal((points, FRAMES, 3))) @ np.sqrt(play)
+    image = np.einsum("fic,fpc->fip", pairs, middle + deform) + noise**0.5 * random.standard_normal((FRAMES, 2, points))
+    rows = image.reshape(2 * FRAMES, points)
+    return truth, pairs, rows @ rows.T / points
+
+
+def test_no_round_makes_the_tracks_less_probable() -> None:
+    _, pairs, gram = drawn(300)
+    covariance = begin(gram, pairs)
+    likelihoods = []
+    for _ in range(12):
+        covariance = improve(covariance, gram, pairs, iterations=1)
+        likelihoods.append(covariance.likelihood)
+    assert (np.diff(likelihoods) < 1e-9).all()
+    assert likelihoods[0] - likelihoods[-1] > 0.01
+
+
+def test_what_the_points_were_drawn_from_is_found() -> None:
+    truth, pairs, gram = drawn()
+    found = improve(begin(gram, pairs), gram, pairs, iterations=300, warm=1e-2)
+    for mine, known in (
+        (found.over_frames(), truth.over_frames()),
+        (found.play, truth.play),
+        (found.extent, truth.extent),
+    ):
+        assert np.linalg.norm(mine - known) < 0.2 * np.linalg.norm(known)
+    assert np.linalg.norm(found.over_frames()) > 0.8 * np.linalg.norm(truth.over_frames())
+
+
+@pytest.mark.parametrize("most", [2, 64])
+def test_learned_is_the_more_probable_of_two_ways(most: int) -> None:
+    _, pairs, gram = drawn(300)
+    found = learned(gram, pairs, most=most)
+    cold = improve(begin(gram, pairs, most=most), gram, pairs, iterations=ITERATIONS, most=most)
+    warm = improve(
+        freed(annealed(gram, pairs, most=most, iterations=ITERATIONS)),
+        gram,
+        pairs,
+        iterations=ITERATIONS // 2,
+        most=most,
+    )
+    assert found.likelihood == min(cold.likelihood, warm.likelihood)
+    assert cold.likelihood != warm.likelihood
+    assert found.modes.shape[1] <= most
+
+
+def test_mean_positions_freed_are_one_more_mode_and_nothing_else() -> None:
+    truth, _, _ = drawn(10)
+    free = freed(truth)
+    np.testing.assert_array_equal(free.modes[:, :-1], truth.modes)
+    np.testing.assert_allclose(free.over_frames() - truth.over_frames(), FREED**2)
+    assert free.extent is truth.extent
+    assert (free.drift, free.noise) == (truth.drift, truth.noise)
+
+
+def test_precisions_are_the_inverse_of_the_covariance() -> None:
+    truth, _, _ = drawn(10)
+    turn = exponential(np.array([0.3, -0.5, 0.8]))
+    turned = replace(truth, extent=turn @ truth.extent @ turn.T, play=np.asarray(truth.play + 0.2))
+    basis, precisions = turned.precisions()
+    whole = np.kron(np.ones((FRAMES, FRAMES)), turned.extent) + np.kron(turned.over_frames(), turned.play)
+    inverse = np.zeros((FRAMES, 3, FRAMES, 3))
+    for axis in range(3):
+        inverse[:, axis, :, axis] = precisions.matrices()[axis]
+    back = np.kron(np.eye(FRAMES), np.linalg.inv(basis))
+    np.testing.assert_allclose(
+        back.T @ inverse.reshape(3 * FRAMES, -1) @ back, np.linalg.inv(whole), rtol=1e-6, atol=1e-4
+    )
+
+
+def test_between_the_frames_used_modes_run_straight() -> None:
+    truth, _, _ = drawn(10)
+    wide = truth.stretched(np.arange(FRAMES) * 2, 2 * FRAMES - 1)
+    np.testing.assert_array_equal(wide.modes[::2], truth.modes)
+    np.testing.assert_allclose(wide.modes[1::2], (truth.modes[1:] + truth.modes[:-1]) / 2)
+    assert np.trace(random_walk(31)) == pytest.approx(31)
+
+
+def test_the_drift_never_falls_below_its_floor() -> None:
+    _, pairs, gram = drawn(300, noise=0.0)
+    assert improve(begin(gram, pairs), gram, pairs, iterations=40).drift >= DRIFT_FLOOR
+
+
+@pytest.fixture(scope="module")
+def face() -> gallery.Sequence:
+    return gallery.face(24, 400)
+
+
+def error(face: gallery.Sequence, *, known: bool, settings: Settings, spoiled: gallery.Sequence | None = None) -> float:
+    cameras = KnownCamera.from_arrays(face.rotations, face.scales) if known else None
+    given = (spoiled or face).tracks
+    return metrics.e3d_frame(solve(given, cameras=cameras, settings=settings).shapes, face.shapes)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_it_brings_a_face_far_nearer_to_the_truth(face: gallery.Sequence, known: bool) -> None:
+    smooth = error(face, known=known, settings=Settings(prior="smooth"))
+    gaussian = error(face, known=known, settings=Settings())
+    assert 1e-4 < gaussian < 0.6 * smooth
+
+
+def test_gross_outliers_are_left_out_and_said(face: gallery.Sequence) -> None:
+    spoiled = gallery.corrupt(face, outliers=0.1, seed=1)
+    assert error(face, known=True, settings=Settings(), spoiled=spoiled) < 0.03
+    cameras = KnownCamera.from_arrays(face.rotations, face.scales)
+    found = solve(spoiled.tracks, cameras=cameras)
+    moved = np.linalg.norm(spoiled.tracks.points - face.tracks.points, axis=2)
+    gross = moved > 0.3 * found.choices.unit
+    assert (found.weights[gross] < 0.1).mean() > 0.98
+    assert (found.weights[moved == 0] > 0.1).mean() > 0.95
+    assert np.median(found.residuals[gross]) > 0.2 * found.choices.unit  # they are reported, not hidden
+
+
+def test_a_long_film_is_learned_from_some_of_its_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+    long = gallery.face(40, 150)
+    whole = metrics.e3d_frame(solve(long.tracks).shapes, long.shapes)
+    monkeypatch.setattr("pliant.solver.cameras.joint_refinement.LEARNED_FRAMES", 25)
+    some = metrics.e3d_frame(solve(long.tracks).shapes, long.shapes)
+    smooth = metrics.e3d_frame(solve(long.tracks, settings=Settings(prior="smooth")).shapes, long.shapes)
+    assert whole < some + 0.01
+    assert some < smooth
+
+
+def test_frames_that_show_little_are_not_learned_from() -> None:
+    visible = np.ones((10, 50))
+    visible[3] = 0
+    visible[4, 4:] = 0
+    assert telling_frames(visible).tolist() == [True] * 3 + [False] * 2 + [True] * 5
+    assert telling_frames(np.eye(10)).all()
+
+
+def test_a_stop_leaves_the_rotations_of_the_start(face: gallery.Sequence) -> None:
+    pairs = np.asarray(face.rotations)[:, :2]
+    points = face.tracks.points - face.tracks.points.mean(axis=1, keepdims=True)
+    rows = points.transpose(0, 2, 1).reshape(48, -1) / points.std()
+    estimate = CameraEstimate(
+        np.asarray(face.rotations),
+        np.ones(24),
+        np.zeros((24, 2)),
+        1,
+        rows @ rows.T / 400,
+        rows.reshape(24, 2, -1).transpose(0, 2, 1),
+    )
+    shown = np.ones(24, dtype=bool)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("pliant.solver.cameras.joint_refinement.learned_in_time", None)  # a stop learns nothing more
+        stopped, _ = learn(estimate, shown, turning=True, should_stop=lambda: True)
+    np.testing.assert_allclose(
+        stopped.rotations, np.asarray(face.rotations) @ np.asarray(face.rotations)[0].T, atol=1e-12
+    )
+    moved, covariance = learn(estimate, shown, turning=True)
+    assert np.abs(moved.rotations - stopped.rotations).max() > 1e-5
+    assert covariance.likelihood < improve(begin(estimate.gram, pairs), estimate.gram, pairs, iterations=5).likelihood

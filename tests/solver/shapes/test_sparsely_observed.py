@@ -1,0 +1,219 @@
+"""Points that are seldom or never seen: the surface is closed over them, and what was seen of them is met."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pliant.solver import KnownCamera, Mesh, Settings, Tracks, gallery, solve
+from pliant.solver.evaluation import metrics
+from pliant.solver.model.shape_covariance import ShapeCovariance
+from pliant.solver.shapes.outlier_rejection import GROSS
+from pliant.solver.shapes.sparsely_observed import DOUBT, LOOSE, SELDOM, Kriging, close_surface, often_seen
+from pliant.solver.tracks.normalization import normalise
+from scipy import sparse
+
+MADE = gallery.face(16, 400, degrees=60, mesh="triangles")
+TRUE = MADE.shapes - MADE.shapes.mean(axis=1, keepdims=True)
+CAMERAS = KnownCamera.from_arrays(MADE.rotations, MADE.scales)
+
+
+def seen_but(points: list[int], *, shown: tuple[int, ...] = ()) -> Tracks:
+    """All is visible, but these points in the frames `shown` alone."""
+    visible = np.ones(MADE.tracks.points.shape[:2])
+    visible[np.ix_(np.setdiff1d(np.arange(16), shown), points)] = 0
+    return Tracks.from_arrays(MADE.tracks.points, visible)
+
+
+def patch(centre: int, rings: int) -> list[int]:
+    found = {centre}
+    for _ in range(rings):
+        found |= set(MADE.mesh.edges[np.isin(MADE.mesh.edges, list(found)).any(axis=1)].ravel().tolist())
+    return sorted(found)
+
+
+HOLE, SHOWN = patch(190, 2), (0, 7, 15)
+ROWS = np.ix_(SHOWN, HOLE)
+
+
+@pytest.mark.parametrize("cameras", [CAMERAS, None], ids=["known", "estimated"])
+def test_a_hole_in_the_face_is_closed(cameras: KnownCamera | None) -> None:
+    assert len(HOLE) > 12
+    found = solve(seen_but(HOLE), MADE.mesh, cameras=cameras)
+    whole = solve(MADE.tracks, MADE.mesh, cameras=cameras).shapes
+    assert metrics.e3d_frame(found.shapes, MADE.shapes) < 1.5 * metrics.e3d_frame(whole, MADE.shapes) + 0.02
+    assert (found.weights[:, HOLE] == 0).all()
+    assert (found.residuals[:, HOLE] == 0).all()
+    np.testing.assert_allclose(found.shapes.mean(axis=1), 0, atol=1e-9)
+    sides = np.delete(np.arange(400), HOLE)
+    centred, expected = (each[:, sides] - each[:, sides].mean(axis=1, keepdims=True) for each in (found.shapes, whole))
+    assert metrics.e3d_frame(centred, expected) < 0.1
+    assert (
+        "3.2% of the points" in found.choices.reasons["seldom_seen"]
+        or "of the points" in found.choices.reasons["seldom_seen"]
+    )
+
+
+def test_what_was_seen_of_a_seldom_seen_point_is_met_and_helps() -> None:
+    """Seen in three frames of 16, the patch passes through what was seen there, and is nearer to the truth than drawn alone."""
+    drawn, seldom = (
+        solve(seen_but(HOLE), MADE.mesh, cameras=CAMERAS),
+        solve(seen_but(HOLE, shown=SHOWN), MADE.mesh, cameras=CAMERAS),
+    )
+    typical = np.median(seldom.residuals[:, np.delete(np.arange(400), HOLE)])
+    assert np.median(seldom.residuals[ROWS]) < 3 * typical
+    assert (seldom.weights[ROWS] > 0).all()
+    image = np.einsum("f,fij,fpj->fpi", seldom.camera.scales, seldom.camera.rotations[:, :2], seldom.shapes)
+    image += seldom.camera.translations[:, None]
+    apart = np.linalg.norm(image - MADE.tracks.points, axis=2)
+    np.testing.assert_allclose(apart[ROWS], seldom.residuals[ROWS], atol=1e-9 * np.abs(MADE.tracks.points).max())
+    errors = [np.linalg.norm((each.shapes - TRUE)[:, HOLE]) for each in (drawn, seldom)]
+    assert errors[1] < 0.9 * errors[0]
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_two_noisy_looks_from_one_side_do_not_send_a_point_off_in_depth(seed: int) -> None:
+    """They hardly tell how deep it is; of points that may be anywhere in the body the error would be three times that of no look."""
+    noise = np.random.default_rng(seed).normal(size=MADE.tracks.points.shape) * 0.02 * np.abs(TRUE).max()
+    errors = []
+    for shown in ((), (0, 1)):
+        tracks = seen_but(HOLE, shown=shown)
+        found = solve(Tracks.from_arrays(tracks.points + noise, tracks.visible), MADE.mesh, cameras=CAMERAS)
+        errors.append(np.linalg.norm((found.shapes - TRUE)[:, HOLE]))
+    assert errors[1] < 1.7 * errors[0]
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+def test_a_mode_that_never_changes_says_what_a_wider_extent_says(seed: int) -> None:
+    """Where the cameras are estimated too, learning leaves to the modes what belongs to the mean positions, or the other way round."""
+    random = np.random.default_rng(seed)
+    frames, share = int(random.integers(3, 12)), random.uniform(0.2, 2)
+    root, modes = random.normal(size=(3, 3)), random.normal(size=(frames, 2))
+    play = root @ root.T + 0.1 * np.eye(3)
+    extent = np.diag(random.uniform(0.1, 1, 3))
+    mode = np.full((frames, 1), share**0.5)
+    problem = SimpleNamespace(points=np.zeros((frames, 2, 1)), projections=random.normal(size=(frames, 2, 3)))
+    one, other = (
+        Kriging.of(problem, ShapeCovariance(a, play, m, 1e-3, 1e-4, 0.0), np.zeros((frames, 2)))  # type: ignore[arg-type]
+        for a, m in ((extent, np.hstack([modes, mode])), (extent + share * play, modes))
+    )
+    for name in ("reach", "image"):
+        expected = getattr(one, name)
+        np.testing.assert_allclose(getattr(other, name), expected, atol=1e-9 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("seed", [5, 6])
+def test_outliers_of_seldom_seen_points_cost_hardly_more_than_not_seeing_them(seed: int) -> None:
+    """Of three observations of a point one or two may be outliers: a fit to all of them would lose the good ones."""
+    tracks = seen_but(HOLE, shown=(0, 5, 10))
+    random, visible = np.random.default_rng(seed), np.asarray(tracks.visible) > 0
+    points, wrong = np.array(tracks.points), visible & (random.random(visible.shape) < 0.1)
+    points[wrong] += random.choice([-1, 1], (int(wrong.sum()), 2)) * np.abs(TRUE).max()
+    found, spared = (
+        solve(Tracks.from_arrays(points, each), MADE.mesh, cameras=CAMERAS) for each in (visible, visible & ~wrong)
+    )
+    in_hole = np.zeros_like(wrong)
+    in_hole[:, HOLE] = True
+    assert (wrong & in_hole).sum() >= 5
+    assert (found.weights[wrong & in_hole] == 0).all()
+    assert (found.weights[visible & ~wrong & in_hole] > 0).mean() > 0.97
+    errors = [np.linalg.norm((each.shapes - TRUE)[:, HOLE]) for each in (found, spared)]
+    assert errors[0] < 1.05 * errors[1]
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+def test_the_worst_of_the_observations_goes_first_and_the_rest_is_judged_without_it(seed: int) -> None:
+    """Against leaving out one after the other by hand, from the conditional mean and covariance of a Gaussian."""
+    random = np.random.default_rng(seed)
+    frames = 6
+    root = random.normal(size=(2 * frames, 2 * frames))
+    image, scatter = root @ root.T / 50, 0.01
+    expected = image + scatter * np.eye(2 * frames)
+    off = random.multivariate_normal(np.zeros(2 * frames), expected).reshape(frames, 2)
+    off[random.random(frames) < 0.3] += 3.0
+    confidence = (random.random((frames, 1)) < 0.8).astype(float)
+    path = np.zeros((frames, 3, 1))
+    problem = SimpleNamespace(points=off[:, :, None], projections=np.zeros((frames, 2, 3)))
+    kriging = Kriging(problem, np.zeros((frames, 2)), np.zeros((18, 12)), image, scatter)  # type: ignore[arg-type]
+    left = np.flatnonzero(confidence[:, 0] > 0).tolist()
+    while left:
+        doubt = []
+        for one in left:
+            others = [2 * f + axis for f in left if f != one for axis in (0, 1)]
+            mine = [2 * one, 2 * one + 1]
+            gain = expected[np.ix_(mine, others)] @ np.linalg.inv(expected[np.ix_(others, others)])
+            apart = off[one] - gain @ off.ravel()[others]
+            spread = expected[np.ix_(mine, mine)] - gain @ expected[np.ix_(others, mine)]
+            doubt.append(apart @ np.linalg.solve(spread, apart) if np.hypot(*apart) > GROSS else 0.0)
+        if max(doubt) <= DOUBT**2:
+            break
+        left.pop(int(np.argmax(doubt)))
+    gone = np.setdiff1d(np.flatnonzero(confidence[:, 0] > 0), left)
+    np.testing.assert_array_equal(kriging.doubtful(0, confidence, path), gone)
+
+
+def test_a_patch_that_hangs_on_an_edge_does_not_fly_off() -> None:
+    far = np.flatnonzero(TRUE[0, :, 1] < np.quantile(TRUE[0, :, 1], 0.3)).tolist()
+    found = solve(seen_but(far), MADE.mesh, cameras=CAMERAS)
+    assert np.abs(found.shapes[:, far]).max() < 1.5 * np.abs(TRUE).max()
+
+
+def test_what_hangs_on_nothing_stays_in_the_middle() -> None:
+    alone = 77
+    faces = MADE.mesh.faces[~(MADE.mesh.faces == alone).any(axis=1)]
+    found = solve(seen_but([alone]), Mesh.from_faces(faces, 400), cameras=CAMERAS)
+    size = np.linalg.norm(found.shapes, axis=2).mean()
+    assert np.linalg.norm(found.shapes[:, alone], axis=1).max() < 0.2 * size
+
+
+def test_a_grid_keeps_its_cells_and_gets_a_hole() -> None:
+    made = gallery.face(12, 400, degrees=60)
+    assert made.mesh.grid is not None
+    hole = made.mesh.grid[8:10, 8:10].ravel()
+    visible = np.ones(made.tracks.points.shape[:2])
+    visible[:, hole] = 0
+    tracks = Tracks.from_arrays(made.tracks.points, visible)
+    part = often_seen(normalise(tracks), made.mesh)
+    assert part is not None
+    assert part.mesh.grid is not None
+    assert part.mesh.grid.shape == made.mesh.grid.shape
+    assert (part.mesh.grid[8:10, 8:10] == -1).all()
+    assert (part.mesh.grid >= 0).sum() == (made.mesh.grid >= 0).sum() - 4
+    found = solve(tracks, made.mesh, cameras=KnownCamera.from_arrays(made.rotations, made.scales))
+    true = made.shapes - made.shapes.mean(axis=1, keepdims=True)
+    assert np.linalg.norm((found.shapes - true)[:, hole], axis=2).max() < 0.1 * np.abs(true).max()
+
+
+@pytest.mark.parametrize(
+    ("tracks", "mesh"),
+    [
+        (MADE.tracks, MADE.mesh),
+        (seen_but([7]), None),
+        (seen_but([7]), Mesh.from_faces(np.zeros((0, 3), dtype=int), 400)),
+        (seen_but(list(range(250))), MADE.mesh),
+        (seen_but([7], shown=tuple(range(int(SELDOM * 16)))), MADE.mesh),
+    ],
+    ids=["all seen", "no mesh", "no faces", "most are seldom seen", "seen just often enough"],
+)
+def test_everything_is_found_together_where(tracks: Tracks, mesh: Mesh | None) -> None:
+    assert often_seen(normalise(tracks), mesh) is None
+
+
+def test_the_surface_is_closed_where_its_energy_is_least_and_the_rest_stays() -> None:
+    random = np.random.default_rng(0)
+    energy, shapes = sparse.random_array((60, 20), density=0.3, rng=random), random.normal(size=(3, 3, 20))
+    known = np.setdiff1d(np.arange(20), [2, 5, 11])
+    before = shapes.copy()
+    close_surface(shapes, known, energy)
+    np.testing.assert_array_equal(shapes[:, :, known], before[:, :, known])
+    pull = shapes @ (energy.T @ energy).toarray() + LOOSE * shapes
+    np.testing.assert_allclose(pull[:, :, [2, 5, 11]], 0, atol=1e-10)
+
+
+@pytest.mark.parametrize("settings", [{"prior": "smooth"}, {"temporal_weight": 0.0}], ids=str)
+def test_the_published_prior_and_one_of_no_weight_find_every_point_by_their_energy(settings: dict[str, object]) -> None:
+    found = solve(seen_but(HOLE), MADE.mesh, cameras=CAMERAS, settings=Settings(**settings))  # type: ignore[arg-type]
+    assert "seldom_seen" not in found.choices.reasons

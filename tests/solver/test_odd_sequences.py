@@ -1,0 +1,78 @@
+"""Tracks of which hardly anything is seen end in shapes or in a sentence, never in an error of the arithmetic."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pliant.solver import InvalidInput, KnownCamera, Mesh, Settings, Tracks, solve
+from pliant.solver.cameras.planar_ambiguity import poses
+from pliant.solver.cameras.scale import rigid_scales
+from pliant.solver.model.marginal_likelihood import LOWER, root_of
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_too_little_seen_is_said(known: bool) -> None:
+    random = np.random.default_rng(0)
+    visible = np.zeros((6, 20), dtype=bool)
+    visible[[0, 3], :3] = True  # three points in two frames, the others once at most
+    visible[2, 3:9] = True
+    cameras = KnownCamera.from_arrays(np.broadcast_to(np.eye(3), (6, 3, 3))) if known else None
+    with pytest.raises(InvalidInput) as caught:
+        solve(Tracks.from_arrays(random.normal(size=(6, 20, 2)), visible), cameras=cameras)
+    assert (caught.value.code, caught.value.field, caught.value.got) == ("too_little_seen", "visibility", "3")
+
+
+@pytest.mark.parametrize("seed", range(24))
+def test_odd_little_sequences_give_finite_shapes_or_a_sentence(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    frames, points = int(random.integers(3, 10)), int(random.integers(4, 30))
+    flat = random.choice([0.0, 0.01, 1.0])
+    shapes = random.normal(size=(points, 3)) * [1, 1, flat] + random.choice([0, 0.3]) * random.normal(
+        size=(frames, points, 3)
+    )
+    angles = np.linspace(0, random.choice([0, 0.3, 2]), frames)
+    zero = np.zeros(frames)
+    rows = [[np.cos(angles), zero, -np.sin(angles)], [zero, zero + 1, zero], [np.sin(angles), zero, np.cos(angles)]]
+    rotations = np.moveaxis(np.array(rows), 2, 0)
+    image = np.einsum("fij,fpj->fpi", rotations[:, :2], shapes) * random.choice([1e-6, 1, 1e5])
+    visible = random.random((frames, points)) > random.choice([0, 0.3, 0.7, 0.9])
+    visible[:, random.integers(0, points, size=points // 3)] &= random.random() < 0.5
+    faces = random.integers(0, points, size=(points, 3))
+    faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 0] != faces[:, 2])]
+    cameras = KnownCamera.from_arrays(rotations) if random.random() < 0.4 else None
+    weight = random.choice([None, None, 0.0, 1.0])
+    try:
+        tracks = Tracks.from_arrays(image, visible)
+        found = solve(
+            tracks, Mesh.from_faces(faces, points), cameras=cameras, settings=Settings(temporal_weight=weight)
+        )
+    except InvalidInput as error:
+        refused = error.code
+    else:
+        refused = None
+    if refused is not None:
+        assert refused in {"too_little_seen", "nothing_visible", "no_extent"}
+        return
+    for array in (found.shapes, found.residuals, found.weights, found.camera.scales, found.camera.translations):
+        assert np.isfinite(array).all()
+
+
+def test_a_covariance_without_extent_along_an_axis_still_has_a_root() -> None:
+    root = np.zeros((3, 3))
+    root[LOWER] = root_of(np.diag([1.0, 0.25, 0.0]))
+    np.testing.assert_allclose(root @ root.T, np.diag([1.0, 0.25, 0.0]), atol=1e-8)
+    np.testing.assert_array_equal(
+        root_of(np.diag([4.0, 1.0, 9.0])), np.linalg.cholesky(np.diag([4.0, 1.0, 9.0]))[LOWER]
+    )
+
+
+def test_frames_that_show_nothing_have_finite_poses_and_scales() -> None:
+    random = np.random.default_rng(1)
+    rows = random.normal(size=(10, 3)) @ random.normal(size=(3, 40))
+    rows[4:6] = 0
+    gram = rows @ rows.T / 40
+    rotations = np.linalg.qr(random.normal(size=(5, 3, 3)))[0]
+    scales = rigid_scales(gram, rotations)
+    assert np.isfinite(scales).all()
+    assert scales.min() > 0
+    assert all(np.isfinite(each).all() for each in poses(gram))

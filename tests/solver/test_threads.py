@@ -1,0 +1,77 @@
+"""Threads: how many there are, that a limit is kept, and that the result does not depend on them."""
+
+from __future__ import annotations
+
+import os
+import threading
+
+import numpy as np
+import pytest
+from pliant.solver import KnownCamera, Settings, Solution, gallery, solve, threads_limited
+from pliant.solver.operators import normal_equations
+from pliant.solver.threads import available_cores, over_ranges
+
+
+@pytest.fixture
+def many_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(4)), raising=False)
+
+
+def threads_at_once(count: int) -> int:
+    """How many threads `over_ranges` really has at work at the same time."""
+    seen: set[int] = set()
+    meet = threading.Barrier(min(count, available_cores()))
+
+    def work(start: int, stop: int) -> None:
+        meet.wait(timeout=10)  # broken, and so an error, if fewer come
+        seen.add(threading.get_ident())
+
+    over_ranges(work, count)
+    return len(seen)
+
+
+def test_a_solve_takes_the_cores_that_the_process_may_use(many_cores: None) -> None:
+    assert available_cores() == 4
+    assert threads_at_once(100) == 4
+    assert threads_at_once(3) == 3
+
+
+@pytest.mark.parametrize(("limit", "threads"), [(1, 1), (3, 3), (50, 4), (None, 4)])
+def test_a_limit_is_kept_and_ends_with_the_block(many_cores: None, limit: int | None, threads: int) -> None:
+    with threads_limited(limit):
+        assert available_cores() == threads
+        assert threads_at_once(100) == threads
+        with threads_limited(2):
+            assert available_cores() == 2
+        assert available_cores() == threads
+    assert available_cores() == 4
+
+
+def test_a_limit_is_the_caller_s_own(many_cores: None) -> None:
+    elsewhere: list[int] = []
+    with threads_limited(1):
+        other = threading.Thread(target=lambda: elsewhere.append(available_cores()))
+        other.start()
+        other.join()
+    assert elsewhere == [4]
+
+
+def test_less_than_one_thread_is_refused() -> None:
+    with pytest.raises(ValueError, match="at least 1 thread, got 0"), threads_limited(0):
+        pass
+
+
+def test_the_result_does_not_depend_on_the_number_of_threads(many_cores: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        normal_equations, "SMALLEST", 1, raising=False
+    )  # or so small a sequence would be left to one thread
+    made = gallery.corrupt(gallery.face(10, 200), outliers=0.1, seed=2)
+    cameras = KnownCamera.from_arrays(made.rotations, made.scales)
+
+    def solved(threads: int) -> Solution:
+        with threads_limited(threads):
+            return solve(made.tracks, made.mesh, cameras=cameras, settings=Settings(max_reweightings=6))
+
+    one, four = solved(1), solved(4)
+    np.testing.assert_array_equal(one.trace.iterations, four.trace.iterations)
+    np.testing.assert_array_equal(one.shapes, four.shapes)

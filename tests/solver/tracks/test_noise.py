@@ -1,0 +1,136 @@
+"""Noise and modes, told from the tracks alone: what each estimate finds, and what the default gains from it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pliant.solver import KnownCamera, Settings, gallery, solve
+from pliant.solver.cameras.multistart import binding
+from pliant.solver.evaluation import metrics
+from pliant.solver.model.marginal_likelihood import STEADINESS
+from pliant.solver.model.model_order import FEWEST, Support, supported
+from pliant.solver.model.shape_covariance import QUIET, WARM, begin, improve, learned
+from pliant.solver.model.so3 import exponential
+from pliant.solver.tracks.noise import roughness, typical_roughness, white_noise
+
+FRAMES = 30
+SIGMA = 0.08
+PAIRS = exponential(np.stack([np.linspace(-0.6, 0.6, FRAMES), np.zeros(FRAMES), np.zeros(FRAMES)], axis=1))[:, :2]
+
+
+def tracks(points: int, *, modes: int, sigma: float) -> np.ndarray:
+    """A body of random points that turns, moves along some slow modes and is seen with noise, shape (F, P, 2)."""
+    random = np.random.default_rng(3)
+    time = np.linspace(0, 1, FRAMES)
+    waves = 0.5 * np.cos(np.pi * np.outer(time, 1 + np.arange(modes)) + np.arange(modes))
+    shapes = random.standard_normal((points, 3)) + np.einsum(
+        "fk,pkc->fpc", waves, random.standard_normal((points, modes, 3))
+    )
+    return np.einsum("fic,fpc->fpi", PAIRS, shapes) + sigma * random.standard_normal((FRAMES, points, 2))
+
+
+def gram_of(points: np.ndarray) -> np.ndarray:
+    rows = points.transpose(0, 2, 1).reshape(2 * FRAMES, -1)
+    return np.asarray(rows @ rows.T / rows.shape[1])
+
+
+@pytest.mark.parametrize("sigma", [0.01, 0.08])
+def test_both_estimates_find_white_noise(sigma: float) -> None:
+    points = tracks(3000, modes=2, sigma=sigma)
+    assert roughness(gram_of(points)) ** 0.5 == pytest.approx(sigma, rel=0.1)
+    assert white_noise(gram_of(points)) ** 0.5 == pytest.approx(sigma, rel=0.1)
+    assert typical_roughness(points) == pytest.approx(sigma, rel=0.1)
+
+
+def test_without_noise_there_is_next_to_none() -> None:
+    points = tracks(3000, modes=2, sigma=0.0)
+    assert white_noise(gram_of(points)) < 1e-6
+    assert typical_roughness(points) < 3e-3
+
+
+def test_noise_grows_with_the_square_of_the_unit() -> None:
+    gram = gram_of(tracks(300, modes=1, sigma=0.05))
+    assert roughness(9 * gram) == pytest.approx(9 * roughness(gram))
+    assert white_noise(9 * gram) == pytest.approx(9 * white_noise(gram))
+
+
+def test_few_points_leave_the_roughness_to_tell_the_noise() -> None:
+    gram = gram_of(tracks(20, modes=1, sigma=0.05))  # rank 20 of 60: the median eigenvalue is 0 whatever the noise
+    assert white_noise(gram) == roughness(gram)
+    assert white_noise(gram) ** 0.5 == pytest.approx(0.05, rel=0.2)
+
+
+def test_a_few_wrong_points_do_not_make_tracks_rough() -> None:
+    points = tracks(200, modes=2, sigma=0.01)
+    points[::3, :20] += 2.0
+    assert typical_roughness(points) < 0.015
+    assert roughness(gram_of(points)) > 0.1
+
+
+@pytest.mark.parametrize("frames", [3, 4])
+def test_short_sequences_use_lower_differences(frames: int) -> None:
+    noise = 0.1 * np.random.default_rng(0).standard_normal((frames, 5000, 2))
+    assert typical_roughness(noise) == pytest.approx(0.1, rel=0.05)
+
+
+def test_the_camera_is_bound_less_where_noise_is_strong() -> None:
+    weights = [binding(gram_of(tracks(500, modes=2, sigma=sigma))) for sigma in (0.0, 0.03, 0.1)]
+    assert weights[0] == pytest.approx(STEADINESS, rel=1e-3)
+    assert weights[1] == pytest.approx(STEADINESS / 2, rel=0.1)
+    assert weights[2] < STEADINESS / 9
+
+
+def test_strong_noise_is_learned_though_a_small_start_misses_it() -> None:
+    gram = gram_of(tracks(500, modes=2, sigma=SIGMA))
+    small = improve(begin(gram, PAIRS, noise=QUIET), gram, PAIRS, iterations=60, warm=WARM)
+    assert small.noise**0.5 < SIGMA / 3
+    assert learned(gram, PAIRS, most=8, noisy=True).noise ** 0.5 == pytest.approx(SIGMA, rel=0.15)
+
+
+def test_fine_deformation_is_not_learned_as_noise() -> None:
+    assert learned(gram_of(tracks(500, modes=6, sigma=0.0)), PAIRS).noise ** 0.5 < 1e-3
+
+
+def test_as_many_modes_are_taken_as_other_points_confirm() -> None:
+    few = [supported(tracks(40, modes=modes, sigma=SIGMA), PAIRS) for modes in (0, 2)]
+    assert [each.most for each in few] == [0, 2]
+    assert all(each.noisy for each in few)
+    assert supported(tracks(40, modes=8, sigma=0.02), PAIRS).most == 8
+
+
+def test_many_points_confirm_at_least_the_modes_there_are() -> None:
+    assert supported(tracks(400, modes=2, sigma=SIGMA), PAIRS).most >= 2
+    assert supported(tracks(400, modes=8, sigma=0.02), PAIRS).most >= 8
+
+
+def test_without_noise_or_with_hardly_a_point_nothing_is_judged() -> None:
+    assert supported(tracks(40, modes=2, sigma=0.0), PAIRS) == Support()
+    assert supported(tracks(FEWEST - 1, modes=2, sigma=SIGMA), PAIRS) == Support()
+
+
+def test_where_outliers_were_found_what_is_left_of_them_is_not_learned_as_modes() -> None:
+    random, sample = np.random.default_rng(0), tracks(40, modes=2, sigma=0.0).copy()
+    wrong = random.random(sample.shape[:2]) < 0.02
+    sample[wrong] += random.normal(0, 0.1, (wrong.sum(), 2))
+    assert supported(sample, PAIRS) == Support()
+    assert supported(sample, PAIRS, spoiled=True) == Support(2, noisy=True)
+
+
+@pytest.mark.parametrize("points", [40, 400])
+@pytest.mark.parametrize("known", [True, False])
+def test_the_default_stands_strong_noise_better_than_the_papers_prior(known: bool, points: int) -> None:
+    face = gallery.face(60, points)
+    cameras = KnownCamera.from_arrays(face.rotations, face.scales) if known else None
+    noisy = gallery.corrupt(face, noise=0.05, seed=1).tracks
+
+    def error(settings: Settings) -> float:
+        return metrics.e3d_frame(solve(noisy, cameras=cameras, settings=settings).shapes, face.shapes)
+
+    assert error(Settings()) < 0.8 * error(Settings(prior="smooth"))
+
+
+def test_the_report_says_how_many_modes_and_why() -> None:
+    face = gallery.face(30, 60)
+    noisy = gallery.corrupt(face, noise=0.03, seed=1).tracks
+    assert "do not make the others more probable" in solve(noisy).choices.reasons["modes"]
+    assert "modes of deformation, noise of" in solve(face.tracks).choices.reasons["modes"]

@@ -1,0 +1,163 @@
+"""preview.bin read back by the layout its docstring states, independently of the writer."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from pliant.solver import Camera, Mesh, Solution, Tracks
+from pliant.solver.evaluation.alignment import align
+from pliant.solver.gallery import Sequence, corrupt, face
+from pliant.worker.artifacts import preview
+
+F, P = 6, 60
+
+
+@pytest.fixture(scope="module")
+def sequence() -> Sequence:
+    return corrupt(face(F, P, scale_change=0.2), noise=0.01, hidden=0.2, seed=3)
+
+
+def solution_of(sequence: Sequence, *, mirrored: bool = False) -> Solution:
+    """The truth itself as a solution, or its bas-relief mirror, which explains the tracks as well."""
+    flip = np.diag([1.0, 1.0, -1.0 if mirrored else 1.0])
+    shapes = (sequence.shapes - sequence.shapes.mean(axis=1, keepdims=True)) @ flip
+    rotations = flip @ sequence.rotations @ flip
+    seen = sequence.tracks.visible > 0
+    free = sequence.tracks.points - sequence.scales[:, None, None] * shapes @ rotations[:, :2].transpose(0, 2, 1)
+    translations = np.array([free[f][seen[f]].mean(axis=0) for f in range(len(shapes))])
+    camera = Camera(rotations, sequence.scales, translations)
+    # The writer reads nothing else of a solution.
+    rest: dict[str, Any] = dict.fromkeys(("residuals", "weights", "trace", "outcome", "choices", "seconds"))
+    return Solution(shapes=shapes, camera=camera, **rest)
+
+
+def write(path: Path, **given: Any) -> None:
+    with path.open("wb") as file:
+        preview.write_preview(file, **given)
+
+
+def read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    raw = path.read_bytes()
+    assert raw[:8] == b"PLIANTPV"
+    version, length = struct.unpack_from("<II", raw, 8)
+    assert version == 1
+    header = json.loads(raw[16 : 16 + length])
+    frames, points = header["num_frames"], header["num_points"]
+    kinds = {
+        "faces": ("<u4", (-1, 3)),
+        "cameras": ("<f4", (frames, 10)),
+        "positions": ("<i2", (frames, points, 3)),
+        "residuals": ("<i2", (frames, points, 2)),
+        "truth": ("<i2", (frames, points, 3)),
+    }
+    arrays = {}
+    for name, section in header["sections"].items():
+        assert section["offset"] % 8 == 0
+        kind, shape = kinds[name]
+        part = raw[section["offset"] : section["offset"] + section["bytes"]]
+        arrays[name] = np.frombuffer(part, kind).reshape(shape)
+    return header, arrays
+
+
+def world(header: dict[str, Any], values: NDArray[Any]) -> NDArray[np.float64]:
+    return np.array(header["origin"]) + header["step"] * values
+
+
+def test_positions_come_back_within_half_a_step(sequence: Sequence, tmp_path: Path) -> None:
+    solution = solution_of(sequence)
+    path = tmp_path / preview.NAME
+    write(path, tracks=sequence.tracks, mesh=sequence.mesh, solution=solution, y_axis="up", fps=12)
+    header, arrays = read(path)
+    error = np.abs(world(header, arrays["positions"]) - solution.shapes).max()
+    assert 0 < error <= 0.5001 * header["step"]
+    assert header["step"] < np.ptp(solution.shapes) / 60_000
+    assert (header["y_axis"], header["fps"], header["frame_stride"]) == ("up", 12, 1)
+    np.testing.assert_allclose(arrays["cameras"][:, :9].reshape(-1, 3, 3), solution.camera.rotations, atol=1e-7)
+    np.testing.assert_allclose(arrays["cameras"][:, 9], solution.camera.scales, rtol=1e-6)
+    assert "truth" not in arrays
+
+
+def test_residuals_lead_from_the_projection_to_the_track(sequence: Sequence, tmp_path: Path) -> None:
+    solution = solution_of(sequence)
+    path = tmp_path / preview.NAME
+    write(path, tracks=sequence.tracks, mesh=None, solution=solution)
+    header, arrays = read(path)
+    hidden = sequence.tracks.visible == 0
+    assert (arrays["residuals"][hidden] == -32768).all()
+    assert (arrays["residuals"][~hidden] > -32768).all()
+    table, positions = arrays["cameras"].astype(float), world(header, arrays["positions"])
+    flat = np.einsum("fpj,fij->fpi", positions, table[:, :9].reshape(-1, 3, 3)[:, :2]) * table[:, 9, None, None]
+    tracks = flat + solution.camera.translations[:, None] + header["residual_step"] * arrays["residuals"]
+    assert np.abs(tracks - sequence.tracks.points)[~hidden].max() < 2 * (header["residual_step"] + header["step"])
+    assert header["num_faces"] == 0
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_truth_stands_where_e3d_frame_compares_it(sequence: Sequence, tmp_path: Path, mirrored: bool) -> None:
+    turned = sequence.shapes @ np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0] + 5.0
+    if (
+        np.linalg.det(
+            np.linalg.lstsq(sequence.shapes[0] - sequence.shapes[0].mean(0), turned[0] - turned[0].mean(0))[0]
+        )
+        < 0
+    ):
+        turned = turned * (1.0, 1.0, -1.0)
+    truth = turned + np.random.default_rng(2).normal(scale=2.0, size=turned.shape)
+    truth[:, 7] = np.nan
+    solution = solution_of(sequence, mirrored=mirrored)
+    path = tmp_path / preview.NAME
+    write(path, tracks=sequence.tracks, mesh=sequence.mesh, solution=solution, truth=truth)
+    header, arrays = read(path)
+    assert header["mirrored"] is mirrored
+    known = np.arange(P) != 7
+    apart = np.linalg.norm(world(header, arrays["truth"]) - world(header, arrays["positions"]), axis=2)
+    expected = align(solution.shapes[:, known], truth[:, known]).distances
+    np.testing.assert_allclose(apart[:, known], expected, atol=2 * header["step"])
+    assert (apart[:, 7] == 0).all()
+
+
+def test_truth_of_too_few_points_is_left_out(sequence: Sequence, tmp_path: Path) -> None:
+    truth = np.full((F, P, 3), np.nan)
+    truth[:, :2] = 1.0
+    path = tmp_path / preview.NAME
+    write(path, tracks=sequence.tracks, mesh=None, solution=solution_of(sequence), truth=truth)
+    assert "truth" not in read(path)[0]["sections"]
+
+
+def test_a_long_sequence_is_thinned_evenly_and_keeps_its_pace(
+    sequence: Sequence, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(preview, "MOST_OBSERVATIONS", F * P // 2)
+    path = tmp_path / preview.NAME
+    solution = solution_of(sequence)
+    write(path, tracks=sequence.tracks, mesh=None, solution=solution, fps=30)
+    header, arrays = read(path)
+    assert (header["num_frames"], header["frame_stride"], header["fps"]) == (3, 2, 15)
+    np.testing.assert_allclose(world(header, arrays["positions"]), solution.shapes[::2], atol=header["step"])
+
+
+def test_quads_become_triangles_of_the_same_sense() -> None:
+    mesh = Mesh.from_grid(np.arange(6).reshape(2, 3))
+    found = preview.triangles(mesh)
+    assert found.shape == (4, 3)
+    plane = np.array([(x, y, 0.0) for y in range(2) for x in range(3)])
+    normals = np.cross(plane[found[:, 1]] - plane[found[:, 0]], plane[found[:, 2]] - plane[found[:, 0]])
+    assert len({float(z) for z in normals[:, 2]}) == 1
+
+
+def test_a_perfect_fit_has_a_step_all_the_same(tmp_path: Path) -> None:
+    sequence = face(3, 12)
+    exact = solution_of(sequence)
+    projected = exact.camera.scales[:, None, None] * exact.shapes @ exact.camera.rotations[:, :2].transpose(0, 2, 1)
+    tracks = Tracks.from_arrays(projected + exact.camera.translations[:, None])
+    path = tmp_path / preview.NAME
+    write(path, tracks=tracks, mesh=None, solution=exact)
+    header, arrays = read(path)
+    assert header["residual_step"] > 0
+    assert np.abs(header["residual_step"] * arrays["residuals"]).max() < 1e-9

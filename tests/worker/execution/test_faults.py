@@ -1,0 +1,300 @@
+"""Real processes, really killed. After each fault: what the record says, that nothing acknowledged was lost, no leftovers."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import secrets
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pliant.schemas.job import Status
+from pliant.worker.execution.pipeline import reconstruct
+from pliant.worker.formats import load_inputs
+from pliant.worker.maintenance.fsck import findings
+from pliant.worker.settings import Settings
+from pliant.worker.store.connection import connect
+from rq import Queue as RqQueue
+from rq.serializers import JSONSerializer
+from worker_house import SHORT, House, children, make_inputs, running, settled
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="finds processes in /proc")
+
+
+@pytest.fixture(scope="module")
+def house(
+    valkey_data: Path, tmp_path_factory: pytest.TempPathFactory, inputs_files: tuple[Path, Path]
+) -> Iterator[House]:
+    """Two workers that notice things soon."""
+    settings = Settings(
+        data=tmp_path_factory.mktemp("house"), redis_url=Settings(data=valkey_data).redis,
+        queue=f"faults-{secrets.token_hex(3)}", workers=2, threads=1, lost_after=2.0, cancel_grace=3.0, stop_grace=1.0,
+    )  # fmt: skip
+    with House(settings, inputs=inputs_files) as house:
+        yield house
+
+
+def test_the_queue_gives_the_same_bits_as_a_plain_call(house: House, tmp_path: Path) -> None:
+    id = house.submit(name="same bits")
+    job = house.final(id)
+    assert (job.status, job.error, job.attempt) == (Status.SUCCEEDED, None, 1)
+    direct = reconstruct(load_inputs(house.short_inputs), SHORT, tmp_path / "direct")
+    assert job.metrics == direct.metrics
+    assert (job.outcome, job.sentence) == (direct.outcome, direct.sentence)
+    assert [each.name for each in job.artifacts] == [each.name for each in direct.artifacts]
+    artifact, blob = house.jobs.artifact(id, "shapes.npz")
+    (tmp_path / "queued.npz").write_bytes(b"".join(blob.read()))
+    assert artifact.bytes == blob.size
+    with np.load(tmp_path / "queued.npz") as queued, np.load(tmp_path / "direct" / "shapes.npz") as plain:
+        assert set(queued) == set(plain)
+        for name in queued:
+            if name != "seconds":
+                np.testing.assert_array_equal(queued[name], plain[name])
+    assert "Wrote shapes.npz" in house.jobs.log(id)
+    assert house.jobs.events(id)[-1].name == "job"
+    settled(house)
+
+
+def test_progress_tells_numbers(house: House) -> None:
+    id = house.submit(long=True)
+    house.until(lambda: (house.jobs.get(id).progress or SHORT) and house.solving(id).progress.reweighting, "reweights")  # type: ignore[union-attr]
+    progress = house.jobs.get(id).progress
+    assert progress is not None
+    assert progress.stage == "reweight"
+    assert 0 < progress.fraction < 0.85
+    assert progress.max_reweightings == 1000
+    assert progress.objective is not None
+    assert progress.residual is not None
+    assert progress.seconds_left is None or progress.seconds_left > 0
+    moments = [event for event in house.jobs.events(id) if event.name == "progress"]
+    assert len(moments) >= 1
+    house.jobs.cancel(id)
+    house.final(id)
+
+
+def test_a_running_job_is_cancelled(house: House) -> None:
+    id = house.submit(long=True)
+    house.solving(id)
+    assert house.jobs.cancel(id).status is Status.CANCELLING
+    job = house.final(id)
+    assert (job.status, job.error, job.artifacts) == (Status.CANCELLED, None, [])
+    settled(house)
+    assert house.blobs_of(id) == {"inputs.npz"}
+
+
+def test_a_killed_horse_fails_its_job_and_nothing_else(house: House) -> None:
+    other = house.submit(long=True)
+    house.solving(other)
+    (bystander,) = house.horses()
+    id = house.submit(long=True)
+    house.solving(id)
+    (victim,) = set(house.horses()) - {bystander}
+    os.kill(victim, signal.SIGKILL)
+    seconds = house.until(lambda: house.jobs.get(id).status.final, "the record says so", seconds=5)
+    job = house.jobs.get(id)
+    assert seconds < 5
+    assert job.status is Status.FAILED
+    assert job.error is not None
+    assert (job.error.code, job.error.retryable) == ("worker_lost", True)
+    assert "SIGKILL" in job.error.detail
+    assert "retry" in job.error.detail
+    assert house.jobs.get(other).status is Status.RUNNING
+    again = house.jobs.retry(id)
+    assert again.retry_of == id
+    for each in (other, again.id):
+        house.jobs.cancel(each)
+        assert house.final(each).status is Status.CANCELLED
+    assert house.final(house.submit()).status is Status.SUCCEEDED, "the service goes on"
+    settled(house)
+
+
+def test_a_crash_leaves_its_stack_in_the_log(house: House) -> None:
+    id = house.submit(long=True)
+    house.solving(id)
+    (victim,) = house.horses()
+    os.kill(victim, signal.SIGSEGV)
+    job = house.final(id)
+    assert job.error is not None
+    assert (job.error.code, "SIGSEGV" in job.error.detail) == ("worker_lost", True)
+    assert "Traceback" not in job.error.detail
+    assert "Segmentation fault" in house.jobs.log(id)
+
+
+def test_the_job_of_a_killed_worker_is_done_by_another(house: House) -> None:
+    id = house.submit(long=True)
+    house.solving(id)
+    (horse,) = house.horses()
+    (worker,) = [pid for pid in house.worker_pids() if horse in children(pid)]
+    os.kill(worker, signal.SIGKILL)
+    house.until(lambda: not running(horse), "the horse dies with its worker")
+    house.until(lambda: house.jobs.get(id).attempt == 2, "another worker begins it", seconds=30)
+    assert "Lost its worker" in house.jobs.log(id)
+    house.jobs.cancel(id)
+    assert house.final(id).status is Status.CANCELLED
+
+
+def test_an_attempt_that_lost_its_job_writes_nothing(house: House) -> None:
+    id = house.submit(long=True)
+    house.solving(id)
+    (horse,) = house.horses()
+    (worker,) = [pid for pid in house.worker_pids() if horse in children(pid)]
+    for pid in (worker, horse):
+        os.kill(pid, signal.SIGSTOP)
+    house.until(lambda: house.jobs.get(id).attempt == 2, "another worker begins it", seconds=30)
+    token = house.jobs.records.get(id).token
+    for pid in (horse, worker):
+        os.kill(pid, signal.SIGCONT)
+    house.until(lambda: not running(horse), "the stale horse is put down")
+    held = house.jobs.records.get(id)
+    assert (held.token, held.job.status, held.job.attempt) == (token, Status.RUNNING, 2)
+    house.jobs.cancel(id)
+    assert house.final(id).status is Status.CANCELLED
+    settled(house)
+
+
+def test_a_worker_that_is_told_to_stop_puts_its_job_back(house: House) -> None:
+    id = house.submit(long=True)
+    house.solving(id)
+    (horse,) = house.horses()
+    (worker,) = [pid for pid in house.worker_pids() if horse in children(pid)]
+    os.kill(horse, signal.SIGTERM)  # as service managers do, which tell every process
+    os.kill(worker, signal.SIGTERM)
+    house.until(lambda: house.jobs.get(id).attempt == 2, "it begins again")
+    assert "worker_lost" not in str([event.data for event in house.jobs.events(id)])
+    house.until(lambda: not running(worker), "the worker ends")
+    house.jobs.cancel(id)
+    assert house.final(id).status is Status.CANCELLED
+
+
+def test_a_worker_that_is_told_to_stop_lets_a_short_job_end(house: House, tmp_path: Path) -> None:
+    settings = dataclasses.replace(
+        house.settings, data=tmp_path, queue=f"calm-{secrets.token_hex(3)}", workers=1, stop_grace=60.0
+    )
+    with House(settings, inputs=(house.short_inputs, house.long_inputs)) as calm:
+        id = calm.submit()
+        calm.until(lambda: calm.jobs.get(id).status is not Status.QUEUED, "it is taken")
+        (worker,) = calm.worker_pids()
+        os.kill(worker, signal.SIGTERM)
+        job = calm.final(id)
+        assert (job.status, job.attempt) == (Status.SUCCEEDED, 1)
+
+
+def test_a_foreign_delivery_is_refused(house: House, tmp_path: Path) -> None:
+    marks = [tmp_path / name for name in ("function", "callback")]
+    raw = connect(house.settings.redis, decode=False)
+    queue = RqQueue(house.settings.queue, connection=raw, serializer=JSONSerializer)
+    queue.enqueue_call("os.mkdir", args=(str(marks[0]),), on_success=None)
+    forged = queue.create_job("pliant.worker.execution.attempt.run", args=("no-such-job", "no-such-token"))
+    forged.save()
+    raw.hset(forged.key, mapping={"success_callback_name": "os.getcwd", "failure_callback_name": "os.getcwd"})
+    queue.enqueue_job(forged)
+    house.until(lambda: not house.jobs.queue.waiting(), "both are taken")
+    assert house.final(house.submit()).status is Status.SUCCEEDED
+    assert not any(mark.exists() for mark in marks)
+    raw.close()
+
+
+def test_a_second_delivery_of_an_attempt_is_dropped(house: House) -> None:
+    id = house.submit(long=True)
+    job = house.solving(id)
+    token = house.jobs.records.get(id).token
+    house.jobs.queue.push(id, token)
+    house.until(lambda: not house.jobs.queue.waiting(), "the second delivery is taken")
+    time.sleep(0.5)
+    held = house.jobs.records.get(id)
+    assert (held.token, held.job.status, held.job.attempt) == (token, Status.RUNNING, job.attempt)
+    assert house.files_at_work() == [token], "the second worker has not cleared the first one's files away"
+    house.jobs.cancel(id)
+    house.final(id)
+
+
+def test_a_job_that_the_queue_forgot_is_done(house: House) -> None:
+    first, second = house.submit(long=True), house.submit(long=True)
+    house.solving(first)
+    house.solving(second)
+    id = house.submit()
+    house.jobs.queue.remove(house.jobs.records.get(id).token)
+    house.jobs.cancel(first)
+    assert house.final(id).status is Status.SUCCEEDED
+    assert "forgotten" in house.jobs.log(id)
+    house.jobs.cancel(second)
+    house.final(second)
+
+
+def test_lost_inputs_are_an_internal_error_whose_trace_is_in_the_log(house: House) -> None:
+    first, second = house.submit(long=True), house.submit(long=True)
+    house.solving(first)
+    house.solving(second)
+    id = house.submit()
+    house.jobs.blobs.delete(house.jobs.records.get(id).inputs)
+    house.jobs.cancel(first)
+    house.jobs.cancel(second)
+    job = house.final(id)
+    assert job.error is not None
+    assert (job.error.code, job.error.status) == ("internal_error", 500)
+    assert "Traceback" not in job.error.detail
+    assert "Traceback" in house.jobs.log(id)
+    house.final(first)
+    house.final(second)
+    (finding,) = findings(house.jobs, settle=0.1)
+    assert finding == f"Job {id} (failed) has lost its inputs."
+    house.jobs.delete(id)
+    settled(house)
+
+
+def test_a_job_that_takes_too_long_says_so(house: House, tmp_path: Path) -> None:
+    settings = dataclasses.replace(
+        house.settings, data=tmp_path, queue=f"late-{secrets.token_hex(3)}", workers=1, time_limit=1.5, memory_limit=0
+    )
+    with House(settings, inputs=(house.short_inputs, house.long_inputs)) as late:
+        job = late.final(late.submit(long=True))
+        assert job.error is not None
+        assert (job.status, job.error.code, job.error.retryable) == (Status.FAILED, "timed_out", True)
+        assert "1.5 s" in job.error.detail
+        id = late.submit()
+        late.until(lambda: late.jobs.get(id).status is not Status.QUEUED, "the worker takes the next one")
+        late.final(id)
+        settled(late)
+
+
+def test_a_job_that_needs_too_much_memory_says_so(house: House, tmp_path: Path) -> None:
+    make_inputs(tmp_path / "big.npz", frames=200, points=6000)
+    settings = dataclasses.replace(
+        house.settings, data=tmp_path, queue=f"lean-{secrets.token_hex(3)}", workers=1, memory_limit=640 << 20
+    )
+    with House(settings, inputs=(house.short_inputs, tmp_path / "big.npz")) as lean:
+        job = lean.final(lean.submit(long=True))
+        assert job.error is not None
+        assert (job.status, job.error.code, job.error.retryable) == (Status.FAILED, "out_of_memory", True)
+        assert "0.6 GiB" in job.error.detail
+        assert lean.final(lean.submit()).status is Status.SUCCEEDED
+        settled(lean)
+
+
+def test_wrong_arguments_and_settings_are_said() -> None:
+    def run(*arguments: str, **env: str) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", "pliant.worker", *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=False, env={**os.environ, **env})
+
+    wrong = run("dance")
+    assert (wrong.returncode, "usage" in wrong.stderr) == (2, True)
+    unset = run("keep", PLIANT_WORKERS="none")
+    assert (unset.returncode, unset.stderr.count("\n")) == (1, 1)
+    assert "PLIANT_WORKERS: expected a whole number" in unset.stderr
+
+
+def test_the_audit_is_a_command(house: House) -> None:
+    command = [sys.executable, "-m", "pliant.worker", "audit"]
+    env = {**os.environ, **house.settings.to_environment()}
+    clean = subprocess.run(command, capture_output=True, text=True, check=False, env=env)
+    assert (clean.returncode, clean.stdout) == (0, "Everything stored is as the records say.\n")
+    house.jobs.blobs.put("jobs/nobody/nobody-1/inputs.npz", house.short_inputs)
+    found = subprocess.run(command, capture_output=True, text=True, check=False, env=env)
+    assert (found.returncode, found.stdout) == (1, "File jobs/nobody/nobody-1/inputs.npz belongs to no job.\n")
+    house.jobs.blobs.delete("jobs/nobody/")

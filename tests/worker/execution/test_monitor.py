@@ -1,0 +1,261 @@
+"""Watching an attempt, on a clock of our own; what is written for a horse that ended without a last word."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import signal
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+from pliant.schemas.job import Interpretation, Problem, Status
+from pliant.schemas.options import Options
+from pliant.solver import InvalidInput
+from pliant.worker.errors import StoreUnavailable
+from pliant.worker.execution.failures import how_it_ended, out_of_memory, problem_of, timed_out
+from pliant.worker.execution.monitor import Patience, Reason, Watch, settle
+from pliant.worker.execution.progress import SHARES, Teller
+from pliant.worker.execution.workdir import OUTPUT, working_directory
+from pliant.worker.jobs import lifecycle
+from pliant.worker.jobs.service import Jobs
+from pliant.worker.processes.containment import OomKills
+from pliant.worker.records import Change, Records, Stored
+
+NOW = datetime(2030, 1, 1, tzinfo=UTC)
+KILLED = int(signal.SIGKILL)
+"""A wait status is the signal's number in the low bits, or the exit code in the next byte."""
+
+
+@pytest.fixture
+def running(jobs: Jobs, inputs_file: Path, interpretation: Interpretation) -> Callable[..., Watch]:
+    """A claimed job under watch, with settings and a clock of the test's own."""
+
+    def make(time: list[float] | None = None, **settings: object) -> Watch:
+        id = jobs.submit(inputs_file, options=Options(), interpretation=interpretation).id
+        token = jobs.records.get(id).token
+        jobs.records.update(id, lambda held: lifecycle.claim(held, token=token, worker="me", now=NOW))
+        clock = time if time is not None else [0.0]
+        changed = dataclasses.replace(jobs.settings, cancel_grace=3.0, **settings)  # type: ignore[arg-type]
+        return Watch(changed, jobs.records, id=id, token=token, worker="me", clock=lambda: clock[0])
+
+    return make
+
+
+def test_a_cancelled_attempt_is_killed_after_its_grace(jobs: Jobs, running: Callable[..., Watch]) -> None:
+    time = [0.0]
+    watch = running(time)
+    assert watch.must_end(stop_by=None) is None
+    jobs.cancel(watch.id)
+    found = []
+    for time[0] in (0.5, 1.5, 4.0, 4.5):
+        found.append(watch.must_end(stop_by=None))
+    assert found == [None, None, None, Reason.CANCELLED], "noticed at the beat of 1.5 s, killed 3 s later"
+    after = settle(watch, status=KILLED, peak=0, patience=Patience(0))
+    assert after is not None
+    assert (after.job.status, after.job.error) == (Status.CANCELLED, None)
+
+
+def test_an_attempt_that_ignores_its_time_limit_is_killed(running: Callable[..., Watch]) -> None:
+    time = [0.0]
+    watch = running(time, time_limit=10.0)
+    time[0] = 12.9
+    assert watch.must_end(stop_by=None) is None
+    time[0] = 13.0
+    assert watch.must_end(stop_by=None) is Reason.TIMED_OUT
+    after = settle(watch, status=KILLED, peak=0, patience=Patience(0))
+    assert after is not None
+    assert after.job.error is not None
+    assert (after.job.error.code, "10 s" in after.job.error.detail) == ("timed_out", True)
+
+
+def test_without_a_limit_there_is_none(running: Callable[..., Watch]) -> None:
+    time = [0.0]
+    watch = running(time, time_limit=0.0)
+    time[0] = 1e9
+    assert watch.must_end(stop_by=None) is None
+
+
+def test_a_worker_that_stops_puts_the_job_back_however_often(jobs: Jobs, running: Callable[..., Watch]) -> None:
+    time = [0.0]
+    watch = running(time, max_attempts=1)
+    assert watch.must_end(stop_by=2.0) is None
+    time[0] = 2.0
+    assert watch.must_end(stop_by=2.0) is Reason.STOPPING
+    after = settle(watch, status=KILLED, peak=0, patience=Patience(0))
+    assert after is not None
+    assert (after.job.status, after.job.attempt, after.worker) == (Status.QUEUED, 1, None)
+    assert after.token != watch.token
+    assert watch.must_end(stop_by=2.0) is Reason.STOPPING
+    time[0] = 3.0
+    assert watch.must_end(stop_by=2.0) is Reason.STALE
+    assert settle(watch, status=KILLED, peak=0, patience=Patience(0)) is None
+
+
+def test_a_horse_that_is_killed_while_its_worker_stops_is_put_back(running: Callable[..., Watch]) -> None:
+    for status, expected in ((KILLED, Status.QUEUED), (int(signal.SIGSEGV), Status.FAILED)):
+        watch = running([0.0])
+        assert watch.must_end(stop_by=100.0) is None
+        after = settle(watch, status=status, peak=0, patience=Patience(0))
+        assert after is not None
+        assert after.job.status is expected
+
+
+def test_an_attempt_that_lost_its_job_is_killed_at_once(jobs: Jobs, running: Callable[..., Watch]) -> None:
+    time = [0.0]
+    watch = running(time)
+    jobs.cancel(watch.id)
+    jobs.records.update(watch.id, lambda held: lifecycle.stop(held, token=watch.token, now=NOW, retention=0))
+    jobs.delete(watch.id)
+    assert watch.must_end(stop_by=None) is Reason.STALE
+    assert settle(watch, status=KILLED, peak=0, patience=Patience(0)) is None
+
+
+def test_a_watch_outlasts_its_store(running: Callable[..., Watch], monkeypatch: pytest.MonkeyPatch) -> None:
+    time = [0.0]
+    watch = running(time)
+
+    def away(*_: object) -> Status | None:
+        raise StoreUnavailable("The job store", reason="TimeoutError")
+
+    monkeypatch.setattr(type(watch.records), "beat", away)
+    for time[0] in range(100):
+        assert watch.must_end(stop_by=None) is None
+    monkeypatch.setattr(type(watch.records), "get", away)
+    with pytest.raises(StoreUnavailable, match="try again"):
+        settle(watch, status=KILLED, peak=0, patience=Patience(0))
+
+
+def test_a_silent_death_is_told_from_one_for_want_of_memory(
+    jobs: Jobs, running: Callable[..., Watch], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def code(watch: Watch, status: int, peak: int = 0) -> str:
+        after = settle(watch, status=status, peak=peak, patience=Patience(0))
+        assert after is not None
+        assert after.job.error is not None
+        assert after.job.error.retryable
+        return after.job.error.code
+
+    assert code(running(), KILLED) == "worker_lost"
+    assert code(running(memory_limit=1000), KILLED, peak=950) == "out_of_memory"
+    assert code(running(memory_limit=1000), KILLED, peak=500) == "worker_lost"
+    assert code(running(), 3 << 8) == "worker_lost"
+    quiet, starved, segfault = running(), running(), running()
+    monkeypatch.setattr(OomKills, "now", classmethod(lambda cls: OomKills(group=10**9, machine=0)))
+    assert code(starved, KILLED) == "out_of_memory"
+    assert code(segfault, int(signal.SIGSEGV)) == "worker_lost", "the kernel kills the hungry with SIGKILL"
+    jobs.records.update(quiet.id, lambda held: held.model_copy(update={"worker": "another"}))
+    assert settle(quiet, status=KILLED, peak=0, patience=Patience(0)) is None, (
+        "a second delivery must not end the first"
+    )
+
+
+def test_kernel_counters_are_whole_numbers_that_do_not_fall() -> None:
+    before = OomKills.now()
+    after = OomKills.now()
+    assert 0 <= before.machine <= after.machine
+    assert 0 <= before.group <= after.group
+    assert OomKills(1, 0).since(OomKills(0, 0))
+    assert not OomKills(1, 1).since(OomKills(1, 1))
+
+
+def test_patience_repeats_until_the_store_answers(jobs: Jobs, running: Callable[..., Watch]) -> None:
+    watch = running()
+    answers = [StoreUnavailable("x", reason="y"), None]
+
+    def call() -> object:
+        error = answers.pop(0)
+        if error is not None:
+            raise error
+        return jobs.records.get(watch.id)
+
+    assert Patience(10).ask(call) == jobs.records.get(watch.id)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "status", "retryable"),
+    [
+        (InvalidInput("wrong_shape", field="tracks", expected="a", got="b", hint="Do c"), "wrong_shape", 422, False),
+        (MemoryError("Unable to allocate"), "out_of_memory", 507, True),
+        (OSError(12, "Cannot allocate memory"), "out_of_memory", 507, True),
+        (OSError(28, "No space left on device"), "storage_failed", 503, True),
+        (StoreUnavailable("The blob store", reason="gone"), "store_unavailable", 503, True),
+        (ZeroDivisionError("secret detail"), "internal_error", 500, False),
+        (OSError("no number"), "internal_error", 500, False),
+    ],
+)  # fmt: skip
+def test_every_error_becomes_a_sentence(error: BaseException, code: str, status: int, retryable: bool) -> None:
+    problem = problem_of(error)
+    assert (problem.code, problem.status, problem.retryable) == (code, status, retryable)
+    assert problem.detail.endswith(".")
+    assert "secret" not in problem.detail
+    if isinstance(error, InvalidInput):
+        assert (problem.field, problem.expected, problem.got, problem.hint) == ("tracks", "a", "b", "Do c")
+
+
+def test_a_thread_that_does_not_fit_is_want_of_memory_only_under_a_limit() -> None:
+    error = RuntimeError("can't start new thread")
+    assert problem_of(error, memory_limit=2**30).code == "out_of_memory"
+    assert "1.0 GiB" in problem_of(error, memory_limit=2**30).detail
+    assert problem_of(error).code == "internal_error"
+
+
+def test_limits_are_named_in_words() -> None:
+    assert "2.0 GiB" in out_of_memory(2**31).detail
+    assert "the machine had" in out_of_memory().detail
+    assert "1.5 s" in timed_out(1.5).detail
+    assert "signal 11 (SIGSEGV)" in how_it_ended(11)
+    assert "code 3" in how_it_ended(3 << 8)
+    assert isinstance(out_of_memory(), Problem)
+
+
+def test_progress_never_falls_and_estimates_what_is_left() -> None:
+    told = []
+    time = [100.0]
+    teller = Teller(told.append, clock=lambda: time[0])
+    teller.part("loading", 1.0)
+    teller.part("solving", 0.5, stage="cameras", max_reweightings=30)
+    time[0] = 110.0
+    teller.part("solving", 0.25, stage="reweight", reweighting=3, objective=2.0)
+    teller.part("exporting", 0.5, residual=0.125)
+    teller.part("exporting", 7.0)
+    fractions = [each.fraction for each in told]
+    assert fractions == sorted(fractions)
+    assert fractions[-1] == 1.0
+    assert told[0].seconds_left is None, "nothing to base it on"
+    middle = fractions[2]
+    assert middle == pytest.approx(0.02 + 0.83 / 2)
+    assert told[2].seconds_left == pytest.approx(10 * (1 - middle) / middle, abs=0.05)
+    assert told[-1].seconds_left == 0
+    assert [each.stage for each in told] == ["loading", "cameras", "reweight", "exporting", "exporting"]
+    assert (told[-1].reweighting, told[-1].max_reweightings, told[-1].objective, told[-1].residual) == (
+        3,
+        30,
+        2.0,
+        0.125,
+    )
+    edges = sorted(SHARES.values())
+    assert edges[0][0] == 0
+    assert edges[-1][1] == 1
+    assert all(before[1] == after[0] for before, after in itertools.pairwise(edges))
+
+
+def test_the_log_is_whole_before_the_record_is_final(
+    jobs: Jobs, running: Callable[..., Watch], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    watch = running([0.0])
+    output = working_directory(watch.settings, watch.token) / OUTPUT
+    output.parent.mkdir(parents=True)
+    output.write_text("Segmentation fault\n")
+    logged: list[str] = []
+    update = type(jobs.records).update
+
+    def seen(self: Records, id: str, change: Change) -> Stored:
+        logged.extend(self.log(id))
+        return update(self, id, change)
+
+    monkeypatch.setattr(type(jobs.records), "update", seen)
+    assert settle(watch, status=KILLED, peak=0, patience=Patience(0)) is not None
+    assert "SIGKILL" in logged[0]
+    assert logged[1:] == ["Segmentation fault"] == jobs.records.log(watch.id)[1:]

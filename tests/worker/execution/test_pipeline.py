@@ -1,0 +1,102 @@
+"""The whole job as a plain call."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from long_jobs import LONG, long_sequence
+from pliant.schemas.job import Progress
+from pliant.schemas.options import SOLVER_FIELDS, Options
+from pliant.solver import InvalidInput, KnownCamera, Mesh, Outcome, Settings, solve
+from pliant.solver.evaluation.metrics import e3d_frame
+from pliant.solver.shapes.irls import MAX_INNER
+from pliant.worker.errors import Interrupted, TimedOut
+from pliant.worker.execution.failures import problem_of
+from pliant.worker.execution.pipeline import reconstruct, solver_settings
+from pliant.worker.formats import Inputs
+from worker_house import make_inputs
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> Inputs:
+    return make_inputs(tmp_path_factory.mktemp("run") / "inputs.npz", frames=8, points=60)
+
+
+def test_the_files_hold_what_the_call_returns(inputs: Inputs, tmp_path: Path) -> None:
+    told: list[Progress] = []
+    finished = reconstruct(inputs, Options(max_reweightings=4), tmp_path / "new", on_progress=told.append)
+    report = json.loads((tmp_path / "new" / "report.json").read_text())
+    assert (report["outcome"], report["sentence"]) == (finished.outcome, finished.sentence)
+    assert report["metrics"] == pytest.approx(finished.metrics)
+    assert {"e3d_sequence", "reprojection_median"} <= set(finished.metrics)
+    for artifact in finished.artifacts:
+        assert (tmp_path / "new" / artifact.name).stat().st_size == artifact.bytes
+    with np.load(tmp_path / "new" / "shapes.npz") as arrays:
+        assert arrays["shapes"].shape == (8, 60, 3)
+        assert inputs.ground_truth is not None
+        assert finished.metrics["e3d_frame"] == pytest.approx(e3d_frame(arrays["shapes"], inputs.ground_truth.shapes))
+    stages = [each.stage for each in told]
+    assert stages[0] == "loading"
+    assert stages[-1] == "exporting"
+    assert {"cameras", "reweight"} <= set(stages)
+    fractions = [each.fraction for each in told]
+    assert fractions == sorted(fractions)
+    assert fractions[-1] == 1
+
+
+@pytest.mark.parametrize("stage", ["loading", "cameras", "initialise", "reweight", "exporting"])
+def test_it_stops_at_every_stage(inputs: Inputs, tmp_path: Path, stage: str) -> None:
+    told: list[Progress] = []
+    with pytest.raises(Interrupted, match="stopped on request"):
+        reconstruct(
+            inputs,
+            Options(),
+            tmp_path,
+            on_progress=told.append,
+            should_stop=lambda: any(p.stage == stage for p in told),
+        )
+    assert stage == "exporting" or (told[-1].stage != "exporting" and told[-1].reweighting <= 1)
+    assert not (tmp_path / "report.json").exists(), "the report is the last to be written"
+    assert not list(tmp_path.glob(".*")), "no half-written file"
+
+
+def test_a_job_keeps_to_its_own_time_limit(inputs: Inputs, tmp_path: Path) -> None:
+    with pytest.raises(TimedOut, match=r"0\.001 s of its option time_limit") as caught:
+        reconstruct(inputs, Options(time_limit=0.001), tmp_path)
+    problem = problem_of(caught.value)
+    assert (problem.code, problem.field, problem.retryable) == ("timed_out", "options.time_limit", True)
+    assert reconstruct(inputs, Options(time_limit=100, max_reweightings=1), tmp_path).outcome == "max_reweightings"
+
+
+def test_every_option_of_the_solver_reaches_it() -> None:
+    chosen = {
+        "method": "spatio_temporal", "camera": "orthographic", "basis_size": 2, "refine_rotations": False, "preset": "paper",
+        "temporal_weight": 0.5, "spatial_weight": 0.25, "robust_scale": 0.125, "temporal_order": 2, "loss": "huber",
+        "laplacian": "uniform", "prior": "smooth+low_rank", "low_rank_weight": 3.0, "max_reweightings": 7, "tolerance": 0.5,
+        "precision": "float32", "seed": 9,
+    }  # fmt: skip
+    assert set(chosen) == set(SOLVER_FIELDS)
+    assert solver_settings(Options.model_validate(chosen)) == Settings(**chosen)  # type: ignore[arg-type]
+
+
+def test_what_does_not_fit_is_refused_before_a_file_is_written(inputs: Inputs, tmp_path: Path) -> None:
+    assert inputs.mesh is not None
+    no_grid = Mesh.from_faces(inputs.mesh.faces, inputs.mesh.num_points)
+    without = Inputs(inputs.tracks, no_grid, None, None, inputs.interpretation)
+    with pytest.raises(InvalidInput):
+        reconstruct(without, Options(laplacian="grid8"), tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_long_job_of_the_fault_tests_is_long_by_construction() -> None:
+    """Every reweighting takes as many inner iterations as may be, and its energy falls: a thousand of them on any machine."""
+    sequence, options = long_sequence(), dict(LONG, max_reweightings=4)
+    solved = solve(sequence.tracks, cameras=KnownCamera(sequence.rotations), settings=Settings(**options))
+    assert solved.outcome is Outcome.MAX_REWEIGHTINGS
+    assert solved.trace.iterations.tolist() == [0, *[MAX_INNER] * 4]
+    falls = -np.diff(solved.trace.objective) / solved.trace.objective[:-1]
+    assert falls.min() > 1e-4, "very far from where nothing falls any more"
+    assert LONG["max_reweightings"] == 1000

@@ -1,0 +1,74 @@
+"""What a worker does for an attempt whose horse has ended, with a store that comes back after a while."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from pliant.schemas.job import Interpretation
+from pliant.schemas.options import Options
+from pliant.worker.errors import StoreUnavailable
+from pliant.worker.execution.monitor import Patience, Watch
+from pliant.worker.execution.rq_worker import PliantWorker
+from pliant.worker.execution.workdir import working_directory
+from pliant.worker.jobs import lifecycle
+from pliant.worker.jobs.service import Jobs
+from pliant.worker.records import Stored, utc_now
+from pliant.worker.settings import Settings
+from pliant.worker.store.connection import connect
+
+
+def test_patience_is_one_span_for_all_that_is_asked() -> None:
+    asked: list[str] = []
+
+    def gone() -> None:
+        asked.append("again")
+        raise StoreUnavailable("The store", reason="gone")
+
+    patience = Patience(0.7)
+    with pytest.raises(StoreUnavailable):
+        patience.ask(gone)
+    assert len(asked) > 1
+    asked.clear()
+    with pytest.raises(StoreUnavailable):
+        patience.ask(gone)
+    assert asked == ["again"], "tried once, though the time is over"
+
+
+@pytest.mark.parametrize("away", ["it comes back", "it stays away"])
+def test_the_working_files_go_once_the_store_says_whose_they_are(
+    jobs: Jobs,
+    settings: Settings,
+    inputs_file: Path,
+    interpretation: Interpretation,
+    monkeypatch: pytest.MonkeyPatch,
+    away: str,
+) -> None:
+    connection = connect(settings.redis, decode=False)
+    worker = PliantWorker(
+        settings=jobs.settings, connection=connection, records=jobs.records, queue=jobs.queue, name="me"
+    )
+    id = jobs.submit(inputs_file, options=Options(), interpretation=interpretation).id
+    token = jobs.records.get(id).token
+    jobs.records.update(id, lambda held: lifecycle.claim(held, token=token, worker="me", now=utc_now()))
+    folder = working_directory(jobs.settings, token)
+    folder.mkdir(parents=True)
+    (folder / "half.npz").write_bytes(b"half")
+    watch = Watch(jobs.settings, jobs.records, id=id, token=token, worker="me")
+    delivery = SimpleNamespace(id=id)
+    looks: list[str] = []
+    get = jobs.records.get
+
+    def stammering(wanted: str) -> Stored:
+        looks.append(wanted)
+        if len(looks) > 1 and (away == "it stays away" or len(looks) < 4):  # the first is the last word's
+            raise StoreUnavailable("The store", reason="gone")
+        return get(wanted)
+
+    monkeypatch.setattr(jobs.records, "get", stammering)
+    worker._stop_by = 0.0  # being stopped, it has two seconds
+    worker._bury(watch, delivery, status=9, peak=0)  # type: ignore[arg-type]
+    connection.close()
+    assert len(looks) >= 4
+    assert folder.exists() == (away == "it stays away"), "whose files nobody can say, the keeper clears"

@@ -1,0 +1,136 @@
+"""Crafted NumPy files: each is refused by its code before its content is inflated."""
+
+from __future__ import annotations
+
+import errno
+import io
+import struct
+import warnings
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pliant.solver import InvalidInput
+from pliant.worker.formats.reading.arrays import read_npy, read_npz
+from pliant.worker.formats.records import Limits
+
+SMALL = Limits(max_bytes=1 << 20, max_members=4)
+
+
+def npy(array: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, array)
+    return buffer.getvalue()
+
+
+def header(text: str, data: bytes = b"", version: int = 1) -> bytes:
+    return b"\x93NUMPY" + bytes([version, 0]) + struct.pack("<H", len(text)) + text.encode() + data
+
+
+def described(descr: str, shape: str) -> str:
+    return f"{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}}}"
+
+
+GOOD = npy(np.zeros((3, 4, 2)))
+HEADERS = {
+    "object": ("object_array", header(described("'|O'", "(2,)"), b"\x80\x04K\x01.")),
+    "structured": ("wrong_type", header(described("[('a', '<f8')]", "(1,)"), bytes(8))),
+    "text": ("wrong_type", header(described("'<U4'", "(1,)"), bytes(16))),
+    "complex": ("wrong_type", header(described("'<c16'", "(1,)"), bytes(16))),
+    "nothing known": ("damaged_file", header(described("'<f3'", "(1,)"), bytes(3))),
+    "more than there is": ("damaged_file", header(described("'<f8'", "(9,)"), bytes(8))),
+    "less than there is": ("damaged_file", header(described("'<f8'", "(1,)"), bytes(16))),
+    "a terabyte": ("too_large", header(described("'<f8'", "(1000000, 131072)"))),
+    "negative": ("damaged_file", header(described("'<f8'", "(-1,)"))),
+    "not a tuple": ("damaged_file", header(described("'<f8'", "'x'"))),
+    "many dimensions": ("damaged_file", header(described("'|u1'", "(" + "1," * 40 + ")"), b"\0")),
+    "code": ("damaged_file", header("__import__('os').system('true')")),
+    "nested": ("damaged_file", header("(" * 3000)),
+    "other entries": ("damaged_file", header("{'descr': '<f8'}")),
+    "version": ("damaged_file", header(described("'<f8'", "(1,)"), bytes(8), version=9)),
+    "cut off": ("damaged_file", GOOD[:20]),
+    "no header": ("damaged_file", b"nonsense and more"),
+}
+
+
+@pytest.mark.parametrize("name", HEADERS)
+def test_headers_that_lie_are_refused(name: str) -> None:
+    code, content = HEADERS[name]
+    with pytest.raises(InvalidInput) as caught:
+        read_npy(io.BytesIO(content), len(content), field="tracks", limits=SMALL)
+    assert caught.value.code == code
+
+
+def archive(path: Path, members: list[tuple[str, bytes]], method: int = zipfile.ZIP_DEFLATED) -> Path:
+    with warnings.catch_warnings(), zipfile.ZipFile(path, "w", method) as file:
+        warnings.simplefilter("ignore")
+        for name, content in members:
+            file.writestr(name, content)
+    return path
+
+
+ARCHIVES = {
+    "duplicate_member": [("tracks.npy", GOOD), ("tracks.npy", GOOD)],
+    "member_name": [("../tracks.npy", GOOD)],
+    "pickle_refused": [("archive/data.pkl", b"\x80\x02.")],
+    "too_large": [("tracks.npy", npy(np.zeros(1 << 18)))],
+}
+
+
+@pytest.mark.parametrize("code", ARCHIVES)
+def test_crafted_archives_are_refused(tmp_path: Path, code: str) -> None:
+    path = archive(tmp_path / "x.npz", ARCHIVES[code])
+    with pytest.raises(InvalidInput) as caught:
+        read_npz(path, field="tracks", limits=SMALL)
+    assert caught.value.code == code
+
+
+def test_too_many_members_and_odd_packing_are_refused(tmp_path: Path) -> None:
+    many = archive(tmp_path / "many.npz", [(f"a{index}.npy", GOOD) for index in range(5)])
+    packed = archive(tmp_path / "lzma.npz", [("tracks.npy", GOOD)], zipfile.ZIP_LZMA)
+    for path, code in ((many, "too_large"), (packed, "unsupported_feature")):
+        with pytest.raises(InvalidInput) as caught:
+            read_npz(path, field="tracks", limits=SMALL)
+        assert caught.value.code == code
+
+
+def test_a_member_whose_checksum_is_wrong_is_refused(tmp_path: Path) -> None:
+    path = archive(tmp_path / "x.npz", [("tracks.npy", GOOD)], zipfile.ZIP_STORED)
+    content = bytearray(path.read_bytes())
+    content[200] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(InvalidInput) as caught:
+        read_npz(path, field="tracks", limits=SMALL)
+    assert caught.value.code == "damaged_file"
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.binary(max_size=300), st.integers(0, len(GOOD)))
+def test_no_bytes_make_the_reader_fail_otherwise(junk: bytes, at: int) -> None:
+    content = GOOD[:at] + junk + GOOD[at + len(junk) :]
+    try:
+        read_npy(io.BytesIO(content), len(content), field="tracks", limits=SMALL)
+    except InvalidInput as error:
+        assert error.code in ("damaged_file", "wrong_type", "too_large", "object_array")  # noqa: PT017
+
+
+def test_a_directory_that_points_before_the_file_is_refused(tmp_path: Path) -> None:
+    path = archive(tmp_path / "x.npz", [("tracks.npy", GOOD)])
+    path.write_bytes(path.read_bytes()[1:])
+    with pytest.raises(InvalidInput) as caught:
+        read_npz(path, field="tracks", limits=SMALL)
+    assert caught.value.code == "damaged_file"
+
+
+def test_a_disk_that_fails_is_not_the_files_fault(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = archive(tmp_path / "x.npz", [("tracks.npy", GOOD)])
+
+    def fails(*_: object, **__: object) -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(zipfile.ZipFile, "open", fails)
+    with pytest.raises(OSError, match="Input/output error"):
+        read_npz(path, field="tracks", limits=SMALL)

@@ -1,0 +1,136 @@
+"""Files of other programs, read in a child process; attacks on it are refused by code and cost one child."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import scipy.io
+from crafting import GFACES, accessors, gltf
+from PIL import Image
+from pliant.schemas.options import Options
+from pliant.solver import InvalidInput
+from pliant.worker.artifacts.animation import animate
+from pliant.worker.artifacts.glb import write_glb
+from pliant.worker.formats import Inputs, Limits, read_inputs
+from pliant.worker.formats.reading.csv import read_csv
+from pliant.worker.formats.reading.gltf import read_gltf
+from pliant.worker.formats.reading.sandbox import parse_in_child
+from results import moving_sheet
+
+F, ROWS, COLUMNS = 6, 4, 5
+P = ROWS * COLUMNS
+POINTS = moving_sheet(F, ROWS, COLUMNS)[..., :2] + 100
+MATRIX = POINTS.transpose(0, 2, 1).reshape(2 * F, P)
+
+
+def read(path: Path, **more: object) -> Inputs:
+    return read_inputs(tracks=path, options=Options(), mesh="none", **more)  # type: ignore[arg-type]
+
+
+def code_of(path: Path, **more: object) -> str:
+    with pytest.raises(InvalidInput) as caught:
+        read(path, **more)
+    return caught.value.code
+
+
+def test_matlab_structs_of_both_versions_give_the_same_tracks(tmp_path: Path) -> None:
+    scipy.io.savemat(tmp_path / "five.mat", {"data": {"W": MATRIX}})
+    with h5py.File(tmp_path / "seven.mat", "w", userblock_size=512) as file:
+        file["data/W"] = MATRIX.T
+    for name in ("five.mat", "seven.mat"):
+        np.testing.assert_array_equal(read(tmp_path / name).tracks.points, POINTS)
+
+
+def test_csv_lines_may_come_in_any_order_and_missing_ones_are_hidden(tmp_path: Path) -> None:
+    lines = [f"{f},{p + 7},{x!r},{y!r}" for f in range(F) for p, (x, y) in enumerate(POINTS[f].tolist())]
+    order = np.random.default_rng(0).permutation(len(lines))
+    (tmp_path / "t.csv").write_text("frame,point,x,y\n" + "\n".join(lines[i] for i in order if i != 3) + "\n")
+    got = read(tmp_path / "t.csv")
+    assert got.tracks.visible[0, 3] == 0
+    assert (got.tracks.visible == 0).sum() == 1
+    np.testing.assert_array_equal(got.tracks.points[1:], POINTS[1:])
+    (tmp_path / "t.csv").write_text("frame,point,x,y\n0,0,1,2\n0,0,1,3\n")
+    assert code_of(tmp_path / "t.csv") == "duplicate_observation"
+    (tmp_path / "t.csv").write_text("frame,point,x,y\n0,0,1,2\n99999999,0,1,3\n")
+    assert code_of(tmp_path / "t.csv") == "too_large"
+    with pytest.raises(InvalidInput, match="2 columns where frame, point, x and y"):
+        read_csv(io.BytesIO(b"1,2\n3,4\n"), field="tracks", limits=Limits())
+    (tmp_path / "t.csv").write_text("frame,point,x,y\n0,zero,1,2\n")
+    assert code_of(tmp_path / "t.csv") == "damaged_file"
+
+
+def test_glb_and_mask_meshes_keep_the_order_of_vertices(tmp_path: Path) -> None:
+    np.savez(tmp_path / "t.npz", tracks=POINTS)
+    faces = np.array([[0, 1, 6], [0, 6, 5], [13, 14, 19]], dtype=np.int32)
+    with (tmp_path / "m.glb").open("wb") as out:
+        write_glb(out, animate(moving_sheet(F, ROWS, COLUMNS)), faces, fps=25, node={})
+    got = read_inputs(tracks=tmp_path / "t.npz", mesh=tmp_path / "m.glb", options=Options())
+    assert got.mesh is not None
+    np.testing.assert_array_equal(got.mesh.faces, faces)
+    mask = np.zeros((ROWS + 2, COLUMNS + 1), dtype=np.uint8)
+    mask[1:-1, 1:] = 255
+    Image.fromarray(mask).save(tmp_path / "m.png")
+    got = read_inputs(tracks=tmp_path / "t.npz", mesh=tmp_path / "m.png", options=Options())
+    assert got.mesh is not None
+    assert len(got.mesh.faces) == (ROWS - 1) * (COLUMNS - 1)
+
+
+def test_hdf5_that_points_elsewhere_or_declares_too_much_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "secret").write_bytes(bytes(8 * 100))
+    with h5py.File(tmp_path / "external.mat", "w") as file:
+        file.create_dataset("W", (10, 10), dtype="f8", external=[(str(tmp_path / "secret"), 0, 800)])
+    with h5py.File(tmp_path / "link.mat", "w") as file:
+        file["W"] = h5py.ExternalLink(str(tmp_path / "external.mat"), "W")
+    with h5py.File(tmp_path / "virtual.mat", "w") as file:
+        layout = h5py.VirtualLayout((10, 10), "f8")
+        layout[:] = h5py.VirtualSource(str(tmp_path / "external.mat"), "W", shape=(10, 10))
+        file.create_virtual_dataset("W", layout)
+    with h5py.File(tmp_path / "huge.mat", "w") as file:
+        file.create_dataset("W", (1 << 20, 1 << 20), dtype="f8", chunks=(16, 16))
+    for name in ("external", "link", "virtual"):
+        assert code_of(tmp_path / f"{name}.mat") == "unsupported_feature"
+    assert code_of(tmp_path / "huge.mat") == "too_large"
+
+
+def test_a_child_out_of_time_or_memory_costs_nothing_else(tmp_path: Path) -> None:
+    (tmp_path / "m.obj").write_text("v 1 2 3\n" * 8_000_000)  # several seconds on any machine, and one is all it gets
+    limits = Limits(parse_seconds=1, max_points=10**8)
+    with pytest.raises(InvalidInput) as caught:
+        parse_in_child("obj", tmp_path / "m.obj", field="mesh", limits=limits)
+    assert caught.value.code == "too_slow"
+    scipy.io.savemat(tmp_path / "t.mat", {"W": np.zeros((4000, 9000))}, do_compression=True)
+    assert code_of(tmp_path / "t.mat", limits=Limits(parse_memory=700 << 20)) == "too_large"
+
+
+def test_damaged_matlab_files_are_refused(tmp_path: Path) -> None:
+    scipy.io.savemat(tmp_path / "t.mat", {"W": MATRIX})
+    whole = (tmp_path / "t.mat").read_bytes()
+    for content in (whole[:200], whole[:128] + os.urandom(400)):
+        (tmp_path / "t.mat").write_bytes(content)
+        assert code_of(tmp_path / "t.mat") in ("damaged_file", "too_large", "missing_array")
+
+
+def test_pickles_are_never_opened(tmp_path: Path) -> None:
+    (tmp_path / "t.pkl").write_bytes(b"\x80\x04cos\nsystem\n.")
+    assert code_of(tmp_path / "t.pkl") == "pickle_refused"
+
+
+def test_gltf_of_text_gives_its_faces_and_whole_numbers_only(tmp_path: Path) -> None:
+    np.savez(tmp_path / "t.npz", tracks=POINTS)
+    document = gltf(buffers=[{"uri": "data:application/octet-stream;base64," + GFACES}])
+    (tmp_path / "m.gltf").write_text(json.dumps(document))
+    got = read_inputs(tracks=tmp_path / "t.npz", mesh=tmp_path / "m.gltf", options=Options())
+    assert got.mesh is not None
+    np.testing.assert_array_equal(got.mesh.faces, [[0, 1, 2], [3, 4, 5]])
+    with pytest.raises(InvalidInput, match="not a whole number"):
+        read_gltf(
+            io.BytesIO(json.dumps({**document, "accessors": accessors(count="20")}).encode()),
+            field="mesh",
+            limits=Limits(),
+        )

@@ -1,0 +1,243 @@
+"""Where two readings of a file fit, nothing is guessed; an option decides, and the evidence is said."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import scipy.io
+from pliant.schemas.options import Options
+from pliant.solver import InvalidInput, Tracks
+from pliant.worker.formats import AmbiguousInput, Inputs, Limits, read_inputs
+from pliant.worker.formats.ground_truth import as_rotations, as_shapes, unexplained
+from pliant.worker.formats.reading.hdf5 import read_matlab73
+from pliant.worker.formats.tracks.interpretation import understand
+from track_files import COLUMNS, MATRIX, POINTS, ROWS, SEEN, SHAPES, WORLD, F, P, pixels
+
+
+def read(tmp_path: Path, arrays: Mapping[str, Any], **options: object) -> Inputs:
+    np.savez(tmp_path / "tracks.npz", **arrays)
+    return read_inputs(tracks=tmp_path / "tracks.npz", mesh="none", options=Options.model_validate(options))
+
+
+def refused(code: str, arrays: Mapping[str, Any], **options: object) -> InvalidInput:
+    with pytest.raises(InvalidInput) as caught:
+        understand({name: np.asarray(array) for name, array in arrays.items()}, Options.model_validate(options))
+    assert caught.value.code == code, str(caught.value)
+    return caught.value
+
+
+def offered(error: InvalidInput) -> list[dict[str, object]]:
+    assert isinstance(error, AmbiguousInput)
+    return [choice["options"] for choice in error.choices]
+
+
+UNIT = POINTS / [8, 4]
+SIGNED = UNIT * 2 - 1
+
+
+def test_fractions_need_the_pictures_size_or_a_word(tmp_path: Path) -> None:
+    error = refused("ambiguous_coordinates", {"tracks": UNIT})
+    assert offered(error) == [{"coordinates": "unit"}, {"coordinates": "pixels"}]
+    assert refused("missing_image_size", {"tracks": UNIT}, coordinates="unit").field == "options.image_size"
+    for options in ({"image_size": "9x5"}, {"image_size": "9x5", "coordinates": "unit"}):
+        got = read(tmp_path, {"tracks": UNIT}, **options)
+        np.testing.assert_array_equal(got.tracks.points, POINTS)
+        assert got.interpretation.coordinates == "unit"
+    np.testing.assert_array_equal(read(tmp_path, {"tracks": UNIT}, coordinates="pixels").tracks.points, UNIT)
+
+
+def test_signed_fractions_are_seen_where_the_size_is_known(tmp_path: Path) -> None:
+    got = read(tmp_path, {"tracks": SIGNED}, image_size="9x5")
+    np.testing.assert_array_equal(got.tracks.points, POINTS)
+    assert got.interpretation.coordinates == "signed"
+    alone = read(tmp_path, {"tracks": SIGNED})
+    assert alone.interpretation.coordinates == "pixels"
+    assert alone.interpretation.y_axis == "up"
+
+
+def test_points_outside_the_picture_do_not_hide_fractions(tmp_path: Path) -> None:
+    some = UNIT.copy()
+    some[-1, :3] = [1.25, -0.5]
+    assert read(tmp_path, {"tracks": some}, image_size="9x5").interpretation.coordinates == "unit"
+
+
+def test_y_before_x_is_seen_where_only_so_all_is_inside(tmp_path: Path) -> None:
+    wide = POINTS * [80, 20]
+    got = read(tmp_path, {"tracks": wide[..., ::-1]}, image_size="641x100")
+    np.testing.assert_array_equal(got.tracks.points, wide)
+    assert any("read as y, x: so 100%" in note for note in got.interpretation.notes)
+    kept = read(tmp_path, {"tracks": wide[..., ::-1]}, image_size="641x100", coordinate_order="xy")
+    np.testing.assert_array_equal(kept.tracks.points, wide[..., ::-1])
+
+
+def test_a_contradicted_layout_is_asked_about(tmp_path: Path) -> None:
+    error = refused("ambiguous_layout", {"tracks": POINTS.swapaxes(0, 1)})
+    assert {"layout": "points_frames"} in offered(error)
+    got = read(tmp_path, {"tracks": POINTS.swapaxes(0, 1)}, layout="points_frames")
+    np.testing.assert_array_equal(got.tracks.points, POINTS)
+    two = refused("ambiguous_layout", {"one.W": MATRIX, "two.W": MATRIX})
+    assert "one.W and two.W" in two.got
+
+
+def test_a_long_list_of_pixels_is_no_long_video() -> None:
+    y, x = np.mgrid[:80, :160].astype(float)
+    first = np.stack([x, y], axis=-1).reshape(1, -1, 2)
+    quick = first + 30.0 * np.arange(4)[:, None, None] ** 1.5  # neighbours in the list are closer than frames
+    assert understand({"tracks": quick}, Options()).points.shape == (4, 80 * 160, 2)
+
+
+def test_y_axis_is_as_asked(tmp_path: Path) -> None:
+    assert read(tmp_path, {"tracks": POINTS}).interpretation.y_axis == "down"
+    up = read(tmp_path, {"tracks": POINTS}, y_axis="up").interpretation
+    assert up.y_axis == "up"
+    assert "y points up, as asked." in up.notes
+
+
+def test_numbers_above_1_are_a_mask_or_logits(tmp_path: Path) -> None:
+    positive = np.where(SEEN, 3.0, 0.5)
+    error = refused("out_of_range", {"tracks": POINTS, "visibility": positive})
+    assert offered(error) == [{"visibility": "bool"}, {"visibility": "logits"}]
+    logits = read(tmp_path, {"tracks": POINTS, "visibility": positive}, visibility="logits")
+    np.testing.assert_allclose(logits.tracks.visible[SEEN], 1 / (1 + np.exp(-3.0)))
+    assert read(tmp_path, {"tracks": POINTS, "visibility": positive}, visibility="bool").tracks.all_visible
+    mask = read(tmp_path, {"tracks": POINTS, "visibility": SEEN * 255})
+    np.testing.assert_array_equal(mask.tracks.visible > 0, SEEN)
+    refused("out_of_range", {"tracks": POINTS, "visibility": positive}, visibility="probability")
+
+
+def test_visibility_of_rows_goes_with_a_matrix(tmp_path: Path) -> None:
+    twice = np.repeat(SEEN, 2, axis=0)
+    np.testing.assert_array_equal(read(tmp_path, {"W": MATRIX, "mask": twice}).tracks.visible > 0, SEEN)
+    stacked = np.vstack([POINTS[..., 0], POINTS[..., 1]])
+    half = np.vstack([SEEN, np.ones_like(SEEN)])
+    np.testing.assert_array_equal(read(tmp_path, {"W": stacked, "mask": half}).tracks.visible > 0, SEEN)
+
+
+def test_more_axes_than_are_known_are_refused() -> None:
+    refused("wrong_shape", {"tracks": np.zeros((1, 1, 2, 3, 4, 2))})
+    assert "a batch of 2" in refused("wrong_shape", {"pred_tracks": np.stack([POINTS, POINTS])}).got
+    assert "a batch of 2" in refused("wrong_shape", {"tracks": np.stack([pixels(POINTS)] * 2)}).got
+    refused("wrong_shape", {"tracks": np.zeros((4, 2, 1, 9))})
+
+
+def test_space_needs_a_camera(tmp_path: Path) -> None:
+    assert refused("missing_array", {"tracks_xyz": WORLD}).field == "tracks.intrinsics"
+    for bad in (np.ones(3), np.array([0.0, 1, 2, 3]), np.array([1, 1, np.nan, 1]), np.array(["8", "8", "4", "2"])):
+        refused("wrong_shape", {"tracks_xyz": WORLD, "intrinsics": bad})
+    matrix = np.array([[8.0, 0, 4], [0, 8, 2], [0, 0, 1]])
+    behind = WORLD.copy()
+    behind[2, 5, 2] = -1
+    got = read(tmp_path, {"tracks_xyz": behind, "intrinsics": matrix})
+    assert got.tracks.visible[2, 5] == 0
+    assert got.interpretation.coordinates == "projected"
+    assert got.ground_truth is not None
+    third = np.where(np.arange(F * P).reshape(F, P, 1) == 3, 2.0, 0.5)
+    refused("unsupported_feature", {"tracks": np.concatenate([POINTS, third], axis=2)})
+
+
+def test_truth_is_read_the_way_that_explains_the_tracks() -> None:
+    understood = understand({"tracks": POINTS}, Options())
+    interleaved = SHAPES.transpose(0, 2, 1).reshape(3 * F, P)
+    stacked = np.vstack([*SHAPES.transpose(2, 0, 1)])
+    for array in (
+        SHAPES,
+        SHAPES.transpose(0, 2, 1),
+        SHAPES.transpose(2, 1, 0),
+        SHAPES.transpose(2, 0, 1),
+        interleaved,
+        stacked,
+        stacked.T,
+    ):
+        np.testing.assert_array_equal(as_shapes(array, understood)[0], SHAPES)
+    assert unexplained(SHAPES, POINTS) < 1e-12 < 0.3 < unexplained(stacked.reshape(F, 3, P).transpose(0, 2, 1), POINTS)
+    _, notes = as_shapes(SHAPES[:, np.random.default_rng(1).permutation(P)], understood)
+    assert "same order?" in notes[0]
+    wrong = np.zeros((F, 4))
+    assert as_shapes(wrong, understood)[0] is wrong
+    assert unexplained(SHAPES[:, :3], POINTS[:, :3]) == 0.0  # too few points to say
+
+
+def test_truth_beside_the_tracks_that_does_not_fit_is_passed_over_and_said(tmp_path: Path) -> None:
+    got = read(tmp_path, {"tracks": POINTS, "shapes": SHAPES[:, 1:]})
+    assert got.ground_truth is None
+    assert any("cannot be used: expected (8, 45, 3)" in note for note in got.interpretation.notes)
+
+
+def test_rotations_are_read_the_way_that_makes_them_rotations() -> None:
+    turns = np.linalg.qr(np.random.default_rng(0).normal(size=(F, 3, 3)))[0]
+    two = turns[:, :2]
+    for array in (turns, turns.transpose(1, 2, 0), turns.reshape(3 * F, 3), np.vstack([*turns.transpose(1, 0, 2)])):
+        np.testing.assert_array_equal(as_rotations(array, F), turns)
+    for array in (
+        two,
+        two.transpose(0, 2, 1),
+        two.transpose(1, 2, 0),
+        two.reshape(2 * F, 3),
+        np.vstack([*two.transpose(1, 0, 2)]),
+    ):
+        np.testing.assert_array_equal(as_rotations(array, F), two)
+    odd = np.zeros((5, 5))
+    assert as_rotations(odd, F) is odd
+
+
+def test_matlab_struct_arrays_hold_a_frame_each(tmp_path: Path) -> None:
+    frames = np.zeros((1, F), dtype=[("W", object), ("name", object)])
+    for index in range(F):
+        frames[0, index] = (POINTS[index].T, "made")
+    scipy.io.savemat(tmp_path / "t.mat", {"frames": frames})
+    got = read_inputs(tracks=tmp_path / "t.mat", mesh="none", options=Options())
+    np.testing.assert_array_equal(got.tracks.points, POINTS)
+
+
+def test_matlab_73_text_and_empty_arrays_are_no_tracks_and_cells_have_a_limit(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "t.mat", "w") as file:
+        file["W"] = MATRIX.T
+        file["text"] = np.zeros((4, 1), dtype=np.uint16)
+        file["text"].attrs["MATLAB_class"] = np.bytes_("char")
+        file["empty"] = np.zeros(2)
+        file["empty"].attrs["MATLAB_empty"] = 1
+        file.create_dataset("mixed", (2,), dtype=h5py.ref_dtype)
+        file["mixed"][...] = [file["W"].ref, file["text"].ref]
+    with (tmp_path / "t.mat").open("rb") as stream:
+        assert set(read_matlab73(stream, field="tracks", limits=Limits())) == {"W"}
+    with h5py.File(tmp_path / "t.mat", "w") as file:
+        file.create_dataset("W", (1, 1 << 20), dtype=h5py.ref_dtype, chunks=(1, 16))
+    with (tmp_path / "t.mat").open("rb") as stream, pytest.raises(InvalidInput, match="at most 20000 cells"):
+        read_matlab73(stream, field="tracks", limits=Limits())
+
+
+def test_whole_pictures_give_their_grid(tmp_path: Path) -> None:
+    np.savez(tmp_path / "t.npz", tracks=pixels(POINTS), visibility=pixels(SEEN))
+    got = read_inputs(tracks=tmp_path / "t.npz", options=Options())
+    assert got.interpretation.mesh_source == "grid"
+    assert got.interpretation.mesh_grid == (ROWS, COLUMNS)
+    np.testing.assert_array_equal(got.tracks.visible > 0, SEEN)
+
+
+def test_numbers_beyond_measure_are_refused_where_they_count(tmp_path: Path) -> None:
+    far = POINTS.copy()
+    far[2, 3] = 1e13
+    with pytest.raises(InvalidInput, match="1 points beyond") as caught:
+        read(tmp_path, {"tracks": far})
+    assert (caught.value.code, caught.value.field) == ("out_of_range", "tracks")
+    seen = np.ones((F, P), dtype=bool)
+    seen[2, 3] = False
+    assert read(tmp_path, {"tracks": far, "visibility": seen}).tracks.visible[2, 3] == 0
+    got = read(tmp_path, {"tracks": POINTS, "shapes": SHAPES * 1e13})
+    assert any("within ±1e+12" in note for note in got.interpretation.notes)
+
+
+def test_empty_arrays_are_refused() -> None:
+    for shape in ((0, 4), (4, 0), (0, 5, 9, 2), (4, 0, 0, 2), (0, 0, 0)):
+        with pytest.raises(InvalidInput):
+            read_whole(np.zeros(shape))
+
+
+def read_whole(array: np.ndarray) -> None:
+    got = understand({"W" if array.ndim == 2 else "tracks": array}, Options())
+    Tracks.from_arrays(got.points)

@@ -1,0 +1,119 @@
+"""Large inputs are read by a process of their own: the same interpretation, the same stored bits, the same refusals, nothing kept."""
+
+from __future__ import annotations
+
+import inspect
+import os
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import scipy.io
+from peaks import forget_peak, peak_of
+from pliant.schemas.options import Options
+from pliant.solver import InvalidInput
+from pliant.worker.formats import AmbiguousInput, Limits, isolated_reader, read_inputs, save_inputs, store_inputs
+from pliant.worker.formats.isolated_reader import announced
+from results import moving_sheet
+
+POINTS = moving_sheet(8, 6, 7)[..., :2] + 100
+
+
+@pytest.fixture
+def all_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(isolated_reader, "LARGE", 0)
+
+
+def test_the_stored_file_and_the_interpretation_are_the_same(all_apart: None, tmp_path: Path) -> None:
+    np.savez(tmp_path / "t.npz", tracks=POINTS)
+    np.savez(tmp_path / "g.npz", shapes=moving_sheet(8, 6, 7))
+    options = Options(stride=2)
+    inputs = read_inputs(tracks=tmp_path / "t.npz", mesh="6x7", ground_truth=tmp_path / "g.npz", options=options)
+    save_inputs(inputs, tmp_path / "here.npz")
+    said = store_inputs(
+        tracks=tmp_path / "t.npz",
+        mesh="6x7",
+        ground_truth=tmp_path / "g.npz",
+        options=options,
+        target=tmp_path / "there.npz",
+    )
+    assert said == inputs.interpretation
+    assert (tmp_path / "here.npz").read_bytes() == (tmp_path / "there.npz").read_bytes()
+    assert store_inputs(tracks=tmp_path / "t.npz", mesh="none", options=Options(), target=None).num_points == 42
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["g.npz", "here.npz", "t.npz", "there.npz"]
+
+
+def test_both_doors_take_the_same() -> None:
+    here, apart_too = (dict(inspect.signature(door).parameters) for door in (read_inputs, store_inputs))
+    assert apart_too.pop("target").default is inspect.Parameter.empty
+    assert here == apart_too
+
+
+def test_refusals_come_back_whole(all_apart: None, tmp_path: Path) -> None:
+    np.savez(tmp_path / "t.npz", tracks=POINTS[:2])
+    with pytest.raises(InvalidInput) as caught:
+        store_inputs(tracks=tmp_path / "t.npz", options=Options(), target=None)
+    assert (caught.value.code, caught.value.field, caught.value.got) == ("too_few_frames", "tracks", "2")
+    np.savez(tmp_path / "t.npz", tracks=POINTS.swapaxes(0, 1))
+    with pytest.raises(AmbiguousInput) as asked:
+        store_inputs(tracks=tmp_path / "t.npz", options=Options(), target=None)
+    assert asked.value.code == "ambiguous_layout"
+    assert {"layout": "points_frames"} in [choice["options"] for choice in asked.value.choices]
+
+
+def test_too_little_memory_or_time_is_the_inputs_fault(all_apart: None, tmp_path: Path) -> None:
+    np.savez_compressed(tmp_path / "t.npz", tracks=np.zeros((1000, 20_000, 2), dtype=np.float32))
+    with pytest.raises(InvalidInput, match="within 419430400 bytes") as caught:
+        store_inputs(tracks=tmp_path / "t.npz", options=Options(), limits=Limits(read_memory=400 << 20), target=None)
+    assert caught.value.code == "too_large"
+    with pytest.raises(InvalidInput, match=r"within 0\.01 s") as late:
+        store_inputs(tracks=tmp_path / "t.npz", options=Options(), limits=Limits(read_seconds=0.01), target=None)
+    assert late.value.code == "too_large"
+
+
+def test_a_fault_of_ours_is_not_the_inputs(all_apart: None, tmp_path: Path) -> None:
+    np.savez(tmp_path / "t.npz", tracks=POINTS)
+    with pytest.raises(RuntimeError, match="No such file or directory"):
+        store_inputs(tracks=tmp_path / "t.npz", options=Options(), target=tmp_path / "nowhere" / "x.npz")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_what_is_read_apart_is_not_kept_here(tmp_path: Path) -> None:
+    path = tmp_path / "t.npz"
+    np.savez(path, tracks=np.linspace(0, 900, 20 * 220_000 * 2).reshape(220_000, 20, 2).swapaxes(0, 1))
+    assert announced(path, field="tracks") > isolated_reader.LARGE
+    before = peak_now()
+    said = store_inputs(tracks=path, mesh="none", options=Options(), target=tmp_path / "c.npz")
+    assert (said.num_frames, said.num_points) == (20, 220_000)
+    assert peak_of(os.getpid()) - before < 40 << 20  # the arrays are 70 MB
+
+
+def peak_now() -> int:
+    """Resident bytes: the peak, once it is forgotten."""
+    forget_peak(os.getpid())
+    return peak_of(os.getpid())
+
+
+def test_what_a_file_announces(tmp_path: Path) -> None:
+    np.savez_compressed(tmp_path / "z.npz", tracks=np.zeros((100, 100, 2)))
+    np.save(tmp_path / "p.npy", np.zeros((100, 100, 2)))
+    scipy.io.savemat(tmp_path / "m.mat", {"W": np.zeros((20, 30))})
+    (tmp_path / "t.csv").write_text("frame,point,x,y\n0,0,1,2\n")
+    size = {path.suffix: path.stat().st_size for path in tmp_path.iterdir()}
+    assert size[".npz"] < 10_000
+    assert announced(tmp_path / "z.npz", field="tracks") == 160_000 + 128  # with the header
+    assert announced(tmp_path / "p.npy", field="tracks") == size[".npy"]
+    np.save(tmp_path / "b.npy", np.zeros((100, 100, 2), dtype=bool))
+    assert announced(tmp_path / "b.npy", field="tracks") == 160_000
+    assert announced(tmp_path / "m.mat", field="tracks") == 1032 * size[".mat"]
+    assert announced(tmp_path / "t.csv", field="tracks") == 8 * size[".csv"]
+    (tmp_path / "n.npz").write_bytes(b"PK\x03\x04" + bytes(400))
+    with pytest.raises(InvalidInput, match="without its directory"):
+        announced(tmp_path / "n.npz", field="tracks")
+    np.savez(tmp_path / "o.npz", tracks=np.array([{}], dtype=object))
+    assert 0 < announced(tmp_path / "o.npz", field="tracks") < 1000
+    with h5py.File(tmp_path / "h.mat", "w", userblock_size=512) as file:
+        file["W"] = np.zeros(4)
+    assert announced(tmp_path / "h.mat", field="tracks") > isolated_reader.LARGE

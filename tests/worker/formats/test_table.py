@@ -1,0 +1,68 @@
+"""Every documented track format, built as its program builds it, gives what the canonical file gives: bit for bit, solved too."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pliant.cli import app
+from pliant.schemas.options import Options
+from pliant.solver import Solution, solve
+from pliant.worker.execution.pipeline import solver_settings
+from pliant.worker.formats import Inputs, Limits, read_inputs
+from pliant.worker.formats.reading import containers
+from pliant.worker.formats.reading.parsers import PARSERS
+from pliant.worker.formats.records import Arrays
+from track_files import COLUMNS, FORMATS, ROWS, Written
+from typer.testing import CliRunner
+
+DOCUMENT = Path(__file__).parents[3] / "docs" / "formats.md"
+MESH = f"{ROWS}x{COLUMNS}"
+QUICK = {"method": "temporal", "refine_rotations": False, "basis_size": 1, "y_axis": "down"}
+
+
+def parse_here(parser: str, path: Path, *, field: str, limits: Limits) -> Arrays:
+    """The same parser without the time that a child process takes to start; `pliant inspect` below starts one."""
+    with path.open("rb") as stream:
+        return PARSERS[parser](stream, field=field, limits=limits)
+
+
+def solved(inputs: Inputs) -> Solution:
+    return solve(inputs.tracks, inputs.mesh, settings=solver_settings(Options.model_validate(QUICK)))
+
+
+@pytest.mark.parametrize("made", FORMATS, ids=str)
+def test_a_format_gives_what_the_canonical_file_gives(made: Written, tmp_path: Path) -> None:
+    path = tmp_path / f"tracks.{made.suffix}"
+    made.write(path)
+    canonical = {"tracks": made.points} | ({} if made.visibility is None else {"visibility": made.visibility})
+    np.savez(tmp_path / "canonical.npz", **canonical)
+    options = Options.model_validate({**QUICK, **made.options})
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(containers, "parse_in_child", parse_here)
+        got = read_inputs(tracks=path, mesh=MESH, options=options)
+    right = read_inputs(tracks=tmp_path / "canonical.npz", mesh=MESH, options=Options.model_validate(QUICK))
+    assert got.tracks.points.tobytes() == right.tracks.points.tobytes()
+    assert got.tracks.visible.tobytes() == right.tracks.visible.tobytes()
+    assert got.interpretation.format == made.recognised
+    if made.truth is not None:
+        assert got.ground_truth is not None
+        np.testing.assert_array_equal(got.ground_truth.shapes, made.truth)
+    mine, theirs = solved(got), solved(right)
+    assert mine.shapes.tobytes() == theirs.shapes.tobytes()
+    assert mine.camera.rotations.tobytes() == theirs.camera.rotations.tobytes()
+
+    pairs = [word for pair in {**QUICK, **made.options}.items() for word in ("-O", "{}={}".format(*pair))]
+    ran = CliRunner().invoke(app, ["inspect", str(path), "--mesh", MESH, *pairs, "--json"])
+    assert ran.exit_code == 0, ran.output
+    assert json.loads(ran.stdout) == got.interpretation.model_dump(mode="json")
+
+
+def test_the_documented_table_is_the_tested_one() -> None:
+    rows = re.findall(r"^\| (.+?) \| (.+?) \|$", DOCUMENT.read_text(encoding="utf-8"), re.MULTILINE)
+    assert [row for row in rows if row in {(made.title, made.layout) for made in FORMATS}] == [
+        (made.title, made.layout) for made in FORMATS
+    ]

@@ -1,0 +1,319 @@
+"""The door to the jobs: one suite, run on Redis with a directory of blobs and on the doubles in memory."""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from pliant.schemas.job import Artifact, Job, Problem, Progress, Status
+from pliant.worker.errors import (
+    Conflict,
+    InvalidRequest,
+    NotAllowedNow,
+    QuotaExceeded,
+    StaleAttempt,
+    UnknownArtifact,
+    UnknownJob,
+)
+from pliant.worker.jobs import lifecycle
+from pliant.worker.jobs.service import Jobs
+from pliant.worker.records import Stored
+
+NOW = datetime(2030, 1, 2, tzinfo=UTC)
+PROBLEM = Problem(
+    title="Lost", status=503, detail="The worker was lost. Try again.", code="worker_lost", retryable=True
+)
+
+
+def claim(jobs: Jobs, id: str) -> Stored:
+    token = jobs.records.get(id).token
+    return jobs.records.update(id, lambda stored: lifecycle.claim(stored, token=token, worker="w", now=NOW))
+
+
+def finish(jobs: Jobs, id: str, file: Path) -> Stored:
+    token = claim(jobs, id).token
+    prefix = f"jobs/{id}/{token}/"
+    jobs.blobs.put(f"{prefix}report.json", file)
+    artifact = Artifact(name="report.json", media_type="application/json", bytes=file.stat().st_size, sha256="0" * 64)
+    return jobs.records.update(
+        id,
+        lambda stored: lifecycle.succeed(
+            stored, token=token, prefix=prefix, artifacts=[artifact], metrics={"reprojection_median": 0.5},
+            outcome="converged", sentence="Converged.", warnings=[], now=NOW, retention=60,
+        ),
+    )  # fmt: skip
+
+
+def blob_names(jobs: Jobs) -> list[str]:
+    return [key for key, _ in jobs.blobs.list("jobs/")]
+
+
+def test_a_submitted_job_has_record_blob_and_place(jobs: Jobs, submit, inputs_file: Path) -> None:  # type: ignore[no-untyped-def]
+    first, second = submit(name="first"), submit(name="second")
+    assert (first.status, first.place_in_queue, second.place_in_queue) == (Status.QUEUED, 0, 1)
+    assert jobs.get(second.id) == second
+    stored = jobs.records.get(first.id)
+    assert b"".join(jobs.blobs.get(stored.inputs).read()) == inputs_file.read_bytes()
+    assert jobs.queue.waiting() == [stored.token, jobs.records.get(second.id).token]
+    assert jobs.records.used() == 2 * inputs_file.stat().st_size
+
+
+def test_an_unknown_job_is_said_so(jobs: Jobs) -> None:
+    for id in ("nobody", "../etc/passwd", "x" * 500):
+        with pytest.raises(UnknownJob, match="List the jobs"):
+            jobs.get(id)
+
+
+def test_pages_hold_every_job_once_newest_first(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
+    ids = [submit(id=f"job-{number}").id for number in range(5)]
+    claim(jobs, "job-3")
+    seen, cursor = [], None
+    for _ in range(3):
+        page = jobs.page(limit=2, cursor=cursor)
+        seen += [job.id for job in page.jobs]
+        cursor = page.next
+    assert cursor is None
+    order = sorted(ids, key=lambda id: jobs.records.get(id).sort_key, reverse=True)
+    assert seen == order
+    running = jobs.page(statuses=[Status.RUNNING])
+    assert [job.id for job in running.jobs] == ["job-3"]
+    places = {job.id: job.place_in_queue for job in jobs.page().jobs}
+    assert places == {"job-0": 0, "job-1": 1, "job-2": 2, "job-3": 3, "job-4": 4} | {"job-3": None}
+    assert jobs.count([Status.QUEUED, Status.RUNNING]) == 5
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code"),
+    [({"cursor": "nonsense"}, "invalid_cursor"), ({"limit": 0}, "invalid_limit"), ({"limit": 201}, "invalid_limit")],
+)
+def test_a_page_that_cannot_be_is_refused(jobs: Jobs, arguments: dict[str, object], code: str) -> None:
+    with pytest.raises(InvalidRequest) as caught:
+        jobs.page(**arguments)  # type: ignore[arg-type]
+    assert caught.value.code == code
+
+
+def test_an_owner_sees_only_his_own(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
+    ann, bob = jobs.of("ann"), jobs.of("bob")
+    hers, his = submit(ann), submit(bob)
+    assert ann.get(hers.id).id == hers.id
+    for call in (bob.get, bob.cancel, bob.retry, bob.delete, bob.log, bob.events):
+        with pytest.raises(UnknownJob):
+            call(hers.id)
+    with pytest.raises(UnknownJob):
+        bob.artifact(hers.id, "report.json")
+    assert [job.id for job in bob.page().jobs] == [his.id]
+    assert {job.id for job in jobs.page().jobs} == {hers.id, his.id}
+    assert (ann.count([Status.QUEUED]), jobs.count([Status.QUEUED])) == (1, 2)
+
+
+def test_a_repeated_request_returns_the_first_job(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
+    first = submit(idempotency_key="k", fingerprint="f")
+    assert submit(idempotency_key="k", fingerprint="f").id == first.id
+    with pytest.raises(Conflict, match="Use a new key") as caught:
+        submit(idempotency_key="k", fingerprint="other")
+    assert (caught.value.code, caught.value.id) == ("idempotency_conflict", first.id)
+    assert submit(jobs.of("ann"), idempotency_key="k", fingerprint="f").id != first.id, "keys are the owner's own"
+    assert len(jobs.queue.waiting()) == 2
+    assert len(blob_names(jobs)) == 2
+
+
+def test_a_chosen_id_is_taken_once(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
+    assert submit(id="mine", fingerprint="f").id == "mine"
+    assert submit(id="mine", fingerprint="f").id == "mine"
+    for more in ({"fingerprint": "other"}, {}):
+        with pytest.raises(Conflict, match="Choose another id") as caught:
+            submit(id="mine", **more)
+        assert caught.value.code == "id_taken"
+    with pytest.raises(Conflict):
+        submit(jobs.of("ann"), id="mine", fingerprint="f")
+    with pytest.raises(InvalidRequest, match="3–64"):
+        submit(id="no/slashes")
+    with pytest.raises(InvalidRequest, match="random UUID"):
+        submit(idempotency_key="")
+    assert len(blob_names(jobs)) == 1
+
+
+def test_simultaneous_requests_with_one_key_make_one_job(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
+    made: list[str] = []
+    gate = threading.Barrier(6)
+
+    def call() -> None:
+        gate.wait()
+        made.append(submit(idempotency_key="k", fingerprint="f").id)
+
+    threads = [threading.Thread(target=call) for _ in range(6)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(made) == 6
+    assert len(set(made)) == 1
+    assert len(blob_names(jobs)) == 1
+    assert jobs.records.used() == 3_000_000
+    assert len(jobs.queue.waiting()) == 1
+
+
+def test_only_the_owning_attempt_writes(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
+    id = submit().id
+    old = claim(jobs, id).token
+    with pytest.raises(StaleAttempt):
+        jobs.records.update(id, lambda stored: lifecycle.claim(stored, token=old, worker="twin", now=NOW))
+    jobs.records.update(
+        id,
+        lambda stored: lifecycle.requeue(
+            stored, token=old, fresh="new-token", problem=PROBLEM, now=NOW, max_attempts=2, retention=0
+        ),
+    )
+    assert jobs.get(id).status is Status.QUEUED
+    assert jobs.records.beat(id, old) is None
+    assert jobs.records.look(id, old) is None
+    progress = Progress(stage="reweight", fraction=0.5, updated_at=NOW)
+    before = jobs.records.get(id)
+    for change in (
+        lambda stored: lifecycle.report(stored, token=old, progress=progress),
+        lambda stored: lifecycle.fail(stored, token=old, problem=PROBLEM, now=NOW, retention=0),
+        lambda stored: lifecycle.stop(stored, token=old, now=NOW, retention=0),
+        lambda stored: lifecycle.redeliver(stored, token=old, fresh="newer"),
+    ):
+        with pytest.raises(StaleAttempt):
+            jobs.records.update(id, change)
+    assert jobs.records.get(id) == before
+
+
+def test_a_job_that_keeps_losing_workers_fails_at_last(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
+    id = submit().id
+    for attempt in (1, 2):
+        token = claim(jobs, id).token
+        after = jobs.records.update(
+            id,
+            lambda stored, token=token, attempt=attempt: lifecycle.requeue(  # type: ignore[misc]
+                stored, token=token, fresh=f"t{attempt}", problem=PROBLEM, now=NOW, max_attempts=2, retention=60
+            ),
+        )
+    assert (after.job.status, after.job.error, after.job.attempt) == (Status.FAILED, PROBLEM, 2)
+    assert after.job.expires_at == NOW + timedelta(seconds=60)
+
+
+def test_cancelling(jobs: Jobs, submit, inputs_file: Path) -> None:  # type: ignore[no-untyped-def]
+    queued, running, done = submit(), submit(), submit()
+    assert jobs.cancel(queued.id).status is Status.CANCELLED
+    token = claim(jobs, running.id).token
+    assert jobs.cancel(running.id).status is Status.CANCELLING
+    assert jobs.cancel(running.id).status is Status.CANCELLING, "asking twice is no error"
+    assert jobs.records.beat(running.id, token) is Status.CANCELLING
+    late = jobs.records.update(
+        running.id, lambda stored: lifecycle.fail(stored, token=token, problem=PROBLEM, now=NOW, retention=0)
+    )
+    assert (late.job.status, late.job.error, late.job.expires_at) == (Status.CANCELLED, None, None)
+    finish(jobs, done.id, inputs_file)
+    with pytest.raises(NotAllowedNow, match="delete it"):
+        jobs.cancel(done.id)
+    assert [token.rsplit("-", 1)[0] for token in jobs.queue.waiting()] == [running.id, done.id], "tokens not yet taken"
+
+
+def test_a_result_is_published_and_read_in_ranges(jobs: Jobs, submit, inputs_file: Path) -> None:  # type: ignore[no-untyped-def]
+    id = submit().id
+    with pytest.raises(UnknownArtifact, match="only a succeeded job"):
+        jobs.artifact(id, "report.json")
+    stored = finish(jobs, id, inputs_file)
+    assert stored.bytes == jobs.records.used() == 6_000_000
+    job = jobs.get(id)
+    assert (job.status, job.outcome, job.metrics) == (Status.SUCCEEDED, "converged", {"reprojection_median": 0.5})
+    artifact, blob = jobs.artifact(id, "report.json")
+    assert artifact.bytes == blob.size == 3_000_000
+    assert sum(len(chunk) for chunk in blob.read(10, 2_500_000)) == 2_499_990
+    assert list(blob.read(5, 5)) == []
+    with pytest.raises(ValueError, match="of a file of 3000000 bytes"):
+        next(blob.read(0, 3_000_001))
+    with pytest.raises(UnknownArtifact, match=r"It has: report\.json"):
+        jobs.artifact(id, "shapes.npz")
+
+
+def test_deleting_leaves_nothing(jobs: Jobs, submit, inputs_file: Path) -> None:  # type: ignore[no-untyped-def]
+    id = submit(idempotency_key="k", fingerprint="f").id
+    with pytest.raises(NotAllowedNow, match="Cancel it first"):
+        jobs.delete(id)
+    finish(jobs, id, inputs_file)
+    jobs.records.append_log(id, ["one", "two"])
+    assert jobs.log(id) == "one\ntwo\n"
+    jobs.delete(id)
+    assert blob_names(jobs) == []
+    assert jobs.records.used() == 0
+    assert jobs.page().jobs == []
+    assert jobs.records.log(id) == []
+    jobs.records.append_log(id, ["too late"])
+    assert jobs.records.log(id) == []
+    with pytest.raises(UnknownJob):
+        jobs.delete(id)
+    assert submit(idempotency_key="k", fingerprint="g").id != id, "the key is free again"
+
+
+def test_running_again_is_a_new_job_with_the_same_inputs(jobs: Jobs, submit, inputs_file: Path) -> None:  # type: ignore[no-untyped-def]
+    old = submit(jobs.of("ann"), name="n")
+    with pytest.raises(NotAllowedNow, match="cancel it first"):
+        jobs.retry(old.id)
+    jobs.cancel(old.id)
+    again = jobs.retry(old.id)
+    assert (again.retry_of, again.name, again.options, again.status) == (old.id, "n", old.options, Status.QUEUED)
+    assert jobs.get(old.id).status is Status.CANCELLED, "final statuses never change"
+    jobs.delete(old.id)
+    assert b"".join(jobs.blobs.get(jobs.records.get(again.id).inputs).read()) == inputs_file.read_bytes()
+    assert jobs.of("ann").get(again.id).id == again.id
+    finish(jobs, again.id, inputs_file)
+    with pytest.raises(NotAllowedNow, match="has its result"):
+        jobs.retry(again.id)
+
+
+def test_events_tell_every_change_once(jobs: Jobs, submit, inputs_file: Path) -> None:  # type: ignore[no-untyped-def]
+    id = submit().id
+    first = jobs.events(id, timeout=0)
+    assert [event.name for event in first] == ["job"]
+    assert Job.model_validate_json(first[0].data).status is Status.QUEUED
+    assert jobs.events(id, after=first[-1].id, timeout=0.05) == []
+    token = claim(jobs, id).token
+    progress = Progress(stage="reweight", fraction=0.5, updated_at=NOW)
+    waiting: list[list[str]] = []
+    seen = jobs.events(id, after=first[-1].id, timeout=1)[-1].id
+    waiter = threading.Thread(target=lambda: waiting.append([e.name for e in jobs.events(id, after=seen, timeout=10)]))
+    waiter.start()
+    jobs.records.update(id, lambda stored: lifecycle.report(stored, token=token, progress=progress))
+    waiter.join(10)
+    assert waiting == [["progress"]]
+    jobs.cancel(id)
+    jobs.records.update(id, lambda stored: lifecycle.stop(stored, token=token, now=NOW, retention=0))
+    last = jobs.events(id, timeout=1)[-1]
+    assert Job.model_validate_json(last.data).status is Status.CANCELLED
+    with pytest.raises(InvalidRequest, match="Last-Event-ID"):
+        jobs.events(id, after="yesterday")
+
+
+def test_events_are_capped(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
+    id = submit().id
+    token = claim(jobs, id).token
+    for number in range(300):
+        progress = Progress(stage="reweight", fraction=number / 300, updated_at=NOW)
+        jobs.records.update(id, lambda stored, p=progress: lifecycle.report(stored, token=token, progress=p))  # type: ignore[misc]
+    assert len(jobs.events(id, timeout=0)) == 256
+    jobs.cancel(id)
+    jobs.records.update(id, lambda stored: lifecycle.stop(stored, token=token, now=NOW, retention=0))
+    kept = jobs.events(id, timeout=0)
+    assert len(kept) == 16
+    assert Job.model_validate_json(kept[-1].data).status is Status.CANCELLED
+
+
+def test_the_quota_refuses_what_does_not_fit(jobs: Jobs, submit, inputs_file: Path) -> None:  # type: ignore[no-untyped-def]
+
+    tight = dataclasses.replace(jobs, settings=dataclasses.replace(jobs.settings, disk_quota=4_000_000))
+    submit(tight)
+    with pytest.raises(QuotaExceeded, match=r"3,000,000 bytes and may hold 4,000,000.*PLIANT_DISK_QUOTA"):
+        submit(tight)
+    assert len(blob_names(jobs)) == 1
+
+
+def test_readiness_names_each_part(jobs: Jobs) -> None:
+    found = jobs.ready()
+    assert (found["redis"], found["blobs"]) == ("ok", "ok")
+    assert found["workers"] == "ok" or "pliant work" in found["workers"]

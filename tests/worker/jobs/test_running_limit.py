@@ -1,0 +1,38 @@
+"""The bound on running jobs, with two real workers and a real keeper."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from pathlib import Path
+
+import pytest
+from pliant.schemas.job import Status
+from pliant.worker.settings import Settings
+from worker_house import House, settled
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="finds processes in /proc")
+def test_with_two_workers_one_owner_has_one_job_running_and_all_get_done(
+    settings: Settings, inputs_files: tuple[Path, Path]
+) -> None:
+    limited = dataclasses.replace(settings, workers=2, max_running=1, threads=1)
+    with House(limited, inputs=inputs_files) as house:
+        long = house.submit(long=True)
+        house.solving(long)
+        shorts = [house.submit() for _ in range(3)]
+        most = 0
+
+        def watched() -> bool:
+            nonlocal most
+            states = [house.jobs.get(id).status for id in (long, *shorts)]
+            most = max(most, states.count(Status.RUNNING))
+            return all(state.final for state in states)
+
+        house.until(lambda: house.jobs.get(shorts[0]).status is Status.QUEUED, "held back", seconds=1)
+        house.jobs.cancel(long)
+        house.until(watched, "all are done", seconds=60)
+        assert most == 1
+        assert [house.jobs.get(id).status for id in shorts] == [Status.SUCCEEDED] * 3
+        assert not any("forgotten" in house.jobs.log(id) for id in shorts)
+        settled(house)

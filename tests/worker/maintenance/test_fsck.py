@@ -1,0 +1,141 @@
+"""The audit finds each kind of misfit, and none where all is well."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+from pliant.schemas.job import Artifact, Interpretation, Problem
+from pliant.schemas.options import Options
+from pliant.worker.execution.workdir import working_directory
+from pliant.worker.jobs import lifecycle
+from pliant.worker.jobs.service import Jobs
+from pliant.worker.maintenance.fsck import findings
+from pliant.worker.records import Stored
+
+NOW = datetime(2030, 1, 1, tzinfo=UTC)
+
+
+@pytest.fixture
+def submit(jobs: Jobs, inputs_file: Path, interpretation: Interpretation) -> Callable[[], Stored]:
+    def make() -> Stored:
+        id = jobs.submit(inputs_file, options=Options(), interpretation=interpretation).id
+        return jobs.records.get(id)
+
+    return make
+
+
+def claim(jobs: Jobs, stored: Stored) -> Stored:
+    jobs.queue.remove(stored.token)
+    return jobs.records.update(stored.job.id, lambda held: lifecycle.claim(held, token=held.token, worker="w", now=NOW))
+
+
+def succeed(jobs: Jobs, stored: Stored, file: Path, *, size: int) -> Stored:
+    prefix = f"jobs/{stored.job.id}/{stored.token}/artifacts/"
+    jobs.blobs.put(f"{prefix}report.json", file)
+    artifact = Artifact(name="report.json", media_type="application/json", bytes=size, sha256="0" * 64)
+    return jobs.records.update(
+        stored.job.id,
+        lambda held: lifecycle.succeed(
+            held, token=held.token, prefix=prefix, artifacts=[artifact], metrics={}, outcome="converged",
+            sentence="Converged.", warnings=[], now=NOW, retention=0,
+        ),
+    )  # fmt: skip
+
+
+def test_jobs_in_every_status_that_are_in_order_give_no_finding(
+    jobs: Jobs, submit: Callable[[], Stored], inputs_file: Path
+) -> None:
+    submit()
+    running = claim(jobs, submit())
+    working_directory(jobs.settings, running.token).mkdir(parents=True)
+    jobs.blobs.put(f"jobs/{running.job.id}/{running.token}/artifacts/half.npz", inputs_file)
+    jobs.cancel(claim(jobs, submit()).job.id)
+    jobs.cancel(submit().job.id)
+    succeed(jobs, claim(jobs, submit()), inputs_file, size=inputs_file.stat().st_size)
+    failed = claim(jobs, submit())
+    problem = Problem(title="t", status=500, detail="d.", code="internal_error")
+    jobs.records.update(
+        failed.job.id,
+        lambda held: lifecycle.fail(held, token=held.token, problem=problem, now=NOW, retention=0),
+    )
+    assert findings(jobs, settle=0) == []
+
+
+def test_every_kind_of_misfit_is_found(jobs: Jobs, submit: Callable[[], Stored], inputs_file: Path) -> None:
+    def only(sentence: str) -> None:
+        (found,) = findings(jobs, settle=0)
+        assert sentence in found
+
+    stored = submit()
+    jobs.blobs.put("jobs/nobody/nobody-1/inputs.npz", inputs_file)
+    only("jobs/nobody/nobody-1/inputs.npz belongs to no job")
+    jobs.blobs.delete("jobs/nobody/")
+
+    stale = f"jobs/{stored.job.id}/{stored.job.id}-0/artifacts/shapes.npz"
+    jobs.blobs.put(stale, inputs_file)
+    only("belongs to no attempt")
+    jobs.blobs.delete(stale)
+
+    directory = working_directory(jobs.settings, "nobody-1")
+    directory.mkdir(parents=True)
+    only("belongs to no running attempt")
+    directory.rmdir()
+
+    jobs.queue.push("nobody", "nobody-1")
+    only("nobody-1, which no queued job owns")
+    jobs.queue.remove("nobody-1")
+
+    jobs.queue.remove(stored.token)
+    only("the queue does not hold it")
+    jobs.queue.push(stored.job.id, stored.token)
+
+    done = succeed(jobs, claim(jobs, submit()), inputs_file, size=5)
+    only("report.json should have 5 bytes and has 3000000")
+    jobs.records.update(done.job.id, lambda held: held.model_copy(update={"prefix": "elsewhere/"}))
+    assert len(findings(jobs, settle=0)) == 2
+    jobs.records.delete(done.job.id)
+    jobs.blobs.delete(f"jobs/{done.job.id}/")
+
+    for update, sentence in (
+        ({"finished_at": NOW}, "time of finishing"),
+        ({"error": Problem(title="t", status=500, detail="d.", code="c")}, "its error is"),
+    ):
+        sound = jobs.records.get(stored.job.id).job
+        jobs.records.update(
+            stored.job.id,
+            lambda held, u=update: held.model_copy(update={"job": held.job.model_copy(update=u)}),  # type: ignore[misc]
+        )
+        only(sentence)
+        jobs.records.update(stored.job.id, lambda held, job=sound: held.model_copy(update={"job": job}))  # type: ignore[misc]
+    jobs.records.update(stored.job.id, lambda held: held.model_copy(update={"prefix": "p/"}))
+    assert any("its results lie under p/" in found for found in findings(jobs, settle=0))
+    jobs.records.update(stored.job.id, lambda held: held.model_copy(update={"prefix": None}))
+
+    upload = jobs.settings.uploads / "somebody" / "half"
+    upload.mkdir(parents=True)
+    only("Upload half holds nothing")
+    upload.rmdir()
+
+    jobs.blobs.delete(stored.inputs)
+    only("has lost its inputs")
+
+
+def test_a_change_caught_half_way_is_no_finding(
+    jobs: Jobs, submit: Callable[[], Stored], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stored = submit()
+    jobs.queue.remove(stored.token)
+    monkeypatch.setattr("time.sleep", lambda seconds: jobs.queue.push(stored.job.id, stored.token))
+    assert findings(jobs) == []
+
+
+def test_a_token_twice_in_the_queue_is_found(
+    jobs: Jobs, submit: Callable[[], Stored], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    token = submit().token
+    monkeypatch.setattr(type(jobs.queue), "waiting", lambda self: [token, token])
+    (found,) = findings(jobs, settle=0)
+    assert found == f"The queue holds {token} 2 times."

@@ -1,0 +1,261 @@
+"""The keeper, on a clock of our own: what counts as lost, what as forgotten, what expires, and what never does."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from keeper_world import World
+from pliant.schemas.job import Interpretation, Problem, Status
+from pliant.schemas.options import Options
+from pliant.worker.errors import StoreUnavailable, UnknownJob
+from pliant.worker.execution.workdir import clean_up, last_words, working_directory
+from pliant.worker.jobs import lifecycle
+from pliant.worker.maintenance.fsck import findings
+from pliant.worker.maintenance.reconciler import Keeper, Stillness
+from pliant.worker.settings import Settings
+from pliant.worker.uploads.service import Room, Uploads
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> World:
+    return World(tmp_path)
+
+
+@pytest.fixture
+def submit(inputs_file: Path, interpretation: Interpretation) -> Callable[[World], str]:
+    return lambda world: world.jobs.submit(inputs_file, options=Options(), interpretation=interpretation).id
+
+
+def test_a_job_whose_worker_falls_silent_is_queued_again_then_fails(
+    world: World, submit: Callable[[World], str]
+) -> None:
+    id = submit(world)
+    old = world.claim(id)
+    working_directory(world.jobs.settings, old).mkdir(parents=True)
+    world.pass_seconds(5)
+    assert world.jobs.get(id).status is Status.RUNNING, "five seconds of watching begin with the first look"
+    world.pass_seconds(1)
+    assert world.jobs.get(id).status is Status.QUEUED
+    assert not working_directory(world.jobs.settings, old).exists()
+    (fresh,) = world.jobs.queue.waiting()
+    assert fresh != old
+    world.claim(id)
+    world.pass_seconds(7)
+    job = world.jobs.get(id)
+    assert (job.status, job.attempt) == (Status.FAILED, 2)
+    assert job.error is not None
+    assert (job.error.code, job.error.retryable) == ("worker_lost", True)
+
+
+def test_a_cancelled_job_whose_worker_falls_silent_is_cancelled(world: World, submit: Callable[[World], str]) -> None:
+    id = submit(world)
+    world.claim(id)
+    world.jobs.cancel(id)
+    world.pass_seconds(7)
+    assert world.jobs.get(id).status is Status.CANCELLED
+
+
+def test_signs_of_life_keep_a_job(world: World, submit: Callable[[World], str]) -> None:
+    id = submit(world)
+    token = world.claim(id)
+    world.pass_seconds(30, meanwhile=lambda: world.jobs.records.beat(id, token))
+    assert world.jobs.get(id).status is Status.RUNNING
+
+
+def test_neither_an_outage_nor_a_jumping_clock_loses_a_job(world: World, submit: Callable[[World], str]) -> None:
+    id = submit(world)
+    token = world.claim(id)
+    world.pass_seconds(2)
+    world.monotonic += 600  # nobody could look, and nobody could give a sign of life
+    world.now += timedelta(days=1)
+    world.pass_seconds(1)
+    assert world.jobs.get(id).status is Status.RUNNING
+    world.jobs.records.beat(id, token)
+    world.pass_seconds(4)
+    assert world.jobs.get(id).status is Status.RUNNING
+
+
+def test_a_queued_job_that_the_queue_does_not_hold_is_queued_again(
+    world: World, submit: Callable[[World], str]
+) -> None:
+    id, other = submit(world), submit(world)
+    token = world.jobs.records.get(id).token
+    world.jobs.queue.remove(token)
+    world.pass_seconds(5)
+    assert world.jobs.records.get(id).token != token, "the old delivery, should it turn up, is void"
+    assert world.jobs.queue.waiting() == [world.jobs.records.get(each).token for each in (id, other)], (
+        "before all the others"
+    )
+
+
+def test_only_what_has_expired_is_removed(world: World, submit: Callable[[World], str]) -> None:
+    queued, running, early, late = (submit(world) for _ in range(4))
+    token = world.claim(running)
+    world.jobs.cancel(early)
+    beat = lambda: world.jobs.records.beat(running, token)  # noqa: E731
+    world.pass_seconds(40, meanwhile=beat)
+    world.jobs.cancel(late)
+    world.pass_seconds(52, meanwhile=beat)
+    with pytest.raises(UnknownJob):
+        world.jobs.get(early)
+    assert {job.id for job in world.jobs.page().jobs} == {queued, running, late}
+    assert world.jobs.get(late).expires_at is not None
+    assert all(early not in key for key, _ in world.jobs.blobs.list("jobs/"))
+
+
+def test_without_retention_nothing_expires(world: World, submit: Callable[[World], str]) -> None:
+    world.jobs = dataclasses.replace(world.jobs, settings=dataclasses.replace(world.jobs.settings, retention=0))
+    world.keeper.jobs = world.jobs
+    id = submit(world)
+    assert world.jobs.cancel(id).expires_at is None
+    world.now += timedelta(days=10_000)
+    world.pass_seconds(40)
+    assert world.jobs.get(id).status is Status.CANCELLED
+
+
+def test_files_of_no_job_are_removed_once_they_are_old(
+    world: World, submit: Callable[[World], str], tmp_path: Path
+) -> None:
+    file = tmp_path / "some-inputs.npz"
+    id = submit(world)
+    token = world.claim(id)
+    wanted = {world.jobs.records.get(id).inputs, f"jobs/{id}/{token}/artifacts/shapes.npz"}
+    stray = {f"jobs/{id}/{id}-000000000000/artifacts/shapes.npz", "jobs/nobody/nobody-1/inputs.npz"}
+    for key in (wanted | stray) - {world.jobs.records.get(id).inputs}:
+        world.jobs.blobs.put(key, file)
+    beat = lambda: world.jobs.records.beat(id, token)  # noqa: E731
+
+    def sweep_at(moment: datetime) -> set[str]:
+        world.now = moment
+        world.monotonic += 3600
+        world.pass_seconds(1, meanwhile=beat)
+        return {key for key, _ in world.jobs.blobs.list("jobs/")}
+
+    unknown = {"jobs/nobody/nobody-1/inputs.npz"}
+    assert sweep_at(datetime.now(UTC) + timedelta(hours=5)) == wanted | unknown
+    assert sweep_at(datetime.now(UTC) + timedelta(hours=7)) == wanted
+
+
+def test_working_files_of_attempts_that_are_over_are_removed(world: World, submit: Callable[[World], str]) -> None:
+    id = submit(world)
+    token = world.claim(id)
+    running, over, just_over = (working_directory(world.jobs.settings, each) for each in (token, f"{id}-0", f"{id}-1"))
+    world.now = datetime.now(UTC)
+    for directory in (running, over, just_over):
+        directory.mkdir(parents=True)
+    for directory in (running, over):
+        os.utime(directory, (0, 0))
+    world.pass_seconds(31, meanwhile=lambda: world.jobs.records.beat(id, token))
+    assert [directory.exists() for directory in (running, over, just_over)] == [True, False, True]
+
+
+def test_what_a_killed_attempt_had_uploaded_is_removed(
+    world: World, submit: Callable[[World], str], tmp_path: Path
+) -> None:
+    id = submit(world)
+    token = world.claim(id)
+    half = f"jobs/{id}/{token}/artifacts/shapes.npz"
+    world.jobs.blobs.put(half, tmp_path / "some-inputs.npz")
+    world.pass_seconds(31, meanwhile=lambda: world.jobs.records.beat(id, token))
+    assert half in dict(world.jobs.blobs.list("jobs/"))
+    problem = Problem(title="t", status=503, detail="d.", code="worker_lost")
+    world.jobs.records.update(
+        id, lambda held: lifecycle.fail(held, token=token, problem=problem, now=world.now, retention=0)
+    )
+    assert any("belongs to no attempt" in each for each in findings(world.jobs, settle=0))
+    world.pass_seconds(1)
+    assert findings(world.jobs, settle=0) == []
+    assert [key for key, _ in world.jobs.blobs.list("jobs/")] == [world.jobs.records.get(id).inputs]
+
+
+def test_what_an_attempt_had_uploaded_is_removed_when_its_worker_is_lost(
+    world: World, submit: Callable[[World], str], tmp_path: Path
+) -> None:
+    id = submit(world)
+    half = f"jobs/{id}/{world.claim(id)}/artifacts/shapes.npz"
+    world.jobs.blobs.put(half, tmp_path / "some-inputs.npz")
+    world.pass_seconds(31)
+    assert world.jobs.get(id).status is Status.QUEUED
+    assert [key for key, _ in world.jobs.blobs.list("jobs/")] == [world.jobs.records.get(id).inputs]
+    assert findings(world.jobs, settle=0) == []
+
+
+def test_a_store_that_is_away_is_waited_for(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = []
+
+    def tick(self: Keeper) -> None:
+        calls.append(self)
+        raise StoreUnavailable("The job store", reason="ConnectionError")
+
+    monkeypatch.setattr(Keeper, "tick", tick)
+    monkeypatch.setattr(time, "sleep", lambda seconds: None)
+    world.keeper.run(lambda: len(calls) == 3)
+    assert len(calls) == 3
+
+
+def test_stillness_counts_only_between_two_looks_at_the_same_thing() -> None:
+    still = Stillness()
+    assert still.look({"a": 1}, 5.0) == {"a": 0.0}
+    assert still.look({"a": 1, "b": 1}, 2.0) == {"a": 2.0, "b": 0.0}
+    assert still.look({"a": 2, "b": 1}, 2.0) == {"a": 0.0, "b": 2.0}
+    assert still.look({"b": 1}, 1.0) == {"b": 3.0}
+    assert still.look({"a": 2}, 1.0) == {"a": 0.0}
+
+
+def test_last_words_are_the_end_of_what_was_written(tmp_path: Path) -> None:
+    settings = Settings(data=tmp_path)
+    assert last_words(settings, "t-1") == []
+    directory = working_directory(settings, "t-1")
+    directory.mkdir(parents=True)
+    (directory / "output.log").write_text("".join(f"line {number}\n" for number in range(5000)))
+    words = last_words(settings, "t-1")
+    assert (len(words), words[-1]) == (100, "line 4999")
+    clean_up(settings, "t-1")
+    clean_up(settings, "t-1")
+    assert not directory.exists()
+
+
+def test_it_removes_uploads_that_have_expired(world: World) -> None:
+    uploads = Uploads.open(world.jobs.settings)
+    for id in ("old", "young"):
+        with uploads.write(id, offset=0, length=None, room=Room(max_bytes=9)) as writer:
+            writer.write(b"x")
+        (file,) = uploads.directory.glob(f"*/{id}/part")
+        moment = world.now.timestamp() - (uploads.expiry if id == "old" else uploads.expiry - 3600)
+        os.utime(file, (moment, moment))
+    world.pass_seconds(31)
+    assert uploads.find("old") is None
+    assert uploads.find("young") is not None
+
+
+@pytest.mark.parametrize("jump", [timedelta(days=365), timedelta(days=-365)])
+def test_a_jump_of_the_clock_loses_nothing(
+    world: World, jump: timedelta, inputs_file: Path, interpretation: Interpretation
+) -> None:
+    def submit() -> str:
+        return world.jobs.submit(inputs_file, options=Options(), interpretation=interpretation).id
+
+    done, busy, waiting = submit(), submit(), submit()
+    world.claim(done)
+    world.jobs.cancel(done)
+    token = world.jobs.records.get(done).token
+    world.jobs.records.update(done, lambda held: lifecycle.stop(held, token=token, now=world.now, retention=60.0))
+    token = world.claim(busy)
+    world.pass_seconds(2, meanwhile=lambda: world.jobs.records.beat(busy, token))
+    world.now += jump
+    world.pass_seconds(70, meanwhile=lambda: world.jobs.records.beat(busy, token))
+    assert world.jobs.get(done).status is Status.CANCELLED, "held, although by the new clock its time may be over"
+    assert (world.jobs.get(busy).status, world.jobs.get(busy).attempt) == (Status.RUNNING, 1)
+    assert world.jobs.get(waiting).place_in_queue == 0
+    assert findings(world.jobs, settle=0) == []
+    world.now -= jump  # put right
+    world.pass_seconds(3700, meanwhile=lambda: world.jobs.records.beat(busy, token))
+    with pytest.raises(UnknownJob):
+        world.jobs.get(done)
+    assert world.jobs.get(busy).attempt == 1

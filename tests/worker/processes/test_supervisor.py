@@ -1,0 +1,296 @@
+"""The supervisor, with small real processes; the embedded Valkey's locks, with real servers."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from pliant.worker.errors import DataDirectoryInUse, ServerFailed, StoreUnavailable
+from pliant.worker.paths import socket_path, valkey_directory
+from pliant.worker.processes.containment import valkey as valkey_module
+from pliant.worker.processes.supervisor import FIRST_PAUSE, Child, Supervisor, worker_children
+from pliant.worker.processes.valkey import Valkey, find_binary
+from pliant.worker.settings import Settings
+from pliant.worker.store.connection import connect, reachable
+
+
+def python(name: str, code: str, **more: object) -> Child:
+    return Child(name=name, argv=[sys.executable, "-S", "-c", code], **more)  # type: ignore[arg-type]
+
+
+def until(condition: Callable[[], object], seconds: float = 15.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def gone(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return True
+    return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] == "Z"
+
+
+SLEEP = "import time; time.sleep(600)"
+
+
+def test_what_ends_is_started_again_with_growing_pauses(tmp_path: Path) -> None:
+    log = tmp_path / "starts"
+    code = f"import time; open({str(log)!r}, 'a').write(f'{{time.monotonic()}}\\n')"
+    supervisor = Supervisor([python("flappy", code), python("steady", SLEEP)])
+    supervisor.start()
+    steady = supervisor.pids()["steady"]
+
+    def starts() -> list[float]:
+        supervisor.look()
+        return [float(line) for line in log.read_text().split()] if log.exists() else []
+
+    until(lambda: len(starts()) >= 4)
+    first, second, third, fourth = starts()[:4]
+    # Each pause is twice the one before; what starting takes comes on top, in bounds that a busy machine widens.
+    for number, gap in enumerate((second - first, third - second, fourth - third), start=1):
+        assert gap >= 2**number * FIRST_PAUSE
+    assert fourth - first < 2 * 14 * FIRST_PAUSE + 10
+    assert supervisor.pids()["steady"] == steady
+    supervisor.stop()
+    assert supervisor.pids() == {}
+    assert gone(steady)
+
+
+def test_children_stop_before_what_they_stand_on_and_stubborn_ones_are_killed(tmp_path: Path) -> None:
+    log = tmp_path / "ends"
+    polite = (
+        "import signal, sys, time\n"
+        "def end(*_):\n"
+        f"    open({str(log)!r}, 'a').write(sys.argv[1] + '\\n'); sys.exit()\n"
+        "signal.signal(signal.SIGTERM, end)\n"
+        f"open({str(tmp_path)!r} + '/' + sys.argv[1], 'w')\n"
+        "time.sleep(600)"
+    )
+    stubborn = polite.replace("signal.signal(signal.SIGTERM, end)", "signal.signal(signal.SIGTERM, signal.SIG_IGN)")
+    children = [
+        Child(name=name, argv=[sys.executable, "-S", "-c", code, name], foundation=foundation, grace=grace)
+        for name, code, foundation, grace in (
+            ("ground", polite, True, 5.0),
+            ("house", polite, False, 5.0),
+            ("mule", stubborn, False, 0.5),
+        )
+    ]
+    supervisor = Supervisor(children)
+    supervisor.start()
+    until(lambda: all((tmp_path / child.name).exists() for child in children))
+    mule = supervisor.pids()["mule"]
+    supervisor.stop()
+    assert log.read_text().split() == ["house", "ground"]
+    assert gone(mule)
+
+
+def test_a_child_that_never_serves_stops_the_rest() -> None:
+    def fail(process: subprocess.Popen[bytes]) -> None:
+        raise ServerFailed("It does not start.", log="")
+
+    supervisor = Supervisor([python("first", SLEEP), python("second", SLEEP, ready=fail)])
+    with pytest.raises(ServerFailed, match="does not start"):
+        supervisor.start()
+    assert supervisor.pids() == {}
+
+
+SUPERVISED = """
+import sys
+from pliant.worker.processes.supervisor import Child, Supervisor
+supervisor = Supervisor([Child(name="c", argv=[sys.executable, "-S", "-c", {code!r}], grace=60.0)])
+supervisor.run(on_started=lambda: print(supervisor.pids()["c"], flush=True))
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_stops_everything(number: signal.Signals) -> None:
+    process = subprocess.Popen([sys.executable, "-c", SUPERVISED.format(code=SLEEP)], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    child = int(process.stdout.readline())
+    process.send_signal(number)
+    assert process.wait(10) == 0
+    process.stdout.close()
+    assert gone(child)
+
+
+def test_a_second_signal_stops_the_waiting() -> None:
+    deaf = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print(flush=True); time.sleep(600)"
+    process = subprocess.Popen([sys.executable, "-c", SUPERVISED.format(code=deaf)], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    lines = {process.stdout.readline().strip() for _ in range(2)}
+    child = int(max(lines))
+    process.send_signal(signal.SIGTERM)
+    with pytest.raises(subprocess.TimeoutExpired):
+        process.wait(0.5)
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(10) == 0
+    process.stdout.close()
+    assert gone(child)
+
+
+def test_a_signal_while_starting_stops_what_was_started() -> None:
+    waiting = SUPERVISED.replace(
+        "grace=60.0", "grace=60.0, ready=lambda c: (print(c.pid, flush=True), time.sleep(600))"
+    )
+    code = "import time\n" + waiting.format(code=SLEEP)
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    child = int(process.stdout.readline())
+    process.terminate()
+    assert process.wait(10) == 0
+    process.stdout.close()
+    assert gone(child)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells a child of its parent's end")
+def test_children_die_with_a_killed_supervisor() -> None:
+    process = subprocess.Popen([sys.executable, "-c", SUPERVISED.format(code=SLEEP)], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    child = int(process.stdout.readline())
+    process.kill()
+    process.wait(10)
+    process.stdout.close()
+    until(lambda: gone(child), 5)
+
+
+def test_a_parent_that_is_gone_already_is_noticed() -> None:
+    code = f"from pliant.worker.processes.containment import die_with_parent; die_with_parent({os.getpid() + 10**6}); print('alive')"
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False)
+    assert (ran.returncode, ran.stdout) == (-signal.SIGKILL, b"")
+
+
+def test_workers_are_told_their_settings_and_threads(tmp_path: Path) -> None:
+    settings = Settings(data=tmp_path, workers=2, threads=3)
+    children = worker_children(settings)
+    assert [child.name for child in children] == ["worker-1", "worker-2", "keeper"]
+    for child in children:
+        assert Settings.from_environment(child.env) == settings
+        assert child.env["OPENBLAS_NUM_THREADS"] == child.env["OMP_NUM_THREADS"] == "1"  # the solver has its own
+
+
+def test_two_supervisors_on_one_directory_are_refused(tmp_path: Path) -> None:
+    first = Valkey.claim(tmp_path)
+    with pytest.raises(DataDirectoryInUse, match=rf"already used by another Pliant \(process {os.getpid()}\).*--data"):
+        Valkey.claim(tmp_path)
+    first.release()
+    Valkey.claim(tmp_path).release()
+
+
+def test_a_server_that_outlived_its_supervisor_is_taken_over_with_its_data(tmp_path: Path) -> None:
+    first = Valkey.claim(tmp_path)
+    orphan = first.start()
+    client = connect(Settings(data=tmp_path).redis, decode=True)
+    client.set("kept", "yes")
+    first.release()
+    second = Valkey.claim(tmp_path)
+    assert orphan.wait(10) == 0
+    server = second.start()
+    assert client.get("kept") == "yes"
+    server.kill()
+    server.wait()
+    again = second.start()
+    assert client.get("kept") == "yes", "not lost by kill -9 either"
+    client.close()
+    again.terminate()
+    again.wait(10)
+    second.release()
+
+
+def test_a_server_that_does_not_stop_keeps_its_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(valkey_module, "STOPS_WITHIN", 0.3)
+    first = Valkey.claim(tmp_path)
+    holder = subprocess.Popen([sys.executable, "-S", "-c", SLEEP], pass_fds=(first.lock,))
+    first.release()
+    with pytest.raises(DataDirectoryInUse, match="a Valkey server that does not stop"):
+        Valkey.claim(tmp_path)
+    holder.kill()
+    holder.wait()
+    Valkey.claim(tmp_path).release()
+
+
+def test_a_damaged_log_is_shown(tmp_path: Path) -> None:
+    first = Valkey.claim(tmp_path)
+    server = first.start()
+    client = connect(Settings(data=tmp_path).redis, decode=True)
+    for number in range(50):
+        client.set(f"key-{number}", "x" * 100)
+    client.close()
+    server.terminate()
+    server.wait(10)
+    (log,) = (valkey_directory(tmp_path) / "appendonlydir").glob("*.incr.aof")
+    held = bytearray(log.read_bytes())
+    held[2000:2100] = os.urandom(100)
+    log.write_bytes(held)
+    with pytest.raises(ServerFailed, match=r"ended with code 1\. Its log ends with: .*AOF"):
+        first.start()
+    first.release()
+
+
+def test_a_server_that_never_answers_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(valkey_module, "STARTS_WITHIN", 0.2)
+    valkey = Valkey.claim(tmp_path)
+    mute = subprocess.Popen([sys.executable, "-S", "-c", SLEEP])
+    with pytest.raises(ServerFailed, match=r"does not answer after 0\.2 s"):
+        valkey.wait(mute)
+    mute.kill()
+    mute.wait()
+    valkey.release()
+
+
+def test_a_socket_directory_that_others_may_write_is_refused(tmp_path: Path) -> None:
+    deep = tmp_path / "/".join(["deep"] * 30)
+    directory = socket_path(deep).parent
+    directory.mkdir(mode=0o700)
+    try:
+        directory.chmod(0o777)
+        with pytest.raises(ServerFailed, match="can be written by others"):
+            Valkey.claim(deep)
+        directory.chmod(0o700)
+        valkey = Valkey.claim(deep)
+        server = valkey.start()
+        server.terminate()
+        server.wait(10)
+        valkey.release()
+    finally:
+        directory.rmdir()
+
+
+def test_without_a_binary_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert find_binary().is_file()
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    monkeypatch.setattr("shutil.which", lambda name: None)
+    with pytest.raises(ServerFailed, match="PLIANT_REDIS_URL"):
+        find_binary()
+    monkeypatch.setattr("shutil.which", lambda name: "/somewhere/redis-server" if name == "redis-server" else None)
+    assert find_binary() == Path("/somewhere/redis-server")
+
+
+def test_a_store_that_hangs_is_asked_once() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as deaf:  # the kernel accepts for it
+        client = connect(f"redis://127.0.0.1:{deaf.getsockname()[1]}", decode=True, retries=5, answer_within=0.3)
+        with pytest.raises(StoreUnavailable, match="TimeoutError"), reachable():
+            client.ping()
+        client.close()
+        deaf.setblocking(False)
+        deaf.accept()[0].close()
+        with pytest.raises(BlockingIOError):
+            deaf.accept()
+
+
+def test_a_store_that_does_not_answer_is_said_so() -> None:
+    with socket.socket() as unused:
+        unused.bind(("127.0.0.1", 0))
+        port = unused.getsockname()[1]
+    client = connect(f"redis://127.0.0.1:{port}", decode=True, retries=1)
+    with pytest.raises(StoreUnavailable, match="try again"), reachable():
+        client.ping()

@@ -1,0 +1,324 @@
+"""The outbox and its postman, with real receivers on 127.0.0.1 and a real store: what is owed, sent, repeated, given up."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import hashlib
+import hmac
+import ipaddress
+import json
+import shutil
+import socket
+import ssl
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import pytest
+from pliant.schemas.job import Interpretation, Job, Status
+from pliant.schemas.options import Options
+from pliant.worker.jobs.service import Jobs
+from pliant.worker.records import Webhook
+from pliant.worker.settings import Settings
+from pliant.worker.store.connection import connect
+from pliant.worker.store.outbox import Outbox
+from pliant.worker.webhooks.sender import HANDS, PAUSES, Postman, resolve
+
+SECRET = "whsec_" + base64.b64encode(b"k" * 32).decode()
+LOOPBACK = "127.0.0.0/8"
+
+
+class Receiver:
+    """A web server that remembers what it got and answers as it is told."""
+
+    def __init__(self) -> None:
+        self.got: list[tuple[str, dict[str, str], bytes]] = []
+        self.answers: list[int] = []
+        self.open = threading.Event()
+        """Cleared, it takes what comes and answers nothing."""
+        self.open.set()
+        receiver = self
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_POST(self) -> None:
+                body = self.rfile.read(int(self.headers["content-length"]))
+                receiver.got.append((self.path, {name.lower(): value for name, value in self.headers.items()}, body))
+                receiver.open.wait(20)
+                status = receiver.answers.pop(0) if receiver.answers else 204
+                self.send_response(status)
+                if 300 <= status < 400:
+                    self.send_header("Location", f"http://127.0.0.1:{receiver.port}/elsewhere")
+                self.end_headers()
+
+            def log_message(self, *_: object) -> None:
+                pass
+
+        self.server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self.port = self.server.server_address[1]
+        self.url = f"http://127.0.0.1:{self.port}/hook?x=1"
+        threading.Thread(target=self.server.serve_forever, daemon=True).start()
+
+
+@pytest.fixture
+def receiver() -> Iterator[Receiver]:
+    made = Receiver()
+    yield made
+    made.server.shutdown()
+    made.server.server_close()
+
+
+@pytest.fixture
+def door(settings: Settings) -> Jobs:
+    return Jobs.open(dataclasses.replace(settings, webhook_networks=LOOPBACK))
+
+
+Made = Callable[..., Job]
+
+
+@pytest.fixture
+def made(door: Jobs, inputs_file: Path, interpretation: Interpretation) -> Made:
+    """Submit a job and cancel it at once: it has ended, and its end is owed."""
+
+    def call(url: str, *, end: bool = True) -> Job:
+        hook = Webhook(url=url, secret=SECRET)
+        job = door.submit(inputs_file, options=Options(), interpretation=interpretation, name="hooked", webhook=hook)
+        return door.cancel(job.id) if end else job
+
+    return call
+
+
+@pytest.fixture
+def postman(door: Jobs) -> Iterator[Postman]:
+    """One with short pauses; started by the test."""
+    carrier = Postman.open(door.settings, door.records)
+    carrier.pauses = (0.05, 0.05)
+    yield carrier
+    carrier.stop()
+    assert not carrier.alive
+
+
+def until(holds: Callable[[], object], *, seconds: float = 10.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not holds():
+        assert time.monotonic() < deadline, "it did not come to hold in time"
+        time.sleep(0.02)
+
+
+def test_the_end_of_a_job_is_told_once_signed_and_whole(
+    door: Jobs, made: Made, receiver: Receiver, postman: Postman
+) -> None:
+    waiting = made(receiver.url, end=False)
+    assert postman.outbox.owed() == 0
+    job = door.cancel(waiting.id)
+    assert postman.outbox.owed() == 1
+    postman.start()
+    until(lambda: postman.outbox.owed() == 0)
+    ((path, headers, body),) = receiver.got
+    assert path == "/hook?x=1"
+    assert headers["host"] == f"127.0.0.1:{receiver.port}"
+    assert headers["content-type"] == "application/json"
+    assert headers["webhook-id"] == f"msg_{job.id}"
+    assert abs(int(headers["webhook-timestamp"]) - time.time()) < 10
+    content = f"{headers['webhook-id']}.{headers['webhook-timestamp']}.".encode() + body
+    digest = hmac.new(b"k" * 32, content, hashlib.sha256).digest()
+    assert headers["webhook-signature"] == f"v1,{base64.b64encode(digest).decode()}"
+    said = json.loads(body)
+    assert (said["type"], Job.model_validate(said["data"])) == ("job.cancelled", job)
+    assert SECRET.encode() not in body
+    until(lambda: "Webhook delivered: the receiver answered 204 (try 1)." in door.log(job.id))
+    time.sleep(0.7)
+    assert len(receiver.got) == 1
+
+
+def test_a_receiver_that_fails_is_asked_again_with_the_same_id(
+    door: Jobs, made: Made, receiver: Receiver, postman: Postman
+) -> None:
+    receiver.answers = [500, 302]
+    job = made(receiver.url)
+    postman.start()
+    until(lambda: postman.outbox.owed() == 0)
+    assert [headers["webhook-id"] for _, headers, _ in receiver.got] == [f"msg_{job.id}"] * 3
+    assert {path for path, _, _ in receiver.got} == {"/hook?x=1"}, "a redirect is not followed"
+    assert len({body for _, _, body in receiver.got}) == 1
+    log = door.log(job.id)
+    assert "the receiver answered 500 (try 1); again in" in log
+    assert "the receiver answered 302 (try 2)" in log
+    assert "(try 3)" in log
+
+
+def test_after_the_last_try_or_a_410_it_is_given_up(
+    door: Jobs, made: Made, receiver: Receiver, postman: Postman
+) -> None:
+    receiver.answers = [500, 500, 500]
+    job = made(receiver.url)
+    postman.start()
+    until(lambda: postman.outbox.owed() == 0)
+    until(lambda: "given up: the receiver answered 500, at try 3, the last." in door.log(job.id))
+    receiver.answers = [410]
+    other = made(receiver.url)
+    until(lambda: "given up: the receiver answered 410" in door.log(other.id))
+    assert len(receiver.got) == 4
+    tallies = door.records.tallies()
+    assert (tallies["webhooks:tried"], tallies["webhooks:given_up"]) == (4, 2)
+
+
+def test_nobody_listening_is_a_failure_like_others(door: Jobs, made: Made, postman: Postman) -> None:
+    with socket.socket() as unused:
+        unused.bind(("127.0.0.1", 0))
+        job = made(f"http://127.0.0.1:{unused.getsockname()[1]}/")
+        postman.start()
+        until(lambda: "ConnectError, at try 3, the last" in door.log(job.id))
+
+
+@pytest.mark.parametrize(
+    "name", ["x" * 64 + ".example", "no-such-name.invalid", "a..b"], ids=["too long", "unknown", "empty label"]
+)
+def test_a_name_that_is_none_is_a_failure_and_harms_nobody(
+    door: Jobs, made: Made, receiver: Receiver, postman: Postman, name: str
+) -> None:
+    bad, good = made(f"http://{name}/"), made(receiver.url)
+    postman.start()
+    until(lambda: "Webhook delivered" in door.log(good.id))
+    until(lambda: "given up" in door.log(bad.id), seconds=30)
+
+
+def test_a_name_that_leads_inside_is_given_up_without_a_connection(
+    door: Jobs, made: Made, receiver: Receiver, postman: Postman
+) -> None:
+    postman.networks = ""
+    job = made(f"http://localhost:{receiver.port}/")
+    mixed = made(f"http://mixed.example:{receiver.port}/")
+    inside, outside = ipaddress.ip_address("127.0.0.1"), ipaddress.ip_address("1.1.1.1")
+    postman.resolve = lambda host, port: [outside, inside] if host == "mixed.example" else resolve(host, port)
+    postman.start()
+    until(lambda: "localhost is" in door.log(job.id))
+    assert "not of the public internet" in door.log(job.id)
+    until(lambda: "mixed.example is 1.1.1.1, 127.0.0.1" in door.log(mixed.id))
+    until(lambda: postman.outbox.owed() == 0)
+    assert receiver.got == []
+
+
+def test_the_name_is_looked_up_once_and_the_connection_goes_to_what_was_found(
+    door: Jobs, made: Made, receiver: Receiver, postman: Postman
+) -> None:
+    """DNS rebinding: an answer that is good when it is checked, and another one when it is used."""
+    asked: list[str] = []
+
+    def rebinding(host: str, port: int) -> list[ipaddress.IPv4Address | ipaddress.IPv6Address]:
+        del port
+        asked.append(host)
+        return [ipaddress.ip_address("127.0.0.1" if len(asked) == 1 else "127.0.0.2")]
+
+    postman.resolve = rebinding
+    job = made(f"http://rebinding.example:{receiver.port}/hook")
+    postman.start()
+    until(lambda: "Webhook delivered" in door.log(job.id))
+    assert asked == ["rebinding.example"]
+    ((_, headers, _),) = receiver.got
+    assert headers["host"] == f"rebinding.example:{receiver.port}"
+
+
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="needs the command openssl to make a certificate")
+def test_the_certificate_must_be_the_names_although_the_connection_goes_to_a_number(
+    door: Jobs, made: Made, receiver: Receiver, postman: Postman, tmp_path: Path
+) -> None:
+    pem = tmp_path / "both.pem"
+    names = ["-subj", "/CN=x", "-addext", "subjectAltName=DNS:right.example"]
+    files = ["-keyout", str(pem), "-out", str(tmp_path / "cert.pem")]
+    kind = ["-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes", "-days", "2"]
+    command = ["openssl", "req", *kind, *names, *files]
+    subprocess.run(command, check=True, capture_output=True, timeout=60)
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(tmp_path / "cert.pem", pem)
+    receiver.server.socket = context.wrap_socket(receiver.server.socket, server_side=True)
+    postman.resolve = lambda host, port: [ipaddress.ip_address("127.0.0.1")]
+    postman.trusted = ssl.create_default_context(cafile=str(tmp_path / "cert.pem"))
+    right, wrong = (made(f"https://{name}.example:{receiver.port}/") for name in ("right", "wrong"))
+    postman.start()
+    until(lambda: "Webhook delivered" in door.log(right.id))
+    until(lambda: "given up: ConnectError" in door.log(wrong.id))
+    postman.trusted = None
+    stranger = made(f"https://right.example:{receiver.port}/")
+    until(lambda: "given up: ConnectError" in door.log(stranger.id))
+    assert len(receiver.got) == 1
+
+
+def test_a_proxy_of_the_environment_is_not_used(
+    door: Jobs, made: Made, receiver: Receiver, postman: Postman, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("http_proxy", "HTTP_PROXY", "ALL_PROXY"):
+        monkeypatch.setenv(name, "http://127.0.0.1:9")
+    job = made(receiver.url)
+    postman.start()
+    until(lambda: "Webhook delivered" in door.log(job.id))
+
+
+def test_a_slow_receiver_holds_up_nobody(door: Jobs, made: Made, receiver: Receiver, postman: Postman) -> None:
+    slow = Receiver()
+    slow.open.clear()
+    try:
+        for _ in range(HANDS - 1):
+            made(slow.url)
+        postman.start()
+        until(lambda: len(slow.got) == HANDS - 1)
+        quick = made(receiver.url)
+        until(lambda: "Webhook delivered" in door.log(quick.id))
+        until(lambda: postman.outbox.owed() == HANDS - 1)  # the others are under way all the while
+    finally:
+        slow.open.set()
+        slow.server.shutdown()
+        slow.server.server_close()
+
+
+def test_what_is_owed_survives_a_postman_that_died_with_it(
+    door: Jobs, made: Made, receiver: Receiver, postman: Postman
+) -> None:
+    job = made(receiver.url)
+    now = int(time.time() * 1000)
+    assert postman.outbox.take(now=now + 10, until=now + 1500) == (job.id, 1), "and then it was killed"
+    assert postman.outbox.take(now=now + 10, until=now + 1500) is None, "nobody else sends it meanwhile"
+    postman.start()
+    until(lambda: "(try 2)" in door.log(job.id))
+    assert len(receiver.got) == 1
+
+
+def test_a_message_that_kills_its_postman_each_time_is_not_tried_for_ever(
+    door: Jobs, made: Made, receiver: Receiver, postman: Postman
+) -> None:
+    job = made(receiver.url)
+    for _ in range(4):
+        postman.outbox.take(now=int(time.time() * 1000) + 10, until=0)
+    postman.start()
+    until(lambda: "tried often enough" in door.log(job.id))
+    assert receiver.got == []
+
+
+def test_a_deleted_job_owes_nothing(door: Jobs, made: Made, receiver: Receiver, settings: Settings) -> None:
+    job = made(receiver.url)
+    outbox = Outbox(connect(settings.redis, decode=True), prefix=settings.queue)
+    door.delete(job.id)
+    assert outbox.owed() == 0
+    outbox.later(job.id, due=0)
+    assert outbox.owed() == 0, "nor does a try that was under way bring it back"
+
+
+def test_a_job_run_again_tells_its_end_too_and_one_without_webhook_does_not(
+    door: Jobs, made: Made, receiver: Receiver, postman: Postman, inputs_file: Path, interpretation: Interpretation
+) -> None:
+    again = door.retry(made(receiver.url).id)
+    door.cancel(again.id)
+    plain = door.submit(inputs_file, options=Options(), interpretation=interpretation)
+    assert door.cancel(plain.id).status is Status.CANCELLED
+    assert postman.outbox.owed() == 2
+    postman.start()
+    until(lambda: len(receiver.got) == 2 and postman.outbox.owed() == 0)
+    assert {headers["webhook-id"] for _, headers, _ in receiver.got} == {f"msg_{again.id}", f"msg_{again.retry_of}"}
+
+
+def test_the_pauses_grow_and_make_a_day() -> None:
+    assert list(PAUSES) == sorted(PAUSES)
+    assert 20 * 3600 < sum(PAUSES) < 28 * 3600

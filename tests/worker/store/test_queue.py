@@ -1,0 +1,37 @@
+"""The queue: what it notes, and what it does when a worker takes what somebody else takes out."""
+
+from __future__ import annotations
+
+import time
+
+from pliant.worker.jobs.service import Jobs
+from pliant.worker.settings import Settings
+from pliant.worker.store.connection import connect
+from pliant.worker.store.queue import RedisQueue
+from rq.executions import ExecutionRegistry
+
+
+def test_the_queue_notes_what_is_held_back_and_forgets_what_is_not(jobs: Jobs) -> None:
+    queue = jobs.queue
+    for token in ("job-1", "job-2"):
+        queue.hold(token)
+    assert (queue.held(), queue.waiting()) == ({"job-1", "job-2"}, [])
+    queue.push("job", "job-3")
+    queue.let_go("job-1")
+    queue.let_go("job-3")
+    queue.remove("job-2")
+    assert (queue.held(), queue.waiting()) == (set(), ["job-3"])
+
+
+def test_a_delivery_that_a_worker_drops_at_this_moment_can_be_taken_out(settings: Settings) -> None:
+    """Between listing what a delivery's workers noted and reading it, the note may be gone."""
+    raw = connect(settings.redis, decode=False)
+    queue = RedisQueue(raw, name=settings.queue)
+    queue.push("job", "job-1")
+    notes = ExecutionRegistry("job-1", connection=raw)
+    raw.zadd(notes.key, {"a-note-that-is-gone": time.time() + 60})
+    queue.remove("job-1")
+    assert queue.waiting() == []
+    assert raw.exists("rq:job:job-1") == 0
+    raw.delete(notes.key)
+    raw.close()

@@ -1,0 +1,225 @@
+"""Uploads on the disk: what is whole, what may be written, what expires; with real locks and real files."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import itertools
+import os
+import subprocess
+import sys
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pliant.worker import errors
+from pliant.worker.uploads.service import MOST, Room, Uploads
+
+ROOM = Room(max_bytes=1000)
+
+
+@pytest.fixture
+def uploads(tmp_path: Path) -> Uploads:
+    return Uploads(directory=tmp_path / "uploads", expiry=3600)
+
+
+def send(uploads: Uploads, id: str, data: bytes, *, offset: int = 0, finish: bool = True, **more: object) -> None:
+    with uploads.write(id, offset=offset, length=more.pop("length", None), room=more.pop("room", ROOM)) as writer:  # type: ignore[arg-type]
+        writer.write(data)
+        if finish:
+            writer.finish(sha256=more.pop("sha256", None))  # type: ignore[arg-type]
+
+
+def now(**later: float) -> datetime:
+    return datetime.now(UTC) + timedelta(**later)
+
+
+@given(data=st.binary(max_size=300), cuts=st.lists(st.integers(0, 300), max_size=5))
+@settings(max_examples=60, deadline=None)
+def test_however_it_is_cut_the_whole_is_the_whole(
+    tmp_path_factory: pytest.TempPathFactory, data: bytes, cuts: list[int]
+) -> None:
+    folder = tmp_path_factory.mktemp("cut")
+    uploads = Uploads(directory=folder / "uploads", expiry=0)
+    places = [0, *sorted(min(cut, len(data)) for cut in cuts), len(data)]
+    for number, (begin, end) in enumerate(itertools.pairwise(places)):
+        send(uploads, "cut", data[begin:end], offset=begin, finish=number == len(places) - 2)
+        assert uploads.get("cut").offset == end
+    there = uploads.get("cut")
+    assert (there.complete, there.length) == (True, len(data))
+    assert there.sha256 == hashlib.sha256(data).hexdigest() == uploads.take("cut", folder / "taken")
+    assert (folder / "taken").read_bytes() == data
+
+
+def test_a_part_cannot_be_taken_and_a_whole_one_not_be_written(uploads: Uploads, tmp_path: Path) -> None:
+    send(uploads, "one", b"half", finish=False)
+    assert (uploads.get("one").complete, uploads.get("one").sha256) == (False, None)
+    with pytest.raises(errors.Conflict, match="not whole yet") as caught:
+        uploads.take("one", tmp_path / "taken")
+    assert caught.value.code == "upload_incomplete"
+    assert not (tmp_path / "taken").exists()
+    send(uploads, "one", b"", offset=4)
+    for offset in (0, 4):
+        with pytest.raises(errors.Conflict, match="is whole"):
+            send(uploads, "one", b"more", offset=offset)
+    uploads.take("one", tmp_path / "taken")
+    uploads.delete("one")
+    assert (tmp_path / "taken").read_bytes() == b"half"
+    for gone in (
+        lambda: uploads.take("one", tmp_path / "x"),
+        lambda: uploads.delete("one"),
+        lambda: uploads.get("../x"),
+    ):
+        with pytest.raises(errors.UnknownUpload):
+            gone()
+    with pytest.raises(errors.UnknownUpload):
+        send(uploads, "one", b"x", offset=4)
+
+
+def test_bytes_in_the_wrong_place_are_refused_and_beginning_anew_is_allowed(uploads: Uploads) -> None:
+    send(uploads, "one", b"half", finish=False)
+    with pytest.raises(errors.OffsetMismatch, match=r"Go on at 4\.") as caught:
+        send(uploads, "one", b"x", offset=3)
+    assert caught.value.offset == 4
+    send(uploads, "one", b"new")
+    assert uploads.get("one").offset == 3
+
+
+def test_the_length_holds_over_requests(uploads: Uploads) -> None:
+    send(uploads, "one", b"half", finish=False, length=6)
+    assert uploads.get("one").length == 6
+    for data, length in ((b"x", 7), (b"xyz", None), (b"x", None)):
+        with pytest.raises(errors.InvalidRequest) as caught:
+            send(uploads, "one", data, offset=uploads.get("one").offset, length=length)
+        assert caught.value.code == "inconsistent_upload_length"
+    assert uploads.get("one").offset == 5, "what fitted is kept"
+    send(uploads, "one", b"y", offset=5)
+    assert uploads.get("one").complete
+
+
+def test_what_is_too_large_is_removed_and_what_has_no_room_is_kept(uploads: Uploads) -> None:
+    for length in (None, 1001):
+        with pytest.raises(errors.UploadTooLarge, match="at most 1000 bytes"):
+            send(uploads, "one", b"x" * 1001, length=length)
+        assert uploads.find("one") is None
+    tight = Room(max_bytes=1000, quota=100, used=40)
+    with uploads.write("one", offset=0, length=None, room=tight) as writer:
+        writer.write(b"x" * 60)
+        with pytest.raises(errors.QuotaExceeded):
+            writer.write(b"x")
+    assert uploads.get("one").offset == uploads.size("one") == uploads.used() == 60
+
+
+def test_other_bytes_than_the_sender_meant_are_removed(uploads: Uploads) -> None:
+    with pytest.raises(errors.InvalidRequest) as caught:
+        send(uploads, "one", b"half", sha256="0" * 64)
+    assert caught.value.code == "digest_mismatch"
+    assert uploads.find("one") is None
+
+
+def test_odd_ids_and_too_many_are_refused(uploads: Uploads) -> None:
+    for id in ("..", "a/b", "x", "a" * 65, ""):
+        with pytest.raises(errors.InvalidRequest):
+            send(uploads, id, b"")
+    for number in range(MOST):
+        send(uploads, f"number-{number}", b"")
+    with pytest.raises(errors.TooManyUploads, match=str(MOST)):
+        send(uploads, "one-more", b"")
+    send(uploads.of("somebody else"), "one-more", b"")
+
+
+def test_owners_do_not_see_each_other(uploads: Uploads, tmp_path: Path) -> None:
+    mine, yours = uploads.of("me"), uploads.of("you")
+    send(mine, "one", b"mine")
+    assert yours.find("one") is None
+    send(yours, "one", b"yours, too")
+    assert (mine.get("one").offset, yours.get("one").offset) == (4, 10)
+    assert uploads.find("one") is None
+    mine.delete("one")
+    yours.take("one", tmp_path / "taken")
+
+
+def test_two_processes_do_not_write_to_one_upload(uploads: Uploads) -> None:
+    code = (
+        "import sys; from pathlib import Path; from pliant.worker.uploads.service import Room, Uploads\n"
+        "with Uploads(directory=Path(sys.argv[1]), expiry=0).write('one', offset=0, length=None, room=Room(max_bytes=9)) as w:\n"
+        "    w.write(b'abc'); print(flush=True); sys.stdin.read()"
+    )
+    other = subprocess.Popen(
+        [sys.executable, "-c", code, str(uploads.directory)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+    assert other.stdout is not None
+    other.stdout.readline()
+    for write in (lambda: send(uploads, "one", b"x", offset=3), lambda: uploads.delete("one")):
+        with pytest.raises(errors.Conflict, match="just now") as caught:
+            write()
+        assert caught.value.code == "upload_busy"
+    assert uploads.expire(now(days=9)) == [], "what is being written does not expire"
+    other.kill()
+    other.communicate()
+    send(uploads, "one", b"def", offset=3)
+    assert uploads.get("one").sha256 == hashlib.sha256(b"abcdef").hexdigest()
+
+
+def test_what_nobody_goes_on_with_expires_and_nothing_younger(uploads: Uploads, tmp_path: Path) -> None:
+    send(uploads, "part", b"x", finish=False)
+    send(uploads.of("you"), "whole", b"x")
+    expires = uploads.get("part").expires_at
+    assert expires is not None
+    assert abs((expires - now(hours=1)).total_seconds()) < 60
+    assert uploads.expire(now(minutes=59)) == []
+    assert sorted(uploads.expire(now(minutes=61))) == ["part", "whole"]
+    assert [path for path in uploads.directory.rglob("*") if path.is_file()] == []
+    send(uploads, "used", b"x")
+    (file,) = uploads.directory.glob("*/used/whole-*")
+    os.utime(file, (0, 0))
+    uploads.take("used", tmp_path / "taken")
+    assert uploads.expire(now(minutes=59)) == [], "using it begins its time anew"
+    for_ever = Uploads(directory=uploads.directory, expiry=0)
+    assert for_ever.get("used").expires_at is None
+    assert for_ever.expire(now(days=9999)) == []
+
+
+def test_the_audit_sees_what_does_not_belong(uploads: Uploads) -> None:
+    send(uploads, "part", b"x", finish=False, length=3)
+    send(uploads, "whole", b"x")
+    assert list(uploads.findings(now())) == []
+    assert sorted(uploads.findings(now(hours=2))) == [
+        "Upload part should have expired.",
+        "Upload whole should have expired.",
+    ]
+    (part,) = uploads.directory.glob("*/part/part")
+    (part.parent / "stray").touch()
+    assert list(uploads.findings(now())) == ["Upload part holds length, part, stray, not one file."]
+    for path in part.parent.iterdir():
+        path.unlink()
+    assert list(uploads.findings(now())) == ["Upload part holds nothing, not one file."]
+
+
+def test_a_full_disk_gets_back_what_the_request_brought(small_disk: Path) -> None:
+    uploads, room = Uploads(directory=small_disk / "uploads", expiry=0), Room(max_bytes=2**30)
+    with pytest.raises(OSError, match="No space"):
+        send(uploads, "announced", b"", length=4_000_000, room=room)
+    send(uploads, "one", b"x" * 1_000_000, finish=False, room=room)
+    with uploads.write("one", offset=1_000_000, length=None, room=room) as writer:
+        writer.write(b"y" * 1_000_000)
+        with pytest.raises(OSError, match="No space"):
+            writer.write(b"y" * 2_000_000)
+    assert uploads.get("one").offset == 1_000_000
+    send(uploads, "one", b"z" * 1_000_000, offset=1_000_000, room=room)
+    assert uploads.get("one").sha256 == hashlib.sha256(b"x" * 1_000_000 + b"z" * 1_000_000).hexdigest()
+
+
+def test_a_file_system_without_links_gets_a_copy(
+    uploads: Uploads, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    send(uploads, "one", b"abc")
+
+    def refused(*_: object) -> None:
+        raise OSError(errno.EPERM, "no links here")
+
+    monkeypatch.setattr(os, "link", refused)
+    uploads.take("one", tmp_path / "taken")
+    assert (tmp_path / "taken").read_bytes() == b"abc"

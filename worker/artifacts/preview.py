@@ -1,0 +1,200 @@
+"""A compact copy of a result for the web page: `preview.bin`.
+
+The page plays a result of 99 frames and 29,000 points in a browser, on a telephone too. `shapes.glb` with a morph target
+a frame is twice the bytes and keeps every target on the graphics card, where the shader walks through them for every vertex;
+`shapes.npz` is four times the bytes and comes whole or not at all. This file holds int16 coordinates frame after frame, so
+that drawing starts when the first frame has arrived, and puts what is not always looked at (residuals, ground truth) where
+a byte range finds it.
+
+Layout, little-endian: `b"PLIANTPV"`, uint32 version, uint32 length of the header, the header as JSON in UTF-8, then sections at
+the offsets that the header gives, each a multiple of 8.
+
+=========  ==================  ===================================================================================
+section    type and shape      meaning
+=========  ==================  ===================================================================================
+faces      uint32 (T, 3)       triangles; quads are split
+cameras    float32 (F, 10)     rotation row by row, camera from world; then the scale
+positions  int16 (F, P, 3)     world = origin + step · value
+residuals  int16 (F, P, 2)     track − projection = residual_step · value; both −32768 where hidden
+truth      int16 (F, P, 3)     as positions; turned onto the result as `e3d_frame` does. Only with ground truth
+=========  ==================  ===================================================================================
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from dataclasses import dataclass
+from typing import IO
+
+import numpy as np
+from numpy.typing import NDArray
+from pliant.solver import Mesh, Solution, Tracks
+from pliant.solver.evaluation.alignment import align
+
+NAME = "preview.bin"
+MEDIA_TYPE = "application/octet-stream"
+DESCRIPTION = "Compact int16 copy that the web page plays; not for measuring."
+
+MAGIC = b"PLIANTPV"
+VERSION = 1
+LARGEST = 32767
+HIDDEN = -32768
+MOST_OBSERVATIONS = 16_000_000
+"""Beyond this many points × frames (96 MB of positions) only every n-th frame is written."""
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """The uniform grid on which coordinates are rounded: `world = origin + step · value`."""
+
+    origin: Floats
+    step: float
+
+    @classmethod
+    def around(cls, *clouds: Floats) -> Box:
+        """Return the grid that just holds every point of the clouds, each `(F, P, 3)`."""
+        low = np.min([cloud.min(axis=(0, 1)) for cloud in clouds], axis=0)
+        high = np.max([cloud.max(axis=(0, 1)) for cloud in clouds], axis=0)
+        return cls((low + high) / 2, float((high - low).max() / 2 / LARGEST) or 1.0)
+
+    def rounded(self, frame: Floats) -> NDArray[np.int16]:
+        """Round one frame's points `(P, 3)`; off by at most half a step."""
+        return np.rint((frame - self.origin) / self.step).clip(-LARGEST, LARGEST).astype("<i2")
+
+
+def write_preview(
+    file: IO[bytes],
+    *,
+    tracks: Tracks,
+    mesh: Mesh | None,
+    solution: Solution,
+    truth: Floats | None = None,
+    y_axis: str = "down",
+    fps: float = 25.0,
+) -> None:
+    """Write the file.
+
+    Parameters
+    ----------
+    file : binary file
+        Open for writing, at its beginning.
+    tracks, mesh, solution
+        What went in, and what came out.
+    truth : array, shape (F, P, 3), optional
+        Ground truth in any axes, the tracks' unit; NaN where unknown.
+    y_axis : {'down', 'up'}
+        Where the image's y points.
+    fps : float
+        Frames per second of the animation, before frames are left out.
+    """
+    stride = max(1, -(-solution.shapes[..., 0].size // MOST_OBSERVATIONS))
+    kept = range(0, len(solution.shapes), stride)
+    facing, mirrored = (None, False) if truth is None else _onto(solution.shapes, truth)
+    box = Box.around(solution.shapes) if facing is None else Box.around(solution.shapes, facing)
+    residual_step = _largest_residual(tracks, solution) / LARGEST or 1.0
+    faces = triangles(mesh)
+    points = solution.shapes.shape[1]
+    sizes = {
+        "faces": faces.nbytes,
+        "cameras": 40 * len(kept),
+        "positions": 6 * points * len(kept),
+        "residuals": 4 * points * len(kept),
+        **({} if facing is None else {"truth": 6 * points * len(kept)}),
+    }
+    header = {
+        "version": VERSION,
+        "num_frames": len(kept),
+        "num_points": points,
+        "num_faces": len(faces),
+        "fps": fps / stride,
+        "frame_stride": stride,
+        "y_axis": y_axis,
+        "mirrored": mirrored,
+        "origin": box.origin.tolist(),
+        "step": box.step,
+        "residual_step": residual_step,
+    }
+    _begin(file, header, sizes)
+    _section(file, faces.tobytes())
+    camera = solution.camera
+    table = np.column_stack([camera.rotations.reshape(-1, 9), camera.scales])[kept]
+    _section(file, table.astype("<f4").tobytes())
+    _section(file, *(box.rounded(solution.shapes[frame]).tobytes() for frame in kept))
+    _section(file, *(_residuals(tracks, solution, frame, residual_step).tobytes() for frame in kept))
+    if facing is not None:
+        _section(file, *(box.rounded(facing[frame]).tobytes() for frame in kept))
+
+
+def triangles(mesh: Mesh | None) -> NDArray[np.uint32]:
+    """Faces as triangles `(T, 3)`; a quad becomes two, in the same sense of rotation."""
+    if mesh is None or len(mesh.faces) == 0:
+        return np.zeros((0, 3), dtype="<u4")
+    faces = mesh.faces
+    if faces.shape[1] == 4:
+        faces = np.stack([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]], axis=1).reshape(-1, 3)
+    return faces.astype("<u4")
+
+
+def _onto(shapes: Floats, truth: Floats) -> tuple[Floats | None, bool]:
+    """Turn the truth onto the result frame by frame, and say whether the result's depth has the other sign.
+
+    Points without truth are left out of the alignment and stand where the result has them.
+    """
+    known = np.isfinite(truth).all(axis=(0, 2))
+    if known.sum() < 3:
+        return None, False
+    aligned = align(shapes[:, known], truth[:, known], kind="frame")
+    turned = shapes.copy()
+    # aligned.shapes = (S − centre) Tᵀ ≈ G, so G T + centre lies on S.
+    turned[:, known] = aligned.truth @ aligned.transforms + shapes[:, known].mean(axis=1, keepdims=True)
+    return turned, bool(np.linalg.det(aligned.transforms[0]) < 0)
+
+
+def _residual(tracks: Tracks, solution: Solution, frame: int) -> Floats:
+    camera = solution.camera
+    projected = (
+        camera.scales[frame] * solution.shapes[frame] @ camera.rotations[frame, :2].T + camera.translations[frame]
+    )
+    return np.asarray(tracks.points[frame] - projected)
+
+
+def _largest_residual(tracks: Tracks, solution: Solution) -> float:
+    return max(
+        float(np.abs(_residual(tracks, solution, frame)[tracks.visible[frame] > 0]).max(initial=0.0))
+        for frame in range(len(solution.shapes))
+    )
+
+
+def _residuals(tracks: Tracks, solution: Solution, frame: int, step: float) -> NDArray[np.int16]:
+    scaled = np.rint(_residual(tracks, solution, frame) / step).clip(-LARGEST, LARGEST).astype("<i2")
+    scaled[tracks.visible[frame] == 0] = HIDDEN
+    return scaled
+
+
+def _begin(file: IO[bytes], header: dict[str, object], sizes: dict[str, int]) -> None:
+    """Write magic, version and header; the offsets in it depend on its own length, so it is padded to a fixed one."""
+    room = 1024
+    offset = 16 + room
+    sections = {}
+    for name, size in sizes.items():
+        sections[name] = {"offset": offset, "bytes": size}
+        offset += _padded(size)
+    text = json.dumps({**header, "sections": sections}, allow_nan=False).encode().ljust(room)
+    if len(text) > room:
+        raise AssertionError(f"the preview's header takes {len(text)} bytes, more than {room}")
+    file.write(MAGIC + struct.pack("<II", VERSION, room) + text)
+
+
+def _section(file: IO[bytes], *parts: bytes) -> None:
+    written = 0
+    for part in parts:
+        file.write(part)
+        written += len(part)
+    file.write(bytes(_padded(written) - written))
+
+
+def _padded(size: int) -> int:
+    return -(-size // 8) * 8

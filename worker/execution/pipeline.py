@@ -1,0 +1,156 @@
+"""A whole job as a plain call: inputs in, files out. `pliant solve` and the queue's worker both call exactly this."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from pliant.schemas.job import Artifact, Progress
+from pliant.schemas.options import SOLVER_FIELDS, Options
+from pliant.solver import Outcome, Settings, Solution, Step, solve
+from pliant.solver.evaluation.metrics import evaluate
+from pliant.worker.artifacts import build_report, kinds_for, write_artifacts
+from pliant.worker.errors import Interrupted, TimedOut
+from pliant.worker.execution.progress import Teller
+from pliant.worker.formats import Inputs
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Finished:
+    """How a job ended, and what it left in its directory."""
+
+    metrics: dict[str, float]
+    """Every metric that the inputs allow and that is finite, by its documented name."""
+
+    outcome: str
+    """How the solver ended: `converged` or `max_reweightings`."""
+
+    sentence: str
+    """The outcome in words."""
+
+    warnings: tuple[str, ...]
+    """Sentences the user should read about this result."""
+
+    artifacts: tuple[Artifact, ...]
+    """The files, named as they lie in the directory."""
+
+
+def solver_settings(options: Options) -> Settings:
+    """Return the solver's part of a job's options."""
+    return Settings(**{name: getattr(options, name) for name in SOLVER_FIELDS})
+
+
+def reconstruct(
+    inputs: Inputs,
+    options: Options,
+    directory: Path,
+    *,
+    on_progress: Callable[[Progress], None] | None = None,
+    should_stop: Callable[[], bool] | None = None,
+) -> Finished:
+    """Solve, measure, write the files.
+
+    Parameters
+    ----------
+    inputs : Inputs
+        As the readers give them.
+    options : Options
+        How to solve and write.
+    directory : Path
+        Where the files go; made if need be.
+    on_progress : callable, optional
+        Told often; whoever cannot listen so often drops some.
+    should_stop : callable, optional
+        Asked often; once it says True, the job ends with `Interrupted`, and the files it has written are not all.
+
+    Raises
+    ------
+    Interrupted
+        `should_stop` said so.
+    TimedOut
+        It took longer than `options.time_limit`.
+    InvalidInput
+        The inputs and the options do not fit together, or a file is asked for that cannot be written here.
+    """
+    # What cannot be written is refused before anything is computed.
+    kinds_for(options, size=(inputs.tracks.num_frames, inputs.tracks.num_points))
+    teller = Teller(on_progress if on_progress is not None else _silent)
+    directory.mkdir(parents=True, exist_ok=True)
+    teller.part("loading", 1.0)
+    began = time.perf_counter()
+    halt = _Halt(should_stop, options.time_limit)
+    solution = solve(
+        inputs.tracks,
+        inputs.mesh,
+        cameras=inputs.cameras,
+        settings=solver_settings(options),
+        on_step=lambda step: _told(teller, step),
+        should_stop=halt.asked,
+    )
+    if solution.outcome is Outcome.STOPPED:
+        halt.check()
+    solved = time.perf_counter()
+    metrics = _metrics(inputs, solution)
+    seconds = {"solve": solved - began, "metrics": time.perf_counter() - solved}
+    report = build_report(inputs, solution, options, metrics=metrics, seconds=seconds)
+
+    def exported(done: float) -> None:
+        teller.part("exporting", done)
+        halt.check()
+
+    artifacts = write_artifacts(inputs, solution, options, report, directory, on_progress=exported)
+    exported(1.0)
+    return Finished(
+        metrics=metrics,
+        outcome=solution.outcome.value,
+        sentence=solution.outcome.sentence,
+        warnings=tuple(solution.choices.warnings),
+        artifacts=tuple(artifacts),
+    )
+
+
+@dataclass(slots=True)
+class _Halt:
+    """Whether to stop, and why; once asked for, it stays so."""
+
+    should_stop: Callable[[], bool] | None
+    limit: float | None
+    began: float = field(default_factory=time.monotonic)
+    reason: Interrupted | TimedOut | None = None
+
+    def asked(self) -> bool:
+        if self.reason is None and self.should_stop is not None and self.should_stop():
+            self.reason = Interrupted()
+        if self.reason is None and self.limit is not None and time.monotonic() > self.began + self.limit:
+            self.reason = TimedOut(self.limit)
+        return self.reason is not None
+
+    def check(self) -> None:
+        if self.asked() and self.reason is not None:
+            raise self.reason
+
+
+def _metrics(inputs: Inputs, solution: Solution) -> dict[str, float]:
+    truth = inputs.ground_truth
+    rotations = None if truth is None else truth.rotations
+    values = evaluate(solution, inputs.tracks, None if truth is None else truth.shapes, rotations)
+    return {name: value for name, value in values.items() if math.isfinite(value)}
+
+
+def _told(teller: Teller, step: Step) -> None:
+    teller.part(
+        "solving",
+        step.fraction,
+        stage=step.stage,
+        reweighting=step.reweighting,
+        max_reweightings=step.max_reweightings,
+        objective=step.objective,
+        residual=step.residual,
+    )
+
+
+def _silent(progress: Progress) -> None:
+    del progress

@@ -1,0 +1,78 @@
+"""Progress: from the solver's steps to what a user reads, with an honest estimate of the time that is left."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+
+from pliant.schemas.job import Progress
+
+SHARES = {"loading": (0.0, 0.02), "solving": (0.02, 0.85), "exporting": (0.85, 1.0)}
+"""Where each part of a job begins and ends on the way from 0 to 1."""
+
+WORTH_ESTIMATING = 0.05
+"""Share that must be done before the time left is extrapolated from the time spent."""
+
+
+@dataclass(slots=True)
+class Teller:
+    """Turns parts of parts into one fraction that never falls.
+
+    Parameters
+    ----------
+    tell : callable
+        Given every `Progress`.
+    clock : callable
+        Monotonic seconds.
+    """
+
+    tell: Callable[[Progress], None]
+    clock: Callable[[], float] = time.monotonic
+    _began: float | None = None
+    _furthest: float = 0.0
+    _last: dict[str, int | float | None] = field(default_factory=dict)
+
+    def part(
+        self,
+        part: str,
+        done: float,
+        *,
+        stage: str | None = None,
+        reweighting: int | None = None,
+        max_reweightings: int | None = None,
+        objective: float | None = None,
+        residual: float | None = None,
+    ) -> None:
+        """Say that `done` (0 to 1) of a part is done; numbers not given stay as they were told last.
+
+        Parameters
+        ----------
+        part : str
+            A key of `SHARES`.
+        stage : str, optional
+            The user's word for it; by default the part's own.
+        """
+        now = self.clock()
+        if self._began is None:
+            self._began = now
+        told = {
+            "reweighting": reweighting, "max_reweightings": max_reweightings, "objective": objective, "residual": residual,
+        }  # fmt: skip
+        self._last |= {name: value for name, value in told.items() if value is not None}
+        low, high = SHARES[part]
+        self._furthest = max(self._furthest, low + (high - low) * min(max(done, 0.0), 1.0))
+        fraction, spent = self._furthest, now - self._began
+        left = spent * (1 - fraction) / fraction if fraction >= WORTH_ESTIMATING else None
+        self.tell(
+            Progress.model_validate(
+                {
+                    **self._last,
+                    "stage": stage or part,
+                    "fraction": fraction,
+                    "seconds_left": None if left is None else round(left, 1),
+                    "updated_at": datetime.now(UTC),
+                }
+            )
+        )

@@ -1,0 +1,215 @@
+"""Our RQ worker: RQ dequeues and forks; how a delivery is checked, watched and buried is ours.
+
+What of RQ is switched off, and why: its job timeout (an alarm that waits for a C call to return), its maintenance
+(notices a lost job after minutes, and two at once queue it twice), its scheduler (a forked one keeps a dead worker's
+connection and swallows jobs), its commands (a thread beside a fork), callbacks and webhooks named by a delivery
+(whoever may write to Redis could name any function).
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import sys
+import time
+from contextlib import suppress
+from types import FrameType
+from typing import Any
+
+import redis
+from pliant.schemas.job import Status
+from pliant.worker.errors import StoreUnavailable, UnknownJob
+from pliant.worker.execution import attempt as work
+from pliant.worker.execution.monitor import Patience, Watch, settle
+from pliant.worker.execution.workdir import clean_up
+from pliant.worker.jobs.lifecycle import ACTIVE
+from pliant.worker.processes.containment import die_with_parent
+from pliant.worker.records import Records
+from pliant.worker.settings import Settings
+from pliant.worker.store.queue import FUNCTION, Queue, alive_key
+from rq import Queue as RqQueue
+from rq import Worker
+from rq.exceptions import StopRequested
+from rq.job import Job as RqJob
+from rq.serializers import JSONSerializer
+from rq.worker import WorkerStatus
+
+logger = logging.getLogger(__name__)
+
+IDLE_WAKE = 5
+"""Seconds an idle worker waits for a delivery before it gives a sign of life."""
+
+ALIVE_FOR = 20
+"""Seconds after its last sign of life that a worker counts as running."""
+
+RSS_UNIT = 1 if sys.platform == "darwin" else 1024
+"""Bytes in one unit of `ru_maxrss`."""
+
+AWAY = (redis.ConnectionError, redis.TimeoutError)
+"""What Redis raises when it does not answer."""
+
+POLL = 0.05
+"""Seconds between looks at a running horse."""
+
+
+class Delivery(RqJob):
+    """A delivery names a job and an attempt. It runs nothing but our own function, whatever it claims to be."""
+
+    settings: Settings | None = None
+
+    def perform(self) -> None:
+        """Run the attempt; a delivery of anything else is refused."""
+        named, arguments = self.func_name, list(self.args)
+        fits = len(arguments) == 2 and all(isinstance(each, str) for each in arguments) and not self.kwargs
+        if named != FUNCTION or not fits or self.settings is None:
+            raise PermissionError(f"a delivery named {named!r} with {len(arguments)} arguments is not ours: refused")
+        work.run(arguments[0], arguments[1], settings=self.settings, worker=str(self.worker_name))
+
+    @property
+    def success_callback(self) -> None:
+        """None: a delivery has no say in what is called."""
+
+    failure_callback = stopped_callback = success_callback
+
+    def send_webhooks(self, *_: Any, **__: Any) -> None:
+        """Send nothing: a delivery has no say in whom we call."""
+
+
+class PliantWorker(Worker):
+    """One job at a time, each in a forked horse."""
+
+    def __init__(
+        self, *, settings: Settings, connection: redis.Redis, records: Records, queue: Queue, name: str
+    ) -> None:
+        rq_queue = RqQueue(settings.queue, connection=connection, serializer=JSONSerializer, job_class=Delivery)
+        super().__init__(
+            [rq_queue],
+            name=name,
+            connection=connection,
+            serializer=JSONSerializer,
+            job_class=Delivery,
+            worker_ttl=IDLE_WAKE + 15,
+            log_job_description=False,
+        )
+        self._settings = settings
+        self._records = records
+        self._deliveries = queue
+        self._stop_by: float | None = None
+
+    def subscribe(self) -> None:
+        """Listen to no commands: we cancel by the record, and a process that forks is better off without threads."""
+
+    def unsubscribe(self) -> None:
+        """Do nothing; see `subscribe`."""
+
+    def run_maintenance_tasks(self) -> None:
+        """Do nothing: the keeper looks after lost jobs."""
+
+    @property
+    def should_run_maintenance_tasks(self) -> bool:
+        """Never; see `run_maintenance_tasks`."""
+        return False
+
+    def check_for_suspension(self, burst: bool) -> None:
+        """Do nothing: we have no use for suspended workers, and the question would need the store."""
+
+    def set_state(self, state: str, pipeline: Any = None) -> None:
+        """Note the state, in RQ's books too if the store is there."""
+        try:
+            super().set_state(state, pipeline)
+        except AWAY as error:
+            logger.warning("state %s not written: %s", state, error)
+
+    def heartbeat(self, timeout: int | None = None, pipeline: Any = None) -> None:
+        """Give RQ's sign of life, and our own that ends with us; a store that is away is no reason to end."""
+        target: Any = pipeline if pipeline is not None else self.connection
+        try:
+            super().heartbeat(timeout, pipeline)
+            target.set(alive_key(self._settings.queue, self.name), os.getpid(), ex=ALIVE_FOR)
+        except AWAY as error:
+            logger.warning("no sign of life: %s", error)
+
+    def execute_job(self, job: RqJob, queue: RqQueue) -> None:
+        """Run a delivery. If the store goes away before there is a horse, the keeper delivers the job again."""
+        try:
+            super().execute_job(job, queue)
+        except AWAY as error:
+            if self.horse_pid:
+                raise
+            logger.warning("delivery %s: %s", job.id, error)
+
+    def request_stop(self, signum: int, frame: FrameType | None) -> None:  # noqa: ARG002
+        """SIGTERM: end when idle; with a job, let it go on for the grace. A second one ends the grace."""
+        first = self._stop_by is None
+        self._stop_by = time.monotonic() + (self._settings.stop_grace if first else 0.0)
+        self._stop_requested = True
+        if self.get_state() != WorkerStatus.BUSY and not self.horse_pid:
+            raise StopRequested
+
+    request_force_stop = request_stop
+
+    def kill_horse(self, sig: signal.Signals = signal.SIGKILL) -> None:
+        """Kill the horse and what it started. Before it has its own process group, its group is ours: spare that."""
+        with suppress(ProcessLookupError):
+            if os.getpgid(self.horse_pid) == self.horse_pid:
+                os.killpg(self.horse_pid, sig)
+            else:
+                os.kill(self.horse_pid, sig)
+
+    def main_work_horse(self, job: RqJob, queue: RqQueue) -> None:
+        """Be the horse: die with the worker, and say nothing but into the attempt's own log."""
+        die_with_parent(int(os.environ["PLIANT_WORKER_PROCESS"]))
+        job.settings = self._settings  # type: ignore[attr-defined]
+        super().main_work_horse(job, queue)
+
+    def setup_work_horse_signals(self) -> None:
+        """Leave stopping to the worker: service managers send SIGTERM to every process of a service at once."""
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+
+    def fork_work_horse(self, job: RqJob, queue: RqQueue) -> None:
+        """Fork; the horse must know who its parent was even if that one is gone at once."""
+        os.environ["PLIANT_WORKER_PROCESS"] = str(os.getpid())
+        super().fork_work_horse(job, queue)
+
+    def monitor_work_horse(self, job: RqJob, queue: RqQueue) -> None:  # noqa: ARG002
+        """Watch the horse until it ends, then bury what it left behind."""
+        id, token = (str(each) for each in (*job.args, "", "")[:2])
+        watch = Watch(self._settings, self._records, id=id, token=token, worker=self.name)
+        next_sign = time.monotonic() + IDLE_WAKE
+        while True:
+            pid, status, usage = os.wait4(self.horse_pid, os.WNOHANG)
+            if pid:
+                break
+            if watch.must_end(stop_by=self._stop_by) is not None:
+                self.kill_horse()
+            if time.monotonic() > next_sign:
+                next_sign = time.monotonic() + IDLE_WAKE
+                self.heartbeat()
+            time.sleep(POLL)
+        self._horse_pid = 0
+        self._bury(watch, job, status=status, peak=usage.ru_maxrss * RSS_UNIT)
+
+    def _bury(self, watch: Watch, job: RqJob, *, status: int, peak: int) -> None:
+        patience = Patience(60.0 if self._stop_by is None else 2.0)
+        try:
+            settled = settle(watch, status=status, peak=peak, patience=patience)
+            if settled is not None and settled.job.status is Status.QUEUED:
+                fresh = settled.token
+                patience.ask(lambda: self._deliveries.push(watch.id, fresh, front=True))  # it has waited before
+            patience.ask(lambda: self._deliveries.remove(job.id))
+        except StoreUnavailable as error:
+            logger.warning("job %s: %s; the keeper will look after it", watch.id, error)
+        finally:
+            with suppress(StoreUnavailable):  # then the keeper clears what is left
+                if not patience.ask(lambda: self._elsewhere(watch)):
+                    clean_up(self._settings, watch.token)
+
+    def _elsewhere(self, watch: Watch) -> bool:
+        """Tell whether another worker is at this very attempt: ours was a second delivery, and the working files are not ours."""
+        try:
+            held = self._records.get(watch.id)
+        except UnknownJob:
+            return False
+        return held.token == watch.token and held.worker != watch.worker and held.job.status in ACTIVE

@@ -1,0 +1,189 @@
+"""Ground truth and known cameras, in the shapes that data sets have them, brought to frames first and points in the tracks' order.
+
+True shapes come as `(F, P, 3)`, `(F, 3, P)`, `(3, P, F)` and the like, or as matrices `(3F, P)` whose rows go x1, y1, z1, x2 … or all x,
+all y, all z. The tracks decide: of the readings that an array's shape allows, the right one is that which an affine camera carries onto
+them. Rotations are read the way that makes their rows orthonormal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import permutations
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pliant.solver import KnownCamera
+from pliant.worker.formats.errors import refusal
+from pliant.worker.formats.reading.containers import read_arrays
+from pliant.worker.formats.records import FARTHEST, Arrays, Limits
+from pliant.worker.formats.tracks.interpretation import Understood
+from pliant.worker.formats.tracks.tracker_formats import TRUE_ROTATIONS, TRUE_SHAPES, short_names
+
+TRUTH_NAMES = frozenset([*TRUE_SHAPES, *TRUE_ROTATIONS])
+CAMERA_NAMES = frozenset([*TRUE_ROTATIONS, "scales"])
+DECISIVE = 1.3
+"""Another reading than the usual one, which comes first, must explain the tracks better by this factor."""
+
+SAMPLE = 24
+"""Frames in which a reading of the truth is held against the tracks."""
+
+FAR = 0.5
+"""Above this share of the tracks' extent left unexplained, truth and tracks hardly belong together."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Truth:
+    """True shapes and cameras as read, not yet checked."""
+
+    shapes: NDArray[np.generic]
+    rotations: NDArray[np.generic] | None
+    notes: list[str]
+
+
+def read_truth(path: Path | None, understood: Understood, *, limits: Limits) -> Truth | None:
+    """Truth from its own file, or from the tracks' file when true shapes came along.
+
+    Raises
+    ------
+    InvalidInput
+        Code missing_array, when a file of its own has none.
+    """
+    if path is None:
+        return _truth_of(understood.arrays, understood)
+    arrays = short_names(read_arrays(path, field="ground_truth", limits=limits, wanted=TRUTH_NAMES))
+    if "array" in arrays:
+        arrays = {"shapes": arrays["array"]}
+    truth = _truth_of(arrays, understood)
+    if truth is None:
+        raise refusal(
+            "missing_array", "ground_truth", expected="shapes (F, P, 3) or S (3F, P)",
+            got=", ".join(sorted(arrays)[:20]) or "no array of a known name",
+            hint="Save as numpy.savez('truth.npz', shapes=shapes).",
+        )  # fmt: skip
+    return truth
+
+
+def read_rotations(path: Path, *, num_frames: int, frames: NDArray[np.intp], limits: Limits) -> KnownCamera:
+    """Known cameras: `rotations` `(F, 2|3, 3)`, `(2F, 3)`, `(3, 3, F)` …, and optionally `scales` `(F,)`; those of `frames` are kept.
+
+    Raises
+    ------
+    InvalidInput
+        Codes missing_array, wrong_shape, not_a_rotation.
+    """
+    arrays = short_names(read_arrays(path, field="rotations", limits=limits, wanted=CAMERA_NAMES))
+    name = next((name for name in ("array", *TRUE_ROTATIONS) if name in arrays), None)
+    if name is None:
+        raise refusal(
+            "missing_array", "rotations", expected="rotations (F, 3, 3)",
+            got=", ".join(sorted(arrays)[:20]) or "no array of a known name",
+            hint="Save as numpy.savez('rotations.npz', rotations=rotations).",
+        )  # fmt: skip
+    turned = as_rotations(arrays[name], num_frames)
+    if turned.dtype.kind not in "fiu" or turned.ndim != 3 or len(turned) != num_frames:
+        raise refusal(
+            "wrong_shape", "rotations", expected=f"({num_frames}, 2, 3) or ({num_frames}, 3, 3), real",
+            got=f"{turned.dtype} {arrays[name].shape}", hint="Give one rotation for each frame of the tracks.",
+        )  # fmt: skip
+    scales = arrays.get("scales")
+    if scales is not None and scales.size == num_frames:
+        scales = scales.reshape(-1)[frames]
+    return KnownCamera.from_arrays(turned[frames], scales)
+
+
+def as_rotations(array: NDArray[np.generic], num_frames: int) -> NDArray[np.generic]:
+    """Rotations frames first; of several readings the one with the most nearly orthonormal rows. What does not fit stays as it is."""
+    found: list[NDArray[np.generic]] = []
+    if array.ndim == 2:
+        found = [rows for _, rows in _matrix_readings(array, num_frames, (2, 3), 3)]
+    elif array.ndim == 3:
+        for axis in (axis for axis in (0, 2, 1) if array.shape[axis] == num_frames):
+            moved = np.moveaxis(array, axis, 0)  # rows stay before columns: a transposed rotation is a rotation too
+            if moved.shape[1:] in ((2, 3), (3, 3)):
+                found.append(moved)
+            elif moved.shape[1:] == (3, 2):
+                found.append(moved.swapaxes(1, 2))
+    if not found or array.dtype.kind not in "fiu":
+        return array
+    return min(found, key=_askew)
+
+
+def as_shapes(array: NDArray[np.generic], understood: Understood) -> tuple[NDArray[np.generic], list[str]]:
+    """Return true shapes as `(F, P, 3)`, and the evidence where the array could be read in several ways."""
+    frames, count = understood.points.shape[:2]
+    found: list[tuple[str, NDArray[np.generic]]] = []
+    if array.ndim == 2:
+        found = [
+            (f"(3F, P), rows {words}", rows.transpose(0, 2, 1))
+            for words, rows in _matrix_readings(array, frames, (3,), count)
+        ]
+    elif array.ndim == 3:
+        for axes in permutations(range(3)):
+            moved = array.transpose(axes)
+            if moved.shape == (frames, count, 3):
+                found.append(("axes " + ", ".join("FP3"[axes.index(axis)] for axis in range(3)), moved))
+    if not found or array.dtype.kind not in "fiu":
+        return array, []
+    if len(found) == 1:
+        return found[0][1], _far(unexplained(found[0][1], understood.points))
+    costs = [unexplained(shapes, understood.points) for _, shapes in found]
+    best = int(np.argmin(costs))
+    if costs[0] <= DECISIVE * costs[best]:
+        best = 0
+    rival = min(cost for place, cost in enumerate(costs) if place != best)
+    evidence = f"True shapes read as {found[best][0]}: a camera explains the tracks but for {costs[best]:.1%}; next best {rival:.1%}."
+    return found[best][1], [evidence, *_far(costs[best])]
+
+
+def unexplained(shapes: NDArray[np.generic], points: NDArray[np.generic]) -> float:
+    """Share of the tracks' extent that no affine camera of each frame explains from the shapes; the median over some frames."""
+    chosen = np.unique(np.linspace(0, len(points) - 1, SAMPLE).round().astype(int))
+    shares = []
+    for frame in chosen:
+        true, seen = np.asarray(shapes[frame], np.float64), np.asarray(points[frame], np.float64)
+        usable = (np.abs(true) <= FARTHEST).all(axis=1) & (np.abs(seen) <= FARTHEST).all(axis=1)
+        if usable.sum() < 6:
+            continue
+        true, seen = true[usable] - true[usable].mean(axis=0), seen[usable] - seen[usable].mean(axis=0)
+        extent = np.linalg.norm(seen)
+        if extent > 0:
+            shares.append(np.linalg.norm(seen - true @ np.linalg.lstsq(true, seen, rcond=None)[0]) / extent)
+    return float(np.median(shares)) if shares else 0.0
+
+
+def _matrix_readings(
+    array: NDArray[np.generic], num_frames: int, heights: tuple[int, ...], width: int
+) -> Iterator[tuple[str, NDArray[np.generic]]]:
+    """Every `(F, k, N)` that a matrix of kF rows and N columns can be."""
+    for matrix in (array, array.T):
+        for height in heights:
+            if matrix.shape == (height * num_frames, width):
+                yield "interleaved", matrix.reshape(num_frames, height, width)
+                yield "stacked", matrix.reshape(height, num_frames, width).swapaxes(0, 1)
+
+
+def _askew(rotations: NDArray[np.generic]) -> float:
+    rows = np.asarray(rotations[:, :2], dtype=np.float64)
+    with np.errstate(over="ignore", invalid="ignore"):
+        deviation = np.abs(rows @ rows.transpose(0, 2, 1) - np.eye(2)).max(axis=(1, 2))
+    return float(np.median(deviation)) if np.isfinite(deviation).all() else float("inf")
+
+
+def _far(share: float) -> list[str]:
+    if share <= FAR:
+        return []
+    return [
+        f"No camera explains the tracks from the true shapes ({share:.0%} is left over): are both in the same order?"
+    ]
+
+
+def _truth_of(arrays: Arrays, understood: Understood) -> Truth | None:
+    name = next((name for name in TRUE_SHAPES if name in arrays), None)
+    if name is None:
+        return None
+    shapes, notes = as_shapes(arrays[name], understood)
+    turned = next((arrays[one] for one in TRUE_ROTATIONS if one in arrays), None)
+    rotations = None if turned is None else as_rotations(turned, len(understood.points))
+    return Truth(shapes, rotations, notes)

@@ -1,0 +1,34 @@
+"""Containers: recognise a file by its first bytes and get the named arrays out of it, in a child process unless it is plain NumPy."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from pathlib import Path
+
+from pliant.worker.formats.errors import refusal, too_large
+from pliant.worker.formats.reading.arrays import NPY_MAGIC, read_file
+from pliant.worker.formats.reading.parsers import recognise
+from pliant.worker.formats.reading.sandbox import parse_in_child
+from pliant.worker.formats.records import Arrays, Limits
+
+ZIP = (b"PK\x03\x04", b"PK\x05\x06")
+
+
+def read_arrays(path: Path, *, field: str, limits: Limits, wanted: Collection[str]) -> Arrays:
+    """Get the named arrays out of a file of any known container.
+
+    Raises
+    ------
+    InvalidInput
+        Codes unknown_format, empty_file, too_large, pickle_refused and those of the container's reader.
+    """
+    size = path.stat().st_size
+    if size > limits.max_bytes:
+        raise too_large(field, expected=f"a file of at most {limits.max_bytes} bytes", got=f"{size} bytes")
+    with path.open("rb") as file:
+        head = file.read(1024)
+    if not head:
+        raise refusal("empty_file", field, expected="a file with content", got="0 bytes", hint="Send the file again.")
+    if head.startswith((NPY_MAGIC, *ZIP)):
+        return read_file(path, field=field, limits=limits, wanted=wanted)
+    return parse_in_child(recognise(head, field), path, field=field, limits=limits)

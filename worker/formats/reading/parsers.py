@@ -1,0 +1,93 @@
+"""The parsers that run in a child process, by name, and how a file is recognised as theirs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from typing import IO
+
+from pliant.solver import InvalidInput
+from pliant.worker.formats.errors import refusal, too_large
+from pliant.worker.formats.reading.arrays import pickle_refusal
+from pliant.worker.formats.reading.csv import looks_like_csv
+from pliant.worker.formats.records import Arrays, Limits
+
+
+@dataclass(frozen=True, slots=True)
+class Parser:
+    """A parser by name: its libraries are loaded when they are needed, since a child that parses a PNG needs no SciPy."""
+
+    module: str
+    function: str
+
+    def load(self) -> Callable[..., Arrays]:
+        """Return the function; a contained child calls this before it gives up the right to open files."""
+        found: Callable[..., Arrays] = getattr(
+            import_module(f"pliant.worker.formats.reading.{self.module}"), self.function
+        )
+        return found
+
+    def __call__(self, stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
+        """Parse."""
+        return self.load()(stream, field=field, limits=limits)
+
+
+PARSERS = {
+    "matlab5": Parser("matlab", "read_matlab5"),
+    "matlab73": Parser("hdf5", "read_matlab73"),
+    "csv": Parser("csv", "read_csv"),
+    "obj": Parser("meshes", "read_obj"),
+    "ply": Parser("meshes", "read_ply"),
+    "glb": Parser("gltf", "read_glb"),
+    "gltf": Parser("gltf", "read_gltf"),
+    "png": Parser("mask", "read_png"),
+}
+MATLAB_5, HDF5 = b"MATLAB 5.0", b"\x89HDF\r\n\x1a\n"
+PICKLE = tuple(bytes([0x80, version]) for version in range(2, 6))
+
+
+def recognise(head: bytes, field: str) -> str:
+    """Name the parser for a file by its first kilobyte.
+
+    Raises
+    ------
+    InvalidInput
+        Codes unknown_format and pickle_refused.
+    """
+    if head.startswith(PICKLE):
+        raise pickle_refusal(field)
+    starts = {MATLAB_5: "matlab5", b"ply\n": "ply", b"ply\r": "ply", b"glTF": "glb", b"\x89PNG\r\n": "png"}
+    for start, name in starts.items():
+        if head.startswith(start):
+            return name
+    if head.startswith(HDF5) or head[512:].startswith(HDF5):
+        return "matlab73"
+    if _is_text(head):
+        if field == "mesh":
+            return "gltf" if head.lstrip().startswith(b"{") else "obj"
+        if looks_like_csv(head):
+            return "csv"
+    raise unknown_format(field, head)
+
+
+def parse(parser: Callable[..., Arrays], stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
+    """Run a parser; running out of memory is the file's fault, since the limits left enough for honest ones."""
+    try:
+        return parser(stream, field=field, limits=limits)
+    except MemoryError as error:
+        raise too_large(field, expected="a file that fits into memory", got="one that does not") from error
+
+
+def unknown_format(field: str, head: bytes) -> InvalidInput:
+    """Say that none of the readers knows the file."""
+    mesh = "npz, npy, OBJ, PLY, glTF, GLB or a PNG mask"
+    kinds = mesh if field == "mesh" else "npz, npy, MATLAB .mat or CSV with the columns frame, point, x, y"
+    return refusal(
+        "unknown_format", field, expected=f"{kinds}, recognised by content", got=f"a file that starts with {head[:16]!r}",
+        hint="Convert it, e.g. numpy.savez('tracks.npz', tracks=points, visibility=visible).",
+    )  # fmt: skip
+
+
+def _is_text(head: bytes) -> bool:
+    return b"\0" not in head and sum(byte < 9 or 13 < byte < 32 for byte in head) == 0

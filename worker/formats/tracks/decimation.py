@@ -1,0 +1,230 @@
+"""Fewer points, spread evenly, and the mesh between them: every n-th row and column of a grid, or clusters of a mesh's vertices.
+
+A mesh is thinned as a centroidal Voronoi diagram on its own edges (the idea of Valette and Chassery, Approximated centroidal Voronoi
+diagrams for uniform polygonal mesh coarsening, 2004): seeds spread over the picture; every vertex goes to the seed that is nearest along
+the edges; each seed moves to the middle of its cluster; and two clusters are neighbours where an edge of the mesh joins them, so the
+faces kept are the triangles of the mesh whose corners lie in three clusters. The points kept are seeds: tracks of the input, unchanged
+and in the input's order, never averages. Edge lengths are the greatest seen in the picture over the frames, which is the nearest that
+two dimensions come to a surface's own.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from pliant.schemas.options import Options
+from pliant.solver import Mesh
+from pliant.solver.records import MIN_POINTS
+from pliant.worker.formats.errors import refusal
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components, dijkstra
+
+ROUNDS = 4
+"""Moves of the seeds; the spread hardly changes after these."""
+
+FRAMES = 8
+"""Frames that lengths and places are measured in."""
+
+Indices = NDArray[np.intp]
+
+
+def thin(
+    points: NDArray[np.generic], visible: NDArray[np.float64] | None, mesh: Mesh | None, options: Options
+) -> tuple[Indices, Mesh | None, list[str]]:
+    """Choose points by the options `stride` and `max_points`.
+
+    Parameters
+    ----------
+    points : ndarray, shape (F, P, 2)
+        Of the chosen frames; NaN where not seen.
+    visible : ndarray, shape (F, P), optional
+        Confidence.
+    mesh : Mesh, optional
+        The mesh of all points; None: the points are a list, whose neighbours are not known yet.
+    options : Options
+        `stride` and `max_points`.
+
+    Returns
+    -------
+    kept : ndarray
+        Indices of the kept points, rising.
+    mesh : Mesh or None
+        The mesh of the kept points; None where none was given.
+    notes : list of str
+        What was done.
+
+    Raises
+    ------
+    InvalidInput
+        Code too_few_points, when a grid's stride leaves fewer than four.
+    """
+    count = points.shape[1]
+    limit = count if options.max_points is None else options.max_points
+    if options.stride == 1 and limit >= count:
+        return np.arange(count), mesh, []
+    if mesh is not None and mesh.grid is not None:
+        return _thin_grid(mesh.grid, options.stride, limit)
+    if mesh is None or len(mesh.faces) == 0:
+        kept = np.arange(0, count, options.stride)
+        how = f"every {options.stride}. of the list" if options.stride > 1 else "all"
+        if len(kept) > limit:
+            kept, how = (
+                kept[spread(*_places(points[:, kept], visible if visible is None else visible[:, kept]), limit)],
+                "spread evenly",
+            )
+        empty = None if mesh is None else Mesh.from_faces(np.zeros((0, 3), np.int32), len(kept))
+        return kept, empty, [f"{len(kept)} of {count} points are used: {how}."]
+    return _thin_mesh(points, visible, mesh, min(limit, math.ceil(count / options.stride)))
+
+
+def _thin_grid(grid: NDArray[np.int32], stride: int, limit: int) -> tuple[Indices, Mesh, list[str]]:
+    while stride < max(grid.shape) and int((grid[::stride, ::stride] >= 0).sum()) > limit:
+        stride += 1
+    coarse = grid[::stride, ::stride]
+    kept = np.sort(coarse[coarse >= 0])
+    if len(kept) < MIN_POINTS:
+        raise refusal(
+            "too_few_points", "options.stride", expected=f"a stride that leaves {MIN_POINTS} points or more",
+            got=f"{len(kept)} points at stride {stride}", hint="Use a smaller stride, or a larger max_points.",
+        )  # fmt: skip
+    numbers = np.full(int(grid.max()) + 1, -1)
+    numbers[kept] = np.arange(len(kept))
+    renumbered = np.where(coarse >= 0, numbers[np.maximum(coarse, 0)], -1)
+    note = f"{len(kept)} of {len(numbers)} points are used: every {stride}. row and column of the grid."
+    return kept.astype(np.intp), Mesh.from_grid(renumbered), [note]
+
+
+def _thin_mesh(
+    points: NDArray[np.generic], visible: NDArray[np.float64] | None, mesh: Mesh, limit: int
+) -> tuple[Indices, Mesh, list[str]]:
+    places, seen = _places(points, visible)
+    triangles = split_quads(mesh.faces)
+    graph = edge_lengths(places, seen, mesh.edges)
+    used = np.unique(mesh.faces).astype(np.intp)
+    parts = np.unique(connected_components(graph, directed=False)[1][used], return_inverse=True)[1]
+    seeds = used[spread(places[:, used], seen[:, used], limit, parts)]
+    cluster = _nearest(graph, seeds)
+    for _ in range(ROUNDS):
+        seeds = _middles(graph, mesh.edges, cluster, seeds, seen.mean(axis=0))
+        cluster = _nearest(graph, seeds)
+    order = np.argsort(seeds)
+    kept = seeds[order]
+    numbers = np.full(places.shape[1] + 1, -1)
+    numbers[kept] = np.arange(len(kept))
+    faces = numbers[np.where(cluster >= 0, seeds[np.maximum(cluster, 0)], -1)][triangles]
+    apart = (
+        (faces[:, 0] != faces[:, 1])
+        & (faces[:, 1] != faces[:, 2])
+        & (faces[:, 2] != faces[:, 0])
+        & (faces >= 0).all(axis=1)
+    )
+    _, first = np.unique(np.sort(faces[apart], axis=1), axis=0, return_index=True)
+    coarse = Mesh.from_faces(faces[apart][np.sort(first)].astype(np.int32), len(kept))
+    alone = len(kept) - len(np.unique(coarse.faces))
+    notes = [
+        f"{len(kept)} of {places.shape[1]} points are used, spread evenly over the mesh; "
+        f"{len(mesh.faces)} faces became {len(coarse.faces)}."
+    ]
+    if alone:
+        notes.append(f"{alone} of the points used belong to no face, so no smoothness in space reaches them.")
+    return kept, coarse, notes
+
+
+def spread(places: NDArray[np.float64], seen: NDArray[np.bool], limit: int, parts: Indices | None = None) -> Indices:
+    """Choose at most `limit` points evenly over the picture: cells as small as the number allows, one point of each part a cell.
+
+    Parameters
+    ----------
+    places : ndarray, shape (m, P, 2)
+        Places in some frames.
+    seen : ndarray of bool, shape (m, P)
+        Where the places mean something.
+    limit : int
+        Most points.
+    parts : ndarray, shape (P,), optional
+        Number of the connected part that each point belongs to; each is sampled by itself.
+    """
+    with np.errstate(invalid="ignore"):
+        weight = seen[..., None].astype(np.float64)
+        mean = (places * weight).sum(axis=0) / np.maximum(weight.sum(axis=0), 1)
+    if parts is not None and parts.max() + 1 > limit:
+        largest = np.argsort(np.bincount(parts), kind="stable")[::-1][:limit]
+        return np.array([np.flatnonzero(parts == part)[0] for part in np.sort(largest)])
+    low, extent = mean.min(axis=0), float(np.ptp(mean, axis=0).max()) or 1.0
+    finest, coarsest = extent / (4 * math.sqrt(len(mean)) + 4), 2 * extent
+    chosen = _one_a_cell(mean, low, finest, parts)
+    for _ in range(24) if len(chosen) > limit else ():
+        size = math.sqrt(finest * coarsest)
+        found = _one_a_cell(mean, low, size, parts)
+        if len(found) > limit:
+            finest = size
+        else:
+            coarsest, chosen = size, found
+    return chosen if len(chosen) <= limit else _one_a_cell(mean, low, coarsest, parts)[:limit]
+
+
+def _one_a_cell(mean: NDArray[np.float64], low: NDArray[np.float64], size: float, parts: Indices | None) -> Indices:
+    """Return, of each cell (and part) that holds points, the point nearest its middle."""
+    cell = np.floor((mean - low) / size)
+    away = np.linalg.norm((mean - low) / size - cell - 0.5, axis=1)
+    keys = np.column_stack([cell.astype(np.int64), np.zeros(len(cell), np.int64) if parts is None else parts])
+    order = np.argsort(away, kind="stable")
+    _, first = np.unique(keys[order], axis=0, return_index=True)
+    return np.sort(order[first])
+
+
+def edge_lengths(places: NDArray[np.float64], seen: NDArray[np.bool], edges: NDArray[np.int32]) -> csr_array:
+    """Return the mesh's edges as a graph, each as long as the greatest distance of its ends in a frame that shows both."""
+    one, two = edges[:, 0], edges[:, 1]
+    lengths = np.zeros(len(edges))
+    for frame, there in zip(places, seen, strict=True):
+        apart = np.where(there[one] & there[two], np.linalg.norm(frame[one] - frame[two], axis=1), 0.0)
+        lengths = np.maximum(lengths, apart)
+    known = lengths > 0
+    lengths[~known] = float(np.median(lengths[known])) if known.any() else 1.0
+    return csr_array((lengths, (one, two)), shape=(places.shape[1], places.shape[1]))
+
+
+def split_quads(faces: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Leave triangles as they are, cut quads along their first diagonal."""
+    return faces if faces.shape[1] == 3 else np.concatenate([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]])
+
+
+def _nearest(graph: csr_array, seeds: Indices) -> Indices:
+    """Return the number of the seed that is nearest along the edges, −1 where none can be reached."""
+    _, _, source = dijkstra(graph, directed=False, indices=seeds, min_only=True, return_predecessors=True)
+    number = np.full(graph.shape[0] + 1, -1, dtype=np.intp)
+    number[seeds] = np.arange(len(seeds))
+    return number[np.where(source < 0, graph.shape[0], source)]
+
+
+def _middles(
+    graph: csr_array, edges: NDArray[np.int32], cluster: Indices, seeds: Indices, shown: NDArray[np.float64]
+) -> Indices:
+    """Return, of each cluster, the vertex farthest from other clusters, those seen often preferred; the seed where there are none."""
+    border = np.unique(edges[cluster[edges[:, 0]] != cluster[edges[:, 1]]])
+    if len(border) == 0:
+        return seeds
+    depth = dijkstra(graph, directed=False, indices=border, min_only=True)
+    depth = np.where(np.isfinite(depth) & (cluster >= 0), depth * (0.1 + shown), -1.0)
+    depth[seeds] += 1e-12  # of equals, the seed stays
+    order = np.lexsort((depth, cluster))
+    last = np.flatnonzero(np.append(np.diff(cluster[order]) != 0, True))  # the deepest of each cluster comes last
+    moved = seeds.copy()
+    moved[cluster[order[last]][cluster[order[last]] >= 0]] = order[last][cluster[order[last]] >= 0]
+    return moved
+
+
+def _places(
+    points: NDArray[np.generic], visible: NDArray[np.float64] | None
+) -> tuple[NDArray[np.float64], NDArray[np.bool]]:
+    """Return places in some frames, evenly chosen, and where they mean something; 0 elsewhere."""
+    chosen = np.unique(np.linspace(0, len(points) - 1, FRAMES).round().astype(int))
+    places = np.array(points[chosen], dtype=np.float64)
+    seen: NDArray[np.bool] = np.asarray(np.isfinite(places).all(axis=2))
+    if visible is not None:
+        seen &= visible[chosen] > 0
+    places[~seen] = 0.0
+    return places, seen

@@ -1,0 +1,142 @@
+"""From named arrays to tracks: which array, which axis, what its numbers and its visibility mean, which way is up; each said in words."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pliant.schemas.options import Options
+from pliant.solver import InvalidInput
+from pliant.worker.formats.errors import refusal
+from pliant.worker.formats.records import Arrays
+from pliant.worker.formats.tracks.dense import flatten
+from pliant.worker.formats.tracks.layouts import Reading, choose
+from pliant.worker.formats.tracks.pixels import Placed, place, project
+from pliant.worker.formats.tracks.tracker_formats import INTRINSICS, PLAIN, TRUE_SHAPES, Dialect, recognise, short_names
+from pliant.worker.formats.tracks.visibility import find_visibility
+
+CENTRED = 0.05
+"""Coordinates count as centred on zero when at least this share of them is negative, in x and in y."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Understood:
+    """A track array, interpreted but not yet checked."""
+
+    points: NDArray[np.generic]
+    """Shape `(F, P, 2)`."""
+
+    visible: NDArray[np.float64] | None
+    """Shape `(F, P)`, or None: all that is finite."""
+
+    format: str
+    layout: str
+    coordinates: str
+    y_axis: str
+    grid: tuple[int, int] | None
+    """Rows and columns, where the points are all the pixels of a picture."""
+
+    notes: list[str]
+    arrays: Arrays
+    """All that the file held, for truth that came along."""
+
+
+def understand(arrays: Arrays, options: Options) -> Understood:
+    """Interpret the arrays of a tracks file.
+
+    Raises
+    ------
+    InvalidInput
+        Codes missing_array, missing_image_size, wrong_type, wrong_shape.
+    AmbiguousInput
+        Two readings fit.
+    """
+    named = short_names(arrays)
+    dialect, name = _recognised(named)
+    flat = flatten(name, _numeric(named[name], name), field="tracks")
+    array, depths, named = _two_numbers(flat.array, name, dialect, named)
+    reading, notes = choose(name, array, dialect=dialect, options=options, field="tracks")
+    found = find_visibility(named, reading, grid=flat.grid, kind=options.visibility)
+    visible, how = (None, []) if found is None else found
+    if depths is None:
+        picture = None if flat.grid is None else (flat.grid[1], flat.grid[0])
+        placed = place(reading.points, options, picture=picture)
+    else:
+        placed = _projected(depths, reading, named)
+    y_axis, why = ("down", []) if depths is not None and options.y_axis == "auto" else upwards(placed.points, options)
+    layout = reading.layout if flat.grid is None else f"{reading.layout}, P = {flat.grid[0]} × {flat.grid[1]} pixels"
+    whose = [] if dialect.name in PLAIN else [f"Recognised as the output of {dialect.name} by the names in the file."]
+    if dialect.note and options.coordinate_order == "auto":
+        whose.append(dialect.note)
+    return Understood(
+        points=placed.points, visible=visible, format=dialect.name, layout=layout, coordinates=placed.coordinates,
+        y_axis=y_axis, grid=flat.grid, notes=[*whose, *notes, *placed.notes, *how, *why], arrays=named,
+    )  # fmt: skip
+
+
+def upwards(points: NDArray[np.generic], options: Options) -> tuple[str, list[str]]:
+    """Which way y grows: as told, else down unless the coordinates are centred on zero, as no picture's are."""
+    if options.y_axis != "auto":
+        return options.y_axis, [f"y points {options.y_axis}, as asked."]
+    flat = points.reshape(-1, 2)[:: max(1, points.shape[0] * points.shape[1] // 100_000)]
+    finite = flat[np.isfinite(flat).all(axis=1)]
+    shares = (finite < 0).mean(axis=0) if len(finite) else np.zeros(2)
+    if (shares >= CENTRED).all():
+        return "up", [
+            f"y is taken to point up: {shares[1]:.0%} of its values are negative, so these are not pixels of a picture."
+        ]
+    return "down", ["y is taken to point down, as in pictures: coordinates are not centred on zero."]
+
+
+def _two_numbers(
+    array: NDArray[np.generic], name: str, dialect: Dialect, named: Arrays
+) -> tuple[NDArray[np.generic], NDArray[np.generic] | None, Arrays]:
+    """Split off a third number of each point: visibility joins the named arrays, a point in space is returned whole."""
+    if array.ndim != 3 or array.shape[-1] != 3 or 2 in array.shape[:2]:
+        return array, None, named
+    if dialect.third == "depth" or any(one in named for one in INTRINSICS):
+        return array[..., :2], array, named
+    third = array[..., 2].astype(np.float64)
+    inside = (third >= 0) & (third <= 1)
+    if dialect.third == "visibility" and bool(inside[np.isfinite(third)].all()):
+        return array[..., :2], None, {"visibility": third, **named}
+    raise refusal(
+        "unsupported_feature", "tracks", expected="two image coordinates for each point, or a third number from 0 to 1 as visibility",
+        got=f"{name} of shape {array.shape}",
+        hint="Save x and y as tracks (F, P, 2); for points in space before a camera, add intrinsics=[fx, fy, cx, cy].",
+    )  # fmt: skip
+
+
+def _projected(depths: NDArray[np.generic], reading: Reading, named: Arrays) -> Placed:
+    """Take the picture of points in space; where no truth came along, they are the truth."""
+    spatial = depths.transpose(1, 0, 2) if reading.order == "points_frames" else depths
+    intrinsics = next((named[one] for one in INTRINSICS if one in named), None)
+    points, kind, notes = project(spatial, intrinsics)
+    if not any(one in named for one in TRUE_SHAPES):
+        named["shapes"] = spatial
+    return Placed(points, kind, notes)
+
+
+def _recognised(named: Arrays) -> tuple[Dialect, str]:
+    found = recognise(named)
+    if found is None:
+        raise refusal(
+            "missing_array", "tracks", expected="an array named tracks (F, P, 2), or W (2F, P)",
+            got=", ".join(sorted(named)[:20]) or "no array of a known name",
+            hint="Save as numpy.savez('tracks.npz', tracks=points, visibility=visible).",
+        )  # fmt: skip
+    return found
+
+
+def _numeric(array: NDArray[np.generic], name: str) -> NDArray[np.generic]:
+    if array.dtype.kind not in "fiu":
+        raise wrong_numbers(f"tracks.{name}", array)
+    return array
+
+
+def wrong_numbers(field: str, array: NDArray[np.generic]) -> InvalidInput:
+    """Not an array of real numbers."""
+    return refusal(
+        "wrong_type", field, expected="real numbers", got=f"dtype {array.dtype}", hint="Convert the array to float."
+    )

@@ -1,0 +1,181 @@
+"""Which axis is what. Every reading that an array's shape allows is tried; documentation and smoothness in time decide.
+
+Tracks hardly move from one frame to the next, while the points of one frame lie all over the picture. So of two readings the right
+one has the smaller mean step in time, measured against the spread of the coordinates. In a matrix whose rows are taken for x and y
+in the wrong order, x and y of a reading are two neighbouring frames of one coordinate, so they are almost equal: that tells too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pliant.schemas.options import Options
+from pliant.solver.records import MIN_FRAMES, MIN_POINTS
+from pliant.worker.formats.errors import AmbiguousInput, refusal
+from pliant.worker.formats.records import FARTHEST
+from pliant.worker.formats.tracks.tracker_formats import Dialect
+
+CONTRADICTED = 5.0
+"""The documented order is doubted when another reading is this many times smoother in time."""
+
+DECISIVE = 1.3
+"""Without a documented order, the best reading must beat the next by this factor."""
+
+ALIKE = 0.98
+"""Correlation of x and y over the points, in the median frame, above which they are one coordinate taken twice."""
+
+SAMPLE = 96
+
+MANY_FRAMES = 10_000
+"""No video has more; a list of all pixels has, and its neighbours are closer to each other than one frame to the next."""
+
+OF_ANY_ORDER = ("matrix", "unnamed")
+"""Dialects whose arrays of three axes have no documented order."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reading:
+    """One way to see an array as tracks."""
+
+    layout: str
+    """In words, e.g. `W (2F, P), rows interleaved`."""
+
+    order: str
+    """Option `layout` that selects it."""
+
+    rows: str | None
+    """Option `rows` that selects it, for matrices."""
+
+    points: NDArray[np.generic]
+    """A view of shape `(F, P, 2)`."""
+
+    @property
+    def options(self) -> dict[str, str]:
+        """The options that select this reading."""
+        return {"layout": self.order} | ({} if self.rows is None else {"rows": self.rows})
+
+
+def readings(name: str, array: NDArray[np.generic]) -> list[Reading]:
+    """Every way to read an array as `(F, P, 2)`; those with fewer than 3 frames or 4 points only if there is no other."""
+    found: list[Reading] = []
+    if array.ndim == 3:
+        for axis in [axis for axis in (2, 1, 0) if array.shape[axis] == 2]:
+            moved = np.moveaxis(array, axis, 2)
+            letters = ["F", "P"]
+            for order, points in (("frames_points", moved), ("points_frames", moved.transpose(1, 0, 2))):
+                spelled = list(letters if order == "frames_points" else letters[::-1])
+                spelled.insert(axis, "2")
+                found.append(Reading(f"{name} ({', '.join(spelled)})", order, None, points))
+    if array.ndim == 2:
+        for order, matrix, spelled_matrix in (
+            ("frames_points", array, "(2F, P)"),
+            ("points_frames", array.T, "(P, 2F)"),
+        ):
+            if matrix.shape[0] % 2:
+                continue
+            pairs = matrix.reshape(matrix.shape[0] // 2, 2, matrix.shape[1]).transpose(0, 2, 1)
+            halves = matrix.reshape(2, matrix.shape[0] // 2, matrix.shape[1]).transpose(1, 2, 0)
+            word = "rows" if order == "frames_points" else "columns"
+            found.append(Reading(f"{name} {spelled_matrix}, {word} interleaved", order, "interleaved", pairs))
+            found.append(Reading(f"{name} {spelled_matrix}, {word} stacked", order, "stacked", halves))
+    fit = [one for one in found if one.points.shape[0] >= MIN_FRAMES and one.points.shape[1] >= MIN_POINTS]
+    return [one for one in fit if one.points.shape[0] <= MANY_FRAMES] or fit or found[:1]
+
+
+def roughness(points: NDArray[np.generic]) -> float:
+    """Mean step in time over the spread of the coordinates, of a sample; infinite if x and y are the same coordinate."""
+    count = points.shape[1]
+    chosen = np.unique(np.linspace(0, count - 1, SAMPLE).round().astype(int))
+    sample = np.asarray(points[: 4 * SAMPLE][:, chosen], dtype=np.float64)
+    sample = np.where(np.isfinite(sample) & (np.abs(sample) <= FARTHEST), sample, np.nan)
+    if np.isfinite(sample).all(axis=2).mean() < 0.01:
+        return float("inf")
+    with np.errstate(invalid="ignore", divide="ignore"):
+        spread = np.nanstd(sample, axis=(0, 1)).mean()
+        step = np.nanmean(np.abs(np.diff(sample, axis=0))) if np.isfinite(np.diff(sample, axis=0)).any() else np.inf
+        centred = sample - np.nanmean(sample, axis=(0, 1))
+        x, y = centred[..., 0], centred[..., 1]
+        usable = np.isfinite(x).sum(axis=1) >= MIN_POINTS
+        x, y = (
+            x[usable] - np.nanmean(x[usable], axis=1, keepdims=True),
+            y[usable] - np.nanmean(y[usable], axis=1, keepdims=True),
+        )
+        alike = np.nansum(x * y, axis=1) / np.sqrt(np.nansum(x * x, axis=1) * np.nansum(y * y, axis=1))
+    if len(alike) and np.isfinite(alike).any() and np.nanmedian(np.abs(alike)) > ALIKE:
+        return float("inf")
+    return float(step / spread) if spread > 0 else float("inf")
+
+
+def choose(
+    name: str, array: NDArray[np.generic], *, dialect: Dialect, options: Options, field: str
+) -> tuple[Reading, list[str]]:
+    """Pick the reading that was asked for, that is documented, or that the data show.
+
+    Parameters
+    ----------
+    name, array
+        As found in the file, batch axis removed.
+    dialect : Dialect
+        Its documented order is kept unless another is five times smoother in time.
+    options : Options
+        `layout` and `rows` overrule detection.
+
+    Returns
+    -------
+    reading : Reading
+    notes : list of str
+        The evidence.
+
+    Raises
+    ------
+    InvalidInput
+        Code wrong_shape when no reading fits.
+    AmbiguousInput
+        When several do.
+    """
+    allowed = [one for one in readings(name, array) if _asked_for(one, options)]
+    if not allowed:
+        raise refusal(
+            "wrong_shape", field, expected="(frames, points, 2) or a matrix of 2·frames rows, with 3 frames and 4 points or more",
+            got=f"{name} of shape {array.shape}", hint="Transpose or reshape the array; check the options layout and rows.",
+        )  # fmt: skip
+    if len(allowed) == 1:
+        return allowed[0], []
+    costs = {one.layout: roughness(one.points) for one in allowed}
+    ranked = sorted(allowed, key=lambda one: costs[one.layout])
+    order = None if array.ndim == 3 and dialect.name in OF_ANY_ORDER else dialect.order
+    documented = [one for one in ranked if order in (None, one.order) or options.layout != "auto"] or ranked
+    best, rivals = documented[0], documented[1:]
+    clear = all(costs[rival.layout] >= DECISIVE * costs[best.layout] for rival in rivals)
+    if clear and costs[best.layout] <= CONTRADICTED * costs[ranked[0].layout]:
+        return best, [_evidence(best, rivals[0], costs)] if rivals else []
+    choices: list[dict[str, Any]] = [
+        {"layout": one.layout, "options": one.options, "evidence": f"mean step in time: {_number(costs[one.layout])}"}
+        for one in ranked
+    ]
+    raise AmbiguousInput(
+        field=field, expected="tracks whose layout is certain", got=f"{name} of shape {array.shape}, which can be read as "
+        + " or ".join(one.layout for one in ranked), hint="Set the options layout and rows to the reading that is right.", choices=choices,
+    )  # fmt: skip
+
+
+def _asked_for(reading: Reading, options: Options) -> bool:
+    return options.layout in ("auto", reading.order) and (
+        reading.rows is None or options.rows in ("auto", reading.rows)
+    )
+
+
+def _evidence(best: Reading, rival: Reading, costs: dict[str, float]) -> str:
+    return (
+        f"Read as {best.layout}, where the mean step in time is {_number(costs[best.layout])}; "
+        f"as {rival.layout}: {_number(costs[rival.layout])}."
+    )
+
+
+def _number(cost: float) -> str:
+    return (
+        f"{cost:.3g} of the coordinates' spread" if np.isfinite(cost) else "x and y would be one coordinate taken twice"
+    )

@@ -1,0 +1,180 @@
+"""What two numbers mean: pixels, fractions of the picture, x before y or after it; and points before a camera as its picture shows them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pliant.schemas.options import Options
+from pliant.worker.formats.errors import AmbiguousInput, refusal
+from pliant.worker.formats.records import FARTHEST
+
+SAMPLE = 100_000
+SLACK = 0.02
+MOST = 0.9
+"""Fractions of a picture: this share of the points lies inside it, and none farther outside than the picture is large."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Placed:
+    """Points in one unit for x and y."""
+
+    points: NDArray[np.generic]
+    """Shape `(F, P, 2)`, x first."""
+
+    coordinates: str
+    """`pixels` (or a unit of their own), `unit` or `signed`: how they came."""
+
+    notes: list[str]
+
+
+def place(points: NDArray[np.generic], options: Options, *, picture: tuple[int, int] | None = None) -> Placed:
+    """Bring coordinates to pixels where they are fractions of the picture, and x before y.
+
+    Parameters
+    ----------
+    points : ndarray, shape (F, P, 2)
+        As in the file.
+    options : Options
+        `coordinates`, `image_size` and `coordinate_order`.
+    picture : tuple of int, optional
+        Width and height, where the points are all the pixels of a picture.
+
+    Raises
+    ------
+    InvalidInput
+        Code missing_image_size.
+    AmbiguousInput
+        Code ambiguous_coordinates: values from 0 to 1, which may be fractions of a picture or a unit of their own.
+    """
+    size = _size(options.image_size)
+    sample = _sampled(points)
+    points, sample, notes = _ordered(points, sample, options, size)
+    kind, why = _kind(sample, options, size or picture)
+    if kind == "pixels":
+        return Placed(points, kind, notes + why)
+    size = size or picture
+    if size is None:
+        raise refusal(
+            "missing_image_size", "options.image_size", expected="the picture's WIDTHxHEIGHT, since coordinates are fractions of it",
+            got="none", hint="Set it, e.g. image_size=640x480.",
+        )  # fmt: skip
+    last = np.array([size[0] - 1, size[1] - 1], dtype=np.float64)
+    wide = np.asarray(points, dtype=np.float64)
+    with np.errstate(over="ignore", invalid="ignore"):
+        placed = wide * last if kind == "unit" else (wide + 1.0) * (last / 2.0)
+    return Placed(placed, kind, [*notes, *why, f"Brought to pixels of a picture of {size[0]} × {size[1]}."])
+
+
+def project(
+    points: NDArray[np.generic], intrinsics: NDArray[np.generic] | None
+) -> tuple[NDArray[np.float64], str, list[str]]:
+    """Take the picture of points before a camera: x = fx X / Z + cx, y = fy Y / Z + cy; NaN for those not before it.
+
+    Parameters
+    ----------
+    points : ndarray, shape (..., 3)
+        X right, Y down, Z ahead of the camera.
+    intrinsics : ndarray, shape (4,) or (3, 3), optional
+        fx, fy, cx, cy in pixels.
+
+    Raises
+    ------
+    InvalidInput
+        Code missing_array or wrong_shape.
+    """
+    if intrinsics is None:
+        raise refusal(
+            "missing_array", "tracks.intrinsics", expected="fx, fy, cx, cy beside points in space", got="none",
+            hint="Save intrinsics=[fx, fy, cx, cy], or the image points as tracks (F, P, 2).",
+        )  # fmt: skip
+    matrix = np.asarray(intrinsics)
+    if matrix.shape == (3, 3):
+        matrix = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
+    if (
+        matrix.size != 4
+        or matrix.dtype.kind not in "fiu"
+        or not np.isfinite(matrix).all()
+        or (matrix.flat[:2] == 0).any()
+    ):
+        raise refusal(
+            "wrong_shape", "tracks.intrinsics", expected="four finite numbers fx, fy, cx, cy, or a 3 × 3 matrix",
+            got=f"{matrix.dtype} {matrix.shape}", hint="Save intrinsics=[fx, fy, cx, cy].",
+        )  # fmt: skip
+    fx, fy, cx, cy = (float(value) for value in matrix.reshape(-1))
+    wide = np.asarray(points, dtype=np.float64)
+    depth = np.where(wide[..., 2] > 0, wide[..., 2], np.nan)
+    with np.errstate(over="ignore", invalid="ignore"):
+        seen = np.stack([fx * wide[..., 0] / depth + cx, fy * wide[..., 1] / depth + cy], axis=-1)
+    note = f"Points in space, projected with fx = {fx:g}, fy = {fy:g}, cx = {cx:g}, cy = {cy:g}; the points themselves serve as truth."
+    return seen, "projected", [note]
+
+
+def _size(text: str | None) -> tuple[int, int] | None:
+    if text is None:
+        return None
+    width, _, height = text.partition("x")
+    return int(width), int(height)
+
+
+def _sampled(points: NDArray[np.generic]) -> NDArray[np.float64]:
+    flat = points.reshape(-1, 2)[:: max(1, points.shape[0] * points.shape[1] // SAMPLE)].astype(np.float64)
+    return flat[(np.abs(flat) <= FARTHEST).all(axis=1)]
+
+
+def _ordered(
+    points: NDArray[np.generic], sample: NDArray[np.float64], options: Options, size: tuple[int, int] | None
+) -> tuple[NDArray[np.generic], NDArray[np.float64], list[str]]:
+    turned, notes = options.coordinate_order == "yx", []
+    if turned:
+        notes = ["Coordinates read as y, x, as asked."]
+    elif options.coordinate_order == "auto" and size is not None and len(sample):
+        inside = [(sample <= np.array(limits)).all(axis=1).mean() for limits in (size, size[::-1])]
+        turned = bool(inside[0] < MOST and inside[1] >= 0.99)
+        if turned:
+            notes = [
+                f"Coordinates read as y, x: so {inside[1]:.0%} of them lie inside {size[0]} × {size[1]}, as x, y only {inside[0]:.0%}."
+            ]
+    return (points[..., ::-1], sample[:, ::-1], notes) if turned else (points, sample, notes)
+
+
+def _kind(sample: NDArray[np.float64], options: Options, size: tuple[int, int] | None) -> tuple[str, list[str]]:
+    if options.coordinates != "auto":
+        return options.coordinates, [f"Coordinates taken as {options.coordinates}, as asked."]
+    if not len(sample) or not (np.ptp(sample, axis=0) > 0).any():
+        return "pixels", []
+    low, high = sample.min(axis=0), sample.max(axis=0)
+    said = f"values from {low.min():.3g} to {high.max():.3g}"
+    if low.min() >= -1 and high.max() <= 2 and _inside(sample, 0.0, 1.0) >= MOST:
+        if size is None:
+            raise _fractions_or_not(said)
+        return "unit", [f"Coordinates are fractions of the picture: {said}."]
+    if (
+        size is not None
+        and min(size) > 4
+        and low.min() >= -3
+        and high.max() <= 3
+        and _inside(sample, -1.0, 1.0) >= MOST
+    ):
+        return "signed", [f"Coordinates run from −1 to 1 over the picture: {said}."]
+    return "pixels", []
+
+
+def _inside(sample: NDArray[np.float64], low: float, high: float) -> float:
+    return float(((sample >= low - SLACK) & (sample <= high + SLACK)).all(axis=1).mean())
+
+
+def _fractions_or_not(said: str) -> AmbiguousInput:
+    choices: list[dict[str, Any]] = [
+        {
+            "layout": "fractions of the picture's width and height", "options": {"coordinates": "unit"},
+            "evidence": f"{said}; give image_size=WIDTHxHEIGHT too",
+        },
+        {"layout": "one unit for x and y, taken as it is", "options": {"coordinates": "pixels"}, "evidence": said},
+    ]  # fmt: skip
+    return AmbiguousInput(
+        code="ambiguous_coordinates", field="tracks", expected="coordinates whose unit is certain", got=said,
+        hint="Give the option image_size=WIDTHxHEIGHT if they are fractions of the picture, else coordinates=pixels.", choices=choices,
+    )  # fmt: skip

@@ -1,0 +1,142 @@
+"""What trackers say about visibility: bool, probability, logits, occlusion instead of visibility, or two numbers to combine."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pliant.worker.formats.errors import AmbiguousInput, refusal
+from pliant.worker.formats.records import Arrays
+from pliant.worker.formats.tracks.dense import flatten_like
+from pliant.worker.formats.tracks.layouts import Reading
+from pliant.worker.formats.tracks.tracker_formats import HIDING, VISIBILITY
+
+SURE = 0.5
+"""A probability below this means hidden: trackers extrapolate there; above, it is kept as the weight."""
+
+TWO_MAPS = ("visconfs_e", "visconf_maps_e")
+"""AllTracker's names: the first channel is visibility, the second confidence."""
+
+
+def find_visibility(
+    named: Arrays, reading: Reading, *, grid: tuple[int, int] | None, kind: str
+) -> tuple[NDArray[np.float64], list[str]] | None:
+    """Confidence that each point is seen, in the order of the tracks.
+
+    Parameters
+    ----------
+    named : dict
+        The arrays of the tracks file.
+    reading : Reading
+        How the tracks were read; visibility goes the same way.
+    grid : tuple of int, optional
+        Rows and columns of the picture whose pixels the points are.
+    kind : str
+        The option `visibility`: auto, bool, probability or logits.
+
+    Returns
+    -------
+    tuple or None
+        Confidence in [0, 1], shape `(F, P)`, and the notes; None when the file says nothing.
+
+    Raises
+    ------
+    InvalidInput
+        Code wrong_shape or wrong_type.
+    AmbiguousInput
+        Code out_of_range: numbers above 1 that may be a mask or logits.
+    """
+    name = next((name for name in VISIBILITY if name in named and name != "expected_dist"), None)
+    if name is None:
+        return None
+    confidence, how = _confidence(name, named[name], grid, kind)
+    if name in HIDING:
+        confidence = 1.0 - confidence
+        how += ", turned from occlusion to visibility"
+        if "expected_dist" in named:
+            confidence = confidence * (1.0 - _confidence("expected_dist", named["expected_dist"], grid, "auto")[0])
+            how += ", times the certainty of the position (expected_dist)"
+    confidence = np.where(np.isfinite(confidence), confidence, 0.0)
+    unsure = (confidence > 0) & (confidence < SURE)
+    confidence[unsure] = 0.0
+    confidence = _arranged(confidence, reading, name)
+    note = f"Visibility from {name}: {how}" + (f"; below {SURE:g} counts as hidden." if unsure.any() else ".")
+    return confidence, [note]
+
+
+def _confidence(
+    name: str, array: NDArray[np.generic], grid: tuple[int, int] | None, kind: str
+) -> tuple[NDArray[np.float64], str]:
+    if array.dtype.kind == "b":
+        return np.array(flatten_like(array, grid), dtype=np.float64), "true or false"
+    if array.dtype.kind not in "fiu":
+        raise refusal(
+            "wrong_type", f"tracks.{name}", expected="bool or numbers", got=f"dtype {array.dtype}",
+            hint="Convert the array to bool.",
+        )  # fmt: skip
+    values = np.array(array, dtype=np.float64)
+    if name in TWO_MAPS and values.ndim >= 3 and values.shape[-1 if name == "visconfs_e" else -3] == 2:
+        axis = values.ndim - (1 if name == "visconfs_e" else 3)
+        one, two = (_meant(name, part, kind)[0] for part in np.moveaxis(values, axis, 0))
+        return flatten_like(one * two, grid), "visibility times confidence"  # type: ignore[return-value]
+    meant, how = _meant(name, values, kind)
+    return flatten_like(meant, grid), how  # type: ignore[return-value]
+
+
+def _meant(name: str, values: NDArray[np.float64], kind: str) -> tuple[NDArray[np.float64], str]:
+    """Numbers as probabilities, and in words what they were."""
+    finite = values[np.isfinite(values)]
+    low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
+    if kind == "auto":
+        kind = _guessed(name, finite, low, high)
+    if kind == "bool":
+        word = "0 or not 0" if high > 1 or low < 0 else "0 or 1"
+        return np.where(np.isfinite(values), (values != 0).astype(np.float64), 0.0), word
+    if kind == "logits":
+        with np.errstate(over="ignore"):
+            return 1.0 / (1.0 + np.exp(-values)), f"logits (values from {low:.3g} to {high:.3g})"
+    if low < 0 or high > 1:
+        raise refusal(
+            "out_of_range", f"tracks.{name}", expected="probabilities from 0 to 1", got=f"values from {low:.3g} to {high:.3g}",
+            hint="Set the option visibility to bool or logits.",
+        )  # fmt: skip
+    return values, "probabilities"
+
+
+def _guessed(name: str, finite: NDArray[np.float64], low: float, high: float) -> str:
+    if "logits" in name:
+        return "logits"
+    if low >= 0 and high >= 1 and (low == 0 or high == 1) and bool(np.isin(finite, (0.0, high)).all()):
+        return "bool"
+    if low >= 0 and high <= 1:
+        return "probability"
+    if low < 0:
+        return "logits"
+    choices: list[dict[str, Any]] = [
+        {"layout": f"{name}: not 0 is yes", "options": {"visibility": "bool"}},
+        {"layout": f"{name}: logits that are all positive", "options": {"visibility": "logits"}},
+    ]
+    raise AmbiguousInput(
+        code="out_of_range", field=f"tracks.{name}", expected="bool, probabilities from 0 to 1, or logits of both signs",
+        got=f"values from {low:.3g} to {high:.3g}", hint="Set the option visibility, or convert the array to bool.", choices=choices,
+    )  # fmt: skip
+
+
+def _arranged(flat: NDArray[np.float64], reading: Reading, name: str) -> NDArray[np.float64]:
+    like = reading.points.shape[:2]
+    if flat.ndim == 2 and reading.order == "points_frames":
+        flat = flat.T
+    if flat.shape == like:
+        return flat
+    if flat.shape == (2 * like[0], like[1]) and reading.rows is not None:  # one row for x and one for y, as in W
+        pairs = (
+            flat.reshape(like[0], 2, like[1])
+            if reading.rows == "interleaved"
+            else flat.reshape(2, like[0], like[1]).swapaxes(0, 1)
+        )
+        return np.ascontiguousarray(pairs.min(axis=1))
+    raise refusal(
+        "wrong_shape", f"tracks.{name}", expected=f"{like}, one value for each observation", got=str(flat.shape),
+        hint="Visibility is (frames, points), in the order of the tracks.",
+    )  # fmt: skip

@@ -1,0 +1,190 @@
+"""What can happen to a job: pure functions from record to record. Nobody else writes a status.
+
+::
+
+    queued ──claim──▶ running ──succeed──▶ succeeded
+      │ ▲               │ │ └──fail──────▶ failed
+      │ └───requeue─────┘ └─cancel─▶ cancelling ──stop──▶ cancelled
+      └──cancel──▶ cancelled
+
+A final status never changes: running a finished job again is a new job (`again`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from datetime import datetime, timedelta
+
+from pliant.schemas.job import Artifact, Problem, Progress, Status
+from pliant.worker.errors import NotAllowedNow, StaleAttempt
+from pliant.worker.records import Stored
+
+ACTIVE = (Status.RUNNING, Status.CANCELLING)
+FINAL = (Status.SUCCEEDED, Status.FAILED, Status.CANCELLED)
+
+
+def claim(stored: Stored, *, token: str, worker: str, now: datetime) -> Stored:
+    """Begin the job.
+
+    Raises
+    ------
+    StaleAttempt
+        The job is not queued under this token: a second delivery, or one that came too late.
+    """
+    if stored.token != token or stored.job.status is not Status.QUEUED:
+        raise StaleAttempt(stored.job.id)
+    job = stored.job.model_copy(
+        update={"status": Status.RUNNING, "started_at": now, "attempt": stored.job.attempt + 1, "progress": None}
+    )
+    return stored.model_copy(update={"job": job, "worker": worker})
+
+
+def report(stored: Stored, *, token: str, progress: Progress) -> Stored:
+    """Say how far the job is.
+
+    Raises
+    ------
+    StaleAttempt
+        The job belongs to another attempt, or is finished.
+    """
+    _check_owner(stored, token)
+    return stored.model_copy(update={"job": stored.job.model_copy(update={"progress": progress})})
+
+
+def succeed(
+    stored: Stored,
+    *,
+    token: str,
+    prefix: str,
+    artifacts: Sequence[Artifact],
+    metrics: Mapping[str, float],
+    outcome: str,
+    sentence: str,
+    warnings: Sequence[str],
+    now: datetime,
+    retention: float,
+) -> Stored:
+    """Publish the result. A job whose cancellation was asked for meanwhile ends cancelled, as its owner was told.
+
+    Raises
+    ------
+    StaleAttempt
+        The job belongs to another attempt, or is finished.
+    """
+    _check_owner(stored, token)
+    if stored.job.status is Status.CANCELLING:
+        return stop(stored, token=token, now=now, retention=retention)
+    update = {
+        "metrics": dict(metrics),
+        "outcome": outcome,
+        "sentence": sentence,
+        "warnings": list(warnings),
+        "artifacts": list(artifacts),
+    }
+    job = stored.job.model_copy(update=update)
+    size = stored.bytes + sum(each.bytes for each in artifacts)
+    published = stored.model_copy(update={"job": job, "prefix": prefix, "bytes": size})
+    return _finish(published, Status.SUCCEEDED, now=now, retention=retention)
+
+
+def fail(stored: Stored, *, token: str, problem: Problem, now: datetime, retention: float) -> Stored:
+    """Record why the attempt failed; a job that was being cancelled ends cancelled.
+
+    Raises
+    ------
+    StaleAttempt
+        The job belongs to another attempt, or is finished.
+    """
+    _check_owner(stored, token)
+    if stored.job.status is Status.CANCELLING:
+        return stop(stored, token=token, now=now, retention=retention)
+    job = stored.job.model_copy(update={"error": problem})
+    return _finish(stored.model_copy(update={"job": job}), Status.FAILED, now=now, retention=retention)
+
+
+def stop(stored: Stored, *, token: str, now: datetime, retention: float) -> Stored:
+    """End the attempt because it was told to.
+
+    Raises
+    ------
+    StaleAttempt
+        The job belongs to another attempt, is finished, or nobody asked for its end.
+    """
+    _check_owner(stored, token)
+    if stored.job.status is not Status.CANCELLING:
+        raise StaleAttempt(stored.job.id)
+    return _finish(stored, Status.CANCELLED, now=now, retention=retention)
+
+
+def cancel(stored: Stored, *, now: datetime, retention: float) -> Stored:
+    """Give the job up: a queued one ends at once, a running one is told to stop. Repeating it is no error.
+
+    Raises
+    ------
+    NotAllowedNow
+        The job has succeeded or failed.
+    """
+    status = stored.job.status
+    if status is Status.QUEUED:
+        return _finish(stored, Status.CANCELLED, now=now, retention=retention)
+    if status is Status.RUNNING:
+        return stored.model_copy(update={"job": stored.job.model_copy(update={"status": Status.CANCELLING})})
+    if status in (Status.CANCELLING, Status.CANCELLED):
+        return stored
+    raise NotAllowedNow(
+        stored.job.id, status, wanted="cancelled", hint="It is finished; delete it if it is not wanted."
+    )
+
+
+def requeue(
+    stored: Stored,
+    *,
+    token: str,
+    fresh: str,
+    problem: Problem,
+    now: datetime,
+    max_attempts: int | None,
+    retention: float,
+) -> Stored:
+    """Put a job back that lost its worker; after `max_attempts` (None: never) it fails with `problem`.
+
+    Parameters
+    ----------
+    token, fresh : str
+        The attempt that was lost, and the one that may write from now on.
+
+    Raises
+    ------
+    StaleAttempt
+        The job belongs to another attempt, or is finished.
+    """
+    _check_owner(stored, token)
+    spent = max_attempts is not None and stored.job.attempt >= max_attempts
+    if spent or stored.job.status is Status.CANCELLING:
+        return fail(stored, token=token, problem=problem, now=now, retention=retention)
+    job = stored.job.model_copy(update={"status": Status.QUEUED, "started_at": None, "progress": None})
+    return stored.model_copy(update={"job": job, "token": fresh, "worker": None})
+
+
+def redeliver(stored: Stored, *, token: str, fresh: str) -> Stored:
+    """Give a queued job that the queue has forgotten a new token, so that only the new delivery counts.
+
+    Raises
+    ------
+    StaleAttempt
+        The job is no longer queued under that token.
+    """
+    if stored.token != token or stored.job.status is not Status.QUEUED:
+        raise StaleAttempt(stored.job.id)
+    return stored.model_copy(update={"token": fresh})
+
+
+def _check_owner(stored: Stored, token: str) -> None:
+    if stored.token != token or stored.job.status not in ACTIVE:
+        raise StaleAttempt(stored.job.id)
+
+
+def _finish(stored: Stored, status: Status, *, now: datetime, retention: float) -> Stored:
+    expires = now + timedelta(seconds=retention) if retention > 0 else None
+    job = stored.job.model_copy(update={"status": status, "finished_at": now, "expires_at": expires})
+    return stored.model_copy(update={"job": job})

@@ -1,0 +1,115 @@
+"""The audit: compares everything that is stored with what the records say ought to be, and says what does not fit.
+
+A sound installation at rest gives no findings. While jobs come and go, a finding may be a change caught half-way:
+look twice before believing it (`findings` does, by `settle`).
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Iterator
+
+from pliant.schemas.job import Status
+from pliant.worker.errors import UnknownJob
+from pliant.worker.jobs.lifecycle import ACTIVE
+from pliant.worker.jobs.service import Jobs
+from pliant.worker.records import Stored
+from pliant.worker.uploads.service import Uploads
+
+
+def findings(jobs: Jobs, *, settle: float = 5.0) -> list[str]:
+    """Return a sentence for everything that does not fit, twice `settle` seconds apart.
+
+    Raises
+    ------
+    StoreUnavailable
+        The job or blob store does not answer.
+    """
+    first = set(_look(jobs))
+    if not first:
+        return []
+    time.sleep(settle)
+    return sorted(first & set(_look(jobs)))
+
+
+def _look(jobs: Jobs) -> Iterator[str]:
+    records = list(_all(jobs))
+    sizes = jobs.blobs.sizes("jobs/")
+    for stored in records:
+        yield from _of_record(stored, sizes)
+    yield from _of_files(jobs, records, sizes)
+    yield from _of_queue(jobs, records)
+    yield from Uploads.open(jobs.settings).findings(jobs.clock())
+    used, counted = jobs.records.used(), sum(stored.bytes for stored in records)
+    if used != counted:
+        yield f"The jobs hold {counted:,} bytes, but {used:,} are on the books."
+
+
+def _all(jobs: Jobs) -> Iterator[Stored]:
+    for status in Status:
+        for id in jobs.records.ids(status):
+            try:
+                stored = jobs.records.get(id)
+            except UnknownJob:
+                continue
+            yield stored
+
+
+def _of_record(stored: Stored, sizes: dict[str, int]) -> Iterator[str]:
+    job = stored.job
+    if stored.inputs not in sizes:
+        yield f"Job {job.id} ({job.status.value}) has lost its inputs."
+    for artifact in job.artifacts:
+        held = sizes.get(f"{stored.prefix}{artifact.name}")
+        if held != artifact.bytes:
+            yield f"Job {job.id}: {artifact.name} should have {artifact.bytes:,} bytes and has {held}."
+    if job.status.final is not (job.finished_at is not None):
+        yield f"Job {job.id} is {job.status.value} and its time of finishing is {job.finished_at}."
+    if (job.status is Status.FAILED) is not (job.error is not None):
+        yield f"Job {job.id} is {job.status.value} and its error is {job.error}."
+    if (job.status is Status.SUCCEEDED) is not (stored.prefix is not None):
+        yield f"Job {job.id} is {job.status.value} and its results lie under {stored.prefix}."
+
+
+def _of_files(jobs: Jobs, records: list[Stored], sizes: dict[str, int]) -> Iterator[str]:
+    ours = {stored.job.id: stored for stored in records}
+    for key in sizes:
+        held = ours.get(key.split("/")[1])
+        if held is None:
+            yield f"File {key} belongs to no job."
+        elif key != held.inputs and not _counts(held, key):
+            yield f"File {key} belongs to no attempt of its job that counts."
+    tokens = {stored.token for stored in records if stored.job.status in ACTIVE}
+    work = jobs.settings.work
+    for directory in work.iterdir() if work.exists() else ():
+        if directory.name not in tokens:
+            yield f"Directory {directory} belongs to no running attempt."
+
+
+def _counts(held: Stored, key: str) -> bool:
+    if held.prefix is not None:
+        return key.startswith(held.prefix)
+    return held.job.status in ACTIVE and key.startswith(f"jobs/{held.job.id}/{held.token}/")
+
+
+def _held_back(jobs: Jobs, records: list[Stored], waiting: set[str]) -> set[str]:
+    """Return the queued jobs whose owner has as many running or about to run as may."""
+    taken = Counter(stored.owner for stored in records if stored.job.status in ACTIVE or stored.token in waiting)
+    usual = jobs.settings.max_running
+    most = {each.job.id: usual if each.max_running is None else each.max_running for each in records}
+    return {each.job.id for each in records if 0 < most[each.job.id] <= taken[each.owner]}
+
+
+def _of_queue(jobs: Jobs, records: list[Stored]) -> Iterator[str]:
+    waiting = Counter(jobs.queue.waiting())
+    queued = {stored.token: stored.job.id for stored in records if stored.job.status is Status.QUEUED}
+    for token, times in waiting.items():
+        if token not in queued:
+            yield f"The queue holds {token}, which no queued job owns."
+        elif times > 1:
+            yield f"The queue holds {token} {times} times."
+    held = _held_back(jobs, records, set(waiting))
+    for token, id in queued.items():
+        if token not in waiting and id not in held:
+            yield f"Job {id} is queued, but the queue does not hold it."

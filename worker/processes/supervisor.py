@@ -1,0 +1,187 @@
+"""The supervisor: starts processes, restarts those that end, stops them all on SIGTERM or Ctrl-C.
+
+It knows nothing of Redis or HTTP, only of commands, so nothing that hangs can hang it.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from types import FrameType
+
+from pliant.worker.processes.containment import die_with_parent
+from pliant.worker.processes.valkey import Valkey
+from pliant.worker.settings import NUMERICAL_THREADS, Settings
+
+logger = logging.getLogger(__name__)
+
+FIRST_PAUSE, LONGEST_PAUSE = 0.2, 15.0
+"""Seconds before a process that ended is started again; doubled each time it ends young."""
+
+GROWN_UP = 20.0
+"""Seconds after which a process counts as having started well."""
+
+POLL = 0.05
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Child:
+    """A process to keep running."""
+
+    name: str
+    argv: list[str]
+    env: Mapping[str, str] = field(default_factory=dict)
+    """Added to the supervisor's own environment."""
+
+    descriptors: tuple[int, ...] = ()
+    """File descriptors it inherits."""
+
+    ready: Callable[[subprocess.Popen[bytes]], None] | None = None
+    """Returns once the process serves; waited for at the start, before the next one is started."""
+
+    foundation: bool = False
+    """Stopped only after all the others, which stand on it."""
+
+    grace: float = 10.0
+    """Seconds between SIGTERM and SIGKILL."""
+
+
+@dataclass(slots=True)
+class _Running:
+    child: Child
+    process: subprocess.Popen[bytes] | None = None
+    began: float = 0.0
+    pause: float = FIRST_PAUSE
+    restart_at: float = 0.0
+
+
+class _ToldToStop(BaseException):
+    """A signal came while the children were being started."""
+
+
+class Supervisor:
+    """Keeps children running until it is told to stop. Use it from the main thread: its children die with that thread."""
+
+    def __init__(self, children: list[Child]) -> None:
+        self._running = [_Running(child) for child in children]
+        self._starting = False
+        self._stopping = False
+        self._hurry = False
+
+    def start(self) -> None:
+        """Start all children, in order, waiting for each one's `ready`; if one fails, stop the others and raise."""
+        try:
+            for each in self._running:
+                self._launch(each)
+                if each.child.ready is not None and each.process is not None:
+                    each.child.ready(each.process)
+        except BaseException:
+            self.stop()
+            raise
+
+    def run(self, *, on_started: Callable[[], None] | None = None) -> None:
+        """Start the children and keep them running until SIGTERM or Ctrl-C; then stop them. A second signal stops waiting.
+
+        Parameters
+        ----------
+        on_started : callable, optional
+            Called once every child has started.
+        """
+        handlers = {number: signal.signal(number, self._told) for number in (signal.SIGTERM, signal.SIGINT)}
+        try:
+            self._starting = True
+            self.start()
+            self._starting = False
+            if on_started is not None:
+                on_started()
+            while not self._stopping:
+                self.look()
+                time.sleep(POLL)
+            self.stop()
+        except _ToldToStop:
+            logger.info("stopped while starting")
+        finally:
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
+
+    def look(self) -> None:
+        """Start again what has ended, after a pause that grows while it keeps ending young."""
+        now = time.monotonic()
+        for each in self._running:
+            if each.process is None:
+                if now >= each.restart_at:
+                    self._launch(each)
+            elif (code := each.process.poll()) is not None:
+                each.pause = FIRST_PAUSE if now - each.began > GROWN_UP else min(2 * each.pause, LONGEST_PAUSE)
+                each.process, each.restart_at = None, now + each.pause
+                logger.warning("%s ended with code %s; starting it again in %.1f s", each.child.name, code, each.pause)
+
+    def stop(self) -> None:
+        """Stop the children, those that others stand on last; each is killed when its grace is over."""
+        for foundation in (False, True):
+            group = [each for each in self._running if each.child.foundation is foundation and each.process is not None]
+            for each in reversed(group):
+                _signal(each, signal.SIGTERM)
+            began = time.monotonic()
+            while alive := [each for each in group if each.process is not None and each.process.poll() is None]:
+                for each in alive:
+                    if time.monotonic() > began + each.child.grace or (self._hurry and not foundation):
+                        logger.warning("%s does not stop; killing it", each.child.name)
+                        _signal(each, signal.SIGKILL)
+                time.sleep(POLL)
+            for each in group:
+                each.process = None
+
+    def pids(self) -> dict[str, int]:
+        """Return the process id of every running child, by name."""
+        return {each.child.name: each.process.pid for each in self._running if each.process is not None}
+
+    def _told(self, signum: int, frame: FrameType | None) -> None:  # noqa: ARG002
+        self._hurry = self._stopping
+        self._stopping = True
+        if self._starting:
+            self._starting = False
+            raise _ToldToStop
+
+    def _launch(self, each: _Running) -> None:
+        child, parent = each.child, os.getpid()
+        each.process = subprocess.Popen(  # noqa: S603
+            child.argv,
+            env={**os.environ, **child.env},
+            pass_fds=child.descriptors,
+            stdin=subprocess.DEVNULL,
+            start_new_session=True,  # Ctrl-C reaches us alone; we stop them in order
+            preexec_fn=lambda: die_with_parent(parent, how=signal.SIGTERM),
+        )
+        each.began = time.monotonic()
+
+
+def valkey_child(valkey: Valkey) -> Child:
+    """Return the embedded Valkey of a claimed data directory as a child."""
+    return Child(
+        name="valkey", argv=valkey.argv, descriptors=(valkey.lock,), ready=valkey.wait, foundation=True, grace=15.0
+    )
+
+
+def worker_children(settings: Settings) -> list[Child]:
+    """Return the workers and the keeper as children."""
+    threads = dict.fromkeys(NUMERICAL_THREADS, "1")
+    env = {**settings.to_environment(), **threads}
+    command = [sys.executable, "-m", "pliant.worker"]
+    grace = settings.stop_grace + 5
+    workers = [
+        Child(name=f"worker-{number + 1}", argv=[*command, "work"], env=env, grace=grace)
+        for number in range(settings.workers)
+    ]
+    return [*workers, Child(name="keeper", argv=[*command, "keep"], env=env)]
+
+
+def _signal(each: _Running, number: signal.Signals) -> None:
+    if each.process is not None and each.process.poll() is None:
+        each.process.send_signal(number)

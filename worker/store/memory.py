@@ -1,0 +1,232 @@
+"""The doubles of record store and queue, in memory: for tests and for reading. The same suite runs on them as on Redis."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from datetime import datetime
+
+from pliant.schemas.job import Status
+from pliant.worker.errors import TooManyQueued, UnknownJob
+from pliant.worker.records import LOG_KEPT, Beat, Event, Records, Stored, counted, event_of, events_kept
+from pliant.worker.store.queue import Queue
+
+
+class MemoryRecords(Records):
+    """Records of one process, safe among its threads."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._records: dict[str, Stored] = {}
+        self._keys: dict[str, str] = {}
+        self._beats: dict[str, int] = {}
+        self._events: dict[str, list[Event]] = {}
+        self._logs: dict[str, list[str]] = {}
+        self._tallies: Counter[str] = Counter()
+        self._clock = 0
+
+    def create(self, stored: Stored, *, max_queued: int = 0) -> Stored:
+        """See `Records.create`."""
+        id = stored.job.id
+        with self._changed:
+            taken = self._keys.get(stored.key) if stored.key is not None else None
+            if taken is not None:
+                return self._records[taken]
+            if id in self._records:
+                return self._records[id]
+            if 0 < max_queued <= self.count([Status.QUEUED], owner=stored.owner):
+                raise TooManyQueued(max_queued)
+            if stored.key is not None:
+                self._keys[stored.key] = id
+            self._records[id] = stored
+            self._beats[id] = 0
+            self._tell(None, stored)
+            return stored
+
+    def get(self, id: str) -> Stored:
+        """See `Records.get`."""
+        with self._changed:
+            if id not in self._records:
+                raise UnknownJob(id)
+            return self._records[id]
+
+    def find(self, key: str) -> Stored | None:
+        """See `Records.find`."""
+        with self._changed:
+            id = self._keys.get(key)
+            return None if id is None else self._records[id]
+
+    def replace(self, before: Stored, after: Stored) -> bool:
+        """See `Records.replace`."""
+        id = before.job.id
+        with self._changed:
+            held = self._records.get(id)
+            if held is None or held.version != before.version:
+                return False
+            self._records[id] = after
+            self._tallies.update(counted(before, after))
+            self._tell(before, after)
+            return True
+
+    def delete(self, id: str) -> None:
+        """See `Records.delete`."""
+        with self._changed:
+            gone = self._records.pop(id, None)
+            if gone is not None and gone.key is not None:
+                self._keys.pop(gone.key, None)
+            for kept in (self._beats, self._events, self._logs):
+                kept.pop(id, None)
+            self._changed.notify_all()
+
+    def page(
+        self, *, cursor: str | None, limit: int, statuses: Sequence[Status], owner: str | None
+    ) -> tuple[list[Stored], str | None]:
+        """See `Records.page`."""
+        with self._changed:
+            fitting = [
+                each
+                for each in self._records.values()
+                if each.job.status in statuses
+                and (owner is None or each.owner == owner)
+                and (cursor is None or each.sort_key < cursor)
+            ]
+        fitting.sort(key=lambda each: each.sort_key, reverse=True)
+        page = fitting[:limit]
+        return page, page[-1].sort_key if len(fitting) > limit else None
+
+    def ids(self, status: Status) -> list[str]:
+        """See `Records.ids`."""
+        with self._changed:
+            fitting = sorted(each.sort_key for each in self._records.values() if each.job.status is status)
+        return [key.split(":", 1)[1] for key in fitting]
+
+    def count(self, statuses: Sequence[Status], *, owner: str | None = None) -> int:
+        """See `Records.count`."""
+        with self._changed:
+            return sum(
+                each.job.status in statuses and (owner is None or each.owner == owner)
+                for each in self._records.values()
+            )
+
+    def oldest(self, status: Status) -> datetime | None:
+        """See `Records.oldest`."""
+        with self._changed:
+            return min(
+                (each.job.created_at for each in self._records.values() if each.job.status is status), default=None
+            )
+
+    def tallies(self) -> dict[str, float]:
+        """See `Records.tallies`."""
+        with self._changed:
+            return dict(self._tallies)
+
+    def used(self) -> int:
+        """See `Records.used`."""
+        with self._changed:
+            return sum(each.bytes for each in self._records.values())
+
+    def beat(self, id: str, token: str) -> Status | None:
+        """See `Records.beat`."""
+        with self._changed:
+            status = self.look(id, token)
+            if status is not None:
+                self._beats[id] += 1
+            return status
+
+    def look(self, id: str, token: str) -> Status | None:
+        """See `Records.look`."""
+        with self._changed:
+            held = self._records.get(id)
+            return held.job.status if held is not None and held.token == token else None
+
+    def beats(self, ids: Iterable[str]) -> dict[str, Beat]:
+        """See `Records.beats`."""
+        with self._changed:
+            held = {id: self._records[id] for id in ids if id in self._records}
+            return {id: Beat(each.token, self._beats[id], each.owner, each.max_running) for id, each in held.items()}
+
+    def events(self, id: str, *, after: str | None, timeout: float) -> list[Event]:
+        """See `Records.events`."""
+        deadline = time.monotonic() + timeout
+        with self._changed:
+            while True:
+                fresh = [each for each in self._events.get(id, []) if after is None or _later(each.id, after)]
+                left = deadline - time.monotonic()
+                if fresh or left <= 0 or id not in self._records:
+                    return fresh
+                self._changed.wait(left)
+
+    def append_log(self, id: str, lines: Sequence[str]) -> None:
+        """See `Records.append_log`."""
+        with self._changed:
+            if id in self._records:
+                self._logs[id] = [*self._logs.get(id, []), *lines][-LOG_KEPT:]
+
+    def log(self, id: str) -> list[str]:
+        """See `Records.log`."""
+        with self._changed:
+            return list(self._logs.get(id, []))
+
+    def ping(self) -> None:
+        """See `Records.ping`."""
+
+    def _tell(self, before: Stored | None, after: Stored) -> None:
+        self._clock += 1
+        name, data = event_of(before, after)
+        events = self._events.setdefault(after.job.id, [])
+        events.append(Event(f"{self._clock}-0", name, data))
+        del events[: -events_kept(after)]
+        self._changed.notify_all()
+
+
+def _later(one: str, other: str) -> bool:
+    first, second = (tuple(int(part) for part in each.split("-")) for each in (one, other))
+    return first > second
+
+
+class MemoryQueue(Queue):
+    """A queue of one process."""
+
+    def __init__(self) -> None:
+        self._tokens: list[str] = []
+        self._held: set[str] = set()
+
+    def push(self, id: str, token: str, *, front: bool = False) -> None:  # noqa: ARG002
+        """See `Queue.push`."""
+        if token not in self._tokens:
+            self._tokens.insert(0 if front else len(self._tokens), token)
+
+    def remove(self, token: str) -> None:
+        """See `Queue.remove`."""
+        self.let_go(token)
+        if token in self._tokens:
+            self._tokens.remove(token)
+
+    def hold(self, token: str) -> None:
+        """See `Queue.hold`."""
+        self._held.add(token)
+
+    def held(self) -> set[str]:
+        """See `Queue.held`."""
+        return set(self._held)
+
+    def let_go(self, token: str) -> None:
+        """See `Queue.let_go`."""
+        self._held.discard(token)
+
+    def waiting(self) -> list[str]:
+        """See `Queue.waiting`."""
+        return list(self._tokens)
+
+    def place(self, token: str) -> int | None:
+        """See `Queue.place`."""
+        return self._tokens.index(token) if token in self._tokens else None
+
+    def tidy(self) -> None:
+        """See `Queue.tidy`."""
+
+    def workers(self) -> list[str]:
+        """See `Queue.workers`."""
+        return ["memory"]

@@ -1,0 +1,76 @@
+"""The outbox: jobs whose end is still to be told by webhook. An entry is written together with the job's final status, in one step.
+
+So a message is owed exactly when the job has ended, whatever is killed in between; it is sent at least once, and the receiver
+knows a repetition by its `webhook-id`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import redis
+from pliant.worker.store.connection import reachable
+
+# ARGV: 1 prefix, 2 now, 3 until when nobody else takes it. Answers id and how often it was tried, this time among them.
+_TAKE = """
+local at = ARGV[1]
+local due = redis.call('ZRANGEBYSCORE', at .. 'outbox', '-inf', ARGV[2], 'LIMIT', 0, 1)
+if not due[1] then return false end
+redis.call('ZADD', at .. 'outbox', ARGV[3], due[1])
+redis.call('HINCRBY', at .. 'tally', 'webhooks:tried', 1)
+return {due[1], redis.call('HINCRBY', at .. 'outbox:tries', due[1], 1)}
+"""
+
+# ARGV: 1 prefix, 2 id, 3 name of the tally
+_CLOSE = """
+if redis.call('ZREM', ARGV[1] .. 'outbox', ARGV[2]) == 0 then return 0 end
+redis.call('HDEL', ARGV[1] .. 'outbox:tries', ARGV[2])
+redis.call('HINCRBY', ARGV[1] .. 'tally', ARGV[3], 1)
+return 1
+"""
+
+
+class Outbox:
+    """The messages that are owed. All times in milliseconds since 1970; every method may raise `StoreUnavailable`."""
+
+    def __init__(self, client: redis.Redis, *, prefix: str) -> None:
+        self._redis: Any = client
+        self._at = f"{prefix}:"
+        self._take = client.register_script(_TAKE)
+        self._close = client.register_script(_CLOSE)
+
+    def take(self, *, now: int, until: int) -> tuple[str, int] | None:
+        """Take the message that has been due longest, so that nobody else takes it before `until`.
+
+        Returns
+        -------
+        id : str
+            The job.
+        tries : int
+            How often it was taken, this time among them.
+        """
+        with reachable():
+            found = self._take(args=[self._at, now, until])
+        return None if found is None else (str(found[0]), int(found[1]))
+
+    def delivered(self, id: str) -> None:
+        """Forget a message that has arrived."""
+        self._closed(id, "webhooks:delivered")
+
+    def given_up(self, id: str) -> None:
+        """Forget a message that will never arrive."""
+        self._closed(id, "webhooks:given_up")
+
+    def later(self, id: str, *, due: int) -> None:
+        """Try a message again, then; nothing happens if its job is gone."""
+        with reachable():
+            self._redis.zadd(f"{self._at}outbox", {id: due}, xx=True)
+
+    def owed(self) -> int:
+        """Return how many messages there are."""
+        with reachable():
+            return int(self._redis.zcard(f"{self._at}outbox"))
+
+    def _closed(self, id: str, tally: str) -> None:
+        with reachable():
+            self._close(args=[self._at, id, tally])

@@ -1,0 +1,151 @@
+"""The queue: RQ carries an attempt's token from the one who submits to the one who works; it knows nothing else."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any
+
+import redis
+from pliant.worker.store.connection import reachable
+from rq import Queue as RqQueue
+from rq import worker_registration
+from rq.exceptions import InvalidJobOperation, NoSuchJobError
+from rq.job import Job as RqJob
+from rq.registry import clean_registries
+from rq.serializers import JSONSerializer
+
+FUNCTION = "pliant.worker.execution.attempt.run"
+"""The only function a delivery may name."""
+
+FAILURE_KEPT = 60
+"""Seconds RQ keeps its own note of a delivery that died; ours is the job record."""
+
+
+def alive_key(queue: str, worker: str) -> str:
+    """Return the key that lives only as long as its worker does (RQ's own entry outlives a killed worker by minutes)."""
+    return f"{queue}:worker:{worker}"
+
+
+class Queue(ABC):
+    """Who is next."""
+
+    @abstractmethod
+    def push(self, id: str, token: str, *, front: bool = False) -> None:
+        """Put an attempt at the end, or before all the others; nothing happens if it waits already."""
+
+    @abstractmethod
+    def remove(self, token: str) -> None:
+        """Take an attempt out, whether it waits or is held back."""
+
+    @abstractmethod
+    def hold(self, token: str) -> None:
+        """Note that an attempt is kept out on purpose, until fewer of its owner's jobs run."""
+
+    @abstractmethod
+    def held(self) -> set[str]:
+        """Return the tokens that are noted as held back."""
+
+    @abstractmethod
+    def let_go(self, token: str) -> None:
+        """Strike the note that an attempt is held back; nothing else happens to it."""
+
+    @abstractmethod
+    def waiting(self) -> list[str]:
+        """Return the tokens of all attempts that wait, next first."""
+
+    @abstractmethod
+    def place(self, token: str) -> int | None:
+        """Return how many attempts wait before this one, None if it does not wait."""
+
+    @abstractmethod
+    def tidy(self) -> None:
+        """Remove what dead workers left behind in the queue's own books."""
+
+    @abstractmethod
+    def workers(self) -> list[str]:
+        """Return the names of the workers that have shown signs of life lately."""
+
+
+class RedisQueue(Queue):
+    """RQ on Redis, JSON only. One queue, so that RQ moves ids by BLMOVE and cannot drop one between two hands."""
+
+    def __init__(self, client: redis.Redis, *, name: str) -> None:
+        self._redis: Any = client
+        self._name = name
+        self._held = f"{name}:held"
+        self._queue = RqQueue(name, connection=client, serializer=JSONSerializer)
+
+    def push(self, id: str, token: str, *, front: bool = False) -> None:
+        """See `Queue.push`."""
+        with reachable():
+            if self._redis.lpos(self._queue.key, token) is not None:
+                return
+            self._queue.enqueue_call(
+                FUNCTION,
+                args=(id, token),
+                job_id=token,
+                timeout=-1,  # ours is kept by the worker, who can end a C call; RQ's alarm cannot
+                result_ttl=0,
+                failure_ttl=FAILURE_KEPT,
+                description=f"job {id}",
+                at_front=front,
+            )
+
+    def remove(self, token: str) -> None:
+        """See `Queue.remove`."""
+        self.let_go(token)
+        with reachable():
+            for key in (self._queue.key, self._queue.intermediate_queue_key):
+                self._redis.lrem(key, 0, token)
+            try:
+                RqJob.fetch(token, connection=self._redis, serializer=JSONSerializer).delete()
+            except (NoSuchJobError, InvalidJobOperation):  # gone already, or just now
+                return
+            except ValueError:  # the worker that took it strikes its note of that just now; RQ stumbles over the gap
+                self._redis.delete(RqJob.key_for(token))
+
+    def hold(self, token: str) -> None:
+        """See `Queue.hold`."""
+        with reachable():
+            self._redis.sadd(self._held, token)
+
+    def held(self) -> set[str]:
+        """See `Queue.held`."""
+        with reachable():
+            return {token.decode() for token in self._redis.smembers(self._held)}
+
+    def let_go(self, token: str) -> None:
+        """See `Queue.let_go`."""
+        with reachable():
+            self._redis.srem(self._held, token)
+
+    def waiting(self) -> list[str]:
+        """See `Queue.waiting`."""
+        with reachable():
+            return [token.decode() for token in self._redis.lrange(self._queue.key, 0, -1)]
+
+    def place(self, token: str) -> int | None:
+        """See `Queue.place`."""
+        with reachable():
+            place: int | None = self._redis.lpos(self._queue.key, token)
+        return place
+
+    def tidy(self) -> None:
+        """See `Queue.tidy`."""
+        with reachable():
+            if not self._queue.acquire_maintenance_lock():
+                return
+            try:
+                clean_registries(self._queue)
+                worker_registration.clean_worker_registry(self._queue)
+            finally:
+                self._queue.release_maintenance_lock()  # type: ignore[no-untyped-call]
+
+    def workers(self) -> list[str]:
+        """See `Queue.workers`."""
+        with reachable():
+            names = sorted(key.rsplit(":", 1)[1] for key in worker_registration.get_keys(queue=self._queue))
+            pipe = self._redis.pipeline(transaction=False)
+            for name in names:
+                pipe.exists(alive_key(self._name, name))
+            return [name for name, alive in zip(names, pipe.execute(), strict=True) if alive]

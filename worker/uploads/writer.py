@@ -1,0 +1,150 @@
+"""An upload while it grows: bytes at the end of a file, their digest, and how many there may be."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import os
+import shutil
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO
+
+from pliant.worker.errors import InvalidRequest, QuotaExceeded, UploadTooLarge
+from pliant.worker.uploads.folder import LENGTH, PART, WHOLE
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Room:
+    """How much one upload may still take."""
+
+    max_bytes: int
+    """Size of the whole upload."""
+    quota: int = 0
+    """Bytes that everything stored may take together; 0: no quota."""
+    used: int = 0
+    """Bytes that everything else takes now."""
+
+
+@dataclass(slots=True, kw_only=True)
+class Writer:
+    """An upload while it grows, behind its lock; made by `Uploads.write`."""
+
+    id: str
+    folder: Path
+    length: int | None
+    """Bytes of the whole upload, where they are known."""
+    room: Room
+    offset: int = 0
+    """Bytes that it holds."""
+    _began: int = 0
+    _file: BinaryIO | None = None
+    _digest: hashlib._Hash = field(default_factory=hashlib.sha256)
+
+    def open(self, offset: int) -> None:
+        """Begin, or go on after what is there, which is read once for its digest.
+
+        Raises
+        ------
+        OSError
+            ENOSPC: the disk has no room for the rest of it.
+        """
+        if self.length is not None:
+            self._check(self.length)
+            if self.length - offset > shutil.disk_usage(self.folder).free:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            fresh = self.folder / f"{LENGTH}.new"
+            fresh.write_text(str(self.length))
+            fresh.replace(self.folder / LENGTH)
+        elif offset == 0:
+            (self.folder / LENGTH).unlink(missing_ok=True)
+        part = self.folder / PART
+        if offset > 0:
+            with part.open("rb") as before:
+                self._digest = hashlib.file_digest(before, "sha256")
+        self._file = part.open("ab" if offset > 0 else "wb", buffering=0)
+        self.offset = self._began = offset
+
+    def write(self, piece: bytes) -> None:
+        """Add bytes.
+
+        Raises
+        ------
+        InvalidRequest
+            They are more than the upload's length; what fitted is kept.
+        UploadTooLarge
+            The upload is larger than it may be; it is removed, since it can never become whole.
+        QuotaExceeded
+            Everything stored is as much as it may be; what fitted is kept.
+        OSError
+            The disk is full; what this request brought is given back to it, since others need the room.
+        """
+        assert self._file is not None
+        if self.length is not None and self.offset + len(piece) > self.length:
+            raise inconsistent(f"{self.length} bytes in all", "more")
+        self._check(self.offset + len(piece))
+        rest = memoryview(piece)
+        try:
+            while rest:
+                count = self._file.write(rest)
+                self._digest.update(rest[:count])
+                rest = rest[count:]
+                self.offset += count
+        except OSError:
+            self._file.truncate(self._began)
+            raise
+
+    def finish(self, *, sha256: str | None) -> None:
+        """Make the upload whole.
+
+        Parameters
+        ----------
+        sha256 : str, optional
+            What the sender says that it is.
+
+        Raises
+        ------
+        InvalidRequest
+            Bytes are missing; or they are not the sender's, and then the upload is removed.
+        """
+        if self.length is not None and self.offset != self.length:
+            raise inconsistent(f"{self.length} bytes in all", str(self.offset))
+        found = self._digest.hexdigest()
+        if sha256 is not None and sha256 != found:
+            self.close()
+            shutil.rmtree(self.folder)
+            raise InvalidRequest(
+                "digest_mismatch", field="Repr-Digest", expected=sha256, got=found,
+                hint="The bytes changed on their way; the upload was removed, send it again.",
+            )  # fmt: skip
+        self.close()
+        (self.folder / PART).rename(self.folder / f"{WHOLE}{found}")
+        folder = os.open(self.folder, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+
+    def close(self) -> None:
+        """Put what has arrived on the disk."""
+        if self._file is not None:
+            os.fsync(self._file.fileno())
+            self._file.close()
+            self._file = None
+
+    def _check(self, size: int) -> None:
+        room = self.room
+        if size > room.max_bytes:
+            self.close()
+            shutil.rmtree(self.folder)
+            raise UploadTooLarge(room.max_bytes, size)
+        if room.quota > 0 and room.used + size > room.quota:
+            raise QuotaExceeded(used=room.used + self.offset, quota=room.quota)
+
+
+def inconsistent(expected: str, got: str) -> InvalidRequest:
+    """Return the refusal of bytes that do not make the length that was said."""
+    return InvalidRequest(
+        "inconsistent_upload_length", field="Upload-Length", expected=expected, got=got,
+        hint="Send what is missing, or begin anew at Upload-Offset: 0.",
+    )  # fmt: skip
