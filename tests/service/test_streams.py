@@ -183,17 +183,17 @@ def test_sigterm_ends_streams_and_waits_at_once_and_cleanly(
 
 STOPPED_BETWEEN_LOOK_AND_WAIT = """
 import os, signal
-from pliant.service import follow
+from pliant.service import event_stream
 from pliant.service.__main__ import main
 
-look = follow._Watcher.newer
+look = event_stream._Watcher.newer
 
 def newer(watcher, last):
     os.kill(os.getpid(), signal.SIGTERM)
-    follow._Watcher.newer = look
+    event_stream._Watcher.newer = look
     return look(watcher, last)
 
-follow._Watcher.newer = newer
+event_stream._Watcher.newer = newer
 raise SystemExit(main())
 """
 
