@@ -45,7 +45,7 @@ test: $(STAMP) $(PAGE)
 build/typed/pliant:
 	mkdir -p $@
 	for folder in schemas solver worker service client cli; do ln -sfn ../../../$$folder $@/$$folder; done
-	for file in __init__.py py.typed; do ln -sfn ../../../pliant/$$file $@/$$file; done
+	for file in __init__.py py.typed; do ln -sfn ../../../door/$$file $@/$$file; done
 
 check: $(STAMP) build/typed/pliant
 	$(BIN)/ruff check .

@@ -4,6 +4,9 @@
 loaded on first use, so ``import pliant`` itself loads neither NumPy nor httpx.
 """
 
+if __name__ != "pliant":
+    raise ImportError(f"import this folder as pliant, not as {__name__!r}: install it with pip install -e .")
+
 from importlib import import_module
 from typing import TYPE_CHECKING
 
