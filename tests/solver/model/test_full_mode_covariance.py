@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pliant.solver.cameras.estimation import joint_refinement
+from pliant.solver.cameras import joint_refinement
 from pliant.solver.model.full_mode_covariance import (
     MOST_FRAMES,
     POINTS_PER_COEFFICIENT,
