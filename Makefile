@@ -39,7 +39,7 @@ demo: $(STAMP) $(PAGE)
 
 # Two processes share the tests. PROCESSES=1 runs them one after the other.
 PROCESSES ?= 2
-SHARED := $(if $(filter-out 1,$(PROCESSES)),-n $(PROCESSES) --dist loadgroup)
+SHARED := $(if $(filter-out 1,$(PROCESSES)),-n $(PROCESSES) --dist loadfile)
 PYTEST := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest $(SHARED)
 NEEDY := slow or chromium or node or s3 or root
 
