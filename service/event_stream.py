@@ -1,7 +1,7 @@
-"""Following jobs: one watcher for a job however many clients follow it, so that a thousand listeners cost one look-up.
+"""Following jobs: one watcher per job, shared by all clients that follow it.
 
-A blocking read for every listener would hold a thread each; the watcher asks twice or thrice a second instead, which is as
-often as progress is written.
+A blocking read per client would hold a thread each; the watcher polls the store about three times a second instead, as often as
+progress is written.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from pliant.worker.records import Event
 from starlette.concurrency import run_in_threadpool
 
 KEPT = 256
-"""Events a watcher holds for listeners that are slow."""
+"""Events that a watcher keeps for slow clients."""
 
 
 class Followers:
@@ -25,7 +25,7 @@ class Followers:
     Attributes
     ----------
     pause : float
-        Seconds between two looks at a job; grows by a hundredth of it for every further job that is watched.
+        Seconds between two reads of a job's events; grows by one hundredth for every further job that is followed.
     """
 
     def __init__(self, *, pause: float = 0.3) -> None:
@@ -35,11 +35,11 @@ class Followers:
 
     @property
     def watched(self) -> int:
-        """How many jobs are followed now."""
+        """Number of jobs that are followed now."""
         return len(self._watchers)
 
     def close(self) -> None:
-        """End every following, so that the server can stop."""
+        """End all streams, so that the server can stop."""
         self.closing.set()
         for watcher in self._watchers.values():
             watcher.wake()
@@ -47,35 +47,40 @@ class Followers:
     async def follow(
         self, jobs: Jobs, id: str, *, after: str | None = None, heartbeat: float = 15.0
     ) -> AsyncGenerator[Event | None]:
-        """Yield a job's events as they come, None when `heartbeat` seconds passed without one; ends at a final status.
+        """Yield a job's events as they occur, None after `heartbeat` seconds without one; end at a final status.
 
         Parameters
         ----------
         jobs : Jobs
-            The jobs as the one who asks may see them.
+            The jobs that the client may see.
         id : str
             The job.
         after : str, optional
-            The last event already known; None begins with all that are kept.
+            The last event received; None starts with all events that are kept.
         heartbeat : float
             Seconds.
 
         Raises
         ------
         UnknownJob
-            There is no such job, or it vanished meanwhile.
+            There is no such job, or it was deleted meanwhile.
         InvalidRequest
-            `after` is no event's id.
+            `after` is not the id of an event.
         """
         watcher = self._watchers.get(id)
         if watcher is None:
             watcher = self._watchers[id] = _Watcher()
         watcher.listeners += 1
         try:
+            job = await run_in_threadpool(jobs.get, id)
             known = await run_in_threadpool(jobs.events, id, after=after, timeout=0)
             last = after or "0-0"
+            if job.status.final:  # no event follows those just read, even if the client has them all
+                for event in known:
+                    yield event
+                return
             if watcher.task is None:
-                # It looks with the rights of the first listener's process, not his: every listener was checked above.
+                # It reads with the rights of the first client; every client was authorized above.
                 watcher.task = asyncio.create_task(
                     self._watch(jobs, id, watcher, since=known[-1].id if known else last)
                 )
@@ -101,7 +106,7 @@ class Followers:
                     del self._watchers[id]
 
     async def wait(self, jobs: Jobs, id: str, seconds: float) -> Job:
-        """Return the job once its status is final, or as it is after so many seconds."""
+        """Return the job once its status is final, or its state after `seconds`."""
         job = await run_in_threadpool(jobs.get, id)
         if job.status.final or seconds <= 0:
             return job
@@ -121,14 +126,14 @@ class Followers:
                 found = await run_in_threadpool(jobs.events, id, after=last, timeout=0)
                 if found:
                     last = found[-1].id
-                    watcher.tell(found)
-        except Exception as error:  # noqa: BLE001 - handed to every listener, who raises it in his own request
+                    watcher.publish(found)
+        except Exception as error:  # noqa: BLE001 - raised again in the request of each client
             watcher.failure = error
             watcher.wake()
 
 
 class _Watcher:
-    """One job that is followed: its latest events, and who waits for the next."""
+    """One job that is followed: its latest events, and a signal for the next."""
 
     def __init__(self) -> None:
         self.listeners = 0
@@ -137,13 +142,13 @@ class _Watcher:
         self._events: deque[Event] = deque(maxlen=KEPT)
         self._next = asyncio.Event()
 
-    def tell(self, events: list[Event]) -> None:
-        """Add events and wake whoever waits."""
+    def publish(self, events: list[Event]) -> None:
+        """Add events and wake all waiting clients."""
         self._events.extend(events)
         self.wake()
 
     def wake(self) -> None:
-        """Wake whoever waits."""
+        """Wake all waiting clients."""
         self._next.set()
         self._next = asyncio.Event()
 
@@ -162,7 +167,7 @@ class _Watcher:
 
 
 def is_final(event: Event) -> bool:
-    """Return True if nothing follows this event."""
+    """Return True if no event follows this one."""
     return event.name == "job" and Job.model_validate_json(event.data).status.final
 
 

@@ -17,7 +17,7 @@ from pliant.service.app import STATUS_OF
 from pliant.service.settings import MB, InvalidServiceSetting, ServiceSettings
 from pliant.service.spool import Incoming
 from pliant.worker import errors
-from serving import Running, Serve, finish, submit, until
+from serving import Running, Serve, finish, settings_from, submit, until
 
 CONTENTS = os.urandom(3_000_000)
 
@@ -178,7 +178,7 @@ def test_a_killed_process_folder_is_swept_and_a_living_ones_is_not(tmp_path: Pat
     (tmp_path / "dead").mkdir()
     (tmp_path / "dead" / "part").write_bytes(b"x")
     (tmp_path / "dead.lock").touch()
-    with living.room() as room:
+    with living.scratch() as room:
         (room / "part").write_bytes(b"x")
         assert Incoming(tmp_path).abandoned() == ["dead"]
         second = Incoming(tmp_path)
@@ -191,9 +191,43 @@ def test_a_killed_process_folder_is_swept_and_a_living_ones_is_not(tmp_path: Pat
 
 
 def test_settings_come_from_the_environment() -> None:
-    settings = ServiceSettings.from_environment({"PLIANT_MAX_BODY_MB": "5", "PLIANT_ALLOWED_HOSTS": "a, b"})
+    settings = settings_from(MAX_BODY_MB="5", ALLOWED_HOSTS="a, b")
     assert (settings.max_body_bytes, settings.allowed_hosts, settings.loopback) == (5 * MB, ("a", "b"), True)
-    assert not ServiceSettings.from_environment({"PLIANT_HOST": "0.0.0.0"}).loopback
-    for name, value in (("PLIANT_PORT", "70000"), ("PLIANT_PARSERS", "0"), ("PLIANT_PORT", "x")):
-        with pytest.raises(InvalidServiceSetting, match=name):
-            ServiceSettings.from_environment({name: value})
+    assert not settings_from(HOST="0.0.0.0").loopback
+    for name, value in (
+        ("PORT", "70000"),
+        ("PARSERS", "0"),
+        ("PORT", "x"),
+        ("MAX_BODY_MB", "0"),
+        ("LOG_FORMAT", "xml"),
+    ):
+        with pytest.raises(InvalidServiceSetting, match=f"PLIANT_{name}"):
+            settings_from(**{name: value})
+
+
+def test_an_empty_variable_counts_as_unset() -> None:
+    names = (
+        "HOST",
+        "PORT",
+        "DATA",
+        "MAX_BODY_MB",
+        "MAX_QUEUED",
+        "REQUESTS_PER_MINUTE",
+        "AUTH",
+        "ALLOWED_HOSTS",
+        "LOG_LEVEL",
+    )
+    assert settings_from(**dict.fromkeys(names, "")) == ServiceSettings()
+
+
+def test_a_dotenv_file_and_secret_files_are_read_the_environment_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / ".env").write_text("PLIANT_PORT=1001\nPLIANT_MAX_QUEUED=7\nSOMETHING_ELSE=x\n")
+    secrets = tmp_path / "secrets"
+    secrets.mkdir()
+    (secrets / "PLIANT_MAX_QUEUED").write_text("8")
+    (secrets / "PLIANT_PARSERS").write_text("3")
+    found = settings_from(PORT="1002", SECRETS_DIR=str(secrets))
+    assert (found.port, found.max_queued, found.parsers) == (1002, 7, 3)

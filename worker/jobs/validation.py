@@ -52,7 +52,7 @@ def check_page(cursor: str | None, limit: int) -> None:
 
 def check_event_id(after: str) -> None:
     """Refuse what is not the id of an event."""
-    if not _EVENT.fullmatch(after):
+    if not _EVENT.fullmatch(after) or any(int(part) >= 2**64 for part in after.split("-")):
         raise InvalidRequest(
             "invalid_event_id", field="Last-Event-ID", expected="the id of an event", got=repr(after)[:80],
             hint="Leave it out to get all events that are kept.",
