@@ -30,7 +30,7 @@ class Status(StrEnum):
 class Record(BaseModel):
     """Base of everything on the wire: unknown fields are ignored, so that an older client reads a newer service."""
 
-    model_config = ConfigDict(frozen=True, extra="ignore")
+    model_config = ConfigDict(frozen=True, extra="ignore", json_schema_serialization_defaults_required=True)
 
 
 class Problem(Record):

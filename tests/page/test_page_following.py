@@ -84,7 +84,7 @@ def test_a_token_is_asked_for_and_then_sent_with_everything(page: Page, url: str
         if route.request.headers.get("authorization") == "Bearer a-token":
             route.continue_()
         else:
-            problem = {"title": "Unauthorised", "status": 401, "detail": "Send a token.", "code": "unauthorised"}
+            problem = {"title": "Token required", "status": 401, "detail": "Send a token.", "code": "unauthorized"}
             route.fulfill(status=401, content_type="application/problem+json", body=json.dumps(problem))
 
     page.route("**/v1/**", guarded)
