@@ -58,6 +58,34 @@ def test_an_interrupted_download_is_resumed(http: httpx.Client, address: str) ->
     assert http.get(address + "x").json()["code"] == "unknown_artifact"
 
 
+def test_a_file_that_is_deleted_meanwhile_is_gone(
+    running: Running, http: httpx.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job = submit(http, name="gone")
+    finish(running, job.id, b"x" * 10)
+    address = f"/v1/jobs/{job.id}/artifacts/shapes.npz"
+    stored = running.jobs.blobs.get(f"{running.jobs.records.get(job.id).prefix}shapes.npz")
+    running.jobs.blobs.delete(f"jobs/{job.id}/")
+    answer = http.get(address)
+    assert (answer.status_code, answer.json()["code"]) == (410, "artifact_gone")
+    # Deleted after its size was read, before its first byte.
+    monkeypatch.setattr("pliant.worker.store.blobs.Blobs.get", lambda *_: stored)
+    answer = http.get(address)
+    assert (answer.status_code, answer.json()["code"]) == (410, "artifact_gone")
+    running.jobs.records.delete(job.id)
+    answer = http.get(address)
+    assert (answer.status_code, answer.json()["code"]) == (404, "unknown_job")
+
+
+def test_an_api_process_without_workers_is_ready_for_its_own_part(http: httpx.Client) -> None:
+    whole = http.get("/readyz")
+    assert (whole.status_code, whole.json()["code"]) == (503, "not_ready")
+    assert "No worker" in whole.json()["detail"]
+    own = http.get("/readyz", params={"exclude": "workers"})
+    assert (own.status_code, own.json()) == (200, {"redis": "ok", "blobs": "ok"})
+    assert http.get("/readyz", params={"exclude": "nothing"}).status_code == 422
+
+
 def test_events_end_with_the_job_and_go_on_from_the_last_one(running: Running, http: httpx.Client) -> None:
     job = submit(http, name="followed")
     timer = threading.Timer(0.5, finish, (running, job.id, b"x"))

@@ -51,7 +51,8 @@ def test_a_refusal_is_logged_with_its_code_and_without_the_query(
     until(lambda: any(vars(record).get("job") == "nobody-here" for record in lines(caplog)))
     (record,) = [record for record in lines(caplog) if vars(record).get("job") == "nobody-here"]
     assert (record.levelname, vars(record)["code"]) == ("WARNING", "unknown_job")
-    assert "SECRET" not in caplog.text
+    ours = [record for record in caplog.records if record.name.startswith("pliant")]
+    assert all("SECRET" not in str(vars(record)) for record in ours)
     http.get("/v1/jobs/a%0Ab%1B")
     until(lambda: any("%0Ab" in record.getMessage() for record in lines(caplog)))
     assert all("\n" not in record.getMessage() and "\x1b" not in record.getMessage() for record in lines(caplog))

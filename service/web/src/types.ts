@@ -7,9 +7,9 @@ type Schemas = components["schemas"];
 
 export type Status = Schemas["Status"];
 /** A problem of the service, or one that the page itself found. */
-export type Problem = Omit<Schemas["Problem"], "code"> & {
-  code: Schemas["ProblemCode"] | "unreachable" | "unknown" | "no_events";
-};
+export type Problem = Pick<Schemas["Problem"], "title" | "status" | "detail"> & {
+  [Name in Exclude<keyof Schemas["Problem"], "code">]?: Schemas["Problem"][Name] | undefined;
+} & { code: Schemas["ProblemCode"] | "unreachable" | "unknown" | "no_events" };
 export type Progress = Schemas["Progress"];
 export type Artifact = Schemas["Artifact"];
 export type Interpretation = Schemas["Interpretation"];
