@@ -1,53 +1,59 @@
-"""Following jobs: one watcher per job, shared by all clients that follow it.
+"""Following jobs: one reader thread in a process, however many clients follow however many jobs.
 
-A blocking read per client would hold a thread each; the watcher polls the store about three times a second instead, as often as
-progress is written.
+The reader waits for the ids of changed jobs (`Records.changes`), reads the new events of those that are followed here, and hands
+them to the followers. A thousand followers of one job cost one read for each change; a job without changes costs nothing.
 """
 
 from __future__ import annotations
 
 import asyncio
+import threading
+import time
 from collections import deque
-from collections.abc import AsyncGenerator
+from collections.abc import AsyncGenerator, Callable
+from contextlib import suppress
+from typing import Any
 
 from pliant.schemas.job import Job
+from pliant.worker.errors import UnknownJob
 from pliant.worker.jobs.service import Jobs
-from pliant.worker.records import Event
+from pliant.worker.records import Changes, Event, Records
 from starlette.concurrency import run_in_threadpool
 
 KEPT = 256
-"""Events that a watcher keeps for slow clients."""
+"""Events that are held for followers that are slow."""
+
+WAIT = 1.0
+"""Seconds the reader waits for a change before it looks whether anybody still follows."""
+
+READ_AGAIN = 10.0
+"""Seconds after which every followed job is read again: a change's message is lost while a connection is re-established."""
 
 
 class Followers:
-    """The watchers of one process.
+    """The clients of one process that follow jobs."""
 
-    Attributes
-    ----------
-    pause : float
-        Seconds between two reads of a job's events; grows by one hundredth for every further job that is followed.
-    """
-
-    def __init__(self, *, pause: float = 0.3) -> None:
-        self.pause = pause
+    def __init__(self) -> None:
         self.closing = asyncio.Event()
         self._watchers: dict[str, _Watcher] = {}
+        self._reader: _Reader | None = None
 
     @property
     def watched(self) -> int:
-        """Number of jobs that are followed now."""
+        """Return how many jobs are followed now."""
         return len(self._watchers)
 
     def close(self) -> None:
-        """End all streams, so that the server can stop."""
+        """End every following, so that the server can stop."""
         self.closing.set()
         for watcher in self._watchers.values():
             watcher.wake()
+        self._stop_reader()
 
     async def follow(
         self, jobs: Jobs, id: str, *, after: str | None = None, heartbeat: float = 15.0
     ) -> AsyncGenerator[Event | None]:
-        """Yield a job's events as they occur, None after `heartbeat` seconds without one; end at a final status.
+        """Yield a job's events as they come, None when `heartbeat` seconds passed without one; ends at a final status.
 
         Parameters
         ----------
@@ -56,7 +62,7 @@ class Followers:
         id : str
             The job.
         after : str, optional
-            The last event received; None starts with all events that are kept.
+            The last event already known; None begins with all that are kept.
         heartbeat : float
             Seconds.
 
@@ -65,25 +71,16 @@ class Followers:
         UnknownJob
             There is no such job, or it was deleted meanwhile.
         InvalidRequest
-            `after` is not the id of an event.
+            `after` is no event's id.
         """
-        watcher = self._watchers.get(id)
-        if watcher is None:
-            watcher = self._watchers[id] = _Watcher()
+        watcher = self._watchers.setdefault(id, _Watcher())
         watcher.listeners += 1
         try:
-            job = await run_in_threadpool(jobs.get, id)
-            known = await run_in_threadpool(jobs.events, id, after=after, timeout=0)
+            self._start_reader(jobs.records)  # before the first read, so that no change falls between the two
+            known = await run_in_threadpool(jobs.events, id, after=after)
             last = after or "0-0"
-            if job.status.final:  # no event follows those just read, even if the client has them all
-                for event in known:
-                    yield event
-                return
-            if watcher.task is None:
-                # It reads with the rights of the first client; every client was authorized above.
-                watcher.task = asyncio.create_task(
-                    self._watch(jobs, id, watcher, since=known[-1].id if known else last)
-                )
+            if not known and (await run_in_threadpool(jobs.get, id)).status.final:
+                return  # nothing follows the last event of a finished job
             while True:
                 for event in known:
                     last = event.id
@@ -99,14 +96,13 @@ class Followers:
                 known = watcher.newer(last)
         finally:
             watcher.listeners -= 1
-            if watcher.listeners == 0:
-                if watcher.task is not None:
-                    watcher.task.cancel()
-                if self._watchers.get(id) is watcher:
-                    del self._watchers[id]
+            if watcher.listeners == 0 and self._watchers.get(id) is watcher:
+                del self._watchers[id]
+            if not self._watchers:
+                self._stop_reader()
 
     async def wait(self, jobs: Jobs, id: str, seconds: float) -> Job:
-        """Return the job once its status is final, or its state after `seconds`."""
+        """Return the job once its status is final, or as it is after so many seconds."""
         job = await run_in_threadpool(jobs.get, id)
         if job.status.final or seconds <= 0:
             return job
@@ -118,37 +114,89 @@ class Followers:
             pass
         return await run_in_threadpool(jobs.get, id)
 
-    async def _watch(self, jobs: Jobs, id: str, watcher: _Watcher, *, since: str) -> None:
-        last = since
+    def _start_reader(self, records: Records) -> None:
+        if self._reader is None or not self._reader.is_alive():
+            self._reader = _Reader(records, self._watchers, asyncio.get_running_loop())
+            self._reader.start()
+
+    def _stop_reader(self) -> None:
+        if self._reader is not None:
+            self._reader.ended.set()
+            self._reader = None
+
+
+class _Reader(threading.Thread):
+    """The thread that waits for changes and reads events. Everything it finds is handed over on the event loop."""
+
+    def __init__(self, records: Records, watchers: dict[str, _Watcher], loop: asyncio.AbstractEventLoop) -> None:
+        super().__init__(name="events", daemon=True)
+        self.ended = threading.Event()
+        self._records = records
+        self._watchers = watchers
+        self._loop = loop
+
+    def run(self) -> None:
+        """Read until nobody follows a job or the store does not answer."""
         try:
-            while True:
-                await asyncio.sleep(self.pause * (1 + self.watched / 100))
-                found = await run_in_threadpool(jobs.events, id, after=last, timeout=0)
-                if found:
-                    last = found[-1].id
-                    watcher.publish(found)
-        except Exception as error:  # noqa: BLE001 - raised again in the request of each client
-            watcher.failure = error
-            watcher.wake()
+            changes = self._records.changes()
+            try:
+                self._follow(changes)
+            finally:
+                changes.close()
+        except Exception as error:  # noqa: BLE001 - handed to every follower, who raises it in its own request
+            for watcher in list(self._watchers.values()):
+                self._hand_over(watcher.fail, error)
+
+    def _follow(self, changes: Changes) -> None:
+        due = 0.0
+        while not self.ended.is_set():
+            everything = time.monotonic() >= due
+            changed = set() if everything else changes.next(WAIT)
+            followed = dict(self._watchers)
+            if everything:
+                due, changed = time.monotonic() + READ_AGAIN, set(followed)
+            for id in changed & followed.keys():
+                self._read(id, followed[id])
+
+    def _read(self, id: str, watcher: _Watcher) -> None:
+        events = self._records.events(id, after=watcher.read_up_to)
+        if events:
+            watcher.read_up_to = events[-1].id
+            self._hand_over(watcher.tell, events)
+            return
+        try:
+            self._records.get(id)
+        except UnknownJob as error:
+            self._hand_over(watcher.fail, error)
+
+    def _hand_over(self, call: Callable[[Any], None], what: object) -> None:
+        with suppress(RuntimeError):  # the loop has ended
+            self._loop.call_soon_threadsafe(call, what)
 
 
 class _Watcher:
-    """One job that is followed: its latest events, and a signal for the next."""
+    """One job that is followed: its latest events, and the followers that wait for the next."""
 
     def __init__(self) -> None:
         self.listeners = 0
-        self.task: asyncio.Task[None] | None = None
         self.failure: Exception | None = None
+        self.read_up_to: str | None = None
+        """The last event that the reader has read."""
         self._events: deque[Event] = deque(maxlen=KEPT)
         self._next = asyncio.Event()
 
-    def publish(self, events: list[Event]) -> None:
-        """Add events and wake all waiting clients."""
+    def tell(self, events: list[Event]) -> None:
+        """Add events and wake the followers."""
         self._events.extend(events)
         self.wake()
 
+    def fail(self, error: Exception) -> None:
+        """End every follower with an error."""
+        self.failure = error
+        self.wake()
+
     def wake(self) -> None:
-        """Wake all waiting clients."""
+        """Wake the followers."""
         self._next.set()
         self._next = asyncio.Event()
 
@@ -167,10 +215,10 @@ class _Watcher:
 
 
 def is_final(event: Event) -> bool:
-    """Return True if no event follows this one."""
+    """Return True if nothing follows this event."""
     return event.name == "job" and Job.model_validate_json(event.data).status.final
 
 
 def _order(id: str) -> tuple[int, int]:
-    time, _, count = id.partition("-")
-    return int(time), int(count)
+    milliseconds, _, count = id.partition("-")
+    return int(milliseconds), int(count)

@@ -67,7 +67,7 @@ async def events(
     """
     stream = core.followers.follow(jobs, id, after=last or None, heartbeat=core.settings.heartbeat_seconds)
     # Refuse before the stream begins: afterwards there is no status code to report an error with.
-    await to_thread.run_sync(partial(jobs.events, id, after=last or None, timeout=0))
+    await to_thread.run_sync(partial(jobs.events, id, after=last or None))
     return EventSourceResponse(
         _encode(stream, still_valid=request.scope.get("pliant.still_valid")),
         headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"},

@@ -161,7 +161,7 @@ async def _receive(
 ) -> tuple[Job, bool]:
     """Receive a form into a scratch directory and submit the job; the directory is removed in any case."""
     rules = form_rules(core.settings, max_body_bytes=bounds.max_body_bytes)
-    await to_thread.run_sync(lambda: jobs.check_room(id=id, idempotency_key=idempotency_key))
+    await to_thread.run_sync(lambda: jobs.check_capacity(id=id, idempotency_key=idempotency_key))
     with core.incoming.scratch() as folder:
         form = await receive_form(request, folder, rules=rules)
         return await to_thread.run_sync(
