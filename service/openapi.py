@@ -89,7 +89,9 @@ SUBMIT_BODY: dict[str, Any] = {
         "multipart/form-data": {
             "schema": {
                 "type": "object",
-                "anyOf": [{"required": ["tracks"]}, {"required": ["tracks_upload"]}],
+                # Tracks, or the upload that holds them. Generators of clients cannot read an anyOf here.
+                "if": {"not": {"required": ["tracks_upload"]}},
+                "then": {"required": ["tracks"]},
                 "properties": {
                     "tracks": {
                         **_FILE,

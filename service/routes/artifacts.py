@@ -22,7 +22,9 @@ from pliant.worker.store.blobs import Blob
 router = APIRouter(prefix="/v1/jobs/{id}/artifacts", tags=["artifacts"])
 
 Name = Annotated[str, Path(description="A file of the job.", examples=["shapes.npz"])]
-_BYTES = {"*/*": {"schema": {"type": "string", "format": "binary"}}}
+_BINARY = {"schema": {"type": "string", "format": "binary"}}
+# Generators of clients take the first; the file's own media type is in its description.
+_BYTES = {"application/octet-stream": _BINARY, "*/*": _BINARY}
 
 
 @router.get("", operation_id="list_artifacts", summary="List a job's files", responses=problems(401, 404, 503))

@@ -41,7 +41,7 @@ def test_the_metrics_count_what_happened(serve: Serve) -> None:
         problem = Problem(title="T", status=500, detail="It broke. Try again.", code="out_of_memory")
         later = NOW + timedelta(seconds=7)
         running.jobs.records.update(
-            failed.id, lambda held: lifecycle.fail(held, token=token, problem=problem, now=later, retention=0)
+            failed.id, lambda held: lifecycle.fail(held, attempt_id=token, problem=problem, now=later, retention=0)
         )
         http.get(f"/v1/jobs/{waiting.id}")
         http.get("/v1/jobs/nobody")

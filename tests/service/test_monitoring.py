@@ -35,7 +35,9 @@ def test_every_query_names_metrics_and_labels_that_exist(running: Running, http:
     problem = Problem(title="T", status=500, detail="It broke.", code="out_of_memory")
     running.jobs.records.update(
         failed.id,
-        lambda held: lifecycle.fail(held, attempt_id=attempt, problem=problem, now=NOW + timedelta(seconds=7), retention=0),
+        lambda held: lifecycle.fail(
+            held, attempt_id=attempt, problem=problem, now=NOW + timedelta(seconds=7), retention=0
+        ),
     )
     labels: dict[str, set[str]] = {}
     families = set()
