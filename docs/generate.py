@@ -149,7 +149,7 @@ def _command(command: Any, path: str) -> Iterator[str]:
         if parameter.name == "help" or getattr(parameter, "hidden", False):
             continue
         named = parameter.param_type_name == "argument"
-        shown = parameter.human_readable_name.upper() if named else ", ".join(parameter.opts)
+        shown = str(parameter.name).upper() if named else ", ".join(parameter.opts)
         rows.append((f"`{shown}`", _click_default(parameter), getattr(parameter, "help", "") or ""))
     if rows:
         parts.append(_table(("parameter", "default", "meaning"), rows))
