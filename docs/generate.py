@@ -10,10 +10,12 @@ from __future__ import annotations
 
 import ast
 import inspect
+import json
 import re
 import shutil
 import sys
 from collections.abc import Callable, Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -63,9 +65,7 @@ def settings() -> str:
             value = value // 2**20 if found[1].endswith("_MB") else value
             service.append((f"`{found[1]}`", _default(value), note.replace(found[0], "")))
     heads = ("variable", "default", "meaning")
-    return (
-        f"## Storage and work\n\n{_table(heads, worker)}\n\n## Access control and rate limits\n\n{_table(heads, service)}"
-    )
+    return f"## Storage and work\n\n{_table(heads, worker)}\n\n## Access control and rate limits\n\n{_table(heads, service)}"
 
 
 def cli() -> str:
@@ -104,7 +104,9 @@ def _operation(method: str, path: str, operation: dict[str, Any]) -> str:
     from pliant.service.middleware.auth import is_public, needed
 
     scope = needed(method, path)
-    lines = [f"### {method} {path}", f"{operation.get('summary', '')}. Scope: {_scope(is_public(path), scope)}."]
+    summary = operation.get("summary", "")
+    summary += "" if summary.endswith(("?", ".")) else "."
+    lines = [f"### {method} {path}", f"{summary} Scope: {_scope(is_public(path), scope)}."]
     about = inspect.cleandoc(operation.get("description", "")).partition("\n\nParameters")[0].partition("\n\nRaises")[0]
     if about:
         lines.append(about)
@@ -163,7 +165,7 @@ def _click_default(parameter: Any) -> str:
     if isinstance(shown, str):
         return shown
     value = parameter.default
-    return "" if value is None or value is False or callable(value) or value in ((), []) else f"`{value}`"
+    return "" if value is None or value is False or callable(value) or value in ((), [], "") else f"`{value}`"
 
 
 def _field_notes(module: Any, name: str) -> dict[str, str]:
@@ -171,7 +173,7 @@ def _field_notes(module: Any, name: str) -> dict[str, str]:
     tree = ast.parse(inspect.getsource(module))
     body = next(node.body for node in tree.body if isinstance(node, ast.ClassDef) and node.name == name)
     notes = {}
-    for field, note in zip(body, body[1:], strict=False):
+    for field, note in pairwise(body):
         if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and isinstance(note, ast.Expr):
             notes[field.target.id] = " ".join(inspect.cleandoc(ast.literal_eval(note.value)).split())
     return notes
@@ -188,7 +190,7 @@ def _type_of(schema: dict[str, Any]) -> str:
     if schema.get("type") == "array":
         return f"list of {_type_of(schema.get('items', {}))}"
     bounds = [
-        f"{sign} {schema[key]:,}"
+        f"{sign} {schema[key]:.10g}"
         for key, sign in (("minimum", "≥"), ("exclusiveMinimum", ">"), ("maximum", "≤"), ("exclusiveMaximum", "<"))
         if key in schema
     ]
@@ -199,11 +201,13 @@ def _type_of(schema: dict[str, Any]) -> str:
 def _default(value: object) -> str:
     if value is None or value == () or value == "":
         return "none"
-    return f"{value:,}" if isinstance(value, int) else f"{value:g}" if isinstance(value, float) else f"{value}"
+    return f"{value:.0f}" if isinstance(value, float) and value.is_integer() else f"{value}"
 
 
 def _plain(value: object) -> str:
-    return "null" if value is None else ", ".join(value) if isinstance(value, list | tuple) else str(value)
+    if isinstance(value, list | tuple):
+        return ", ".join(value)
+    return value if isinstance(value, str) else json.dumps(value)
 
 
 def _table(heads: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
