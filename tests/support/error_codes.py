@@ -28,15 +28,14 @@ _CODE = re.compile(r"[a-z]+(_[a-z0-9]+)*")
 
 def codes_in_source() -> set[str]:
     """Return every code that can reach a user."""
-    trees = {path: ast.parse(path.read_text(encoding="utf-8")) for path in _sources()}
-    everywhere: dict[str, int] = {}
-    for tree in trees.values():
-        everywhere |= {name: at for name, at in _makers(tree).items() if not name.startswith("_")}
+    files = [list(ast.walk(ast.parse(path.read_text(encoding="utf-8")))) for path in _sources()]
+    local = [_makers(nodes) for nodes in files]
+    everywhere = {name: at for makers in local for name, at in makers.items() if not name.startswith("_")}
     found: set[str] = set()
-    for tree in trees.values():
-        makers = everywhere | _makers(tree)
-        for node in ast.walk(tree):
-            found |= set(filter(_CODE.fullmatch, _codes_of(node, makers)))
+    for nodes, makers in zip(files, local, strict=True):
+        known = everywhere | makers
+        for node in nodes:
+            found |= set(filter(_CODE.fullmatch, _codes_of(node, known)))
     return (found | PUT_TOGETHER) - NOT_ANSWERED
 
 
@@ -47,17 +46,17 @@ def _sources() -> Iterator[Path]:
                 yield path
 
 
-def _makers(tree: ast.Module) -> dict[str, int]:
+def _makers(nodes: list[ast.AST]) -> dict[str, int]:
     """Return the functions and classes with a positional parameter `code`, and its place in a call."""
     found: dict[str, int] = {}
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.ClassDef):
             inner = [each for each in node.body if isinstance(each, ast.FunctionDef) and each.name == "__init__"]
             for each in inner:
                 found |= _place_of_code(each, node.name, drop=1)
         elif isinstance(node, ast.FunctionDef):
             found |= _place_of_code(node, node.name, drop=0)
-    for node in ast.walk(tree):  # a class without an __init__ of its own takes its base's
+    for node in nodes:  # a class without an __init__ of its own takes its base's
         if isinstance(node, ast.ClassDef):
             for base in node.bases:
                 if isinstance(base, ast.Name) and base.id in found and node.name not in found:
