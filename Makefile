@@ -85,4 +85,4 @@ format: $(STAMP)
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info service/web/dist service/web/dist.next service/web/node_modules
+	rm -rf $(VENV) .cache build dist *.egg-info service/web/dist service/web/dist.next service/web/node_modules

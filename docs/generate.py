@@ -94,7 +94,7 @@ def openapi() -> dict[str, Any]:
     from pliant.worker.settings import Settings
     from pliant.worker.tokens import Tokens
 
-    of_worker = Settings()
+    of_worker = Settings(blob_url="memory:///")
     app = create_app(Jobs.open(of_worker), ServiceSettings(), tokens=Tokens.open(of_worker))
     found: dict[str, Any] = app.openapi()
     return found

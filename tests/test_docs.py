@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from _pytest.mark.structures import ParameterSet
 from pliant.solver.gallery import face
 
 ROOT = Path(__file__).parents[1]
@@ -28,7 +29,15 @@ READ = {"json"}
 SHOWN = {"text", "mermaid", "http"}
 """Languages that are run, parsed, or only shown."""
 
+SLOW = {
+    "docs/explanation/depth.md", "docs/how-to/deploy.md", "docs/how-to/outliers.md", "docs/how-to/tokens.md", "docs/reference/artifacts.md",
+    "docs/reference/cli.md", "docs/reference/rest.md", "docs/reference/sdk.md", "docs/tutorials/blender.md", "docs/tutorials/compare.md",
+}  # fmt: skip
+"""Pages whose code solves several jobs or starts an embedded Valkey, left to `make test-slow`."""
+
 ADDRESS = "http://127.0.0.1:8000"
+SIZE = re.compile(r"\bface\(\d+, \d+\)")
+"""Gallery sequences in the pages; they are run with a smaller one."""
 KNOWN_COMMANDS = {"make", "docker", "pip", "git", "cd", "npm", "npx", "uv"}
 """First words of shell lines that are looked at instead of run: they install, build or need what is not here."""
 
@@ -66,6 +75,22 @@ def blocks_of(document: Path) -> list[Block]:
 BLOCKS = [block for document in DOCUMENTS for block in blocks_of(document)]
 
 
+TESTS = set(re.findall(r"def (test_\w+)\(", "".join(path.read_text() for path in (ROOT / "tests").rglob("*.py"))))
+
+
+def pages(language: str) -> list[ParameterSet]:
+    """The documents that have something to run, the slow ones marked."""
+    named = {path: path.relative_to(ROOT).as_posix() for path in DOCUMENTS}
+    ran = [
+        path for path in DOCUMENTS if any(b.document == path and b.language == language and not b.note for b in BLOCKS)
+    ]
+    return [pytest.param(path, id=named[path], marks=[pytest.mark.slow] if named[path] in SLOW else []) for path in ran]
+
+
+def test_the_slow_pages_exist() -> None:
+    assert {path.relative_to(ROOT).as_posix() for path in DOCUMENTS} >= SLOW
+
+
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """The files that documents speak of."""
@@ -93,17 +118,20 @@ def test_every_block_says_what_it_is(block: Block) -> None:
         json.loads(block.text)
 
 
-@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.relative_to(ROOT).as_posix())
+@pytest.mark.parametrize("document", pages("python"))
 def test_python_runs(document: Path, service_url: str, folder: Path) -> None:
     blocks = [block for block in BLOCKS if block.document == document and block.language == "python" and not block.note]
-    if not blocks:
-        return
+    assert blocks
     lines: list[str] = []
     for block in blocks:  # at its own line, so that a traceback names the document's
-        lines += [""] * (block.line - len(lines)) + block.text.replace(ADDRESS, service_url).splitlines()
+        lines += [""] * (block.line - len(lines)) + small(block.text.replace(ADDRESS, service_url)).splitlines()
     runner = "import sys; exec(compile(sys.stdin.read(), sys.argv[1], 'exec'))"
     ran = run([sys.executable, "-W", "error", "-c", runner, document.name], folder, service_url, given="\n".join(lines))
     assert ran.returncode == 0, f"{document.name}:\n{ran.stderr}"
+
+
+def small(code: str) -> str:
+    return SIZE.sub("face(12, 60)", code)
 
 
 def test_the_readmes_first_program_is_five_lines() -> None:
@@ -113,7 +141,7 @@ def test_the_readmes_first_program_is_five_lines() -> None:
     assert "from pliant import Client" in first.text
 
 
-@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.relative_to(ROOT).as_posix())
+@pytest.mark.parametrize("document", pages("bash"))
 def test_shell_runs(document: Path, service_url: str, folder: Path) -> None:
     (folder / "examples").symlink_to(ROOT / "examples")
     for block in BLOCKS:
@@ -155,12 +183,10 @@ def test_every_file_and_test_that_is_named_exists(document: Path) -> None:
     text = document.read_text()
     for target in re.findall(r"\]\((?!https?:|#|mailto:)([^)#]+)", text):
         assert (document.parent / target).exists(), f"{document.name}: no file {target}"
-    tests = {path.name: path.read_text() for path in (ROOT / "tests").rglob("*.py")}
     for name in re.findall(r"`(test_\w+\.py)`", text):
-        assert name in tests, f"{document.name}: no {name}"
-    written = set(re.findall(r"def (test_\w+)\(", "".join(tests.values())))
+        assert list((ROOT / "tests").rglob(name)), f"{document.name}: no {name}"
     for name in re.findall(r"`(test_\w+)`", text):
-        assert name in written, f"{document.name}: no test {name}"
+        assert name in TESTS, f"{document.name}: no test {name}"
     for name in re.findall(
         r"`((?:schemas|client|cli|solver|worker|service|tests|examples|benchmarks|docs)/[\w/]*\w\.\w+)`", text
     ):
