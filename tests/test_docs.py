@@ -32,6 +32,7 @@ SHOWN = {"text", "mermaid", "http"}
 SLOW = {
     "docs/explanation/depth.md", "docs/how-to/deploy.md", "docs/how-to/outliers.md", "docs/how-to/tokens.md", "docs/reference/artifacts.md",
     "docs/reference/cli.md", "docs/reference/rest.md", "docs/reference/sdk.md", "docs/tutorials/blender.md", "docs/tutorials/compare.md",
+    "docs/tutorials/python.md",
 }  # fmt: skip
 """Pages whose code solves several jobs or starts an embedded Valkey, left to `make test-slow`."""
 
