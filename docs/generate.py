@@ -1,9 +1,10 @@
-"""Copy docs/ to a folder and replace each marker ``<!-- generated: NAME -->`` by what the code says of itself.
+"""Copy docs/ to a folder, replace each marker ``<!-- generated: NAME -->`` by text from the code, and clean the code fences.
 
     python docs/generate.py build/docs
 
 Markers: `options` (JSON schema of the job options), `settings` (environment variables), `cli` (the commands' help), `rest`
-(OpenAPI document). Pages, links and anchors are checked by the strict build that follows in `make docs`.
+(OpenAPI document). A fence such as ``bash not-run: REASON`` becomes ``bash``, because Markdown renderers other than GitHub's
+take a longer line for text. Pages, links and anchors are checked by the strict build that follows in `make docs`.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from typing import Any
 
 DOCS = Path(__file__).resolve().parent
 MARKER = re.compile(r"^<!-- generated: (\w+) -->$", re.MULTILINE)
+NOTE = re.compile(r"^( *```\w+) not-run: .*$", re.MULTILINE)
 
 
 def main(target: Path) -> None:
@@ -29,21 +31,21 @@ def main(target: Path) -> None:
     shutil.copytree(DOCS, target, ignore=shutil.ignore_patterns("*.py", "__pycache__"))
     for page in sorted(target.rglob("*.md")):
         text = page.read_text(encoding="utf-8")
-        filled = MARKER.sub(lambda found: GENERATORS[found[1]](), text)
+        filled = NOTE.sub(r"\1", MARKER.sub(lambda found: GENERATORS[found[1]](), text))
         if filled != text:
             page.write_text(filled, encoding="utf-8")
 
 
 def options() -> str:
-    """Return a table of every job option, from the JSON schema."""
+    """Return a section for every job option, from the JSON schema."""
     from pliant.schemas.options import Options
 
     properties = Options.model_json_schema()["properties"]
-    rows = [
-        (f"`{name}`", _type_of(field), f"`{_plain(field.get('default'))}`", field.get("description", ""))
+    return "\n\n".join(
+        f"### {name}\n\n{field.get('description', '')}\n\n"
+        f"Type: {_type_of(field)}. Default: `{_plain(field.get('default'))}`."
         for name, field in properties.items()
-    ]
-    return _table(("option", "type", "default", "meaning"), rows)
+    )
 
 
 def settings() -> str:

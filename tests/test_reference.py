@@ -105,9 +105,9 @@ def test_every_command_is_generated_with_its_parameters(generate: ModuleType) ->
 
 def test_every_option_is_generated_with_its_default(generate: ModuleType) -> None:
     text = generate.options()
-    assert re.findall(r"^\| `(\w+)` \|", text, re.MULTILINE) == list(Options.model_fields)
-    assert "| `fps` | number, > 0, ≤ 1000 | `25.0` |" in text
-    assert "| `refine_rotations` | boolean | `true` |" in text
+    assert re.findall(r"^### (\w+)$", text, re.MULTILINE) == list(Options.model_fields)
+    assert "Type: number, > 0, ≤ 1000. Default: `25.0`." in text
+    assert "Type: boolean. Default: `true`." in text
 
 
 def test_every_setting_is_documented(generate: ModuleType) -> None:
@@ -145,10 +145,13 @@ def test_every_prometheus_metric_is_documented() -> None:
 def test_markers_are_replaced_and_pages_copied(generate: ModuleType, tmp_path: Path) -> None:
     generate.main(tmp_path / "site")
     made = tmp_path / "site" / "reference" / "options.md"
-    assert "| `method` |" in made.read_text(encoding="utf-8")
+    assert "### method" in made.read_text(encoding="utf-8")
     pages = sorted((tmp_path / "site").rglob("*.md"))
     assert len(pages) == len(list((ROOT / "docs").rglob("*.md")))
     assert [page for page in pages if "<!-- generated" in page.read_text(encoding="utf-8")] == []
+    fences = [line for page in pages for line in page.read_text(encoding="utf-8").splitlines() if "```" in line]
+    assert len(fences) > 100
+    assert [line for line in fences if not re.fullmatch(r" *```\w*", line)] == []
     assert not (tmp_path / "site" / "generate.py").exists()
 
 
