@@ -54,6 +54,8 @@ def settings() -> str:
     from pliant.worker import settings as of_worker
 
     notes, defaults = _field_notes(of_worker, "Settings"), of_worker.Settings()
+    for name, (variable, _, _) in of_worker.VARIABLES.items():  # the page speaks of variables, the class of fields
+        notes = {each: note.replace(f"`{name}`", f"`{variable}`") for each, note in notes.items()}
     worker = [
         (f"`{variable}`", _default(getattr(defaults, name)), f"{notes[name]} Expected: {expected}.")
         for name, (variable, expected, _) in of_worker.VARIABLES.items()
@@ -177,7 +179,8 @@ def _field_notes(module: Any, name: str) -> dict[str, str]:
     notes = {}
     for field, note in pairwise(body):
         if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and isinstance(note, ast.Expr):
-            notes[field.target.id] = " ".join(inspect.cleandoc(ast.literal_eval(note.value)).split())
+            text = " ".join(inspect.cleandoc(ast.literal_eval(note.value)).split())
+            notes[field.target.id] = text.replace("None:", "not set:")
     return notes
 
 

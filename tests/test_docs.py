@@ -30,7 +30,7 @@ SHOWN = {"text", "mermaid", "http"}
 """Languages that are run, parsed, or only shown."""
 
 SLOW = {
-    "docs/explanation/depth.md", "docs/how-to/deploy.md", "docs/how-to/outliers.md", "docs/how-to/tokens.md", "docs/reference/artifacts.md",
+    "docs/explanation/depth.md", "docs/how-to/outliers.md", "docs/how-to/tokens.md", "docs/reference/artifacts.md",
     "docs/reference/cli.md", "docs/reference/rest.md", "docs/reference/sdk.md", "docs/tutorials/blender.md", "docs/tutorials/compare.md",
     "docs/tutorials/python.md",
 }  # fmt: skip
