@@ -175,7 +175,7 @@ def run(command: list[str], folder: Path, url: str, *, given: str | None = None)
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     env = {**os.environ, "PATH": path, "PLIANT_URL": url, "MPLCONFIGDIR": str(folder / ".matplotlib")}
     return subprocess.run(
-        command, cwd=folder, env=env, input=given, capture_output=True, text=True, timeout=180, check=False
+        command, cwd=folder, env=env, input=given, capture_output=True, text=True, timeout=280, check=False
     )
 
 
