@@ -17,7 +17,7 @@ from pliant.solver.records import Floats
 INTERVAL = (0.4, 2.2)
 """Factors around the expected error that hold the true one in nine of ten sequences."""
 
-POOR, BAD = 0.15, 0.35
+POOR, BAD = 0.15, 0.7
 """Upper end of the expected error, share of the size, from which a result is to be used with care, and not to be used."""
 
 LOOSE, LOST = 0.08, 0.25
