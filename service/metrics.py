@@ -99,11 +99,11 @@ class StoreCollector(Collector):
             ("pliant_stored_bytes", "Bytes of all jobs' inputs and results.", records.used()),
         ):
             yield GaugeMetricFamily(name, text, value=value)
-        yield _counter(tallies, "pliant_jobs_ended", "Jobs that ended, by status.", group="ended", label="status")
-        yield _counter(tallies, "pliant_jobs_failed", "Failed jobs, by error code.", group="failed", label="code")
+        yield _counter(tallies, "pliant_jobs_ended_total", "Jobs that ended, by status.", group="ended", label="status")
+        yield _counter(tallies, "pliant_jobs_failed_total", "Failed jobs, by error code.", group="failed", label="code")
         yield _durations(tallies)
         text = "Webhooks: attempts, and their outcomes."
-        yield _counter(tallies, "pliant_webhooks", text, group="webhooks", label="result")
+        yield _counter(tallies, "pliant_webhooks_total", text, group="webhooks", label="result")
 
 
 def _counter(tallies: Mapping[str, float], name: str, text: str, *, group: str, label: str) -> Metric:
