@@ -20,7 +20,7 @@ from pliant.worker.artifacts.glb import write_glb
 from pliant.worker.formats import Inputs, Limits, read_inputs
 from pliant.worker.formats.reading.csv import read_csv
 from pliant.worker.formats.reading.gltf import read_gltf
-from pliant.worker.formats.reading.sandbox import parse_in_child
+from pliant.worker.formats.reading.sandbox import parse_in_sandbox
 from results import moving_sheet
 
 F, ROWS, COLUMNS = 6, 4, 5
@@ -102,7 +102,7 @@ def test_a_child_out_of_time_or_memory_costs_nothing_else(tmp_path: Path) -> Non
     (tmp_path / "m.obj").write_text("v 1 2 3\n" * 8_000_000)  # several seconds on any machine, and one is all it gets
     limits = Limits(parse_seconds=1, max_points=10**8)
     with pytest.raises(InvalidInput) as caught:
-        parse_in_child("obj", tmp_path / "m.obj", field="mesh", limits=limits)
+        parse_in_sandbox("obj", tmp_path / "m.obj", field="mesh", limits=limits)
     assert caught.value.code == "too_slow"
     scipy.io.savemat(tmp_path / "t.mat", {"W": np.zeros((4000, 9000))}, do_compression=True)
     assert code_of(tmp_path / "t.mat", limits=Limits(parse_memory=700 << 20)) == "too_large"
