@@ -132,7 +132,7 @@ async def _receive(
 ) -> tuple[Job, bool]:
     """Receive a form into a room of its own and submit what it holds; the room is gone afterwards, whatever happened."""
     rules = form_rules(core.settings, max_body_bytes=bounds.max_body_bytes)
-    await to_thread.run_sync(lambda: jobs.check_room(id=id, idempotency_key=idempotency_key))
+    await to_thread.run_sync(lambda: jobs.check_capacity(id=id, idempotency_key=idempotency_key))
     with core.incoming.room() as room:
         form = await receive_form(request, room, rules=rules)
         return await to_thread.run_sync(

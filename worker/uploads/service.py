@@ -16,7 +16,7 @@ from pathlib import Path
 
 from pliant.schemas.job import Upload
 from pliant.worker.errors import Conflict, OffsetMismatch, TooManyUploads, UnknownUpload
-from pliant.worker.jobs.validation import check_id, is_id
+from pliant.worker.ids import check_id, is_id
 from pliant.worker.settings import Settings
 from pliant.worker.uploads.folder import LENGTH, PART, WHOLE, content, locked, said_length
 from pliant.worker.uploads.writer import Room as Room

@@ -13,6 +13,7 @@ from pliant.schemas.options import Options
 from pliant.worker.execution.attempt import Attempt
 from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.service import Jobs
+from pliant.worker.jobs.submission import Submission
 
 
 @pytest.fixture
@@ -24,10 +25,12 @@ def now(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
 @pytest.fixture
 def attempt(jobs: Jobs, now: list[float], inputs_file: Path, interpretation: Interpretation) -> Attempt:
-    id = jobs.submit(inputs_file, options=Options(), interpretation=interpretation).id
-    token = jobs.records.get(id).token
-    jobs.records.update(id, lambda held: lifecycle.claim(held, token=token, worker="w", now=datetime.now(UTC)))
-    return Attempt(jobs=jobs, id=id, token=token, deadline=9.0)
+    id = jobs.submit(inputs_file, Submission(options=Options()), interpretation=interpretation).id
+    attempt_id = jobs.records.get(id).attempt_id
+    jobs.records.update(
+        id, lambda held: lifecycle.claim(held, attempt_id=attempt_id, worker="w", now=datetime.now(UTC))
+    )
+    return Attempt(jobs=jobs, id=id, attempt_id=attempt_id, deadline=9.0)
 
 
 def through(now: list[float], seconds: float, each: Callable[[], object]) -> None:

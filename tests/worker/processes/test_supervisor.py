@@ -172,7 +172,7 @@ def test_a_parent_that_is_gone_already_is_noticed() -> None:
 def test_workers_are_told_their_settings_and_threads(tmp_path: Path) -> None:
     settings = Settings(data=tmp_path, workers=2, threads=3)
     children = worker_children(settings)
-    assert [child.name for child in children] == ["worker-1", "worker-2", "keeper"]
+    assert [child.name for child in children] == ["worker-1", "worker-2", "reconciler"]
     for child in children:
         assert Settings.from_environment(child.env) == settings
         assert child.env["OPENBLAS_NUM_THREADS"] == child.env["OMP_NUM_THREADS"] == "1"  # the solver has its own
