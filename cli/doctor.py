@@ -230,7 +230,7 @@ def check_stored(data: Path) -> Iterator[Finding]:
         yield Finding("stored", "bad", str(fault), "Start `pliant up` on this directory, then ask again.")
         return
     for sentence in found:
-        yield Finding("stored", "bad", sentence, "The keeper puts right what it can within minutes; report what stays.")
+        yield Finding("stored", "bad", sentence, "The reconciler puts right what it can within minutes; report what stays.")
     for name in Incoming(data / "incoming").abandoned():
         advice = "The next start of the service removes it."
         yield Finding("stored", "bad", f"Folder incoming/{name} belongs to a process that is gone.", advice)

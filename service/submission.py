@@ -15,6 +15,7 @@ from pliant.worker.artifacts import kinds_for
 from pliant.worker.errors import Conflict, UnknownUpload
 from pliant.worker.formats import Limits, store_inputs
 from pliant.worker.jobs.service import Jobs
+from pliant.worker.jobs.submission import Submission
 from pliant.worker.uploads.service import Uploads
 from pliant.worker.webhooks.message import parse_webhook
 from pydantic import ValidationError
@@ -85,21 +86,20 @@ def accept(
         form.texts.get("webhook_secret", "").strip(),
         networks=jobs.settings.webhook_networks,
     )
-    known = jobs.known(id=id, idempotency_key=idempotency_key, fingerprint=form.fingerprint)
-    if known is not None:
-        return known, False
-    canonical = room / "canonical.npz"
-    interpretation = read_form(form, options, limits, target=canonical)
-    job = jobs.submit(
-        canonical,
+    submission = Submission(
         options=options,
-        interpretation=interpretation,
         name=name,
         id=id,
         idempotency_key=idempotency_key,
         fingerprint=form.fingerprint,
         webhook=webhook,
     )
+    known = jobs.known(submission)
+    if known is not None:
+        return known, False
+    canonical = room / "canonical.npz"
+    interpretation = read_form(form, options, limits, target=canonical)
+    job = jobs.submit(canonical, submission, interpretation=interpretation)
     return job, True
 
 

@@ -59,7 +59,7 @@ async def events(
     """
     stream = core.followers.follow(jobs, id, after=last or None, heartbeat=core.settings.heartbeat_seconds)
     # What can be refused is refused before the stream begins: afterwards there is no status code to say it with.
-    await to_thread.run_sync(partial(jobs.events, id, after=last or None, timeout=0))
+    await to_thread.run_sync(partial(jobs.events, id, after=last or None))
     return StreamingResponse(
         _written(stream, still_good=request.scope.get("pliant.still_good")),
         media_type="text/event-stream",

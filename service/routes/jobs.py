@@ -132,10 +132,11 @@ async def _receive(
 ) -> tuple[Job, bool]:
     """Receive a form into a room of its own and submit what it holds; the room is gone afterwards, whatever happened."""
     rules = form_rules(core.settings, max_body_bytes=bounds.max_body_bytes)
-    await to_thread.run_sync(lambda: jobs.check_room(id=id, idempotency_key=idempotency_key))
+    await to_thread.run_sync(lambda: jobs.check_capacity(id=id, idempotency_key=idempotency_key))
     with core.incoming.room() as room:
         form = await receive_form(request, room, rules=rules)
-        return await to_thread.run_sync(
+        return await core.parsing.run(
+            jobs.owner or "",
             lambda: accept(
                 form,
                 room,
@@ -145,7 +146,6 @@ async def _receive(
                 id=id,
                 idempotency_key=idempotency_key,
             ),
-            limiter=core.parsing,
         )
 
 

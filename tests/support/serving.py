@@ -105,17 +105,17 @@ def submit(http: httpx.Client, **parts: Any) -> Job:
 
 
 def claim(running: Running, id: str) -> str:
-    token = running.jobs.records.get(id).token
-    running.jobs.records.update(id, lambda stored: lifecycle.claim(stored, token=token, worker="w", now=NOW))
-    return token
+    attempt_id = running.jobs.records.get(id).attempt_id
+    running.jobs.records.update(id, lambda stored: lifecycle.claim(stored, attempt_id=attempt_id, worker="w", now=NOW))
+    return attempt_id
 
 
 def finish(running: Running, id: str, contents: bytes, *, name: str = "shapes.npz") -> None:
     """Do as a worker would: claim the job, store a file, publish it."""
-    token = claim(running, id)
+    attempt_id = claim(running, id)
     file = running.settings.incoming.parent / f"{id}.tmp"
     file.write_bytes(contents)
-    prefix = f"jobs/{id}/{token}/"
+    prefix = f"jobs/{id}/{attempt_id}/"
     running.jobs.blobs.put(f"{prefix}{name}", file)
     artifact = Artifact(
         name=name, media_type="application/octet-stream", bytes=len(contents), sha256=sha256(contents).hexdigest()
@@ -123,7 +123,7 @@ def finish(running: Running, id: str, contents: bytes, *, name: str = "shapes.np
     running.jobs.records.update(
         id,
         lambda stored: lifecycle.succeed(
-            stored, token=token, prefix=prefix, artifacts=[artifact], metrics={}, outcome="converged",
+            stored, attempt_id=attempt_id, prefix=prefix, artifacts=[artifact], metrics={}, outcome="converged",
             sentence="Converged.", warnings=[], now=NOW, retention=0,
         ),
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Jobs in memory and a keeper, on clocks that a test turns."""
+"""Jobs in memory and a reconciler, on clocks that a test turns."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from pathlib import Path
 
 from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.service import Jobs
-from pliant.worker.maintenance.reconciler import Keeper
+from pliant.worker.maintenance.reconciler import Reconciler
 from pliant.worker.settings import Settings
 from pliant.worker.store.blobs import Blobs
 from pliant.worker.store.memory import MemoryQueue, MemoryRecords
 
 
 class World:
-    """Jobs in memory, two clocks that we turn, a keeper."""
+    """Jobs in memory, two clocks that we turn, a reconciler."""
 
     def __init__(self, data: Path, **settings: object) -> None:
         self.now = datetime(2030, 1, 1, tzinfo=UTC)
@@ -27,18 +27,20 @@ class World:
             settings=Settings(data=data, lost_after=5.0, retention=60.0, max_attempts=2, **settings),  # type: ignore[arg-type]
             clock=lambda: self.now,
         )
-        self.keeper = Keeper(jobs=self.jobs, clock=lambda: self.monotonic)
-        self.keeper.tick()
+        self.reconciler = Reconciler(jobs=self.jobs, clock=lambda: self.monotonic)
+        self.reconciler.tick()
 
     def pass_seconds(self, seconds: float, *, meanwhile: Callable[[], object] = lambda: None) -> None:
         for _ in range(round(seconds)):
             self.monotonic += 1
             self.now += timedelta(seconds=1)
             meanwhile()
-            self.keeper.tick()
+            self.reconciler.tick()
 
     def claim(self, id: str) -> str:
-        token = self.jobs.records.get(id).token
-        self.jobs.queue.remove(token)
-        self.jobs.records.update(id, lambda held: lifecycle.claim(held, token=token, worker="w", now=self.now))
-        return token
+        attempt_id = self.jobs.records.get(id).attempt_id
+        self.jobs.queue.remove(attempt_id)
+        self.jobs.records.update(
+            id, lambda held: lifecycle.claim(held, attempt_id=attempt_id, worker="w", now=self.now)
+        )
+        return attempt_id
