@@ -6,7 +6,6 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from importlib.metadata import version
 
-import anyio
 from fastapi import FastAPI
 from pliant.service import openapi, problems
 from pliant.service.dependencies import Service
@@ -24,7 +23,7 @@ from pliant.service.routes import artifacts, events, examples, inspection, jobs,
 from pliant.service.routes import errors as error_pages
 from pliant.service.routes import metrics as metrics_route
 from pliant.service.settings import ServiceSettings
-from pliant.service.spool import Incoming
+from pliant.service.spool import Incoming, ParserSlots
 from pliant.service.upload_locks import UploadLocks
 from pliant.worker import errors
 from pliant.worker.formats import InvalidInput, Limits
@@ -61,7 +60,7 @@ def create_app(
     settings: ServiceSettings,
     *,
     tokens: Tokens,
-    limits: Limits = Limits(),  # noqa: B008
+    limits: Limits | None = None,
 ) -> FastAPI:
     """Return the application.
 
@@ -73,10 +72,11 @@ def create_app(
         Settings of the service.
     tokens : Tokens
         The bearer tokens, where the settings require them.
-    limits : Limits
-        Largest inputs that the readers accept.
+    limits : Limits, optional
+        Largest inputs that the readers accept; None: the usual limits, with `read_memory` of the jobs' settings.
     """
     metrics = Metrics()
+    limits = limits or Limits(read_memory=jobs_of_all.settings.read_memory)
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
@@ -91,7 +91,7 @@ def create_app(
             metrics=metrics,
             uploads=Uploads.open(jobs_of_all.settings),
             upload_locks=UploadLocks(),
-            parsing=anyio.CapacityLimiter(settings.parsers),
+            parsing=ParserSlots(settings.parsers),
         )
         yield
         incoming.close()

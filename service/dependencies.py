@@ -5,12 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Annotated
 
-import anyio
 from fastapi import Depends, Request
 from pliant.service.event_stream import Followers
 from pliant.service.metrics import Metrics
 from pliant.service.settings import ServiceSettings
-from pliant.service.spool import Incoming
+from pliant.service.spool import Incoming, ParserSlots
 from pliant.service.upload_locks import UploadLocks
 from pliant.worker.formats import Limits
 from pliant.worker.jobs.service import Jobs
@@ -33,7 +32,7 @@ class Service:
     """The uploads of all owners; routes use `MyUploads` instead."""
     upload_locks: UploadLocks
     metrics: Metrics
-    parsing: anyio.CapacityLimiter
+    parsing: ParserSlots
     """Limits the inputs that are in memory at once."""
 
 

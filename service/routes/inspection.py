@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from anyio import to_thread
 from fastapi import APIRouter, Request
 from numpy.typing import NDArray
 from pliant.schemas.job import Inspection
@@ -41,7 +40,7 @@ async def inspect(request: Request, core: Core, bounds: Bound, uploads: MyUpload
     rules = form_rules(core.settings, max_body_bytes=bounds.max_body_bytes)
     with core.incoming.scratch() as folder:
         form = await receive_form(request, folder, rules=rules)
-        return await to_thread.run_sync(lambda: interpret(form, folder, uploads, core.limits), limiter=core.parsing)
+        return await core.parsing.run(uploads.owner, lambda: interpret(form, folder, uploads, core.limits))
 
 
 def interpret(form: Form, folder: Path, uploads: Uploads, limits: Limits) -> Inspection:

@@ -164,7 +164,8 @@ async def _receive(
     await to_thread.run_sync(lambda: jobs.check_capacity(id=id, idempotency_key=idempotency_key))
     with core.incoming.scratch() as folder:
         form = await receive_form(request, folder, rules=rules)
-        return await to_thread.run_sync(
+        return await core.parsing.run(
+            jobs.owner or "",
             lambda: accept(
                 form,
                 folder,
@@ -174,7 +175,6 @@ async def _receive(
                 id=id,
                 idempotency_key=idempotency_key,
             ),
-            limiter=core.parsing,
         )
 
 
