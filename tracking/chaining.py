@@ -12,7 +12,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pliant.tracking.appearance import Appearance
 from pliant.tracking.errors import TrackingStopped
 from pliant.tracking.flow import Bools, Floats, Grey, Match, match

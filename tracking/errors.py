@@ -1,8 +1,8 @@
 """Errors of the tracker.
 
-    TrackingError              base: catch this one
-    ├── FilmError              a film, region or option that cannot be used; states both sides and what to do
-    └── TrackingStopped        `should_stop` returned True
+TrackingError              base: catch this one
+├── FilmError              a film, region or option that cannot be used; states both sides and what to do
+└── TrackingStopped        `should_stop` returned True
 """
 
 from __future__ import annotations

@@ -83,7 +83,9 @@ def match(first: Grey, second: Grey, points: Floats) -> Match:
     lengths = (step**2).sum(axis=1) + (back**2).sum(axis=1)
     height, width = first.shape
     outside = (landed < 0).any(axis=1) | (landed > (width - 1, height - 1)).any(axis=1)
-    return Match(landed, gap, (gap >= CYCLE_RATIO * lengths + CYCLE_FLOOR) | outside, _on_boundary(backward, landed, back))
+    return Match(
+        landed, gap, (gap >= CYCLE_RATIO * lengths + CYCLE_FLOOR) | outside, _on_boundary(backward, landed, back)
+    )
 
 
 def sample(field: Floats, points: Floats) -> Floats:

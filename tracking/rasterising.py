@@ -60,7 +60,11 @@ def rasterise(pixels: Floats, depth: Floats, triangles: Ints, *, size: tuple[int
     hit = np.flatnonzero(nearest >= 0)
     chosen = nearest[hit]
     surface = Surface(np.full(height * width, -1), np.zeros((height * width, 3)), np.full(height * width, np.inf))
-    surface.triangle[hit], surface.weights[hit], surface.depth[hit] = triangle[chosen], weights[chosen], 1 / total[chosen]
+    surface.triangle[hit], surface.weights[hit], surface.depth[hit] = (
+        triangle[chosen],
+        weights[chosen],
+        1 / total[chosen],
+    )
     return Surface(
         surface.triangle.reshape(height, width),
         surface.weights.reshape(height, width, 3),

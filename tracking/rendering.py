@@ -240,9 +240,7 @@ def render_film(
     slopes = np.abs(shapes[..., :2] / shapes[..., 2:]).max(axis=(0, 1))
     focal = float((fill * np.array(size) / 2 / slopes).min())
     rest = sequence.shapes[0] * (focal / (distance * radius))
-    return RenderedFilm(
-        size, focal, shapes, triangulate(sequence.mesh.faces), rest, blur, noise, occluder, seed
-    )
+    return RenderedFilm(size, focal, shapes, triangulate(sequence.mesh.faces), rest, blur, noise, occluder, seed)
 
 
 def _texture(points: Floats, height: int, seed: int) -> Floats:
