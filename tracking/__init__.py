@@ -8,14 +8,17 @@
 Needs OpenCV: `pip install 'pliant[film]'`.
 """
 
+if __name__ != "pliant.tracking":
+    raise ImportError(f"import this folder as pliant.tracking, not as {__name__!r}: install it with pip install -e .")
+
 try:
     import cv2 as _cv2
 except ImportError as error:
     raise ImportError("Tracking films needs OpenCV. Install it with: pip install 'pliant[film]'") from error
 
-from pliant.tracking.decoding import Film, Frame, open_film
+from pliant.tracking.decoding.film import Film, Frame, open_film
+from pliant.tracking.decoding.limits import FilmLimits
 from pliant.tracking.errors import FilmError, TrackingError, TrackingStopped
-from pliant.tracking.limits import FilmLimits
 from pliant.tracking.records import FilmInfo, OnStep, TrackedFilm, TrackingStep
 from pliant.tracking.track import track_film
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.tracking.decoding import Film
+from pliant.tracking.decoding.film import Film
 from pliant.tracking.survey import Survey
 
 SHORT = 10

@@ -9,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pliant.tracking.contact_sheet import Sheet, draw_contact_sheet
 
 Stage = Literal["read", "locate", "track"]
 
@@ -82,7 +83,7 @@ class TrackedFilm:
     """Texture coordinates in the template image, shape `(P, 2)`, in [0, 1]: u right, v down, (0, 0) its upper left corner."""
 
     thumbnails: NDArray[np.uint8]
-    """Some frames in colour, at most 320 pixels wide, shape `(N, h, w, 3)`."""
+    """Some frames in colour, 320 pixels wide, shape `(N, h, w, 3)`."""
 
     thumbnail_frames: NDArray[np.int64]
     """Their indices among the F frames, shape `(N,)`."""
@@ -130,6 +131,8 @@ class TrackedFilm:
 
     def contact_sheet(self, *, quality: int = 85) -> bytes:
         """Draw the tracks over some frames, as one small JPEG picture."""
-        from pliant.tracking.contact_sheet import draw_contact_sheet
-
-        return draw_contact_sheet(self, quality=quality)
+        sheet = Sheet(
+            self.thumbnails, self.thumbnail_frames, self.tracks, self.visibility, self.grid, self.template,
+            self.frame_times, self.image_size[0],
+        )  # fmt: skip
+        return draw_contact_sheet(sheet, quality=quality)

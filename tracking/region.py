@@ -79,7 +79,7 @@ def transport(
             raise TrackingStopped
         ways = [(start, seeds.points, np.ones_like(seen), np.zeros_like(variance)), (before, points, seen, variance)]
         frame = read(here)
-        found = list(pool.map(lambda way: match(read(way[0]), frame, way[1]), ways))
+        found = [done.result() for done in [pool.submit(match, read(way[0]), frame, way[1]) for way in ways]]
         sees = np.stack([way[2] & ~m.lost for way, m in zip(ways, found, strict=True)])
         sums = np.stack([way[3] + m.gap for way, m in zip(ways, found, strict=True)])
         best = np.lexsort((sums, ~sees), axis=0)[0]

@@ -89,7 +89,7 @@ def textured(image: Grey) -> Bools:
 
 
 def number(plane: Floats, wanted: Bools) -> Seeds:
-    """Number the wanted cells that belong to a face, row by row; drop rows and columns that hold none."""
+    """Give numbers to the wanted cells that belong to a face, row by row; drop rows and columns that hold none."""
     square = wanted[:-1, :-1] & wanted[1:, :-1] & wanted[:-1, 1:] & wanted[1:, 1:]
     kept = np.zeros_like(wanted)
     for down in (0, 1):

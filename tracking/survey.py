@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pliant.tracking.decoding import Film
+from pliant.tracking.decoding.film import Film
 from pliant.tracking.errors import FilmError, TrackingStopped
 from pliant.tracking.flow import Grey
 from pliant.tracking.frame_store import FrameStore

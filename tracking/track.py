@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from pliant.tracking.advice import warnings_before, warnings_of
 from pliant.tracking.appearance import Appearance
 from pliant.tracking.chaining import Chain, chain
-from pliant.tracking.decoding import Film, open_film
+from pliant.tracking.decoding.film import Film, open_film
+from pliant.tracking.decoding.limits import FilmLimits
 from pliant.tracking.errors import FilmError, TrackingStopped
 from pliant.tracking.flow import Bools, opencv_serial
 from pliant.tracking.frame_store import FrameStore
-from pliant.tracking.limits import FilmLimits
 from pliant.tracking.records import FilmInfo, OnStep, TrackedFilm, TrackingStep
 from pliant.tracking.region import Region, read_region, transport
 from pliant.tracking.seeding import default_step, keep, neighbours, place, quads
@@ -36,6 +36,7 @@ LEAST_POINTS = 16
 
 THUMBNAILS = 6
 THUMBNAIL_WIDTH = 320
+"""Pixels; small films are enlarged, so that drawn tracks leave something of the picture."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,7 +243,7 @@ def _pictures(
     """Decode the film again for the template in colour and the thumbnails; the store holds grey frames only."""
     wanted = {int(indices[row]) for row in picked} | {int(indices[template])}
     width, height = run.film.size
-    small = (min(width, THUMBNAIL_WIDTH), max(1, round(height * min(1, THUMBNAIL_WIDTH / width))))
+    small = (THUMBNAIL_WIDTH, max(1, round(height * THUMBNAIL_WIDTH / width)))
     thumbnails, image = {}, np.zeros((0, 0, 3), np.uint8)
     for frame in run.film.frames():
         if run.should_stop():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,12 +12,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pliant.tracking.containers import Container, recognise
+from pliant.tracking.decoding.containers import Container, recognise
+from pliant.tracking.decoding.limits import FilmLimits
+from pliant.tracking.decoding.pictures import checked, folder_pictures, gif_frames, read_picture, zip_pictures
 from pliant.tracking.errors import FilmError
-from pliant.tracking.limits import FilmLimits
-from pliant.tracking.pictures import checked, folder_pictures, gif_frames, read_picture, zip_pictures
-
-__all__ = ["Film", "Frame", "open_film"]
 
 PICTURE_RATE = 30.0
 """Frames a second that are assumed of pictures, which carry no times."""
@@ -60,7 +58,7 @@ class Film:
 
     limits: FilmLimits
 
-    def frames(self) -> Iterator[Frame]:
+    def frames(self) -> Generator[Frame, None, None]:
         """Decode the selected frames in order; memory does not grow with the film.
 
         Raises
@@ -94,7 +92,7 @@ class Film:
                 got=f"{width}×{height} in frame {frame.index}", hint="Export all frames in one size.",
             )  # fmt: skip
 
-    def _decode(self, start: int, stop: int | None, step: int) -> Iterator[Frame]:
+    def _decode(self, start: int, stop: int | None, step: int) -> Generator[Frame, None, None]:
         if self.container == "gif":
             for index, (time, image) in enumerate(gif_frames(self.path, self.limits)):
                 if stop is not None and index >= stop:

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageOps
+from pliant.tracking.decoding.limits import FilmLimits
 from pliant.tracking.errors import FilmError
-from pliant.tracking.limits import FilmLimits
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp")
 FORMATS = ("PNG", "JPEG", "WEBP", "BMP")

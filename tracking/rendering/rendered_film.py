@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.gallery import Sequence
 from pliant.tracking.errors import FilmError
-from pliant.tracking.rasterising import Floats, Ints, Surface, rasterise, triangulate
+from pliant.tracking.rendering.rasterising import Floats, Ints, Surface, rasterise, triangulate
 
 SUPERSAMPLING = 2
 """Samples per pixel side."""
@@ -94,7 +94,7 @@ class RenderedFilm:
         if self.blur > 0:
             small = cv2.GaussianBlur(small, (0, 0), self.blur)
         grain = np.random.default_rng((self.seed, index)).standard_normal(small.shape)
-        return np.clip(np.round(small + self.noise * grain), 0, 255).astype(np.uint8)
+        return np.asarray(np.clip(np.round(small + self.noise * grain), 0, 255), dtype=np.uint8)
 
     def region(self, index: int) -> NDArray[np.bool_]:
         """Return the pixels that show the object, shape `(H, W)`."""
@@ -145,7 +145,7 @@ class RenderedFilm:
                 got=target.name,
                 hint="Choose another suffix.",
             )
-        writer = cv2.VideoWriter(str(target), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*code), fps, self.size)
+        writer = cv2.VideoWriter(str(target), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*code), fps, self.size)
         try:
             if not writer.isOpened():
                 raise FilmError(
@@ -236,7 +236,7 @@ def render_film(
     """
     turned = sequence.shapes @ sequence.rotations.transpose(0, 2, 1)
     radius = np.abs(turned[..., 1]).max()
-    shapes = turned + (0.0, 0.0, distance * radius)
+    shapes = turned + np.array([0.0, 0.0, distance * radius])
     slopes = np.abs(shapes[..., :2] / shapes[..., 2:]).max(axis=(0, 1))
     focal = float((fill * np.array(size) / 2 / slopes).min())
     rest = sequence.shapes[0] * (focal / (distance * radius))
