@@ -20,13 +20,6 @@ PATCH = np.stack(np.meshgrid(*[np.arange(-6, 7, 2, dtype=np.float32)] * 2), axis
 """Sample places of a patch in pixels around its point: 7 × 7, two pixels apart."""
 
 
-REFINEMENTS = 3
-"""Gauss-Newton steps; the third moves points by less than 0.02 px."""
-
-PRIOR, FARTHEST = 0.5, 1.5
-"""Standard deviation and largest length of the shift by which patches correct the flow, pixels."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Appearance:
     """The points of a template, their neighbours, and the patches around them."""
@@ -40,48 +33,14 @@ class Appearance:
     patches: Floats
     """Grey levels with their mean removed, shape `(P, 49)`."""
 
-    slopes: Floats
-    """Gradient of the template at the samples, with its mean removed, grey levels per pixel, shape `(P, 49, 2)`."""
-
     noise: float
     """Variance of the template's noise, square grey levels."""
 
     @classmethod
     def of(cls, template: Grey, points: Floats, neighbours: NDArray[np.int64]) -> Appearance:
         """Cut the patches out of a template."""
-        smooth = _smooth(template)
-        places = points[:, None] + PATCH
-        patches = _cut(smooth, places)
-        ahead = [_cut(smooth, places + step) - _cut(smooth, places - step) for step in np.eye(2, dtype=np.float32)]
-        slopes = np.stack(ahead, axis=-1) / 2
-        patches -= patches.mean(axis=1, keepdims=True)
-        slopes -= slopes.mean(axis=1, keepdims=True)
-        return cls(points, neighbours, patches, slopes, noise_variance(template))
-
-    def refine(self, frame: Grey, points: Floats, visible: Bools) -> Floats:
-        """Move visible points to where the frame fits the template's patches best, and return all points, `(P, 2)`.
-
-        Inverse compositional Gauss-Newton steps (Baker and Matthews 2004) on the shift alone, after the tracks' affine map;
-        brightness may change. A Gaussian prior of `PRIOR` keeps points near the flow where the patch says little.
-        """
-        affine = self._affine(points, visible)
-        spread = np.einsum("pij,kj->pki", affine, PATCH)
-        smooth = _smooth(frame)
-        normal = np.einsum("pki,pkj->pij", self.slopes, self.slopes)
-        moved = points.copy()
-        shift = np.zeros_like(points)
-        for _ in range(REFINEMENTS):
-            residual = _cut(smooth, moved[:, None] + spread)
-            residual -= residual.mean(axis=1, keepdims=True)
-            residual -= self.patches
-            # The residual holds bending and compression as well as noise; its own size weighs the prior against it.
-            weight = np.maximum((residual**2).mean(axis=1), self.noise + 1.0) / PRIOR**2
-            pull = np.einsum("pki,pk->pi", self.slopes, residual) + weight[:, None] * shift
-            matrix = normal + weight[:, None, None] * np.eye(2, dtype=np.float32)
-            shift -= np.linalg.solve(matrix, pull[..., None])[..., 0]
-            shift *= np.minimum(1, FARTHEST / np.maximum(np.linalg.norm(shift, axis=1), 1e-6))[:, None]
-            moved = points + np.einsum("pij,pj->pi", affine, shift)
-        return np.asarray(np.where(visible[:, None], moved, points), dtype=np.float32)
+        patches = _cut(_smooth(template), points[:, None] + PATCH)
+        return cls(points, neighbours, patches - patches.mean(axis=1, keepdims=True), noise_variance(template))
 
     def agrees(self, frame: Grey, points: Floats, visible: Bools) -> Bools:
         """Compare a frame with the template at tracked points; return which of the visible ones stay so, shape `(P,)`.

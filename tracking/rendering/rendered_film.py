@@ -18,11 +18,11 @@ from pliant.tracking.rendering.rasterising import Floats, Ints, Surface, rasteri
 SUPERSAMPLING = 2
 """Samples per pixel side."""
 
-WAVES = 60
+WAVES = 80
 """Plane waves that make up a texture."""
 
-DETAIL = (0.05, 0.35)
-"""Finest and coarsest wavelength of a texture, in image heights: at 120 lines the finest, 6 pixels, survives sampling and blur."""
+FINEST, COARSEST = 6.0, 0.35
+"""Wavelengths of a texture: the finest in pixels, which sampling and blur leave visible, the coarsest in image heights."""
 
 LAYER = 0.04
 """A point is visible if it lies at most this far behind the nearest surface, in radii of the object. The facets of a gallery
@@ -248,7 +248,7 @@ def _texture(points: Floats, height: int, seed: int) -> Floats:
     random = np.random.default_rng(seed)
     direction = random.standard_normal((WAVES, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    wavelength = height * np.exp(random.uniform(np.log(DETAIL[0]), np.log(DETAIL[1]), WAVES))
+    wavelength = np.exp(random.uniform(np.log(FINEST), np.log(COARSEST * height), WAVES))
     phase = random.uniform(0, 2 * np.pi, WAVES)
     shared = random.standard_normal((WAVES, 1)) + 0.3 * random.standard_normal((WAVES, 3))
     strength = shared * wavelength[:, None] ** 0.5
