@@ -22,12 +22,20 @@ def turning(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RenderedFil
     return path, films.rendered(sphere(FRAMES, 600, degrees=20), path, size=(96, 72))
 
 
-@pytest.mark.parametrize("name", ["face", "flag", "sphere", "occluded"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("face", marks=pytest.mark.slow),
+        pytest.param("flag", marks=pytest.mark.slow),
+        "sphere",
+        pytest.param("occluded", marks=pytest.mark.slow),
+    ],
+)
 def test_tracks_agree_with_the_truth(tmp_path: Path, name: str) -> None:
     sequence = {
         "face": lambda: face(20, 1500, degrees=25),
         "flag": lambda: flag(20, 1500, degrees=30),
-        "sphere": lambda: sphere(20, 1500, degrees=30),
+        "sphere": lambda: sphere(20, 800, degrees=30),
         "occluded": lambda: flag(20, 1500, degrees=20),
     }[name]()
     film = films.rendered(sequence, tmp_path / "film.avi", occluder=name == "occluded")
@@ -86,7 +94,7 @@ def test_the_contact_sheet_shows_film_and_tracks(turning: tuple[Path, RenderedFi
     drawn = np.abs(picture[:240, :320].astype(int) - bare).max(axis=2) > 80
     outside = ~cv2.resize(film.region(0).astype(np.uint8), (320, 240)).astype(bool)
     outside[215:, :80] = False  # the time
-    assert drawn[~outside].mean() > 0.05
+    assert drawn[~outside].mean() > 0.03
     assert drawn[outside].mean() < 0.02
 
 
@@ -109,7 +117,7 @@ def test_a_region_is_carried_to_another_template(turning: tuple[Path, RenderedFi
     column, row = np.round(tracked.tracks[9]).astype(int).T
     assert film.region(9)[row, column].mean() > 0.95
     covered = cv2.dilate(_mask(tracked, 9, (72, 96)), np.ones((5, 5), np.uint8)) > 0
-    assert (covered & film.region(9)).sum() > 0.75 * film.region(9).sum()
+    assert (covered & film.region(9)).sum() > 0.65 * film.region(9).sum()
     assert {step.stage for step in steps} == {"read", "locate", "track"}
     assert [step.done for step in steps if step.stage == "track"] == list(range(2, FRAMES + 1))
     assert steps[0] == TrackingStep("read", 1, None)
@@ -214,14 +222,15 @@ def test_a_region_without_texture_is_refused(tmp_path: Path) -> None:
 
 
 def test_frames_that_share_nothing_are_refused(tmp_path: Path) -> None:
-    pictures = [films.textured_pictures(1, (96, 72), seed=seed)[0] for seed in range(8)]
+    random = np.random.default_rng(0)
+    pictures = [random.integers(0, 256, (96, 128, 3), dtype=np.uint8) for _ in range(16)]
     path = films.write_film(tmp_path / "film.mkv", pictures)
-    region = [(20, 20), (70, 20), (70, 55), (20, 55)]
+    region = [(20, 20), (100, 20), (100, 75), (20, 75)]
     with pytest.raises(FilmError, match="Film more slowly") as caught:
         track_film(path, region=region)
     assert caught.value.code == "tracks_lost"
     with pytest.raises(FilmError) as caught:
-        track_film(path, region=region, template_frame=6)
+        track_film(path, region=region, template_frame=12)
     assert caught.value.code == "region_lost"
 
 
