@@ -18,8 +18,8 @@ from pliant.tracking.seeding import Seeds, quads
 
 Region = NDArray[np.bool_] | NDArray[np.uint8] | Sequence[Sequence[float]] | Path | str
 
-LONG_STEP = 4
-"""Frames between the stations on a region's way to the template."""
+LONG_STEP = 2
+"""Frames between the stations on a region's way to the template; longer ones lose fast motion."""
 
 
 def read_region(region: Region, size: tuple[int, int]) -> Bools:

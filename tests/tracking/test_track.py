@@ -229,8 +229,12 @@ def test_frames_that_share_nothing_are_refused(tmp_path: Path) -> None:
     with pytest.raises(FilmError, match="Film more slowly") as caught:
         track_film(path, region=region)
     assert caught.value.code == "tracks_lost"
-    with pytest.raises(FilmError) as caught:
-        track_film(path, region=region, template_frame=12)
+
+
+def test_a_region_that_leaves_before_the_template_is_refused(tmp_path: Path) -> None:
+    path = films.write_film(tmp_path / "film.mkv", films.textured_pictures(32, (96, 72), step=3))
+    with pytest.raises(FilmError, match="Draw the region in the template frame itself") as caught:
+        track_film(path, region=[(10, 20), (40, 20), (40, 55), (10, 55)], template_frame=31)
     assert caught.value.code == "region_lost"
 
 

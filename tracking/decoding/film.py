@@ -235,6 +235,8 @@ def _decode_video(path: Path, fps: float, start: int, stop: int | None, step: in
                     return
                 yield Frame(index, time, np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8))
             index += 1
+        if index == 0:
+            raise _undecodable(path)
     except cv2.error as error:
         raise _undecodable(path) from error
     finally:
