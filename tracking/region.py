@@ -11,10 +11,11 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image, UnidentifiedImageError
+from pliant.tracking.appearance import Appearance
 from pliant.tracking.errors import FilmError, TrackingStopped
 from pliant.tracking.flow import Bools, Floats, Grey, match
 from pliant.tracking.records import OnStep, TrackingStep
-from pliant.tracking.seeding import Seeds, quads
+from pliant.tracking.seeding import Seeds, neighbours, quads
 
 Region = NDArray[np.bool_] | NDArray[np.uint8] | Sequence[Sequence[float]] | Path | str
 
@@ -71,6 +72,7 @@ def transport(
     """
     points, seen = seeds.points, np.ones(len(seeds.points), dtype=bool)
     variance = np.zeros(len(points), dtype=np.float32)
+    appearance = Appearance.of(read(start), seeds.points, neighbours(seeds.grid, len(points)))
     direction = 1 if end > start else -1
     stations = [*range(start, end, direction * LONG_STEP), end]
     for before, here in itertools.pairwise(stations):
@@ -85,7 +87,7 @@ def transport(
         best = np.lexsort((sums, ~sees), axis=0)[0]
         every = np.arange(len(best))
         points = np.stack([m.points for m in found])[best, every]
-        seen, variance = sees[best, every], sums[best, every]
+        seen, variance = appearance.agrees(frame, points, sees[best, every]), sums[best, every]
     return _cover(points, seen, seeds, read(end).shape)
 
 
