@@ -62,7 +62,8 @@ def _bars() -> Iterator[OnStep]:
     """Show one bar for each stage on a terminal; nothing where there is no terminal."""
     from rich.progress import Progress, TaskID
 
-    with Progress(console=err, disable=not err.is_terminal) as progress:
+    screen = err()
+    with Progress(console=screen, disable=not screen.is_terminal) as progress:
         tasks: dict[str, TaskID] = {}
 
         def on_step(step: TrackingStep) -> None:
@@ -84,5 +85,5 @@ def _show(tracked: TrackedFilm, output: Path, *, as_json: bool) -> None:
         )  # fmt: skip
         return
     for warning in tracked.warnings:
-        err.print(f"[yellow]Warning:[/yellow] {warning}")
-    out.print(f"{output}: {points} points in {count} frames, visible in {tracked.visibility.mean():.0%}.")
+        err().print(f"[yellow]Warning:[/yellow] {warning}")
+    out().print(f"{output}: {points} points in {count} frames, visible in {tracked.visibility.mean():.0%}.")

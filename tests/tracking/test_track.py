@@ -232,9 +232,10 @@ def test_frames_that_share_nothing_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_region_that_is_gone_before_the_template_is_refused(tmp_path: Path) -> None:
-    pictures = films.textured_pictures(14, (96, 72))
-    faded = [np.uint8(128 + (picture - 128.0) * max(0, 1 - t / 10)) for t, picture in enumerate(pictures)]
-    path = films.write_film(tmp_path / "film.mkv", faded)
+    pictures = [picture.copy() for picture in films.textured_pictures(14, (96, 72))]
+    for number, picture in enumerate(pictures):
+        picture[max(14, 72 - 6 * number) :] = 120  # a blank panel rises and covers the region
+    path = films.write_film(tmp_path / "film.mkv", pictures)
     with pytest.raises(FilmError, match="Draw the region in the template frame itself") as caught:
         track_film(path, region=[(10, 20), (40, 20), (40, 55), (10, 55)], template_frame=13)
     assert caught.value.code == "region_lost"
