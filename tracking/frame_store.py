@@ -41,7 +41,7 @@ class FrameStore:
 
     def append(self, frame: Grey) -> None:
         """Add a grey frame, shape `(H, W)`, dtype uint8."""
-        # Level 1 with fixed filters: 40 % of the size at a tenth of the time of the default.
+        # Level 1: the file is short-lived, so time counts more than size.
         packed = cv2.imencode(".png", frame, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
         start = sum(self._places[-1]) if self._places else 0
         self._file.seek(start)

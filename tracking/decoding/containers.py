@@ -18,7 +18,7 @@ Container = Literal["mp4", "matroska", "avi", "gif", "zip", "folder"]
 
 ACCEPTED = "an mp4, mov, webm, mkv or avi film, an animated GIF, a zip of pictures, or a folder of pictures"
 MAX_BOXES = 20_000
-"""Boxes of an MP4 file that are looked at; a fragmented film of an hour has about 5,000."""
+"""Boxes of an MP4 file that are looked at. A fragmented film has two for every fragment of about a second."""
 
 MAX_STREAMS = 16
 """Streams in one film: a camera writes two to five (picture, sound, metadata)."""
