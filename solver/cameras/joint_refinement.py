@@ -24,7 +24,6 @@ from pliant.solver.model.shape_covariance import (
     NOISE_FLOOR,
     ShapeCovariance,
     learned,
-    random_walk,
 )
 from pliant.solver.model.so3 import angles_between, exponential
 from pliant.solver.records import Floats, read_only
@@ -303,7 +302,7 @@ def _coupled(gram: Floats, found: Learned, *, with_scales: bool, should_stop: Ca
 
 def _scene(gram: Floats, rotations: Floats, *, with_scales: bool) -> Scene:
     return Scene(
-        gram, rotations, with_scales=with_scales, walk=random_walk(len(rotations)), steadiness=STEADY,
+        gram, rotations, with_scales=with_scales, steadiness=STEADY,
         noise_floor=NOISE_FLOOR**0.5, smoothness=0.0,
     )  # fmt: skip
 

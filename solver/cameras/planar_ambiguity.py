@@ -22,7 +22,6 @@ from pliant.solver.cameras.factorization import leading_factor
 from pliant.solver.cameras.multistart import carried, gram_of
 from pliant.solver.cameras.scale import rigid_scales
 from pliant.solver.model.marginal_likelihood import Motion, Scene, cameras_of, fit, start
-from pliant.solver.model.shape_covariance import random_walk
 from pliant.solver.model.so3 import MIRROR, angles_between, from_rows, start_at_identity
 from pliant.solver.records import Floats
 from scipy.optimize import minimize
@@ -145,7 +144,7 @@ def unfold(
 def fitted(gram: Floats, rotations: Floats, scales: Floats, sides: Sides, *, iterations: int = DEEP) -> Unfolded:
     """Return the cameras of highest likelihood near the given ones."""
     scene = Scene(
-        gram, rotations, with_scales=True, walk=random_walk(len(rotations)), steadiness=STEADY, noise_floor=NOISE,
+        gram, rotations, with_scales=True, steadiness=STEADY, noise_floor=NOISE,
         smoothness=0.0,
     )  # fmt: skip
     begun = replace(start(scene, scales, num_modes=MODES), logs=np.log([0.01, 0.05]))
