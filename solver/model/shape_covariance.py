@@ -236,11 +236,12 @@ def rounds(
     (Tipping, Bishop 1999) of C seen relative to the random walk. `DENSE_FRAMES` says in which form K is.
     """
     factor, subspace = factor_of(gram), None
-    for floor in floors:
+    for number, floor in enumerate(floors):
         if len(pairs) <= DENSE_FRAMES:
             covariance = _round(covariance, factor, pairs, floor, most)
         else:
             covariance, subspace = _linear_round(covariance, factor, pairs, floor, most, subspace)
+            subspace = np.hstack([subspace, _cosines(len(pairs), GUARD, first=number * GUARD)])
         yield covariance
 
 
@@ -308,8 +309,7 @@ def _linear_round(
     square = along.T @ along + 2 * covariance.drift * np.eye(count)
     total = float((along**2).sum()) + frames * covariance.drift
     total += (float((square * inner).sum()) + covariance.drift * float((walk * by_walk).sum())) / 3
-    begun = np.hstack([along, _cosines(frames, GUARD)]) if subspace is None else subspace
-    values, vectors = _nystrom(product, begun)
+    values, vectors = _nystrom(product, np.hstack([along, _cosines(frames, most)]) if subspace is None else subspace)
     modes, drift = _kept(values, vectors, total, floor, min(most, frames - 1))
     better = _improved(
         covariance, coloured(modes), drift,
@@ -321,10 +321,10 @@ def _linear_round(
     return better, vectors[:, : modes.shape[1] + GUARD]
 
 
-def _cosines(frames: int, count: int) -> Floats:
-    """Return the slowest cosines, orthonormal, shape `(F, count)`."""
-    angles = np.pi * np.outer(np.arange(frames) + 0.5, np.arange(count)) / frames
-    return np.asarray(np.cos(angles) * (2 / frames) ** 0.5)
+def _cosines(frames: int, count: int, *, first: int = 0) -> Floats:
+    """Return `count` cosines of rising frequency, orthonormal but for the constant, shape `(F, count)`; after the last comes the first."""
+    frequencies = (first + np.arange(min(count, frames))) % frames
+    return np.asarray(np.cos(np.pi * np.outer(np.arange(frames) + 0.5, frequencies) / frames) * (2 / frames) ** 0.5)
 
 
 def _nystrom(product: Callable[[Floats], Floats], begun: Floats) -> tuple[Floats, Floats]:
