@@ -7,12 +7,16 @@ STAMP := $(VENV)/.installed
 PAGE := service/web/dist/index.html
 PAGE_SOURCES := $(wildcard service/web/*.json service/web/*.mjs service/web/src/* service/web/src/*/*)
 
-.PHONY: help demo test page check format clean
+.PHONY: help demo test test-slow matrix coverage page docs types check format clean
 
 help:
 	@echo "make demo    reconstruct a moving face end to end: service, queue, worker, glTF"
-	@echo "make test    run every test"
+	@echo "make test    run the tests: four minutes on two cores, nothing but Python needed"
+	@echo "make test-slow  run what is slow or needs Chromium, Node.js, an S3 server or root"
+	@echo "make matrix  make test with every Python from 3.11 to 3.14 on this machine"
+	@echo "make coverage   make test, with the share of lines that it runs"
 	@echo "make page    bundle the web page"
+	@echo "make docs    build the documentation site into build/site; a warning is an error"
 	@echo "make check   lint (ruff) and types (mypy --strict)"
 	@echo "make format  let ruff rewrite the files"
 	@echo "make clean   remove .venv and build output"
@@ -34,18 +38,42 @@ page: $(PAGE)
 demo: $(STAMP) $(PAGE)
 	$(BIN)/pliant demo $(DEMO)
 
-# Two processes share the test files out: half of them wait for real servers, the others compute. PROCESSES=1: one after the other.
+# Two processes share the tests. PROCESSES=1 runs them one after the other.
 PROCESSES ?= 2
 SHARED := $(if $(filter-out 1,$(PROCESSES)),-n $(PROCESSES) --dist loadfile)
+PYTEST := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest $(SHARED)
+NEEDY := slow or chromium or node or s3 or root
 
-test: $(STAMP) $(PAGE)
-	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest $(SHARED) $(TESTS)
+test: $(STAMP)
+	$(PYTEST) -m "not ($(NEEDY))" $(TESTS)
+
+test-slow: $(STAMP) $(PAGE)
+	$(PYTEST) -m "$(NEEDY)" $(TESTS)
+
+# Every interpreter of 3.11 to 3.14 on this machine, each in an environment of its own.
+matrix:
+	@for version in 3.11 3.12 3.13 3.14; do \
+	  if command -v python$$version >/dev/null; then \
+	    echo "== Python $$version"; $(MAKE) --no-print-directory test PYTHON=python$$version VENV=.venv-$$version || exit 1; \
+	  else echo "== Python $$version is not on this machine"; fi; done
+
+coverage: $(STAMP)
+	$(PYTEST) -m "not ($(NEEDY))" --cov=pliant --cov-report=term $(TESTS)
+
+# Zensical builds what docs/generate.py writes: the pages, and the reference that is read from the code.
+docs: $(STAMP) build/typed/pliant
+	@$(BIN)/python -c 'import zensical' 2>/dev/null || $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
+	$(BIN)/python docs/generate.py build/docs
+	NO_COLOR=1 $(BIN)/python -m zensical build --clean --strict
 
 # mypy reads the folders under their import names, so it gets a tree of links that has them.
 build/typed/pliant:
 	mkdir -p $@
 	for folder in schemas solver worker service client cli; do ln -sfn ../../../$$folder $@/$$folder; done
 	for file in __init__.py py.typed; do ln -sfn ../../../door/$$file $@/$$file; done
+
+types: $(STAMP) build/typed/pliant
+	$(BIN)/mypy -p pliant
 
 check: $(STAMP) build/typed/pliant
 	$(BIN)/ruff check .
@@ -57,4 +85,4 @@ format: $(STAMP)
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info service/web/dist service/web/dist.next service/web/node_modules
+	rm -rf $(VENV) .cache build dist *.egg-info service/web/dist service/web/dist.next service/web/node_modules

@@ -5,7 +5,7 @@
     python -m benchmarks.accuracy --data DIR --only face --corruptions all
     python -m benchmarks.accuracy --data DIR --plan        the whole table, part by part (see plan.py)
     python -m benchmarks.accuracy --tables                  print what has been measured so far, and the aims beside it
-    python -m benchmarks.accuracy --tables --into FILE      write all of it, in every metric, as a page of Markdown
+    python -m benchmarks.accuracy --tables --summary FILE   write mean and spread of every cell, in every metric, as JSON lines
     python -m benchmarks.accuracy --gate                    small gallery sequences against the committed baseline
 
 Every finished cell is a line of JSON in `--results`, with the commit that it was measured at; a second run skips what is there, or,
@@ -28,12 +28,14 @@ from benchmarks.cells import CORRUPTIONS, METHODS, Key, append_row, measure, rea
 from benchmarks.commit import commit
 from benchmarks.plan import PARTS
 from benchmarks.sequences import Case, cases, wanted
+from benchmarks.summary import write_summary
 from benchmarks.tables import METRICS, clean_table, corruption_table, cost_table, number
 
 SLOW = 10.0
 """Seconds; three trials instead of five where a run takes longer."""
 
-VISIBILITIES = {"file": "Points hidden as the files state", "all": "Every point taken as seen"}
+VISIBILITIES = ("file", "all")
+"""Visibility as the sequence states it, or every point taken as visible."""
 
 
 def main() -> int:
@@ -46,8 +48,8 @@ def main() -> int:
             measure_all(argparse.Namespace(**{**vars(options), **asdict(part)}))
     elif not options.tables:
         measure_all(options)
-    if options.into is not None:
-        options.into.write_text(page(options))
+    if options.summary is not None:
+        write_summary(options.summary, read_rows(options.results).values())
     else:
         print("\n" + tables(options, options.visibility, options.metrics))
     return 0
@@ -106,19 +108,6 @@ def keys(case: Case, options: argparse.Namespace) -> Iterator[Key]:
                     )  # fmt: skip
 
 
-def page(options: argparse.Namespace) -> str:
-    """Return all that has been measured, in every metric, as a page of Markdown."""
-    head = (
-        "# Accuracy, cell by cell\n\n"
-        "Written by `python -m benchmarks.accuracy --tables --into FILE` from the cells that `--data DIR --plan` measures; not by hand. "
-        "`true` and `estimated` say whose cameras; `default` is what a job gets that sets nothing. Corrupted: mean ± standard deviation "
-        "over the trials that the column of that name counts at most; – was not measured, or has no truth to compare with. "
-        "Metrics are defined in `solver/evaluation/metrics.py`."
-    )
-    sections = [f"## {title}\n\n{tables(options, name, METRICS)}" for name, title in VISIBILITIES.items()]
-    return "\n\n".join([head, *sections]) + "\n"
-
-
 def tables(options: argparse.Namespace, visibility: str, metrics: Iterable[str]) -> str:
     """Return Markdown for the rows that the options select."""
     rows = [
@@ -150,9 +139,7 @@ def _parser() -> argparse.ArgumentParser:
 
     parser.add_argument("--data", type=Path, help="directory of sequences; the gallery when not given")
     parser.add_argument("--points", type=int, help="thin every sequence to so many points, keeping a mesh")
-    parser.add_argument(
-        "--visibility", choices=list(VISIBILITIES), default="file", help="all: take hidden points as seen"
-    )
+    parser.add_argument("--visibility", choices=VISIBILITIES, default="file", help="all: take hidden points as seen")
     parser.add_argument("--only", type=words, default=[], help="sequences whose name holds one of these words")
     parser.add_argument("--methods", type=words, default=list(METHODS))
     parser.add_argument("--cameras", type=words, default=["true", "estimated"])
@@ -164,7 +151,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--plan", action="store_true", help="the whole table of the recorded sequences; needs --data")
     parser.add_argument("--remeasure", action="store_true", help="measure cells of other commits anew")
     parser.add_argument("--tables", action="store_true", help="measure nothing")
-    parser.add_argument("--into", type=Path, help="write a page of every metric into this file instead of printing")
+    parser.add_argument(
+        "--summary", type=Path, help="write mean and spread of every cell and metric to this JSON-lines file"
+    )
     parser.add_argument("--gate", action="store_true", help="exit 1 if a small sequence got worse than the baseline")
     parser.add_argument("--update-baseline", action="store_true", help="write the baseline anew")
     return parser

@@ -78,7 +78,7 @@ SUBMIT_BODY: dict[str, Any] = {
                     "tracks": {
                         **_FILE,
                         "description": "The 2-D tracks: npz with `tracks (F, P, 2)` and optionally `visibility (F, P)`, "
-                        "or another layout that docs/formats.md lists.",
+                        "or another layout that docs/reference/formats.md lists.",
                     },
                     "mesh": {
                         "anyOf": [_FILE, {"type": "string", "pattern": "^([0-9]{1,6}x[0-9]{1,6}|none)$"}],

@@ -31,15 +31,15 @@ class ServiceSettings:
     incoming: Path = field(default_factory=lambda: Path("pliant-data") / "incoming")
     """Where bodies are written while they arrive, on the data volume (PLIANT_DATA, its folder `incoming`)."""
     max_body_bytes: int = 2048 * MB
-    """Largest body of one request, in bytes (PLIANT_MAX_BODY_MB)."""
+    """Largest body of one request, in bytes; the variable is in MiB (PLIANT_MAX_BODY_MB)."""
     max_text_bytes: int = 1 * MB
     """Largest text field of a form, or whole JSON body, in bytes."""
     max_queued: int = 1000
     """Jobs of one token that may wait at once, unless the token has a limit of its own; 0: any number. Where tokens are off,
     all jobs count as one token's (PLIANT_MAX_QUEUED)."""
     requests_per_minute: int | None = None
-    """Requests in a minute of one token, or of one address where tokens are off; 0: any number; None: `USUAL_RATE` where the
-    service is not on the loopback address or asks for tokens, any number elsewhere (PLIANT_REQUESTS_PER_MINUTE)."""
+    """Requests per minute of one token, or of one address where tokens are off; 0: any number; not set: 1,200 where
+    the service is not on the loopback address or requires tokens, any number elsewhere (PLIANT_REQUESTS_PER_MINUTE)."""
     parsers: int = 2
     """How many bodies are parsed at once; each may hold a whole input in memory (PLIANT_PARSERS)."""
     stall_seconds: float = 60.0

@@ -55,11 +55,16 @@ def test_accuracy_measures_once_and_resumes(tmp_path):
     assert "| tiny, 5 × 60 | outliers 6 % | 2 |" in first.stdout
     assert f"{len(rows)} cells, measured at {rows[0]['commit']}" in first.stdout
     assert "### e3d_frame, estimated over true cameras, clean" in first.stdout
-    page = tmp_path / "page.md"
-    assert run(*arguments, "--tables", "--into", page).stdout == ""
-    for metric in rows[0]["metrics"]:
-        assert f"### {metric}, clean" in page.read_text()
-    assert "## Every point taken as seen\n\n### e3d_frame, clean\n\n(nothing measured)" in page.read_text()
+    summary = tmp_path / "summary.jsonl"
+    assert run(*arguments, "--tables", "--summary", summary).stdout == ""
+    records = [json.loads(line) for line in summary.read_text().splitlines()]
+    assert {record["metric"] for record in records} == set(rows[0]["metrics"])
+    spoiled = [r for r in records if r["corruption"] != "clean" and r["metric"] == "e3d_frame"]
+    errors = [r["metrics"]["e3d_frame"] for r in rows if (r["corruption"], r["cameras"], r["method"]) == (
+        spoiled[0]["corruption"], spoiled[0]["cameras"], spoiled[0]["method"])]  # fmt: skip
+    assert spoiled[0]["trials"] == 2
+    assert spoiled[0]["mean"] == pytest.approx(np.mean(errors))
+    assert spoiled[0]["std"] == pytest.approx(np.std(errors, ddof=1))
     kept = results.read_text()
     results.write_text(kept[:-40])  # the last line was cut off by an interruption
     again = run(*arguments)
@@ -262,3 +267,13 @@ def test_pictures_are_drawn_of_anything(tmp_path: Path, given: str) -> None:
 )
 def test_numbers_are_written_in_the_field_s_manner(bench, value, text):
     assert bench("tables").number(value) == text
+
+
+def test_the_committed_figures_are_drawn_from_the_committed_results(bench, tmp_path, monkeypatch):
+    plots = bench("plots")
+    drawn = {name for name, (source, _) in plots.FIGURES.items() if plots.read(source)}
+    assert drawn
+    assert drawn <= {path.stem for path in (ROOT / "docs" / "images").glob("*.png")}
+    monkeypatch.setattr(sys, "argv", ["plots", "--into", str(tmp_path)])
+    plots.main()
+    assert {path.stem for path in tmp_path.glob("*.png")} == drawn

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from pliant.solver import Settings, gallery
-from pliant.solver.cameras.estimation import TOO_DEEP, CameraEstimate, estimate_cameras, joint_refinement, restarted
+from pliant.solver.cameras import joint_refinement
+from pliant.solver.cameras.estimation import TOO_DEEP, CameraEstimate, estimate_cameras, restarted
 from pliant.solver.cameras.joint_refinement import learn
 from pliant.solver.cameras.multistart import depth
 from pliant.solver.model.model_order import Support

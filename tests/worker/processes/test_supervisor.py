@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from pliant.worker.errors import DataDirectoryInUse, ServerFailed, StoreUnavailable
 from pliant.worker.paths import socket_path, valkey_directory
-from pliant.worker.processes.containment import valkey as valkey_module
+from pliant.worker.processes import valkey as valkey_module
 from pliant.worker.processes.supervisor import FIRST_PAUSE, Child, Supervisor, worker_children
 from pliant.worker.processes.valkey import Valkey, find_binary
 from pliant.worker.settings import Settings

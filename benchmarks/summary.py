@@ -1,0 +1,46 @@
+"""Measured cells summarised over their trials: one JSON line for each cell and metric, committed in `benchmarks/results`."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+from collections import defaultdict
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+FIELDS = ("case", "frames", "points", "visibility", "cameras", "corruption", "method")
+
+
+def write_summary(path: Path, rows: Iterable[dict[str, Any]]) -> None:
+    """Write mean and standard deviation over trials of every metric and of the seconds; `settings` cells are left out."""
+    cells: dict[tuple[Any, ...], list[dict[str, Any]]] = defaultdict(list)
+    for row in rows:
+        if not row["settings"]:
+            cells[tuple(row[name] for name in FIELDS)].append(row)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w") as file:
+        for key, trials in cells.items():
+            for record in summarised(dict(zip(("sequence", *FIELDS[1:]), key, strict=True)), trials):
+                file.write(json.dumps(record, ensure_ascii=False) + "\n")
+
+
+def summarised(cell: dict[str, Any], trials: list[dict[str, Any]]) -> Iterable[dict[str, Any]]:
+    """Yield one record for each metric that a cell's trials have."""
+    for metric in dict.fromkeys(name for trial in trials for name in trial["metrics"]):
+        values = [trial["metrics"][metric] for trial in trials if metric in trial["metrics"]]
+        record = {**cell, "metric": metric, "mean": float(np.mean(values)), "trials": len(values)}
+        if len(values) > 1:
+            record["std"] = float(np.std(values, ddof=1))
+        record["seconds"] = round(float(np.mean([trial["seconds"] for trial in trials])), 1)
+        record["machine"] = f"{platform.machine()}, {os.cpu_count()} cores"
+        record["commit"] = trials[-1]["commit"]
+        yield record
+
+
+def read_summary(path: Path) -> list[dict[str, Any]]:
+    """Return the records of a summary."""
+    return [json.loads(line) for line in path.read_text().splitlines()]
