@@ -114,7 +114,9 @@ def learn(
     start = np.asarray(estimate.scales)
     unscaled = _of_frames(estimate.gram / np.outer(np.repeat(start, 2), np.repeat(start, 2)), used)
     sample = (estimate.sample / start[:, None, None])[used]
-    support = supported(sample, np.asarray(estimate.rotations)[used, :2], spoiled=spoiled and not turning)
+    support = supported(
+        sample, np.asarray(estimate.rotations)[used, :2], spoiled=spoiled and not turning, should_stop=should_stop
+    )
     if spoiled and turning:
         # Few modes would let the cameras follow the deformation; what is left of outliers is judged for the shapes.
         support = replace(support, most=MOST_MODES)
@@ -139,7 +141,7 @@ def learn(
         # From scratch: what the way to these cameras has left in the modes is worth less than it makes the tracks more probable.
         pairs = rotations[:, :2] * scales[:, None, None]
         if spoiled and turning:
-            support = supported(sample, pairs, spoiled=True)
+            support = supported(sample, pairs, spoiled=True, should_stop=should_stop)
         covariance, modes = learned_in_time(sample, unscaled, pairs, support, should_stop=should_stop)
     if len(used) < frames:
         covariance = covariance.stretched(used, frames)
@@ -170,12 +172,12 @@ def refined(
 ) -> Learned:
     """Return cameras and covariance after rounds in which one is refined for the other; scales stay 1 without `with_scales`."""
     pairs = rotations[:, :2] * scales[:, None, None]
-    covariance = learned(gram, pairs, most=support.most, noisy=support.noisy)
+    covariance = learned(gram, pairs, most=support.most, noisy=support.noisy, should_stop=should_stop)
     found = Learned(rotations, scales, covariance, np.inf)
     for _ in range(rounds):
         if should_stop is not None and should_stop():
             break
-        found = _turn(gram, found, with_scales=with_scales)
+        found = _turn(gram, found, with_scales=with_scales, should_stop=should_stop)
     return found
 
 
@@ -268,7 +270,7 @@ def telling_frames(visible: Floats) -> NDArray[np.bool_]:
     return telling if telling.sum() >= 3 else np.ones(len(seen), dtype=bool)
 
 
-def _turn(gram: Floats, found: Learned, *, with_scales: bool) -> Learned:
+def _turn(gram: Floats, found: Learned, *, with_scales: bool, should_stop: Callable[[], bool] | None) -> Learned:
     """Return cameras and covariance of higher likelihood."""
     frames, covariance = len(found.rotations), found.covariance
     scene = _scene(gram, found.rotations, with_scales=with_scales)
@@ -277,7 +279,7 @@ def _turn(gram: Floats, found: Learned, *, with_scales: bool) -> Learned:
         root_of(covariance.extent), root_of(covariance.play),
         0.5 * np.log([max(covariance.noise - scene.noise_floor**2, LEAST_NOISE), covariance.drift]),
     )  # fmt: skip
-    moved, energy = fit(scene, started, iterations=TURNS, turning=True)
+    moved, energy = fit(scene, started, iterations=TURNS, turning=True, should_stop=should_stop)
     extent, play, noise, drift = covariances_of(scene, moved)
     play = play + FLATTEST * np.trace(play) / 3 * np.eye(3)
     size = np.trace(play) / 3

@@ -79,7 +79,7 @@ def learned_in_time(
             covariance = next(islice(path, number - 1, None))
             return covariance, described(covariance, told)
     told = f"more than {support.most} modes, learned from some points, do not make the others more probable."
-    covariance = learned(gram, pairs, most=support.most, noisy=support.noisy)
+    covariance = learned(gram, pairs, most=support.most, noisy=support.noisy, should_stop=should_stop)
     return covariance, described(covariance, told if support.most < MOST_MODES else "")
 
 

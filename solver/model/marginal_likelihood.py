@@ -19,6 +19,7 @@ and a talking face nods with its jaw. What binds the cameras is in
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -217,10 +218,13 @@ def energy(scene: Scene, motion: Motion) -> tuple[float, Motion]:
     return found.value + rough + scene.steadiness * (uneven + unsteady), gradient
 
 
-def fit(scene: Scene, motion: Motion, *, iterations: int, turning: bool) -> tuple[Motion, float]:
+def fit(
+    scene: Scene, motion: Motion, *, iterations: int, turning: bool, should_stop: Callable[[], bool] | None = None
+) -> tuple[Motion, float]:
     """Return the parameters that minimise the energy from `motion` on, by L-BFGS, and the energy reached.
 
-    With `turning` False the rotations stay; everything else, scales included, is fitted.
+    With `turning` False the rotations stay; everything else, scales included, is fitted. Once `should_stop`, called after every
+    iteration, returns True, the parameters reached are returned.
     """
     frames = len(scene.rotations)
     held = 0 if turning else 3 * frames
@@ -230,9 +234,14 @@ def fit(scene: Scene, motion: Motion, *, iterations: int, turning: bool) -> tupl
         value, gradient = energy(scene, Motion.unflat(np.concatenate([given[:held], free]), frames))
         return value, gradient.flat()[held:]
 
+    def asked(xk: Floats) -> None:  # noqa: ARG001 - SciPy calls it by this name
+        if should_stop is not None and should_stop():
+            raise StopIteration
+
     found = minimize(
-        objective, given[held:], jac=True, method="L-BFGS-B", options={"maxiter": iterations, "maxcor": 20}
-    )
+        objective, given[held:], jac=True, method="L-BFGS-B", callback=asked,
+        options={"maxiter": iterations, "maxcor": 20},
+    )  # fmt: skip
     return Motion.unflat(np.concatenate([given[:held], np.asarray(found.x)]), frames), float(found.fun)
 
 

@@ -132,7 +132,14 @@ class ShapeCovariance:
         return replace(self, modes=np.stack(modes, axis=1) if modes else np.zeros((num_frames, 0)))
 
 
-def learned(gram: Floats, pairs: Floats, *, most: int = MOST_MODES, noisy: bool = False) -> ShapeCovariance:
+def learned(
+    gram: Floats,
+    pairs: Floats,
+    *,
+    most: int = MOST_MODES,
+    noisy: bool = False,
+    should_stop: Callable[[], bool] | None = None,
+) -> ShapeCovariance:
     """Return the most probable of the covariances that expectation maximisation finds from scratch in two ways.
 
     Annealed, and then once more without, from a start whose mean positions may also be a mode: annealing that has taken the turn
@@ -147,22 +154,33 @@ def learned(gram: Floats, pairs: Floats, *, most: int = MOST_MODES, noisy: bool 
         Columns of L at most.
     noisy : bool
         Begin with all that is rough in the tracks as noise, not with hardly any.
+    should_stop : callable, optional
+        Asked after every round; once it returns True, the best so far is returned.
     """
     count = min(ITERATIONS, max(FEWEST, FRAMES // len(pairs)))
-    warm = freed(annealed(gram, pairs, most=most, noisy=noisy, iterations=count))
+    warm = freed(annealed(gram, pairs, most=most, noisy=noisy, iterations=count, should_stop=should_stop))
     runs = (
-        improve(warm, gram, pairs, iterations=count // 2, most=most),
-        improve(scratch(gram, pairs, most, noisy=noisy), gram, pairs, iterations=count, most=most),
-    )
+        improve(warm, gram, pairs, iterations=count // 2, most=most, should_stop=should_stop),
+        improve(
+            scratch(gram, pairs, most, noisy=noisy), gram, pairs,
+            iterations=count, most=most, should_stop=should_stop,
+        ),
+    )  # fmt: skip
     return min(runs, key=lambda run: run.likelihood)
 
 
 def annealed(
-    gram: Floats, pairs: Floats, *, most: int = MOST_MODES, noisy: bool = False, iterations: int
+    gram: Floats,
+    pairs: Floats,
+    *,
+    most: int = MOST_MODES,
+    noisy: bool = False,
+    iterations: int,
+    should_stop: Callable[[], bool] | None = None,
 ) -> ShapeCovariance:
     """Return the covariance that so many annealed rounds find from scratch."""
     start = scratch(gram, pairs, most, noisy=noisy)
-    return improve(start, gram, pairs, iterations=iterations, warm=WARM, most=most)
+    return improve(start, gram, pairs, iterations=iterations, warm=WARM, most=most, should_stop=should_stop)
 
 
 def freed(covariance: ShapeCovariance) -> ShapeCovariance:
@@ -215,6 +233,7 @@ def improve(
     iterations: int,
     warm: float = DRIFT_FLOOR,
     most: int = MOST_MODES,
+    should_stop: Callable[[], bool] | None = None,
 ) -> ShapeCovariance:
     """Return the covariance after rounds of expectation maximisation, with a floor of τ that falls from `warm` to `DRIFT_FLOOR`.
 
@@ -223,6 +242,8 @@ def improve(
     floors = np.geomspace(warm, DRIFT_FLOOR, iterations)
     for better in rounds(covariance, gram, pairs, floors=floors, most=most):
         covariance = better
+        if should_stop is not None and should_stop():
+            break
     return covariance
 
 
@@ -285,14 +306,18 @@ def _linear_round(
     frames, count = covariance.modes.shape
     root0, root1 = root_matrix(covariance.extent), root_matrix(covariance.play)
     walk = pairs @ root1
-    columns = np.concatenate([(pairs @ root0)[:, :, None], covariance.modes[:, None, :, None] * walk[:, :, None]], axis=2)
+    columns = np.concatenate(
+        [(pairs @ root0)[:, :, None], covariance.modes[:, None, :, None] * walk[:, :, None]], axis=2
+    )
     model = ImageModel(columns.reshape(2 * frames, -1), walk, covariance.noise, covariance.drift)
     seen = Explained.of(model, factor)
     found = seen.terms()
     by_columns = -frames * found.by_columns.reshape(columns.shape)
     by_walk = -frames * found.by_walk  # [K B (τT ⊗ I)]_ff
     extents = np.einsum("fic,fid->cd", columns[:, :, 0], by_columns[:, :, 0])
-    plays = np.einsum("fikc,fikd->cd", columns[:, :, 1:], by_columns[:, :, 1:]) + np.einsum("fic,fid->cd", walk, by_walk)
+    plays = np.einsum("fikc,fikd->cd", columns[:, :, 1:], by_columns[:, :, 1:]) + np.einsum(
+        "fic,fid->cd", walk, by_walk
+    )
     along = whitened(covariance.modes)
 
     def spread(vectors: Floats) -> Floats:  # C̃ times them
@@ -352,7 +377,14 @@ def _kept(values: Floats, vectors: Floats, total: float, floor: float, most: int
 
 
 def _improved(
-    covariance: ShapeCovariance, modes: Floats, drift: float, *, extent: Floats, play: Floats, surplus: float, nll: float
+    covariance: ShapeCovariance,
+    modes: Floats,
+    drift: float,
+    *,
+    extent: Floats,
+    play: Floats,
+    surplus: float,
+    nll: float,
 ) -> ShapeCovariance:
     """Return the covariance with new moments; `surplus`: mean of K's diagonal, `nll`: of the covariance before."""
     return ShapeCovariance(
