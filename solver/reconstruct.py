@@ -173,6 +173,7 @@ def _learned(
         telling_frames(normalised.visible),
         turning=cameras is None and settings.refine_rotations and not spoiled_sheet,
         zooming=settings.camera == "scaled_orthographic",
+        seed=settings.seed,
         should_stop=should_stop,
     )
 

@@ -92,6 +92,7 @@ def learn(
     *,
     turning: bool,
     zooming: bool = False,
+    seed: int = 0,
     should_stop: Callable[[], bool] | None = None,
 ) -> tuple[CameraEstimate, ShapeCovariance]:
     """Return the cameras, refined if `turning`, and the shape covariance of all frames.
@@ -106,6 +107,8 @@ def learn(
         False leaves the cameras as they are: given ones, or as the user wished.
     zooming : bool
         True: scales that are all 1 are refined with the rotations, if that makes the tracks more probable than chance does.
+    seed : int
+        Deals the points out where some are held back to judge what was learned from the others.
     should_stop : callable, optional
         Asked between refinements; once it says True, the best so far is returned.
     """
@@ -115,7 +118,11 @@ def learn(
     unscaled = _of_frames(estimate.gram / np.outer(np.repeat(start, 2), np.repeat(start, 2)), used)
     sample = (estimate.sample / start[:, None, None])[used]
     support = supported(
-        sample, np.asarray(estimate.rotations)[used, :2], spoiled=spoiled and not turning, should_stop=should_stop
+        sample,
+        np.asarray(estimate.rotations)[used, :2],
+        spoiled=spoiled and not turning,
+        seed=seed,
+        should_stop=should_stop,
     )
     if spoiled and turning:
         # Few modes would let the cameras follow the deformation; what is left of outliers is judged for the shapes.
@@ -141,8 +148,8 @@ def learn(
         # From scratch: what the way to these cameras has left in the modes is worth less than it makes the tracks more probable.
         pairs = rotations[:, :2] * scales[:, None, None]
         if spoiled and turning:
-            support = supported(sample, pairs, spoiled=True, should_stop=should_stop)
-        covariance, modes = learned_in_time(sample, unscaled, pairs, support, should_stop=should_stop)
+            support = supported(sample, pairs, spoiled=True, seed=seed, should_stop=should_stop)
+        covariance, modes = learned_in_time(sample, unscaled, pairs, support, seed=seed, should_stop=should_stop)
     if len(used) < frames:
         covariance = covariance.stretched(used, frames)
     estimate = replace(estimate, reasons={**estimate.reasons, "modes": modes})

@@ -100,9 +100,8 @@ def begin(scene: Scene, scales: Floats, covariance: ShapeCovariance) -> Basis:
     return Basis(np.zeros((frames, 3)), np.log(scales), weights, root, 0.5 * np.log([noise, covariance.drift]))
 
 
-@np.errstate(
-    over="ignore", invalid="ignore", divide="ignore"
-)  # a line search may try a step far too long: that energy is `UNLIKELY`
+# A line search may try a step far too long: that energy is `UNLIKELY`.
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
 def energy(scene: Scene, play: Floats, basis: Basis) -> tuple[float, Basis]:
     """Return the energy with the terms for the camera's steadiness, and its gradient, analytic in every parameter.
 

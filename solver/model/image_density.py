@@ -166,7 +166,7 @@ class Explained:
         frames, noise, columns = len(model.walk), model.noise_variance, model.columns
         walk = WalkPosterior.of(model.walk, noise_variance=noise, walk_variance=model.walk_variance)
         solved, walked = _solved(walk, model, columns)
-        root = np.linalg.cholesky(np.eye(columns.shape[1]) + columns.T @ solved)
+        root = np.asarray(np.linalg.cholesky(np.eye(columns.shape[1]) + columns.T @ solved), dtype=np.float64)
         means = linalg.cho_solve((root, True), solved.T @ factor, check_finite=False)
         rest = factor - columns @ means
         left, strayed = _solved(walk, model, rest)

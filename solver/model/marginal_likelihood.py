@@ -25,7 +25,7 @@ from typing import Protocol
 
 import numpy as np
 from pliant.solver.model.camera_motion_prior import unevenness, unsteadiness
-from pliant.solver.model.image_density import ImageModel, factor_of, terms
+from pliant.solver.model.image_density import ImageModel, factor_of, inverted, terms
 from pliant.solver.model.so3 import exponential, left_jacobian, vee
 from pliant.solver.records import Floats
 from scipy.optimize import minimize
@@ -176,9 +176,27 @@ def covariances_of(scene: Scene, motion: Motion) -> tuple[Floats, Floats, float,
     return root0 @ root0.T, root1 @ root1.T, float(noise) + scene.noise_floor**2, float(drift)
 
 
-@np.errstate(
-    over="ignore", invalid="ignore", divide="ignore"
-)  # a line search may try a step far too long: that energy is `UNLIKELY`
+def image_of(scene: Scene, motion: Motion) -> ImageModel:
+    """Return the covariance of the images, by its parts."""
+    rotations, scales = cameras_of(scene, motion)
+    pairs = rotations[:, :2] * scales[:, None, None]
+    root0, root1 = _root(motion.extent), _root(motion.play)
+    noise, drift = np.exp(2 * motion.logs)
+    walk = pairs @ root1
+    columns = np.concatenate([(pairs @ root0)[:, :, None], motion.modes[:, None, :, None] * walk[:, :, None]], axis=2)
+    return ImageModel(columns.reshape(2 * len(pairs), -1), walk, float(noise) + scene.noise_floor**2, float(drift))
+
+
+def energy_with_inverse(scene: Scene, motion: Motion) -> tuple[float, Motion, Floats | None]:
+    """Return E, its gradient and M⁻¹, shape `(2F, 2F)`, for ∂E/∂G = M⁻¹/2F; None where M is not positive definite."""
+    value, gradient = energy(scene, motion)
+    if value == UNLIKELY:
+        return value, gradient, None
+    return value, gradient, inverted(image_of(scene, motion).covariance())[0]
+
+
+# A line search may try a step far too long: that energy is `UNLIKELY`.
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
 def energy(scene: Scene, motion: Motion) -> tuple[float, Motion]:
     """Return E with the penalties on modes, turns and scales, and its gradient, analytic in every parameter.
 
@@ -190,10 +208,8 @@ def energy(scene: Scene, motion: Motion) -> tuple[float, Motion]:
     pairs = rotations[:, :2] * scales[:, None, None]
     root0, root1 = _root(motion.extent), _root(motion.play)
     noise, drift = np.exp(2 * motion.logs)
-    walk = pairs @ root1
-    columns = np.concatenate([(pairs @ root0)[:, :, None], motion.modes[:, None, :, None] * walk[:, :, None]], axis=2)
-    model = ImageModel(columns.reshape(2 * frames, -1), walk, float(noise) + scene.noise_floor**2, float(drift))
     try:
+        model = image_of(scene, motion)
         found = terms(model, scene.factor)
     except np.linalg.LinAlgError:
         return UNLIKELY, Motion.unflat(np.zeros_like(motion.flat()), frames)
@@ -210,7 +226,7 @@ def energy(scene: Scene, motion: Motion) -> tuple[float, Motion]:
     gradient = Motion(
         np.einsum("fji,fj->fi", left_jacobian(motion.turns), turned),
         (by_logs - by_logs.mean()) * scene.with_scales,
-        by_modes + np.einsum("fikc,fic->fk", by_columns[:, :, 1:], walk),
+        by_modes + np.einsum("fikc,fic->fk", by_columns[:, :, 1:], model.walk),
         np.einsum("fic,fid->cd", pairs, by_columns[:, :, 0])[LOWER],
         np.einsum("fic,fid->cd", pairs, by_walk)[LOWER],
         2 * np.array([found.by_noise * noise, found.by_drift * drift]),

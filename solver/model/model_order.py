@@ -49,7 +49,12 @@ class Support:
 
 
 def supported(
-    sample: Floats, pairs: Floats, *, spoiled: bool = False, should_stop: Callable[[], bool] | None = None
+    sample: Floats,
+    pairs: Floats,
+    *,
+    spoiled: bool = False,
+    seed: int = 0,
+    should_stop: Callable[[], bool] | None = None,
 ) -> Support:
     """Return what the sample supports: all modes where there is neither noise nor what is left of outliers to mistake for one.
 
@@ -61,6 +66,8 @@ def supported(
         s_f times the first two rows of R_f.
     spoiled : bool
         Outliers were found: some that were not are still in the sample.
+    seed : int
+        Deals the points into halves.
     should_stop : callable, optional
         Asked after every round of learning; once it returns True, what was not judged counts as improbable.
     """
@@ -69,7 +76,7 @@ def supported(
         return Support()
     used = np.unique(np.linspace(0, frames - 1, min(frames, JUDGED_FRAMES)).round().astype(np.intp))
     rows = sample[used].transpose(0, 2, 1).reshape(2 * len(used), count)
-    order = np.random.default_rng(0).permutation(count)
+    order = np.random.default_rng(seed).permutation(count)
     one, other = rows[:, order[0::2]], rows[:, order[1::2]]
     quiet, noisy = (
         (

@@ -53,7 +53,7 @@ def _pivots(diagonal: Floats, beside: Floats) -> Floats:
 def random_walk(num_frames: int) -> Floats:
     """Return T, the covariance of the random walk, mean of the diagonal 1, shape `(F, F)`; read-only."""
     inverse, norm = walk_precision(num_frames)
-    walk: Floats = np.linalg.inv(inverse) / norm
+    walk = np.asarray(np.linalg.inv(inverse) / norm, dtype=np.float64)
     read_only(walk)
     return walk
 
@@ -62,7 +62,7 @@ def random_walk(num_frames: int) -> Floats:
 def whitener(num_frames: int) -> Floats:
     """Return the lower triangular root with T⁻¹ = root rootᵀ, shape `(F, F)`; read-only."""
     inverse, norm = walk_precision(num_frames)
-    root: Floats = np.linalg.cholesky(inverse * norm)
+    root = np.asarray(np.linalg.cholesky(inverse * norm), dtype=np.float64)
     read_only(root)
     return root
 
@@ -191,4 +191,4 @@ def _gathered(blocks: Floats, pivots: Floats, coupling: float) -> Floats:
     for axis in range(3):
         gathered[:, each[:-1], axis, each[1:], axis] = coupled
         gathered[:, each[1:], axis, each[:-1], axis] = coupled
-    return np.linalg.inv(gathered.reshape(count, 3 * BLOCK, 3 * BLOCK))
+    return np.asarray(np.linalg.inv(gathered.reshape(count, 3 * BLOCK, 3 * BLOCK)), dtype=np.float64)
