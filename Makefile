@@ -7,7 +7,7 @@ STAMP := $(VENV)/.installed
 PAGE := service/web/dist/index.html
 PAGE_SOURCES := $(wildcard service/web/*.json service/web/*.mjs service/web/src/* service/web/src/*/*)
 
-.PHONY: help demo test test-slow matrix coverage page docs types check format clean
+.PHONY: help demo test test-slow matrix coverage page client docs types check format clean
 
 help:
 	@echo "make demo    reconstruct a moving face end to end: service, queue, worker, glTF"
@@ -16,6 +16,7 @@ help:
 	@echo "make matrix  make test with every Python from 3.11 to 3.14 on this machine"
 	@echo "make coverage   make test, with the share of lines that it runs"
 	@echo "make page    bundle the web page"
+	@echo "make client  generate the synchronous client from the asynchronous one"
 	@echo "make docs    build the documentation site into build/site; a warning is an error"
 	@echo "make check   lint (ruff) and types (mypy --strict)"
 	@echo "make format  let ruff rewrite the files"
@@ -34,6 +35,9 @@ $(PAGE): $(PAGE_SOURCES) | $(STAMP)
 	@$(BIN)/python build_page.py
 
 page: $(PAGE)
+
+client: $(STAMP)
+	$(BIN)/python build_client.py
 
 demo: $(STAMP) $(PAGE)
 	$(BIN)/pliant demo $(DEMO)

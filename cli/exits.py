@@ -27,7 +27,7 @@ class Exit(IntEnum):
     """There is no such job, file or token."""
     NOT_NOW = 6
     """The job's status, the token, or another Pliant on the same data does not allow it."""
-    TIME_IS_UP = 7
+    TIMEOUT = 7
     """The time given was not enough; the job goes on."""
     UNHEALTHY = 8
     """`doctor` found something that has to be put right."""
@@ -37,7 +37,7 @@ class Exit(IntEnum):
 
 _CODES: tuple[tuple[str, str, Exit], ...] = (
     ("pliant.client.errors", "JobEnded", Exit.FAILED),
-    ("pliant.client.errors", "TimeIsUp", Exit.TIME_IS_UP),
+    ("pliant.client.errors", "WaitTimeout", Exit.TIMEOUT),
     ("pliant.client.errors", "InvalidRequest", Exit.REFUSED),
     ("pliant.client.errors", "BadArgument", Exit.REFUSED),
     ("pliant.client.errors", "NotFound", Exit.NOT_FOUND),

@@ -12,7 +12,7 @@ import typer
 
 if TYPE_CHECKING:
     import httpx
-    from pliant.client.client import Client
+    from pliant.client import Client
 
 Url = Annotated[
     str, typer.Option("--url", envvar="PLIANT_URL", help="Address of the service.", show_default=True, metavar="URL")
@@ -48,12 +48,12 @@ class Session:
 
     def client(self, url: str, *, as_json: bool, first_contact: float | None = None) -> Client:
         """Open a client; the token comes from PLIANT_TOKEN, so that it stands in no list of processes."""
-        from pliant.client.client import Client
-        from pliant.client.retry import Policy
+        from pliant.client import Client
+        from pliant.client.retry import Retry
 
         self.json = as_json
-        policy = Policy() if first_contact is None else Policy(first_contact=first_contact)
-        return Client(url, token=os.environ.get("PLIANT_TOKEN") or None, transport=self.transport, policy=policy)
+        retries = Retry() if first_contact is None else Retry(first_contact=first_contact)
+        return Client(url, token=os.environ.get("PLIANT_TOKEN") or None, transport=self.transport, retries=retries)
 
 
 def parse_options(pairs: list[str] | None) -> dict[str, Any]:

@@ -162,7 +162,7 @@ def until_ready(url: str) -> Callable[[subprocess.Popen[bytes]], None]:
     """
 
     def wait(process: subprocess.Popen[bytes]) -> None:
-        from pliant.client.client import Client
+        from pliant.client import Client
         from pliant.client.errors import PliantError, Unreachable
 
         deadline = time.monotonic() + READY_WITHIN

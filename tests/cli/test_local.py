@@ -17,7 +17,7 @@ from pliant.cli.demo import GOOD, announced, judge
 from pliant.cli.session import Session, parse_options
 from pliant.cli.solve import file_or_word
 from pliant.client import BadArgument, Unreachable
-from pliant.client.testing import FakeService
+from pliant.service.testing import InMemoryService
 from pliant.worker.settings import NUMERICAL_THREADS
 
 doctor = importlib.import_module("pliant.cli.doctor")  # the name in the package is the command's
@@ -171,8 +171,10 @@ def test_the_doctor_looks_for_the_queue(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def test_the_doctor_asks_the_service() -> None:
-    assert verdicts(doctor.check_service(Session(transport=FakeService()), "http://pliant.test")) == {"service": "good"}
-    assert verdicts(doctor.check_service(Session(transport=FakeService(token="t")), "http://pliant.test")) == {
-        "service": "note"
+    assert verdicts(doctor.check_service(Session(transport=InMemoryService()), "http://pliant.test")) == {
+        "service": "good"
     }
+    assert verdicts(
+        doctor.check_service(Session(transport=InMemoryService(auth="required")), "http://pliant.test")
+    ) == {"service": "note"}
     assert "PLIANT_TOKEN" not in os.environ
