@@ -170,9 +170,9 @@ def until_ready(url: str) -> Callable[[subprocess.Popen[bytes]], None]:
         from pliant.client import Client
         from pliant.client.errors import PliantError, Unreachable
 
-        deadline = time.monotonic() + READY_WITHIN
         reason = "it did not answer"
         with Client(url) as client:
+            deadline = time.monotonic() + READY_WITHIN
             while time.monotonic() < deadline:
                 if process.poll() is not None:
                     raise Unreachable(f"The service ended with code {process.returncode}; see its last lines above.")

@@ -57,7 +57,7 @@ class InMemoryService(httpx.BaseTransport, httpx.AsyncBaseTransport):
         problem: Problem | None = None,
         auth: Literal["off", "required"] = "off",
     ) -> None:
-        self._scratch = TemporaryDirectory(prefix="pliant-in-memory-")
+        self._scratch = TemporaryDirectory(prefix="pliant-in-memory-", ignore_cleanup_errors=True)
         self.folder = Path(self._scratch.name)
         self.requests: list[httpx.Request] = []
         self.jobs = Jobs(

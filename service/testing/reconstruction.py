@@ -80,7 +80,8 @@ class Worker:
         self._stopped.set()
         assert isinstance(self._jobs.queue, DeliveringQueue)
         self._jobs.queue.deliveries.put(None)
-        self._thread.join(10)
+        if threading.current_thread() is not self._thread:
+            self._thread.join(10)
 
     def _run(self) -> None:
         jobs = self._jobs

@@ -39,10 +39,11 @@ class Loop:
         return asyncio.run_coroutine_threadsafe(work, self.loop).result()
 
     def stop(self) -> None:
-        """End the application and its thread."""
+        """End the application and its thread. The garbage collector may call this on the thread itself."""
         if self._thread.is_alive():
             self.loop.call_soon_threadsafe(self._stopping.set)
-            self._thread.join(10)
+            if threading.current_thread() is not self._thread:
+                self._thread.join(10)
 
     def _run(self) -> None:
         with asyncio.Runner(loop_factory=lambda: self.loop) as runner:

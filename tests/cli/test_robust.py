@@ -168,7 +168,7 @@ def test_the_id_is_printed_before_waiting(run: Run, tracks: Path, service: InMem
     ran = run("submit", tracks, "-m", "none", "--id", "early", "--wait", "--timeout", "0.5")
     assert ran.exit_code == Exit.TIMEOUT
     assert words(ran).startswith("Job early")
-    assert "The timeout of 0.5 s passed during the wait for job early." in words(ran)
+    assert "The timeout of 0.5 s passed during the wait for job early" in words(ran)
     run("cancel", "early")
 
 
