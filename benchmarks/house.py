@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
-from pliant.client import Client, Job, Policy
+from pliant.client import Client, Job, Retry
 from pliant.service.spool import Incoming
 from pliant.worker.errors import StoreUnavailable
 from pliant.worker.jobs.service import Jobs
@@ -27,7 +27,7 @@ SOON = {
 }  # fmt: skip
 """Settings under which faults are noticed within seconds."""
 
-PATIENT = Policy(first_contact=60, shortest_pause=0.05, longest_pause=0.5)
+PATIENT = Retry(first_contact=60, shortest_pause=0.05, longest_pause=0.5)
 
 ROLES = {"service": b"pliant.service", "worker": b"pliant.worker\0work", "reconciler": b"pliant.worker\0reconcile"}
 
@@ -69,7 +69,7 @@ class House:
 
     def client(self) -> Client:
         """A client that waits for a service which is being started again."""
-        return Client(self.url, policy=PATIENT)
+        return Client(self.url, retries=PATIENT)
 
     def start(self) -> None:
         """Start it; while the children of a killed one still hold the port or the directory, again, as a service manager does."""

@@ -8,7 +8,7 @@ import time
 import httpx
 import pytest
 from pliant.client import Client, TooManyRequests
-from pliant.client.retry import Policy
+from pliant.client.retry import Retry
 from pliant.service.middleware.rate_limit import MOST_CLIENTS, Rates, _client
 from pliant.service.settings import USUAL_RATE, InvalidServiceSetting
 from pliant.worker.tokens import Scope
@@ -100,7 +100,7 @@ def test_the_sdk_honours_retry_after_and_succeeds(serve: Serve) -> None:
         for _ in range(62):
             client.options()
         assert 0.5 < time.monotonic() - begun < 20
-    hasty = Client(running.url, policy=Policy(patience=0.0, first_contact=0.0))
+    hasty = Client(running.url, retries=Retry(patience=0.0, first_contact=0.0))
 
     def many() -> None:
         for _ in range(40):

@@ -61,7 +61,7 @@ def run(id: str, attempt_id: str, *, settings: Settings, worker: str) -> None:
     with _own_output(directory / OUTPUT):
         try:
             with _limited_memory(settings.memory_limit):
-                end = _work(attempt, stored, directory)
+                end = work(attempt, stored, directory)
             attempt.conclude(end)
         except (StaleAttempt, UnknownJob) as error:
             logger.info("attempt %s ended: %s", attempt_id, error)
@@ -192,18 +192,23 @@ class Attempt:
         self.jobs.records.append_log(self.id, lines)
 
 
-def _work(attempt: Attempt, stored: Stored, directory: Path) -> Finished | Problem | None:
-    """Run the job; every exception becomes the problem it is, its traceback goes into the log."""
+def work(
+    attempt: Attempt, stored: Stored, directory: Path, *, reconstruct: Callable[..., Finished] | None = None
+) -> Finished | Problem | None:
+    """Run the job; every exception becomes the problem it is, its traceback goes into the log.
+
+    `reconstruct` replaces `pliant.worker.execution.pipeline.reconstruct`, in tests.
+    """
     try:
         from pliant.solver import threads_limited
-        from pliant.worker.execution.pipeline import reconstruct
+        from pliant.worker.execution import pipeline
         from pliant.worker.formats import load_inputs
 
         file = directory / "inputs.npz"
         attempt.wait_for_store(lambda: attempt.jobs.blobs.fetch(stored.inputs, file))
         results = directory / "artifacts"
         with threads_limited(attempt.jobs.settings.threads_per_job):
-            finished = reconstruct(
+            finished = (reconstruct or pipeline.reconstruct)(
                 load_inputs(file),
                 stored.job.options,
                 results,

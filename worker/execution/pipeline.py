@@ -50,6 +50,7 @@ def reconstruct(
     *,
     on_progress: Callable[[Progress], None] | None = None,
     should_stop: Callable[[], bool] | None = None,
+    solver: Callable[..., Solution] | None = None,
 ) -> Finished:
     """Solve, measure, write the files.
 
@@ -65,6 +66,8 @@ def reconstruct(
         Told often; whoever cannot listen so often drops some.
     should_stop : callable, optional
         Asked often; once it says True, the job ends with `Interrupted`, and the files it has written are not all.
+    solver : callable, optional
+        Replaces `pliant.solver.solve`, in tests.
 
     Raises
     ------
@@ -82,7 +85,7 @@ def reconstruct(
     reporter.part("loading", 1.0)
     began = time.perf_counter()
     halt = _Halt(should_stop, options.time_limit)
-    solution = solve(
+    solution = (solver or solve)(
         inputs.tracks,
         inputs.mesh,
         cameras=inputs.cameras,

@@ -253,3 +253,26 @@ class MemoryQueue(Queue):
     def workers(self) -> list[str]:
         """See `Queue.workers`."""
         return ["memory"]
+
+
+class MemoryHash:
+    """The commands of Redis on hashes that `pliant.worker.tokens.Tokens` uses."""
+
+    def __init__(self) -> None:
+        self._hashes: dict[str, dict[str, str]] = {}
+
+    def hset(self, key: str, name: str, value: str) -> None:
+        """Set a field of a hash."""
+        self._hashes.setdefault(key, {})[name] = value
+
+    def hget(self, key: str, name: str) -> str | None:
+        """Return a field of a hash, None if there is none."""
+        return self._hashes.get(key, {}).get(name)
+
+    def hvals(self, key: str) -> list[str]:
+        """Return every value of a hash."""
+        return list(self._hashes.get(key, {}).values())
+
+    def hdel(self, key: str, name: str) -> None:
+        """Remove a field of a hash."""
+        self._hashes.get(key, {}).pop(name, None)

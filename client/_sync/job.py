@@ -1,27 +1,29 @@
-"""What the synchronous client hands out: a job of the service, and its result."""
+# Generated from client/_async/job.py by `make client`. Edit that file instead.
+"""What the client returns: a job of the service, and its result."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
+from pliant.client._sync.operations import OnJob
 from pliant.client.multipart import OnBytes
-from pliant.client.operations import OnJob
 from pliant.client.result import ANIMATION, LOADED, Reconstruction, copied
 from pliant.schemas.job import Job, Status
 
 if TYPE_CHECKING:
-    from pliant.client.client import Client
+    from pliant.client._sync.client import Client
 
 
 class RemoteJob:
-    """A job of a service: its record as last seen, and the verbs that apply to it.
+    """A job of a service: its latest known record, and its operations.
 
     Attributes
     ----------
     record : Job
-        What the service said last; `refresh` asks again.
+        As of the last call; `refresh` updates it.
     """
 
     def __init__(self, client: Client, record: Job) -> None:
@@ -38,12 +40,12 @@ class RemoteJob:
 
     @property
     def status(self) -> Status:
-        """The status as last seen."""
+        """The status as of the last call."""
         return self.record.status
 
     def refresh(self, *, timeout: float | None = None) -> Self:
-        """Ask for the record again."""
-        self.record = self._client.get(self.id, timeout=timeout).record
+        """Read the record again."""
+        self.record = (self._client.get(self.id, timeout=timeout)).record
         return self
 
     def wait(
@@ -54,42 +56,57 @@ class RemoteJob:
         load: bool = True,
         timeout: float | None = None,
     ) -> Result:
-        """Wait until the job is over, and return its result: see `Client.wait`."""
-        return self._client.wait(self.id, on_progress=on_progress, folder=folder, load=load, timeout=timeout)
+        """Wait until the job is finished and return its result: see `Client.wait`."""
 
-    def events(self, *, timeout: float | None = None) -> Iterator[Job]:
-        """Iterate over the record each time something about it is new; the last one is final."""
-        for job in self._client.events(self.id, timeout=timeout):
+        def report(job: Job) -> None:
             self.record = job
-            yield job
+            if on_progress is not None:
+                on_progress(job)
+
+        result = self._client.wait(
+            self.id,
+            on_progress=None if on_progress is None else report,
+            folder=folder,
+            load=load,
+            timeout=timeout,
+        )
+        self.record = result.job
+        return result
+
+    def events(self, *, timeout: float | None = None) -> Generator[Job, None, None]:
+        """Yield the record each time it changes; the last one has a final status."""
+        with closing(self._client.events(self.id, timeout=timeout)) as changes:
+            for job in changes:
+                self.record = job
+                yield job
 
     def log(self, *, timeout: float | None = None) -> str:
-        """Return what its attempts have logged so far."""
+        """Return the job's log so far, one entry per line."""
         return self._client.log(self.id, timeout=timeout)
 
     def cancel(self, *, timeout: float | None = None) -> Self:
-        """Ask for the job to be stopped."""
-        self.record = self._client.cancel(self.id, timeout=timeout).record
+        """Request that the job stops."""
+        self.record = (self._client.cancel(self.id, timeout=timeout)).record
         return self
 
     def retry(self, *, timeout: float | None = None) -> RemoteJob:
-        """Queue a new job with the same inputs and options after this one failed or was cancelled; return the new one."""
+        """Queue and return a new job with the same inputs and options, after this one failed or was cancelled."""
         return self._client.retry(self.id, timeout=timeout)
 
     def delete(self, *, timeout: float | None = None) -> None:
-        """Remove the job and its files."""
+        """Delete the job and its files."""
         self._client.delete(self.id, timeout=timeout)
 
 
 class Result(Reconstruction):
-    """The result of a job; files that are not here yet are fetched by its methods."""
+    """The result of a job; its methods download the files that are not local yet."""
 
     def __init__(self, client: Client, job: Job, folder: Path | str | None) -> None:
         super().__init__(job, folder)
         self._client = client
 
     def load(self, *, timeout: float | None = None) -> Self:
-        """Fetch the arrays and the report."""
+        """Download the arrays and the report."""
         self._client.download(self.job.id, self.folder, names=LOADED, timeout=timeout)
         return self
 
@@ -101,10 +118,10 @@ class Result(Reconstruction):
         on_download: OnBytes | None = None,
         timeout: float | None = None,
     ) -> dict[str, Path]:
-        """Fetch files into a folder: see `Client.download`."""
+        """Download files into a folder: see `Client.download`."""
         return self._client.download(self.job.id, folder, names=names, on_download=on_download, timeout=timeout)
 
     def save_glb(self, path: Path | str, *, timeout: float | None = None) -> Path:
-        """Save the animated mesh as glTF, for Blender or any viewer."""
+        """Save the animated mesh as glTF, for Blender or any glTF viewer."""
         held = self._client.download(self.job.id, self.folder, names=[ANIMATION], timeout=timeout)
         return copied(held[ANIMATION], path)
