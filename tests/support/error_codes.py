@@ -14,8 +14,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 FOLDERS = ("schemas", "solver", "tracking", "worker", "service", "client", "cli")
-LEFT_OUT = ("client/testing", "solver/gallery")
-"""The double repeats the service's codes; the gallery's arguments are no user's input."""
+LEFT_OUT = ("solver/gallery",)
+"""The gallery's arguments are not user input."""
 
 PUT_TOGETHER = frozenset({"unknown_option", "invalid_option", "invalid_request"})
 """`service.problems.from_validation` makes these from a prefix and the field's name."""
