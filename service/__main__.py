@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import signal
 import socket
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import uvicorn
 from fastapi import FastAPI
@@ -78,8 +79,19 @@ def check_access(settings: ServiceSettings, tokens: Tokens) -> None:
         )
 
 
-def main() -> int:
-    """Serve until SIGTERM or SIGINT; return the exit code."""
+def print_openapi(*, schemas_only: bool) -> None:
+    """Write the OpenAPI document of a service with default settings to standard output, or its schemas alone."""
+    of_worker = Settings()
+    app = create_app(Jobs.open(of_worker), ServiceSettings(), tokens=Tokens.open(of_worker))
+    document = {**app.openapi(), "paths": {}} if schemas_only else app.openapi()
+    sys.stdout.write(json.dumps(document, indent=2, ensure_ascii=False) + "\n")
+
+
+def main(arguments: Sequence[str] = ()) -> int:
+    """Serve until SIGTERM or SIGINT; return the exit code. With `openapi [--schemas]` print the OpenAPI document instead."""
+    if arguments[:1] == ["openapi"]:
+        print_openapi(schemas_only="--schemas" in arguments)
+        return 0
     try:
         settings = ServiceSettings.from_environment()
         configure_logging(settings.log_level, settings.log_format)
@@ -109,4 +121,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(sys.argv[1:]))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import sys
 from http import HTTPStatus
 from typing import Any
 
@@ -220,23 +218,3 @@ def _complete(operation: dict[str, Any], path: str) -> None:
     for status in usual:
         responses.setdefault(str(status), _problem(status))
     operation["responses"] = dict(sorted(responses.items()))
-
-
-def main() -> None:
-    """Print the OpenAPI document of a service with default settings; with `--schemas` only its schemas."""
-    from pliant.service.app import create_app
-    from pliant.service.settings import ServiceSettings
-    from pliant.worker.jobs.service import Jobs
-    from pliant.worker.settings import Settings
-    from pliant.worker.tokens import Tokens
-
-    of_worker = Settings()
-    app = create_app(Jobs.open(of_worker), ServiceSettings(), tokens=Tokens.open(of_worker))
-    found = app.openapi()
-    if "--schemas" in sys.argv[1:]:
-        found = {**found, "paths": {}}
-    sys.stdout.write(json.dumps(found, indent=2, ensure_ascii=False) + "\n")
-
-
-if __name__ == "__main__":
-    main()

@@ -74,7 +74,10 @@ class PageFiles(StaticFiles):
             stat_result=stat_result,
         )
         if self.is_not_modified(response.headers, asked):
-            return NotModifiedResponse(response.headers)
+            unchanged = NotModifiedResponse(response.headers)
+            # A browser replaces the headers it has stored by those of the 304, so the page's policy must be among them.
+            unchanged.headers.update(HEADERS)
+            return unchanged
         return response
 
 

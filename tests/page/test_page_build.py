@@ -107,7 +107,7 @@ def test_the_types_of_the_api_are_generated_from_its_document(builder: ModuleTyp
         pytest.skip("openapi-typescript is not installed; run `make page`")
     document, made = tmp_path / "openapi.json", tmp_path / "schema.d.ts"
     printed = subprocess.run(
-        [sys.executable, "-m", "pliant.service.openapi", "--schemas"], capture_output=True, check=True
+        [sys.executable, "-m", "pliant.service", "openapi", "--schemas"], capture_output=True, check=True
     )
     document.write_bytes(printed.stdout)
     (node, _) = builder.node_commands()

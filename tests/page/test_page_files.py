@@ -52,6 +52,8 @@ def test_an_unchanged_file_is_not_sent_twice(built: TestClient, encoding: str) -
     again = built.get("/", headers={**asked, "If-None-Match": first.headers["etag"]})
     assert (again.status_code, again.content) == (304, b"")
     assert again.headers["etag"] == first.headers["etag"]
+    for name in ("content-security-policy", "cache-control", "vary", "referrer-policy"):
+        assert again.headers[name] == first.headers[name], "a browser takes over the headers of a 304"
 
 
 def test_the_packed_and_the_plain_file_have_different_validators(built: TestClient) -> None:

@@ -27,9 +27,9 @@ def test_from_an_upload_to_a_playing_mesh(page: Page, url: str, small: dict[str,
     expect(seen).to_contain_text("10 frames of 300 points")
     expect(seen).to_contain_text("tracks (F, P, 2), y down")
     expect(seen).to_contain_text("given; errors are measured against it")
-    expect(seen.get_by_role("img", name="Some of the tracks")).to_be_visible()
+    expect(seen.get_by_role("img", name="Sample of the tracks")).to_be_visible()
     painted = "(it) => it.getContext('2d').getImageData(0, 0, it.width, it.height).data.filter((v, i) => i % 4 === 3 && v > 0).length"
-    assert seen.get_by_role("img", name="Some of the tracks").evaluate(painted) > 200 * 9  # a dot each of 200 points
+    assert seen.get_by_role("img", name="Sample of the tracks").evaluate(painted) > 200 * 9  # a dot each of 200 points
     page.get_by_label("Preset").select_option(label="automatic")
     page.get_by_label("name (optional)").fill("my flag")
     page.get_by_role("button", name="Reconstruct").click()

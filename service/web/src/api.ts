@@ -40,7 +40,7 @@ export function problemOf(status: number, text: string): Problem {
       return { title: "Refused", status, code: "unknown", ...given, detail: given.detail };
     }
   } catch {
-    // Not JSON: a proxy's page, or nothing. The status is all there is to say.
+    // Not JSON: a proxy's page, or an empty body. Only the status is known.
   }
   return {
     title: "Refused",

@@ -53,7 +53,7 @@ export class Compose {
     if (!this.sending) this.inspection.changed();
   }
 
-  /** Fetch what the service knows about options and examples. */
+  /** Load options and examples. */
   async load(): Promise<void> {
     this.options.load(await getOptions());
     try {
@@ -62,7 +62,7 @@ export class Compose {
       this.examples.replaceChildren(...this.exampleButtons(examples));
     } catch (error) {
       if (!(error instanceof Refusal)) throw error;
-      this.examples.replaceChildren(); // a service without examples is whole all the same
+      this.examples.replaceChildren(); // the examples are optional
     }
   }
 

@@ -104,7 +104,7 @@ class Curve {
     if (!first || !last || this.samples.length < 2) return;
     const values = this.samples.map((sample) => sample.value);
     const [low, high] = [Math.min(...values), Math.max(...values)];
-    // A range of more than a decade is drawn in logarithms, or everything but the first step would be a flat line.
+    // A range of more than a decade gets a logarithmic axis; otherwise all but the first step would be a flat line.
     const logarithmic = low > 0 && high / low > 10;
     const scale = (value: number): number => (logarithmic ? Math.log10(value) : value);
     const span = scale(high) - scale(low) || 1;

@@ -51,7 +51,7 @@ function named(): string | null {
   return new URLSearchParams(location.hash.slice(1)).get("job") || null;
 }
 
-/** Something every part of the page depends on failed: say it at the top, and ask for a token if that is what is missing. */
+/** Show a failure that concerns the whole page at its top, with a form for a token if one is missing. */
 function report(error: unknown): void {
   if (!(error instanceof Refusal)) throw error;
   const parts: Node[] = [refusalBox(error.problem)];
@@ -73,7 +73,7 @@ function tokenForm(): HTMLElement {
   return form;
 }
 
-/** The shortest way to see it work, where there is nothing else to look at yet. */
+/** Offer the example while there are no jobs. */
 function offer(): void {
   const place = document.getElementById("try") as HTMLElement;
   place.hidden = !compose.hasExamples;
@@ -95,7 +95,7 @@ async function start(): Promise<void> {
   }
 }
 
-/** Look at the list again: often while something runs, seldom otherwise, never while nobody looks. */
+/** Refresh the list: often while a job runs, rarely otherwise, never while the page is hidden. */
 async function watch(): Promise<void> {
   for (;;) {
     await new Promise((resolve) => setTimeout(resolve, list.busy ? 2000 : 8000));

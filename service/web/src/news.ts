@@ -1,4 +1,4 @@
-// Which of two things said about a job is the newer one: events tell the past again, and answers overtake each other.
+// Which of two records of a job is newer: events repeat the past, and answers overtake each other.
 
 import { type Job, type Progress, isFinal } from "./types";
 

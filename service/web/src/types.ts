@@ -1,5 +1,5 @@
 // The types of the API. schema.d.ts is generated from the service's OpenAPI document:
-//   python -m pliant.service.openapi --schemas > openapi.json && npx openapi-typescript openapi.json -o src/schema.d.ts
+//   python -m pliant.service openapi --schemas > openapi.json && npx openapi-typescript openapi.json -o src/schema.d.ts
 
 import type { components } from "./schema";
 
