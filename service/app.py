@@ -6,7 +6,6 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from importlib.metadata import version
 
-import anyio
 from fastapi import FastAPI
 from pliant.service import openapi, problems
 from pliant.service.dependencies import Service
@@ -19,7 +18,7 @@ from pliant.service.middleware.rate_limit import RateLimit
 from pliant.service.page import mount_page
 from pliant.service.routes import artifacts, events, examples, inspection, jobs, meta, metrics, uploads
 from pliant.service.settings import ServiceSettings
-from pliant.service.spool import Incoming
+from pliant.service.spool import Incoming, ParserSlots
 from pliant.service.upload_locks import Turns
 from pliant.worker import errors
 from pliant.worker.formats import InvalidInput, Limits
@@ -56,7 +55,7 @@ def create_app(
     settings: ServiceSettings,
     *,
     tokens: Tokens,
-    limits: Limits = Limits(),  # noqa: B008
+    limits: Limits | None = None,
 ) -> FastAPI:
     """Make the application.
 
@@ -68,10 +67,11 @@ def create_app(
         How the service runs.
     tokens : Tokens
         Who may ask, where the settings say that tokens are asked for.
-    limits : Limits
-        What the readers accept.
+    limits : Limits, optional
+        What the readers accept; None: the usual limits, with `read_memory` of the jobs' settings.
     """
     requests = Requests()
+    limits = limits or Limits(read_memory=jobs_of_all.settings.read_memory)
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
@@ -86,7 +86,7 @@ def create_app(
             requests=requests,
             uploads=Uploads.open(jobs_of_all.settings),
             turns=Turns(),
-            parsing=anyio.CapacityLimiter(settings.parsers),
+            parsing=ParserSlots(settings.parsers),
         )
         yield
         incoming.close()

@@ -5,12 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Annotated
 
-import anyio
 from fastapi import Depends, Request
 from pliant.service.event_stream import Followers
 from pliant.service.metrics import Requests
 from pliant.service.settings import ServiceSettings
-from pliant.service.spool import Incoming
+from pliant.service.spool import Incoming, ParserSlots
 from pliant.service.upload_locks import Turns
 from pliant.worker.formats import Limits
 from pliant.worker.jobs.service import Jobs
@@ -34,7 +33,7 @@ class Service:
     turns: Turns
     requests: Requests
     """What has been counted of them."""
-    parsing: anyio.CapacityLimiter
+    parsing: ParserSlots
     """Holds the number of inputs that are in memory at once."""
 
 

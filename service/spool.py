@@ -1,4 +1,4 @@
-"""The folder where bodies lie while they arrive, and nothing afterwards.
+"""The folder where bodies lie while they arrive, and nothing afterwards; and the slots in which they are read.
 
 Each process owns one sub-folder beside a locked file; each request gets a room of its own in it, removed when the request
 ends however it ends. What a killed process left behind is known by its free lock and swept by the next one that starts.
@@ -11,9 +11,17 @@ import os
 import secrets
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections import Counter, OrderedDict, deque
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
+from typing import TypeVar
+
+import anyio
+from anyio import to_thread
+
+Answer = TypeVar("Answer")
 
 
 class Incoming:
@@ -88,3 +96,63 @@ class Incoming:
                 pass
             finally:
                 os.close(descriptor)
+
+
+class ParserSlots:
+    """Runs calls on threads, so many at once. A slot that becomes free goes to the waiting owner that holds the fewest.
+
+    Parameters
+    ----------
+    total : int
+        Calls at once.
+    """
+
+    def __init__(self, total: int) -> None:
+        self._free = total
+        self._limiter = anyio.CapacityLimiter(total)
+        self._held: Counter[str] = Counter()
+        self._waiting: OrderedDict[str, deque[anyio.Event]] = OrderedDict()
+
+    async def run(self, owner: str, call: Callable[..., Answer], *arguments: object) -> Answer:
+        """Return what the call returns, once a slot is free for its owner."""
+        await self._take(owner)
+        try:
+            return await to_thread.run_sync(partial(call, *arguments), limiter=self._limiter)
+        finally:
+            self._give_back(owner)
+
+    async def _take(self, owner: str) -> None:
+        if self._free > 0:
+            self._free -= 1
+            self._held[owner] += 1
+            return
+        granted = anyio.Event()
+        self._waiting.setdefault(owner, deque()).append(granted)
+        try:
+            await granted.wait()
+        except BaseException:
+            if granted.is_set():
+                self._give_back(owner)
+            else:
+                self._leave(owner, granted)
+            raise
+
+    def _give_back(self, owner: str) -> None:
+        self._held[owner] -= 1
+        if not self._held[owner]:
+            del self._held[owner]
+        if not self._waiting:
+            self._free += 1
+            return
+        following = min(self._waiting, key=lambda each: self._held[each])  # of equals the first to have come
+        granted = self._waiting[following][0]
+        self._leave(following, granted)
+        if following in self._waiting:
+            self._waiting.move_to_end(following)
+        self._held[following] += 1
+        granted.set()
+
+    def _leave(self, owner: str, granted: anyio.Event) -> None:
+        self._waiting[owner].remove(granted)
+        if not self._waiting[owner]:
+            del self._waiting[owner]

@@ -16,6 +16,7 @@ from pliant.worker.execution.rq_worker import PliantWorker
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.maintenance.fsck import findings
 from pliant.worker.maintenance.reconciler import Reconciler
+from pliant.worker.paths import make_data_directory
 from pliant.worker.settings import NUMERICAL_THREADS, Settings
 from pliant.worker.store.connection import BLOCK_WITHIN, connect
 from pliant.worker.store.queue import RedisQueue
@@ -42,7 +43,7 @@ def work(settings: Settings) -> int:
         importlib.import_module(module)
     gc.collect()
     gc.freeze()  # or every job process's first collection would copy all the pages it shares with us
-    settings.work.mkdir(parents=True, exist_ok=True)
+    make_data_directory(settings.data)
     quick = connect(settings.redis, decode=True, retries=0, answer_within=WATCH_ANSWERS_WITHIN)
     connection = connect(settings.redis, decode=False, answer_within=BLOCK_WITHIN)
     PliantWorker(

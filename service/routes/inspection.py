@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from anyio import to_thread
 from fastapi import APIRouter, Request
 from pliant.schemas.job import Inspection
 from pliant.service.dependencies import Bound, Core, MyUploads
@@ -33,7 +32,7 @@ async def inspect(request: Request, core: Core, bounds: Bound, uploads: MyUpload
     rules = form_rules(core.settings, max_body_bytes=bounds.max_body_bytes)
     with core.incoming.room() as room:
         form = await receive_form(request, room, rules=rules)
-        return await to_thread.run_sync(lambda: understood(form, room, uploads, core.limits), limiter=core.parsing)
+        return await core.parsing.run(uploads.owner, lambda: understood(form, room, uploads, core.limits))
 
 
 def understood(form: Form, room: Path, uploads: Uploads, limits: Limits) -> Inspection:

@@ -135,7 +135,8 @@ async def _receive(
     await to_thread.run_sync(lambda: jobs.check_capacity(id=id, idempotency_key=idempotency_key))
     with core.incoming.room() as room:
         form = await receive_form(request, room, rules=rules)
-        return await to_thread.run_sync(
+        return await core.parsing.run(
+            jobs.owner or "",
             lambda: accept(
                 form,
                 room,
@@ -145,7 +146,6 @@ async def _receive(
                 id=id,
                 idempotency_key=idempotency_key,
             ),
-            limiter=core.parsing,
         )
 
 

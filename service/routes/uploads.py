@@ -26,7 +26,7 @@ from pliant.service.multipart import batches
 from pliant.service.openapi import problems
 from pliant.service.problems import Refusal
 from pliant.worker.errors import OffsetMismatch
-from pliant.worker.uploads.service import Room, Uploads, Writer
+from pliant.worker.uploads.service import Capacity, Uploads, Writer
 
 router = APIRouter(prefix="/v1/uploads", tags=["uploads"])
 
@@ -172,8 +172,8 @@ class Sending:
 
 async def _receive(request: Request, core: Service, *, uploads: Uploads, id: str, sending: Sending) -> None:
     """Write the body as it arrives. If it breaks off, what has arrived stays: that is where the client goes on."""
-    room = await to_thread.run_sync(partial(_room, core, uploads, id, bounds_of(request)))
-    held = uploads.write(id, offset=sending.offset, length=sending.length, room=room)
+    capacity = await to_thread.run_sync(partial(_capacity, core, bounds_of(request)))
+    held = uploads.write(id, offset=sending.offset, length=sending.length, capacity=capacity)
     try:
         writer: Writer = await to_thread.run_sync(held.__enter__)
     except OffsetMismatch as error:
@@ -191,10 +191,9 @@ async def _receive(request: Request, core: Service, *, uploads: Uploads, id: str
             await to_thread.run_sync(held.__exit__, None, None, None)
 
 
-def _room(core: Service, uploads: Uploads, id: str, bounds: Bounds) -> Room:
+def _capacity(core: Service, bounds: Bounds) -> Capacity:
     quota = core.jobs.settings.disk_quota
-    used = core.jobs.used() + uploads.used() - uploads.size(id) if quota > 0 else 0
-    return Room(max_bytes=bounds.max_upload_bytes, quota=quota, used=used)
+    return Capacity(max_bytes=bounds.max_upload_bytes, quota=quota, used=core.jobs.used() if quota > 0 else 0)
 
 
 async def _already(uploads: Uploads, id: str, sending: Sending) -> Upload | None:

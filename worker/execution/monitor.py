@@ -13,8 +13,8 @@ from enum import StrEnum
 from typing import TypeVar
 
 from pliant.schemas.job import Problem, Status
-from pliant.worker.errors import StaleAttempt, StoreUnavailable, UnknownJob
-from pliant.worker.execution.failures import how_it_ended, out_of_memory, timed_out, worker_lost
+from pliant.worker.errors import StaleAttempt, StoreUnavailable, TimedOut, UnknownJob
+from pliant.worker.execution.failures import how_it_ended, out_of_memory, problem_of, timed_out, worker_lost
 from pliant.worker.execution.workdir import last_words
 from pliant.worker.ids import new_attempt_id
 from pliant.worker.jobs import lifecycle
@@ -82,6 +82,8 @@ class Watch:
     kills: OomKills = field(init=False)
     _next_beat: float = field(init=False)
     _cancelled: float | None = None
+    _own_limit: float | None = None
+    """The option `time_limit` of the job, 0 for none; None: not read yet."""
 
     def __post_init__(self) -> None:
         self.began = self._next_beat = self.clock()
@@ -100,7 +102,7 @@ class Watch:
         if now >= self._next_beat:
             self._next_beat = now + BEAT
             self._look(now)
-        grace, limit = self.settings.cancel_grace, self.settings.time_limit
+        grace, limit = self.settings.cancel_grace, self.limit
         if self.reason is Reason.STALE:
             return self.reason
         if self._cancelled is not None and now >= self._cancelled + grace:
@@ -111,9 +113,18 @@ class Watch:
             self.reason = Reason.STOPPING
         return self.reason
 
+    @property
+    def limit(self) -> float:
+        """Seconds that the attempt may take: the lower one of the setting's and the job's own; 0: no limit."""
+        return min((each for each in (self.settings.time_limit, self._own_limit or 0.0) if each > 0), default=0.0)
+
     def _look(self, now: float) -> None:
         try:
             status = self.records.beat(self.id, self.attempt_id)
+            if self._own_limit is None and status is not None:
+                self._own_limit = self.records.get(self.id).job.options.time_limit or 0.0
+        except UnknownJob:
+            status = None
         except StoreUnavailable:
             return  # the job goes on; it needs no store until it writes its result
         if status is None:
@@ -181,7 +192,8 @@ def _verdict(watch: Watch, *, status: int, peak: int) -> Callable[[Stored], Stor
                 retention=settings.retention,
             )
         if watch.reason is Reason.TIMED_OUT:
-            problem = timed_out(settings.time_limit)
+            own = watch.limit != settings.time_limit
+            problem = problem_of(TimedOut(watch.limit)) if own else timed_out(settings.time_limit)
         else:
             problem = _death(watch, status=status, peak=peak)
         return lifecycle.fail(stored, attempt_id=attempt_id, problem=problem, now=now, retention=settings.retention)

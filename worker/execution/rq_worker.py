@@ -186,10 +186,17 @@ class PliantWorker(Worker):
                 self.kill_horse()
             if time.monotonic() > next_sign:
                 next_sign = time.monotonic() + IDLE_WAKE
-                self.heartbeat()
+                self._keep_execution(job)
             time.sleep(POLL)
         self._horse_pid = 0
         self._reap(watch, job, status=status, peak=usage.ru_maxrss * RSS_UNIT)
+
+    def _keep_execution(self, job: RqJob) -> None:
+        """Give our sign of life, and RQ's for the delivery: without it RQ declares every job of more than 90 s abandoned."""
+        try:
+            self.maintain_heartbeats(job)
+        except AWAY as error:
+            logger.warning("no sign of life: %s", error)
 
     def _reap(self, watch: Watch, job: RqJob, *, status: int, peak: int) -> None:
         patience = Patience(60.0 if self._stop_by is None else 2.0)

@@ -23,6 +23,7 @@ from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.submission import Acceptance, Submission, key_digest
 from pliant.worker.jobs.validation import LARGEST_PAGE as LARGEST_PAGE
 from pliant.worker.jobs.validation import check_event_id, check_key, check_page
+from pliant.worker.paths import make_data_directory
 from pliant.worker.records import Event, Records, Stored, utc_now
 from pliant.worker.settings import Settings
 from pliant.worker.store.blobs import Blob, Blobs
@@ -53,6 +54,9 @@ class Jobs:
     @classmethod
     def open(cls, settings: Settings) -> Jobs:
         """Connect to what the settings name. Nothing is sent before it is needed, so Redis may still be starting."""
+        if settings.blob_url is None:
+            with suppress(OSError):  # what is wrong is said by what opens it
+                make_data_directory(settings.data)
         return cls(
             records=RedisRecords(connect(settings.redis, decode=True), prefix=settings.queue),
             blobs=Blobs.open(settings.blobs),

@@ -33,8 +33,8 @@ KILLED = int(signal.SIGKILL)
 def running(jobs: Jobs, inputs_file: Path, interpretation: Interpretation) -> Callable[..., Watch]:
     """A claimed job under watch, with settings and a clock of the test's own."""
 
-    def make(time: list[float] | None = None, **settings: object) -> Watch:
-        id = jobs.submit(inputs_file, Submission(options=Options()), interpretation=interpretation).id
+    def make(time: list[float] | None = None, options: Options | None = None, **settings: object) -> Watch:
+        id = jobs.submit(inputs_file, Submission(options=options or Options()), interpretation=interpretation).id
         attempt_id = jobs.records.get(id).attempt_id
         jobs.records.update(id, lambda held: lifecycle.claim(held, attempt_id=attempt_id, worker="me", now=NOW))
         clock = time if time is not None else [0.0]
@@ -69,6 +69,19 @@ def test_an_attempt_that_ignores_its_time_limit_is_killed(running: Callable[...,
     assert after is not None
     assert after.job.error is not None
     assert (after.job.error.code, "10 s" in after.job.error.detail) == ("timed_out", True)
+
+
+def test_a_jobs_own_time_limit_is_enforced_too(running: Callable[..., Watch]) -> None:
+    time = [0.0]
+    watch = running(time, options=Options(time_limit=4.0), time_limit=100.0)
+    time[0] = 6.9
+    assert watch.must_end(stop_by=None) is None
+    time[0] = 7.1
+    assert watch.must_end(stop_by=None) is Reason.TIMED_OUT, "its 4 s and a grace of 3 s"
+    after = finalize(watch, status=KILLED, peak=0, patience=Patience(0))
+    assert after is not None
+    assert after.job.error is not None
+    assert (after.job.error.code, "4 s of its option time_limit" in after.job.error.detail) == ("timed_out", True)
 
 
 def test_without_a_limit_there_is_none(running: Callable[..., Watch]) -> None:

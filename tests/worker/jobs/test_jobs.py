@@ -20,7 +20,9 @@ from pliant.worker.errors import (
 )
 from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.service import Jobs
+from pliant.worker.jobs.submission import Submission
 from pliant.worker.records import Stored
+from pliant.worker.uploads.service import Capacity, Uploads
 
 NOW = datetime(2030, 1, 2, tzinfo=UTC)
 PROBLEM = Problem(
@@ -331,3 +333,36 @@ def test_readiness_names_each_part(jobs: Jobs) -> None:
     found = jobs.ready()
     assert (found["redis"], found["blobs"]) == ("ok", "ok")
     assert found["workers"] == "ok" or "pliant work" in found["workers"]
+
+
+def test_a_retry_that_meets_a_deletion_says_that_the_job_is_gone(
+    jobs: Jobs, submit, monkeypatch: pytest.MonkeyPatch
+) -> None:  # type: ignore[no-untyped-def]
+    id = submit().id
+    jobs.cancel(id)
+    known = Jobs.known
+
+    def deleted_meanwhile(door: Jobs, submission: Submission) -> Job | None:
+        jobs.delete(id)
+        return known(door, submission)
+
+    monkeypatch.setattr(Jobs, "known", deleted_meanwhile)
+    with pytest.raises(UnknownJob):
+        jobs.retry(id)
+    assert jobs.records.ids(Status.QUEUED) == []
+    assert jobs.records.deleted() == {}
+
+
+def test_jobs_count_the_uploads_and_the_quota_holds_at_the_moment_of_writing(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
+    tight = dataclasses.replace(jobs, settings=dataclasses.replace(jobs.settings, disk_quota=4_000_000))
+    uploads = Uploads.open(tight.settings)
+    with uploads.write("big-one", offset=0, length=None, capacity=Capacity(max_bytes=10**7)) as writer:
+        writer.write(bytes(1_500_000))
+    with pytest.raises(QuotaExceeded, match="hold 1,500,000 bytes"):
+        submit(tight)
+    uploads.delete("big-one")
+    stored = jobs.records.get(submit(tight).id)
+    job = stored.job.model_copy(update={"id": "another"})
+    with pytest.raises(QuotaExceeded, match="hold 3,000,000 bytes and may hold 4,000,000"):
+        jobs.records.create(stored.model_copy(update={"job": job}), max_bytes=4_000_000)
+    assert jobs.records.used() == 3_000_000

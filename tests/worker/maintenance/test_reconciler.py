@@ -7,6 +7,7 @@ import os
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -19,7 +20,8 @@ from pliant.worker.jobs.submission import Submission
 from pliant.worker.maintenance.fsck import findings
 from pliant.worker.maintenance.reconciler import Reconciler, Stillness
 from pliant.worker.settings import Settings
-from pliant.worker.uploads.service import Room, Uploads
+from pliant.worker.store.blobs import Blobs
+from pliant.worker.uploads.service import Capacity, Uploads
 from reconciler_world import World
 
 
@@ -227,7 +229,7 @@ def test_last_words_are_the_end_of_what_was_written(tmp_path: Path) -> None:
 def test_it_removes_uploads_that_have_expired(world: World) -> None:
     uploads = Uploads.open(world.jobs.settings)
     for id in ("old", "young"):
-        with uploads.write(id, offset=0, length=None, room=Room(max_bytes=9)) as writer:
+        with uploads.write(id, offset=0, length=None, capacity=Capacity(max_bytes=9)) as writer:
             writer.write(b"x")
         (file,) = uploads.directory.glob(f"*/{id}/part")
         moment = world.now.timestamp() - (uploads.expiry if id == "old" else uploads.expiry - 3600)
@@ -264,3 +266,44 @@ def test_a_jump_of_the_clock_loses_nothing(
     with pytest.raises(UnknownJob):
         world.jobs.get(done)
     assert world.jobs.get(busy).attempt == 1
+
+
+def test_what_a_stale_attempt_stores_late_is_removed_soon(
+    world: World, submit: Callable[[World], str], tmp_path: Path
+) -> None:
+    """After Redis was cut off for 200 s the files of stale attempts stayed until the hourly sweep."""
+    id = submit(world)
+    old = world.claim(id)
+    world.pass_seconds(7)
+    fresh = world.claim(id)
+    stop = partial(lifecycle.stop, attempt_id=fresh, now=world.now, retention=60.0)
+    (tmp_path / "late").write_text("late")
+    world.jobs.cancel(id)
+    world.jobs.records.update(id, stop)
+    world.pass_seconds(2)
+    world.jobs.blobs.put(f"jobs/{id}/{old}/artifacts/shapes.npz", tmp_path / "late")
+    assert findings(world.jobs, pause=0) != []
+    world.pass_seconds(31)
+    assert findings(world.jobs, pause=0) == []
+
+
+def test_files_of_a_deleted_job_go_once_the_blob_store_is_back(
+    world: World, submit: Callable[[World], str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    id = submit(world)
+    world.jobs.cancel(id)
+    world.now = datetime.now(UTC) + timedelta(seconds=1)  # the blob store has its own clock
+    with monkeypatch.context() as away:
+        away.setattr(Blobs, "delete", refuse)
+        world.jobs.delete(id)
+    with pytest.raises(UnknownJob):
+        world.jobs.get(id)
+    assert list(world.jobs.records.deleted()) == [id]
+    assert len(world.jobs.blobs.list()) == 1
+    world.pass_seconds(31)
+    assert world.jobs.blobs.list() == []
+    assert world.jobs.records.deleted() == {}
+
+
+def refuse(*_: object) -> None:
+    raise StoreUnavailable("The blob store", reason="away")

@@ -1,4 +1,4 @@
-"""The process that parses a stranger's file loads its parser and no more: it is started for every file, and less of it can be attacked."""
+"""The sandbox loads its parser and no more: it is started for every file, and less of it can be attacked."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ ALSO = {"matlab5": {"scipy.sparse", "scipy.linalg"}}
 
 
 @pytest.mark.parametrize("parser", PARSERS)
-def test_a_child_loads_its_parser_and_no_more(parser: str) -> None:
+def test_a_sandbox_loads_its_parser_and_no_more(parser: str) -> None:
     ran = subprocess.run([sys.executable, "-I", "-c", LISTED, parser], capture_output=True, text=True, check=True)
     loaded = set(ran.stdout.split())
     needed = NEEDED.get(parser, set())
