@@ -98,7 +98,7 @@ def test_a_finished_job_waits_for_a_blob_store_that_is_away(
     now[0] += 1
     with pytest.raises(Interrupted):
         attempt.store(finished, tmp_path)
-    monkeypatch.setattr(attempt, "should_stop", lambda: False)
+    monkeypatch.setattr(Attempt, "should_stop", lambda self: False)
     monkeypatch.setattr("pliant.worker.execution.attempt.PATIENCE", -1.0)
     away[0] = 1
     with pytest.raises(StoreUnavailable):
