@@ -7,7 +7,7 @@ STAMP := $(VENV)/.installed
 PAGE := service/web/dist/index.html
 PAGE_SOURCES := $(wildcard service/web/*.json service/web/*.mjs service/web/src/* service/web/src/*/*)
 
-.PHONY: help demo test test-slow matrix coverage page types check format clean
+.PHONY: help demo test test-slow matrix coverage page docs types check format clean
 
 help:
 	@echo "make demo    reconstruct a moving face end to end: service, queue, worker, glTF"
@@ -16,6 +16,7 @@ help:
 	@echo "make matrix  make test with every Python from 3.11 to 3.14 on this machine"
 	@echo "make coverage   make test, with the share of lines that it runs"
 	@echo "make page    bundle the web page"
+	@echo "make docs    build the documentation site into build/site; a warning is an error"
 	@echo "make check   lint (ruff) and types (mypy --strict)"
 	@echo "make format  let ruff rewrite the files"
 	@echo "make clean   remove .venv and build output"
@@ -59,6 +60,12 @@ matrix:
 coverage: $(STAMP)
 	$(PYTEST) -m "not ($(NEEDY))" --cov=pliant --cov-report=term $(TESTS)
 
+# Zensical builds what docs/generate.py writes: the pages, and the reference that is read from the code.
+docs: $(STAMP) build/typed/pliant
+	@$(BIN)/python -c 'import zensical' 2>/dev/null || $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
+	$(BIN)/python docs/generate.py build/docs
+	NO_COLOR=1 $(BIN)/python -m zensical build --clean --strict
+
 # mypy reads the folders under their import names, so it gets a tree of links that has them.
 build/typed/pliant:
 	mkdir -p $@
@@ -78,4 +85,4 @@ format: $(STAMP)
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info service/web/dist service/web/dist.next service/web/node_modules
+	rm -rf $(VENV) .cache build dist *.egg-info service/web/dist service/web/dist.next service/web/node_modules

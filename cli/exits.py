@@ -11,7 +11,7 @@ from typer.core import TyperGroup
 
 
 class Exit(IntEnum):
-    """How a command ended. Documented in docs/cli.md; a test holds the two together."""
+    """How a command ended. Documented in docs/reference/cli.md; a test holds the two together."""
 
     DONE = 0
     """Everything asked for was done."""

@@ -1,4 +1,4 @@
-"""Reconstruct every track file of a folder, as many at once as the service has workers; run it again to go on.
+"""Reconstruct every track file of a folder, as many at once as the service has workers. Run it again to resume.
 
 python examples/batch.py FOLDER OUT
 """
@@ -7,7 +7,8 @@ import os
 import sys
 from pathlib import Path
 
-from pliant.client import Client, InvalidRequest, JobEnded
+from pliant import Client
+from pliant.client import InvalidRequest, JobEnded
 
 folder, out = Path(sys.argv[1]), Path(sys.argv[2])
 
@@ -15,12 +16,12 @@ with Client(os.environ.get("PLIANT_URL", "http://127.0.0.1:8000")) as client:
     jobs = {}
     for path in sorted(folder.glob("*.npz")):
         try:
-            # The same key for the same file: running this script again finds the jobs of the first time, and makes no new ones.
+            # The same key for the same file: a second run of this script finds the first run's jobs.
             jobs[path.stem] = client.submit(
                 path, name=path.stem, idempotency_key=f"batch/{path.resolve()}/{path.stat().st_mtime_ns}"
             )
-        except InvalidRequest as refusal:
-            print(f"{path.name}: {refusal}")
+        except InvalidRequest as error:
+            print(f"{path.name}: {error}")
     for name, job in jobs.items():
         try:
             files = job.wait(load=False, timeout=3600).download(out / name)

@@ -10,7 +10,7 @@ import sys
 
 import numpy as np
 from matplotlib.figure import Figure
-from pliant.client import Client
+from pliant import Client
 
 tracks, truth, target = sys.argv[1], sys.argv[2], sys.argv[3] if len(sys.argv) > 3 else "error.png"
 
@@ -19,7 +19,7 @@ with Client(os.environ.get("PLIANT_URL", "http://127.0.0.1:8000")) as client:
 for name, value in result.metrics.items():
     print(f"{name:24} {value:.4g}")
 
-# The error of one frame, after the best similarity: the service reports the means, this shows where they come from.
+# The error of each frame after the best similarity. The service reports its mean as e3d_frame_similarity.
 true = np.load(truth)["shapes"]
 true = true - true.mean(axis=1, keepdims=True)
 errors = []

@@ -1,4 +1,4 @@
-"""Reconstruct what CoTracker tracked: its dictionary goes to Pliant as it is.
+"""Reconstruct CoTracker's output: its dictionary is submitted unchanged.
 
     python examples/from_cotracker.py TRACKS.npz [OUT.glb]
 
@@ -10,17 +10,15 @@ import os
 import sys
 
 import numpy as np
-from pliant.client import Client
+from pliant import Client
 from pliant.client.progress import progress_bar
 
 source, target = sys.argv[1], sys.argv[2] if len(sys.argv) > 2 else "cotracker.glb"
-result_of_the_tracker = dict(
-    np.load(source)
-)  # in a script that tracks: {"pred_tracks": …, "pred_visibility": …}, tensors too
+tracker_output = dict(np.load(source))  # in a tracking script: {"pred_tracks": …, "pred_visibility": …}; tensors, too
 
 with Client(os.environ.get("PLIANT_URL", "http://127.0.0.1:8000")) as client, progress_bar() as bar:
-    job = client.submit(result_of_the_tracker, name="cotracker", on_upload=bar.on_upload)
-    print("understood as:", job.record.interpretation.layout)
+    job = client.submit(tracker_output, name="cotracker", on_upload=bar.on_upload)
+    print("read as:", job.record.interpretation.layout)
     result = job.wait(on_progress=bar.on_progress, timeout=3600)
     print("shapes", result.shapes.shape, "saved as", result.save_glb(target))
 for warning in result.job.warnings:

@@ -7,13 +7,13 @@ import os
 import sys
 
 import numpy as np
-from pliant.client import Client
+from pliant import Client
 
 source, target = sys.argv[1], sys.argv[2] if len(sys.argv) > 2 else "shapes.npz"
 
 with Client(os.environ.get("PLIANT_URL", "http://127.0.0.1:8000")) as client:
-    # The file is sent as it is. The service finds W and says how it read the rows; it refuses to guess where two readings fit.
+    # The file is sent unchanged. The service finds W and reports how it read the rows; an ambiguous file is an error.
     result = client.submit(source, mesh="none", name=os.path.basename(source)).wait(timeout=3600)
-    print("understood as:", result.job.interpretation.layout)
+    print("read as:", result.job.interpretation.layout)
     np.savez_compressed(target, shapes=result.shapes, rotations=result.rotations)
     print(f"{result.shapes.shape[0]} frames × {result.shapes.shape[1]} points saved as {target}")

@@ -1,4 +1,4 @@
-"""Submit several clips at once with asyncio, and follow them all as they go.
+"""Submit several clips at once with asyncio, and follow their progress.
 
 python examples/many_at_once.py CLIP.npz [CLIP.npz ...]
 """
@@ -7,7 +7,7 @@ import asyncio
 import os
 import sys
 
-from pliant.client import AsyncClient
+from pliant import AsyncClient
 
 
 async def reconstruct(client: AsyncClient, path: str) -> str:

@@ -25,7 +25,7 @@ def built(tmp_path: Path) -> TestClient:
     return TestClient(app)
 
 
-def test_the_page_is_asked_for_again_and_its_files_are_kept_for_ever(built: TestClient) -> None:
+def test_the_page_is_revalidated_and_its_files_are_immutable(built: TestClient) -> None:
     for address in ("/", "/docs"):
         index = built.get(address)
         assert index.status_code == 200

@@ -22,7 +22,7 @@ from pliant.worker.jobs.service import Jobs
 from pliant.worker.settings import Settings
 from pliant.worker.store.connection import connect
 from pliant.worker.tokens import Scope, Tokens
-from serving import Running, Serve, finish, form, submit, tracks
+from serving import Running, Serve, finish, form, settings_from, submit, tracks
 
 
 @pytest.fixture(scope="module")
@@ -60,14 +60,14 @@ def test_every_address_but_the_public_ones_asks_for_a_token(guarded: Running) ->
         open_to_all = set()
         for method, path in [*addresses(guarded), ("GET", "/nowhere"), ("POST", "/"), ("DELETE", "/v1")]:
             if is_public(path):
-                open_to_all.add(path)
+                open_to_all.add("/errors" if path.startswith("/errors") else path)
                 continue
             for headers in asked.values():
                 answer = http.request(method, path, headers=headers)
                 assert answer.status_code == 401, (method, path)
                 assert answer.headers["www-authenticate"].startswith('Bearer realm="pliant"')
                 assert answer.headers["content-type"] == "application/problem+json"
-        assert open_to_all == {"/healthz", "/readyz", "/"}
+        assert open_to_all == {"/healthz", "/readyz", "/", "/errors"}
         for path in ("/healthz", "/openapi.json"):
             assert http.get(path).status_code == 200
 
@@ -96,7 +96,7 @@ def test_wrong_revoked_and_expired_tokens_are_told_apart_from_none(guarded: Runn
         answer = httpx.get(f"{guarded.url}/v1/jobs", headers={"Authorization": f"Bearer {value}"})
         return answer.status_code, answer.json()["code"], 'error="invalid_token"' in answer.headers["www-authenticate"]
 
-    assert httpx.get(f"{guarded.url}/v1/jobs").json()["code"] == "unauthorised"
+    assert httpx.get(f"{guarded.url}/v1/jobs").json()["code"] == "unauthorized"
     assert said("nonsense") == (401, "invalid_token", True)
     assert said(text[:-2] + "zz") == (401, "invalid_token", True)
     assert said(short) == (401, "expired_token", True)
@@ -241,7 +241,7 @@ def test_a_store_that_is_away_lets_nobody_in(serve: Serve, tmp_path: Path, caplo
     assert (answer.status_code, answer.json()["code"], answer.headers["retry-after"]) == (503, "store_unavailable", "2")
     ready = httpx.get(f"{running.url}/readyz", timeout=30)
     assert (ready.status_code, ready.json()["code"]) == (503, "not_ready")
-    assert ready.json()["detail"] == "Not ready: redis, workers. The service's log says why.", (
+    assert ready.json()["detail"] == "Not ready: redis, workers. The service's log has the reasons.", (
         "reasons are not for strangers"
     )
     assert "ConnectionError" in caplog.text
@@ -263,13 +263,13 @@ def test_a_preflight_needs_no_token_and_a_refusal_can_be_read(serve: Serve) -> N
 
 def test_tokens_are_off_on_loopback_and_on_elsewhere_unless_told(valkey_url: str) -> None:
     def asks(**env: str) -> bool:
-        return ServiceSettings.from_environment({f"PLIANT_{key}": value for key, value in env.items()}).asks_for_tokens
+        return settings_from(**env).asks_for_tokens
 
     assert [asks(), asks(HOST="::1"), asks(HOST="localhost")] == [False, False, False]
     assert [asks(HOST="0.0.0.0"), asks(HOST="::"), asks(HOST="10.0.0.1"), asks(HOST="example.org")] == [True] * 4
     assert asks(AUTH="required")
     assert not asks(HOST="0.0.0.0", AUTH="off")
-    with pytest.raises(InvalidServiceSetting, match="auto, required, off"):
+    with pytest.raises(InvalidServiceSetting, match="'auto', 'required' or 'off'"):
         asks(AUTH="no")
 
 
@@ -277,14 +277,14 @@ def test_a_service_that_nobody_could_use_does_not_start(valkey_url: str, caplog:
     tokens = Tokens(connect(valkey_url, decode=True), prefix="check-door")
     strict, open_door = ServiceSettings(host="0.0.0.0"), ServiceSettings(host="0.0.0.0", auth="off")
     with pytest.raises(InvalidServiceSetting, match=r"pliant token create.*PLIANT_AUTH=off"):
-        process.check_door(strict, tokens)
-    process.check_door(open_door, tokens)
-    assert "may read and delete every job" in caplog.text
-    process.check_door(ServiceSettings(), tokens)
+        process.check_access(strict, tokens)
+    process.check_access(open_door, tokens)
+    assert "can read and delete every job" in caplog.text
+    process.check_access(ServiceSettings(), tokens)
     made, _ = tokens.create("somebody")
-    process.check_door(strict, tokens)
+    process.check_access(strict, tokens)
     tokens.revoke(made.id)
-    process.check_door(strict, Tokens(connect("unix:///nonexistent/x.sock", decode=True, retries=0), prefix="x"))
+    process.check_access(strict, Tokens(connect("unix:///nonexistent/x.sock", decode=True, retries=0), prefix="x"))
 
 
 def test_with_tokens_off_one_that_is_sent_changes_nothing(running: Running, http: httpx.Client) -> None:

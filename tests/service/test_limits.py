@@ -9,10 +9,10 @@ import httpx
 import pytest
 from pliant.client import Client, TooManyRequests
 from pliant.client.retry import Policy
-from pliant.service.middleware.rate_limit import MOST_CLIENTS, Rates, _who
-from pliant.service.settings import USUAL_RATE, InvalidServiceSetting, ServiceSettings
+from pliant.service.middleware.rate_limit import MOST_CLIENTS, Rates, _client
+from pliant.service.settings import USUAL_RATE, InvalidServiceSetting
 from pliant.worker.tokens import Scope
-from serving import Running, Serve, claim, form, submit, tracks
+from serving import Running, Serve, claim, form, settings_from, submit, tracks
 
 
 class Clock:
@@ -62,12 +62,12 @@ def test_the_memory_of_clients_is_bounded_and_the_greedy_are_not_forgotten() -> 
 
 def test_an_address_is_one_client_and_so_is_an_ipv6_network() -> None:
     def who(host: str) -> str:
-        return _who({"client": (host, 1)}, None)
+        return _client({"client": (host, 1)}, None)
 
     assert who("10.0.0.1") != who("10.0.0.2")
     assert who("2001:db8::1") == who("2001:db8::ffff:1") != who("2001:db8:0:1::1")
     assert who("testclient") == "testclient"
-    assert _who({"client": None}, None) == ""
+    assert _client({"client": None}, None) == ""
 
 
 def test_too_many_requests_are_refused_with_the_time_to_wait_and_before_the_body(serve: Serve) -> None:
@@ -174,7 +174,7 @@ def test_a_token_may_have_a_smaller_body_than_the_service_allows(serve: Serve) -
 
 def test_the_usual_rate_holds_where_strangers_may_come() -> None:
     def rate(own: int | None = None, **env: str) -> int:
-        return ServiceSettings.from_environment({f"PLIANT_{name}": value for name, value in env.items()}).rate_of(own)
+        return settings_from(**env).rate_of(own)
 
     assert rate() == 0
     assert rate(HOST="0.0.0.0") == rate(AUTH="required") == rate(HOST="::", AUTH="off") == USUAL_RATE

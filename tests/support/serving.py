@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import socket
 import time
 from collections.abc import Callable
@@ -12,6 +13,7 @@ from datetime import UTC, datetime
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import httpx
 import numpy as np
@@ -58,6 +60,14 @@ class Running:
 
 
 Serve = Callable[..., Running]
+
+
+def settings_from(**env: str) -> ServiceSettings:
+    """Read the settings of the service with these `PLIANT_` variables set, and no others."""
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("PLIANT_")}
+    given = {f"PLIANT_{name}": value for name, value in env.items()}
+    with mock.patch.dict(os.environ, kept | given, clear=True):
+        return ServiceSettings.from_environment()
 
 
 def until(holds: Callable[[], Any], *, seconds: float = 10.0) -> None:

@@ -1,4 +1,4 @@
-"""One small sequence, written the way each program and data set writes it: the table of formats that docs/formats.md shows.
+"""One small sequence, written the way each program and data set writes it: the table of formats that docs/reference/formats.md shows.
 
 The points are the 5 × 9 pixels of a tiny picture, on a sheet that turns and waves. Every number is a small multiple of a power of two,
 so that dividing by (width − 1, height − 1) = (8, 4) and multiplying again gives the same bits.

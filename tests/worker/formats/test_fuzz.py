@@ -1,6 +1,6 @@
 """Whatever comes in, what comes out is checked inputs or a refusal: files bent at random, and arrays of any name, shape and content.
 
-`python tests/worker/formats/test_fuzz.py` does the same at length and writes the counts into docs/attacks.md.
+`python tests/worker/formats/test_fuzz.py` does the same at length and writes the counts to build/fuzzing.md.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from pliant.worker.formats import Limits, load_inputs, read_inputs, save_inputs
 from pliant.worker.formats.tracks.tracker_formats import KNOWN
 
 SUPPORT = Path(__file__).parents[2] / "support"
-DOCUMENT = Path(__file__).parents[3] / "docs" / "attacks.md"
+DOCUMENT = Path(__file__).parents[3] / "build" / "fuzzing.md"
 sys.path.insert(0, str(SUPPORT))  # where pytest finds it too
 
 from fuzzing import CRASHED, NATIVE, READERS  # noqa: E402
@@ -157,21 +157,15 @@ def main(examples: int = 3000) -> None:
         total, good, crashed = sum(answers.values()), answers.get("read", 0), answers.get(CRASHED, 0)
         rows.append(f"| {parser} | {total:,} | {good:,} | {total - good - crashed:,} | {crashed:,} | 0 |")
         print(rows[-1], file=sys.stderr)
-    text = DOCUMENT.read_text(encoding="utf-8").partition("\n## Files bent at random")[0]
-    DOCUMENT.write_text(text.rstrip("\n") + "\n" + FUZZED + "\n".join(rows) + "\n", encoding="utf-8")
+    DOCUMENT.parent.mkdir(exist_ok=True)
+    DOCUMENT.write_text(HEAD + "\n".join(rows) + "\n", encoding="utf-8")
 
 
-FUZZED = """
-## Files bent at random
+HEAD = """# Files changed at random
 
-Honest files of every format, and the attacks above, bent by hypothesis (bytes set, inserted, cut, repeated, numbers exchanged) and given to
-each reader. Arrays or a refusal must come back; `test_formats_fuzz.py` does less of the same at every run of the tests, and reads arrays
-of any name, shape, type and content through the whole interpretation besides. SciPy's reader of MATLAB v5 files has crashed on
-some such files, which is why it runs in a process that may be lost: the answer is then 422 `damaged_file`.
-
-```bash not-run: takes minutes, and rewrites the table
-python tests/worker/formats/test_fuzz.py
-```
+Honest files of every format, and the attacks, changed by hypothesis (bytes set, inserted, cut, repeated, numbers
+exchanged) and given to each reader. Arrays or an error must come back. SciPy's reader of MATLAB v5 files has
+crashed on some such files; it runs in a process of its own, and the answer is then 422 `damaged_file`.
 
 """
 

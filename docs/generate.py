@@ -1,0 +1,227 @@
+"""Copy docs/ to a folder, replace each marker ``<!-- generated: NAME -->`` by text from the code, and clean the code fences.
+
+    python docs/generate.py build/docs
+
+Markers: `options` (JSON schema of the job options), `settings` (environment variables), `cli` (the commands' help), `rest`
+(OpenAPI document). A fence such as ``bash not-run: REASON`` becomes ``bash``, because Markdown renderers other than GitHub's
+take a longer line for text. Pages, links and anchors are checked by the strict build that follows in `make docs`.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import json
+import re
+import shutil
+import sys
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+DOCS = Path(__file__).resolve().parent
+MARKER = re.compile(r"^<!-- generated: (\w+) -->$", re.MULTILINE)
+NOTE = re.compile(r"^( *```\w+) not-run: .*$", re.MULTILINE)
+
+
+def main(target: Path) -> None:
+    """Write the site's sources to a folder, which is emptied first."""
+    shutil.rmtree(target, ignore_errors=True)
+    shutil.copytree(DOCS, target, ignore=shutil.ignore_patterns("*.py", "__pycache__"))
+    for page in sorted(target.rglob("*.md")):
+        text = page.read_text(encoding="utf-8")
+        filled = NOTE.sub(r"\1", MARKER.sub(lambda found: GENERATORS[found[1]](), text))
+        if filled != text:
+            page.write_text(filled, encoding="utf-8")
+
+
+def options() -> str:
+    """Return a section for every job option, from the JSON schema."""
+    from pliant.schemas.options import Options
+
+    properties = Options.model_json_schema()["properties"]
+    return "\n\n".join(
+        f"### {name}\n\n{field.get('description', '')}\n\n"
+        f"Type: {_type_of(field)}. Default: `{_plain(field.get('default'))}`."
+        for name, field in properties.items()
+    )
+
+
+def settings() -> str:
+    """Return a table of the environment variables of the service and one of those of the workers."""
+    from pliant.service import settings as of_service
+    from pliant.worker import settings as of_worker
+
+    notes, defaults = _field_notes(of_worker, "Settings"), of_worker.Settings()
+    for name, (variable, _, _) in of_worker.VARIABLES.items():  # the page speaks of variables, the class of fields
+        notes = {each: note.replace(f"`{name}`", f"`{variable}`") for each, note in notes.items()}
+    worker = [
+        (f"`{variable}`", _default(getattr(defaults, name)), f"{notes[name]} Expected: {expected}.")
+        for name, (variable, expected, _) in of_worker.VARIABLES.items()
+    ]
+    service_defaults = of_service.ServiceSettings()
+    service = []
+    for name, note in _field_notes(of_service, "ServiceSettings").items():
+        found = re.search(r"\s*\((PLIANT_\w+)[^)]*\)", note)
+        if found is not None and found[1] not in {variable for variable, _, _ in of_worker.VARIABLES.values()}:
+            value = getattr(service_defaults, name)
+            value = value // 2**20 if found[1].endswith("_MB") else value
+            service.append((f"`{found[1]}`", _default(value), note.replace(found[0], "")))
+    heads = ("variable", "default", "meaning")
+    return f"## Storage and work\n\n{_table(heads, worker)}\n\n## Access control and rate limits\n\n{_table(heads, service)}"
+
+
+def cli() -> str:
+    """Return the help of every command, as Markdown."""
+    import typer
+    from pliant.cli import app
+
+    return "\n\n".join(_command(typer.main.get_command(app), "pliant"))
+
+
+def rest() -> str:
+    """Return every operation of the OpenAPI document: scope, parameters, answers."""
+    document = openapi()
+    parts = []
+    for path, operations in document["paths"].items():
+        for method, operation in operations.items():
+            parts.append(_operation(method.upper(), path, operation))
+    return "\n\n".join(parts)
+
+
+def openapi() -> dict[str, Any]:
+    """Return the OpenAPI document of a service that was never started."""
+    from pliant.service.app import create_app
+    from pliant.service.settings import ServiceSettings
+    from pliant.worker.jobs.service import Jobs
+    from pliant.worker.settings import Settings
+    from pliant.worker.tokens import Tokens
+
+    of_worker = Settings(blob_url="memory:///")
+    app = create_app(Jobs.open(of_worker), ServiceSettings(), tokens=Tokens.open(of_worker))
+    found: dict[str, Any] = app.openapi()
+    return found
+
+
+def _operation(method: str, path: str, operation: dict[str, Any]) -> str:
+    from pliant.service.middleware.auth import is_public, needed
+
+    scope = needed(method, path)
+    summary = operation.get("summary", "")
+    summary += "" if summary.endswith(("?", ".")) else "."
+    lines = [f"### {method} {path}", f"{summary} Scope: {_scope(is_public(path), scope)}."]
+    about = inspect.cleandoc(operation.get("description", "")).partition("\n\nParameters")[0].partition("\n\nRaises")[0]
+    if about:
+        lines.append(about)
+    parameters = [
+        (f"`{each['name']}`", each["in"], "yes" if each.get("required") else "no", _schema_note(each))
+        for each in operation.get("parameters", [])
+        if each["name"] != "id" or each["in"] != "path"
+    ]
+    if parameters:
+        lines.append(_table(("parameter", "in", "required", "meaning"), parameters))
+    answers = sorted(operation["responses"])
+    good = [status for status in answers if int(status) < 400]
+    lines.append(
+        f"Answers: {', '.join(good)}. Errors: {', '.join(status for status in answers if status not in good)}."
+    )
+    return "\n\n".join(lines)
+
+
+def _scope(public: bool, scope: Any) -> str:
+    return "none" if public else "any" if scope is None else f"`{scope.value}`"
+
+
+def _schema_note(parameter: dict[str, Any]) -> str:
+    schema = parameter.get("schema", {})
+    return f"{parameter.get('description', schema.get('description', ''))} ({_type_of(schema)})"
+
+
+def _command(command: Any, path: str) -> Iterator[str]:
+    import click
+
+    if hasattr(command, "commands"):
+        if path != "pliant":
+            yield f"### {path}\n\n{inspect.cleandoc(command.help or '')}"
+        for name, each in command.commands.items():
+            yield from _command(each, f"{path} {name}")
+        return
+    context = click.Context(command, info_name=path)
+    usage = " ".join(command.collect_usage_pieces(context))
+    parts = [f"### {path}", inspect.cleandoc(command.help or ""), f"```text\n{path} {usage}\n```"]
+    rows = []
+    for parameter in command.params:
+        if parameter.name == "help" or getattr(parameter, "hidden", False):
+            continue
+        named = parameter.param_type_name == "argument"
+        shown = str(parameter.name).upper() if named else ", ".join(parameter.opts)
+        rows.append((f"`{shown}`", _click_default(parameter), getattr(parameter, "help", "") or ""))
+    if rows:
+        parts.append(_table(("parameter", "default", "meaning"), rows))
+    yield "\n\n".join(part for part in parts if part)
+
+
+def _click_default(parameter: Any) -> str:
+    if parameter.required:
+        return "required"
+    shown = getattr(parameter, "show_default", None)
+    if isinstance(shown, str):
+        return shown
+    value = parameter.default
+    return "" if value is None or value is False or callable(value) or value in ((), [], "") else f"`{value}`"
+
+
+def _field_notes(module: Any, name: str) -> dict[str, str]:
+    """Return the string behind each field of a class, which Python itself forgets."""
+    tree = ast.parse(inspect.getsource(module))
+    body = next(node.body for node in tree.body if isinstance(node, ast.ClassDef) and node.name == name)
+    notes = {}
+    for field, note in pairwise(body):
+        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and isinstance(note, ast.Expr):
+            text = " ".join(inspect.cleandoc(ast.literal_eval(note.value)).split())
+            notes[field.target.id] = text.replace("None:", "not set:")
+    return notes
+
+
+def _type_of(schema: dict[str, Any]) -> str:
+    """Return a JSON schema's type, choices and bounds in words."""
+    if "anyOf" in schema:
+        return " or ".join(_type_of(each) for each in schema["anyOf"])
+    if "enum" in schema:
+        return ", ".join(f"`{each}`" for each in schema["enum"])
+    if "$ref" in schema:
+        return f"`{schema['$ref'].rpartition('/')[2]}`"
+    if schema.get("type") == "array":
+        return f"list of {_type_of(schema.get('items', {}))}"
+    bounds = [
+        f"{sign} {schema[key]:.10g}"
+        for key, sign in (("minimum", "≥"), ("exclusiveMinimum", ">"), ("maximum", "≤"), ("exclusiveMaximum", "<"))
+        if key in schema
+    ]
+    pattern = [f"pattern `{schema['pattern']}`"] if "pattern" in schema else []
+    return ", ".join([str(schema.get("type", "any")), *bounds, *pattern])
+
+
+def _default(value: object) -> str:
+    if value is None or value == () or value == "":
+        return "none"
+    return f"{value:.0f}" if isinstance(value, float) and value.is_integer() else f"{value}"
+
+
+def _plain(value: object) -> str:
+    if isinstance(value, list | tuple):
+        return ", ".join(value)
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def _table(heads: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
+    lines = [" | ".join(heads), " | ".join("---" for _ in heads)]
+    lines += [" | ".join(" ".join(cell.split()).replace("|", "\\|") for cell in row) for row in rows]
+    return "\n".join(f"| {line} |" for line in lines)
+
+
+GENERATORS: dict[str, Callable[[], str]] = {"options": options, "settings": settings, "cli": cli, "rest": rest}
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

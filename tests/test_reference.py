@@ -1,0 +1,169 @@
+"""The reference pages are complete: every code, warning, metric, option, setting, command, operation and exit code, and no others."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import re
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from pliant.cli import app
+from pliant.cli.exits import Exit
+from pliant.schemas.options import Options
+from pliant.schemas.problems import ProblemCode
+from pliant.service import metrics
+from pliant.service.settings import ServiceSettings, _Environment
+from pliant.service.submission import FILES, TEXTS, UPLOADS
+from pliant.solver.evaluation import metrics as errors_of_shapes
+from pliant.worker.settings import VARIABLES
+
+ROOT = Path(__file__).parents[1]
+REFERENCE = ROOT / "docs" / "reference"
+
+
+@pytest.fixture(scope="module")
+def generate() -> ModuleType:
+    """`docs/generate.py`, which is a script and no package."""
+    spec = importlib.util.spec_from_file_location("generate", ROOT / "docs" / "generate.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def headings(page: str) -> list[str]:
+    return re.findall(r"^### (.+)$", (REFERENCE / page).read_text(encoding="utf-8"), re.MULTILINE)
+
+
+def test_the_page_of_error_codes_has_exactly_the_codes_of_the_table() -> None:
+    documented = headings("errors.md")
+    assert len(documented) == len(set(documented))
+    assert set(documented) == {code.value for code in ProblemCode}
+
+
+def test_every_error_code_has_a_remedy() -> None:
+    sections = re.split(r"^### ", (REFERENCE / "errors.md").read_text(encoding="utf-8"), flags=re.MULTILINE)[1:]
+    assert [text.partition("\n")[0] for text in sections if "**Remedy:**" not in text] == []
+
+
+def test_every_warning_of_the_source_is_documented_and_no_other() -> None:
+    assert {normal(text) for text in headings("warnings.md")} == {normal(text) for text in warnings_in_source()}
+
+
+def normal(sentence: str) -> str:
+    return re.sub(r"\{[^}]*\}", "…", sentence)
+
+
+def warnings_in_source() -> set[str]:
+    """Sentences in functions whose name speaks of warnings, and of settings without effect; values in them as `…`."""
+    found = set()
+    for path in (ROOT / "solver").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.FunctionDef) and ("warning" in node.name or node.name == "without_effect"):
+                body = [each for each in node.body if not isinstance(each, ast.Expr) or "said" in ast.unparse(each)]
+                found |= {text for each in body for text in sentences(each)}
+    return found
+
+
+def sentences(node: ast.AST) -> set[str]:
+    if isinstance(node, ast.JoinedStr):
+        text = "".join(str(part.value) if isinstance(part, ast.Constant) else "…" for part in node.values)
+        return {text} if text.endswith(".") else set()
+    if isinstance(node, ast.Constant) and isinstance(node.value, str):
+        return {node.value} if node.value.endswith(".") else set()
+    return {text for child in ast.iter_child_nodes(node) for text in sentences(child)}
+
+
+def test_every_metric_has_its_formula() -> None:
+    tree = ast.parse(Path(errors_of_shapes.__file__).read_text(encoding="utf-8"))
+    evaluate = next(node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name == "evaluate")
+    names = set()
+    for node in ast.walk(evaluate):
+        if isinstance(node, ast.Dict):
+            names |= {key.value for key in node.keys if isinstance(key, ast.Constant)}
+        if isinstance(node, ast.Subscript) and isinstance(node.slice, ast.Constant):
+            names.add(node.slice.value)
+    assert len(names) > 5
+    assert set(headings("metrics.md")) == names
+
+
+def test_every_exit_code_is_documented() -> None:
+    text = (REFERENCE / "cli.md").read_text(encoding="utf-8")
+    assert [int(code) for code in re.findall(r"^\| (\d+) \|", text, re.MULTILINE)] == [int(code) for code in Exit]
+
+
+def test_every_command_is_generated_with_its_parameters(generate: ModuleType) -> None:
+    text = generate.cli()
+    names = {command.name for command in app.registered_commands}
+    assert names <= set(re.findall(r"^### pliant (\w+)$", text, re.MULTILINE))
+    assert "### pliant token create" in text
+    assert "| `--ground-truth, -g` |" in text
+
+
+def test_every_option_is_generated_with_its_default(generate: ModuleType) -> None:
+    text = generate.options()
+    assert re.findall(r"^### (\w+)$", text, re.MULTILINE) == list(Options.model_fields)
+    assert "Type: number, > 0, ≤ 1000. Default: `25.0`." in text
+    assert "Type: boolean. Default: `true`." in text
+
+
+def test_every_setting_is_documented(generate: ModuleType) -> None:
+    listed = re.findall(r"^\| `(PLIANT_\w+)` \|", generate.settings(), re.MULTILINE)
+    of_service = {f"PLIANT_{name.upper()}" for name in _Environment.model_fields}
+    of_service -= {"PLIANT_MAX_BODY_BYTES", "PLIANT_INCOMING"}  # PLIANT_MAX_BODY_MB and PLIANT_DATA give these
+    assert len(listed) == len(set(listed))
+    assert set(listed) == {variable for variable, _, _ in VARIABLES.values()} | of_service
+    assert f"| `PLIANT_PORT` | {ServiceSettings().port} |" in generate.settings()
+    assert "| `PLIANT_RETENTION` | 2592000 |" in generate.settings()
+
+
+def test_every_operation_is_generated_with_its_scope(generate: ModuleType) -> None:
+    text, document = generate.rest(), generate.openapi()
+    real = [f"{method.upper()} {path}" for path, methods in document["paths"].items() for method in methods]
+    assert re.findall(r"^### (.+)$", text, re.MULTILINE) == real
+    assert text.count(" Scope: ") == len(real)
+    assert "### GET /healthz\n\nLiveness: the process answers. Scope: none." in text
+    assert re.search(r"### GET /metrics\n\n.*Scope: `admin`\.", text)
+
+
+def test_every_part_of_a_submission_is_documented() -> None:
+    table = (REFERENCE / "rest.md").read_text(encoding="utf-8").partition("## Submit")[2].partition("## Wait")[0]
+    parts = (FILES | TEXTS) - set(UPLOADS) | {"tracks_upload"}
+    assert {part for part in parts if f"`{part}`" not in table} == set()
+
+
+def test_every_prometheus_metric_is_documented() -> None:
+    made = set(re.findall(r'"(pliant_\w+)"', Path(metrics.__file__).read_text(encoding="utf-8")))
+    text = (ROOT / "docs" / "how-to" / "monitor.md").read_text(encoding="utf-8")
+    assert len(made) > 10
+    assert set(re.findall(r"^\| `(pliant_\w+)` \|", text, re.MULTILINE)) == made
+
+
+def test_markers_are_replaced_and_pages_copied(generate: ModuleType, tmp_path: Path) -> None:
+    generate.main(tmp_path / "site")
+    made = tmp_path / "site" / "reference" / "options.md"
+    assert "### method" in made.read_text(encoding="utf-8")
+    pages = sorted((tmp_path / "site").rglob("*.md"))
+    assert len(pages) == len(list((ROOT / "docs").rglob("*.md")))
+    assert [page for page in pages if "<!-- generated" in page.read_text(encoding="utf-8")] == []
+    fences = [line for page in pages for line in page.read_text(encoding="utf-8").splitlines() if "```" in line]
+    assert len(fences) > 100
+    assert [line for line in fences if not re.fullmatch(r" *```\w*", line)] == []
+    assert not (tmp_path / "site" / "generate.py").exists()
+
+
+def test_every_page_is_in_the_navigation() -> None:
+    import tomllib
+
+    def pages(nav: object) -> list[str]:
+        if isinstance(nav, str):
+            return [nav]
+        parts = nav.values() if isinstance(nav, dict) else nav
+        return [page for part in parts for page in pages(part)]  # type: ignore[union-attr]
+
+    config = tomllib.loads((ROOT / "zensical.toml").read_text(encoding="utf-8"))
+    named = pages(config["project"]["nav"])
+    assert sorted(named) == sorted(path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").rglob("*.md"))
