@@ -69,7 +69,7 @@ docs: $(STAMP) build/typed/pliant
 # mypy reads the folders under their import names, so it gets a tree of links that has them.
 build/typed/pliant:
 	mkdir -p $@
-	for folder in schemas solver worker service client cli; do ln -sfn ../../../$$folder $@/$$folder; done
+	for folder in schemas solver tracking worker service client cli; do ln -sfn ../../../$$folder $@/$$folder; done
 	for file in __init__.py py.typed; do ln -sfn ../../../door/$$file $@/$$file; done
 
 types: $(STAMP) build/typed/pliant

@@ -15,6 +15,7 @@ from pliant.cli.doctor import doctor
 from pliant.cli.exits import Guarded
 from pliant.cli.session import Session
 from pliant.cli.solve import inspect, solve
+from pliant.cli.track import track
 from pliant.cli.up import up, work
 
 app = typer.Typer(
@@ -47,7 +48,7 @@ def _begin(
 
 
 _COMMANDS: dict[str, dict[str, Callable[..., None]]] = {
-    "Here": {"solve": solve, "inspect": inspect, "demo": demo, "doctor": doctor},
+    "Here": {"solve": solve, "track": track, "inspect": inspect, "demo": demo, "doctor": doctor},
     "Run a service": {"up": up, "work": work},
     "Talk to a service": {
         "submit": jobs.submit, "status": jobs.status, "watch": jobs.watch, "result": jobs.result, "list": jobs.list_jobs,

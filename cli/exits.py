@@ -46,6 +46,7 @@ _CODES: tuple[tuple[str, str, Exit], ...] = (
     ("pliant.client.errors", "PliantError", Exit.UNREACHABLE),
     ("pliant.solver.errors", "InvalidInput", Exit.REFUSED),
     ("pliant.solver.errors", "SolverError", Exit.FAILED),
+    ("pliant.tracking.errors", "TrackingError", Exit.REFUSED),
     ("pliant.worker.errors", "InvalidSetting", Exit.REFUSED),
     ("pliant.worker.errors", "InvalidRequest", Exit.REFUSED),
     ("pliant.worker.errors", "UnknownToken", Exit.NOT_FOUND),

@@ -75,8 +75,8 @@ def create_app(
     limits : Limits, optional
         Largest inputs that the readers accept; None: the usual limits, with `read_memory` of the jobs' settings.
     """
-    limits = limits or Limits(read_memory=jobs_of_all.settings.read_memory)
     metrics = Metrics()
+    limits = limits or Limits(read_memory=jobs_of_all.settings.read_memory)
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:

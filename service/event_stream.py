@@ -162,7 +162,7 @@ class _Reader(threading.Thread):
         events = self._records.events(id, after=watcher.read_up_to)
         if events:
             watcher.read_up_to = events[-1].id
-            self._hand_over(watcher.tell, events)
+            self._hand_over(watcher.publish, events)
             return
         try:
             self._records.get(id)
@@ -185,7 +185,7 @@ class _Watcher:
         self._events: deque[Event] = deque(maxlen=KEPT)
         self._next = asyncio.Event()
 
-    def tell(self, events: list[Event]) -> None:
+    def publish(self, events: list[Event]) -> None:
         """Add events and wake the followers."""
         self._events.extend(events)
         self.wake()

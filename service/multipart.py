@@ -231,8 +231,8 @@ class _Reader:
 
     def _open(self) -> None:
         part, rules = self._part, self._rules
-        kind, said = parse_options_header(part.disposition)
-        part.name = said.get(b"name", b"").decode("utf-8", "replace")
+        kind, options = parse_options_header(part.disposition)
+        part.name = options.get(b"name", b"").decode("utf-8", "replace")
         if kind != b"form-data" or not part.name:
             raise _malformed("a part has no Content-Disposition: form-data with a name")
         known = rules.files | rules.texts
@@ -249,8 +249,8 @@ class _Reader:
             code = ProblemCode.REPEATED_PART
             raise wrong_input(code, field=part.name, expected="the part once", got="it twice", hint="Send it once.")
         # A part that can only be text is text even if the client gave it a file name, as several HTTP libraries do.
-        if part.name in rules.files and b"filename" in said:
-            suffix = Path(said[b"filename"].decode("utf-8", "replace")).suffix.lower()
+        if part.name in rules.files and b"filename" in options:
+            suffix = Path(options[b"filename"].decode("utf-8", "replace")).suffix.lower()
             part.path = self._folder / f"{part.name}{suffix if _SUFFIX.fullmatch(suffix) else ''}"
             part.sink = part.path.open("xb")
         elif part.name not in rules.texts:

@@ -1,4 +1,4 @@
-"""The spool: a folder for request bodies while they arrive, empty afterwards; and the slots in which they are read.
+"""The spool: a folder for request bodies while they arrive, empty afterwards; and the slots in which they are parsed.
 
 Each process owns one sub-folder and locks a file beside it; each request gets a scratch directory in it, removed when the
 request ends. The next process that starts removes sub-folders of killed processes, recognized by their free lock.

@@ -16,8 +16,8 @@ from pliant.solver.settings import Settings
 from pliant.solver.tracks.completion import Completed, complete
 from pliant.solver.tracks.normalization import Normalised
 
-SHARE = 0.3
-"""Share of the whole solve that progress gives to the cameras."""
+SHARE = 0.03
+"""Fraction reported at the end, beside what is counted by `should_stop` (`solver.monitor`)."""
 
 HARDLY = np.radians(10.0)
 """Largest turn between any frame and the first below which the user is warned."""
@@ -105,7 +105,11 @@ def estimate_cameras(
         if entries and should_stop is not None and should_stop():
             break
         upgrades.append(upgrade(gram, size))
-        entries.append(held(part, _thinned(upgrades[-1], used), np.ones(len(part) // 2), with_scales=False))
+        entries.append(
+            held(
+                part, _thinned(upgrades[-1], used), np.ones(len(part) // 2), with_scales=False, should_stop=should_stop
+            )
+        )
         tell(Step("cameras", (0.4 + 0.04 * len(entries)) * SHARE))
     best, ran = min(entries, key=lambda candidate: candidate.energy), entries
     if settings.refine_rotations:

@@ -24,7 +24,6 @@ from pliant.solver.model.shape_covariance import (
     NOISE_FLOOR,
     ShapeCovariance,
     learned,
-    random_walk,
 )
 from pliant.solver.model.so3 import angles_between, exponential
 from pliant.solver.records import Floats, read_only
@@ -93,6 +92,7 @@ def learn(
     *,
     turning: bool,
     zooming: bool = False,
+    seed: int = 0,
     should_stop: Callable[[], bool] | None = None,
 ) -> tuple[CameraEstimate, ShapeCovariance]:
     """Return the cameras, refined if `turning`, and the shape covariance of all frames.
@@ -107,6 +107,8 @@ def learn(
         False leaves the cameras as they are: given ones, or as the user wished.
     zooming : bool
         True: scales that are all 1 are refined with the rotations, if that makes the tracks more probable than chance does.
+    seed : int
+        Deals the points out where some are held back to judge what was learned from the others.
     should_stop : callable, optional
         Asked between refinements; once it says True, the best so far is returned.
     """
@@ -115,7 +117,13 @@ def learn(
     start = np.asarray(estimate.scales)
     unscaled = _of_frames(estimate.gram / np.outer(np.repeat(start, 2), np.repeat(start, 2)), used)
     sample = (estimate.sample / start[:, None, None])[used]
-    support = supported(sample, np.asarray(estimate.rotations)[used, :2], spoiled=spoiled and not turning)
+    support = supported(
+        sample,
+        np.asarray(estimate.rotations)[used, :2],
+        spoiled=spoiled and not turning,
+        seed=seed,
+        should_stop=should_stop,
+    )
     if spoiled and turning:
         # Few modes would let the cameras follow the deformation; what is left of outliers is judged for the shapes.
         support = replace(support, most=MOST_MODES)
@@ -140,8 +148,8 @@ def learn(
         # From scratch: what the way to these cameras has left in the modes is worth less than it makes the tracks more probable.
         pairs = rotations[:, :2] * scales[:, None, None]
         if spoiled and turning:
-            support = supported(sample, pairs, spoiled=True)
-        covariance, modes = learned_in_time(sample, unscaled, pairs, support, should_stop=should_stop)
+            support = supported(sample, pairs, spoiled=True, seed=seed, should_stop=should_stop)
+        covariance, modes = learned_in_time(sample, unscaled, pairs, support, seed=seed, should_stop=should_stop)
     if len(used) < frames:
         covariance = covariance.stretched(used, frames)
     estimate = replace(estimate, reasons={**estimate.reasons, "modes": modes})
@@ -171,12 +179,12 @@ def refined(
 ) -> Learned:
     """Return cameras and covariance after rounds in which one is refined for the other; scales stay 1 without `with_scales`."""
     pairs = rotations[:, :2] * scales[:, None, None]
-    covariance = learned(gram, pairs, most=support.most, noisy=support.noisy)
+    covariance = learned(gram, pairs, most=support.most, noisy=support.noisy, should_stop=should_stop)
     found = Learned(rotations, scales, covariance, np.inf)
     for _ in range(rounds):
         if should_stop is not None and should_stop():
             break
-        found = _turn(gram, found, with_scales=with_scales)
+        found = _turn(gram, found, with_scales=with_scales, should_stop=should_stop)
     return found
 
 
@@ -269,7 +277,7 @@ def telling_frames(visible: Floats) -> NDArray[np.bool_]:
     return telling if telling.sum() >= 3 else np.ones(len(seen), dtype=bool)
 
 
-def _turn(gram: Floats, found: Learned, *, with_scales: bool) -> Learned:
+def _turn(gram: Floats, found: Learned, *, with_scales: bool, should_stop: Callable[[], bool] | None) -> Learned:
     """Return cameras and covariance of higher likelihood."""
     frames, covariance = len(found.rotations), found.covariance
     scene = _scene(gram, found.rotations, with_scales=with_scales)
@@ -278,7 +286,7 @@ def _turn(gram: Floats, found: Learned, *, with_scales: bool) -> Learned:
         root_of(covariance.extent), root_of(covariance.play),
         0.5 * np.log([max(covariance.noise - scene.noise_floor**2, LEAST_NOISE), covariance.drift]),
     )  # fmt: skip
-    moved, energy = fit(scene, started, iterations=TURNS, turning=True)
+    moved, energy = fit(scene, started, iterations=TURNS, turning=True, should_stop=should_stop)
     extent, play, noise, drift = covariances_of(scene, moved)
     play = play + FLATTEST * np.trace(play) / 3 * np.eye(3)
     size = np.trace(play) / 3
@@ -303,7 +311,7 @@ def _coupled(gram: Floats, found: Learned, *, with_scales: bool, should_stop: Ca
 
 def _scene(gram: Floats, rotations: Floats, *, with_scales: bool) -> Scene:
     return Scene(
-        gram, rotations, with_scales=with_scales, walk=random_walk(len(rotations)), steadiness=STEADY,
+        gram, rotations, with_scales=with_scales, steadiness=STEADY,
         noise_floor=NOISE_FLOOR**0.5, smoothness=0.0,
     )  # fmt: skip
 

@@ -80,9 +80,19 @@ def gram_of(gram: Floats, used: slice) -> Floats:
     return np.ascontiguousarray(blocks).reshape(2 * len(blocks), 2 * len(blocks))
 
 
-def held(gram: Floats, upgrade: Upgrade, scales: Floats, *, with_scales: bool) -> Candidate:
+def held(
+    gram: Floats,
+    upgrade: Upgrade,
+    scales: Floats,
+    *,
+    with_scales: bool,
+    should_stop: Callable[[], bool] | None = None,
+) -> Candidate:
     """Return a factorization's cameras with the energy they have unturned."""
-    return _entered(gram, upgrade.rotations, scales, upgrade.basis_size, with_scales=with_scales, steadied=False)
+    return _entered(
+        gram, upgrade.rotations, scales, upgrade.basis_size,
+        with_scales=with_scales, steadied=False, should_stop=should_stop,
+    )  # fmt: skip
 
 
 def race(
@@ -104,25 +114,27 @@ def race(
         return _rating(gram, candidate)
 
     ordered = sorted(entries, key=rating)
-    running = ordered + [steadied(gram, candidate) for candidate in ordered[:STEADIED]]
+    running = ordered + [steadied(gram, each, should_stop=should_stop) for each in ordered[:STEADIED]]
     first: list[Candidate] = []
     for iterations, left in HEATS:
         finished: list[Candidate] = []
         for candidate in running:
             stopped = should_stop is not None and should_stop()
-            finished.append(candidate if stopped else refined(candidate, iterations))
+            finished.append(candidate if stopped else refined(candidate, iterations, should_stop=should_stop))
         first = first or finished
         running = sorted(finished, key=rating)[:left]
     return running[0], first
 
 
-def refined(candidate: Candidate, iterations: int) -> Candidate:
+def refined(candidate: Candidate, iterations: int, *, should_stop: Callable[[], bool] | None = None) -> Candidate:
     """Return the candidate after that many iterations with the rotations free."""
-    motion, energy = fit(candidate.scene, candidate.motion, iterations=iterations, turning=True)
+    motion, energy = fit(
+        candidate.scene, candidate.motion, iterations=iterations, turning=True, should_stop=should_stop
+    )
     return Candidate(candidate.basis_size, candidate.steadied, candidate.scene, motion, energy)
 
 
-def steadied(gram: Floats, candidate: Candidate) -> Candidate:
+def steadied(gram: Floats, candidate: Candidate, *, should_stop: Callable[[], bool] | None = None) -> Candidate:
     """Return the cameras nearest to the candidate's that turn as steadily as one can.
 
     A factorization of a body that deforms as fast as it turns gives cameras that jitter with it, and a minimum of the energy near
@@ -131,8 +143,11 @@ def steadied(gram: Floats, candidate: Candidate) -> Candidate:
     rotations, scales = candidate.cameras
     with_scales = candidate.scene.with_scales
     calm = Scene.of(gram, rotations, with_scales=with_scales, steadiness=STEADIED_WEIGHT, noise_floor=STEADIED_NOISE)
-    motion, _ = fit(calm, start(calm, scales), iterations=STEADIED_ITERATIONS, turning=True)
-    return _entered(gram, *cameras_of(calm, motion), candidate.basis_size, with_scales=with_scales, steadied=True)
+    motion, _ = fit(calm, start(calm, scales), iterations=STEADIED_ITERATIONS, turning=True, should_stop=should_stop)
+    return _entered(
+        gram, *cameras_of(calm, motion), candidate.basis_size,
+        with_scales=with_scales, steadied=True, should_stop=should_stop,
+    )  # fmt: skip
 
 
 def carried(rotations: Floats, winner: Floats, used: slice) -> Floats:
@@ -158,10 +173,19 @@ def carried(rotations: Floats, winner: Floats, used: slice) -> Floats:
 
 
 def _entered(
-    gram: Floats, rotations: Floats, scales: Floats, basis_size: int, *, with_scales: bool, steadied: bool
+    gram: Floats,
+    rotations: Floats,
+    scales: Floats,
+    basis_size: int,
+    *,
+    with_scales: bool,
+    steadied: bool,
+    should_stop: Callable[[], bool] | None,
 ) -> Candidate:
     scene = Scene.of(gram, rotations, with_scales=with_scales, steadiness=binding(gram))
-    motion, energy = fit(scene, start(scene, scales), iterations=HELD_ITERATIONS, turning=False)
+    motion, energy = fit(
+        scene, start(scene, scales), iterations=HELD_ITERATIONS, turning=False, should_stop=should_stop
+    )
     return Candidate(basis_size, steadied, scene, motion, energy)
 
 

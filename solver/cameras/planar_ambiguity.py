@@ -22,7 +22,6 @@ from pliant.solver.cameras.factorization import leading_factor
 from pliant.solver.cameras.multistart import carried, gram_of
 from pliant.solver.cameras.scale import rigid_scales
 from pliant.solver.model.marginal_likelihood import Motion, Scene, cameras_of, fit, start
-from pliant.solver.model.shape_covariance import random_walk
 from pliant.solver.model.so3 import MIRROR, angles_between, from_rows, start_at_identity
 from pliant.solver.records import Floats
 from scipy.optimize import minimize
@@ -105,7 +104,7 @@ def on_its_sides(
     used = frames_unfolded(len(rotations))
     part, given = gram_of(gram, used), rotations[used]
     planes, scales = poses(gram)
-    rival = fitted(part, given, rigid_scales(part, given), np.zeros(len(given), dtype=bool))
+    rival = fitted(part, given, rigid_scales(part, given), np.zeros(len(given), dtype=bool), should_stop=should_stop)
     found = unfold(part, planes[used], scales[used], should_stop=should_stop)
     if found.energy >= rival.energy:
         return rotations, "The tracks are those of a sheet; its sides are as they were."
@@ -136,20 +135,28 @@ def unfold(
     for sides in _starts(rotations):
         if best is not None and should_stop is not None and should_stop():
             return best
-        found = fitted(gram, reversed_at(rotations, MIRROR, sides), scales, sides)
+        found = fitted(gram, reversed_at(rotations, MIRROR, sides), scales, sides, should_stop=should_stop)
         best = found if best is None or found.energy < best.energy else best
     assert best is not None
     return _settled(gram, best, should_stop)
 
 
-def fitted(gram: Floats, rotations: Floats, scales: Floats, sides: Sides, *, iterations: int = DEEP) -> Unfolded:
+def fitted(
+    gram: Floats,
+    rotations: Floats,
+    scales: Floats,
+    sides: Sides,
+    *,
+    iterations: int = DEEP,
+    should_stop: Callable[[], bool] | None = None,
+) -> Unfolded:
     """Return the cameras of highest likelihood near the given ones."""
     scene = Scene(
-        gram, rotations, with_scales=True, walk=random_walk(len(rotations)), steadiness=STEADY, noise_floor=NOISE,
+        gram, rotations, with_scales=True, steadiness=STEADY, noise_floor=NOISE,
         smoothness=0.0,
     )  # fmt: skip
     begun = replace(start(scene, scales, num_modes=MODES), logs=np.log([0.01, 0.05]))
-    motion, energy = fit(scene, begun, iterations=iterations, turning=True)
+    motion, energy = fit(scene, begun, iterations=iterations, turning=True, should_stop=should_stop)
     return Unfolded(*cameras_of(scene, motion), sides, motion, energy)
 
 
@@ -228,11 +235,13 @@ def _settled(gram: Floats, found: Unfolded, should_stop: Callable[[], bool] | No
             if should_stop is not None and should_stop():
                 return found
             turned = reversed_at(found.rotations, plane[0], run)
-            tried.append(fitted(gram, turned, found.scales, found.sides ^ run, iterations=SHORT))
+            tried.append(
+                fitted(gram, turned, found.scales, found.sides ^ run, iterations=SHORT, should_stop=should_stop)
+            )
         tried.sort(key=lambda each: each.energy)
         better = None
         for each in tried[:TRIED_DEEPLY]:
-            deep = fitted(gram, each.rotations, each.scales, each.sides)
+            deep = fitted(gram, each.rotations, each.scales, each.sides, should_stop=should_stop)
             if deep.energy < found.energy - GAIN:
                 better = deep
                 break

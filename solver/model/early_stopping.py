@@ -49,6 +49,7 @@ def learned_in_time(
     pairs: Floats,
     support: Support,
     *,
+    seed: int = 0,
     should_stop: Callable[[], bool] | None = None,
 ) -> tuple[ShapeCovariance, str]:
     """Return the covariance learned from scratch, for as many rounds as suit points that were not learned from, and the reason.
@@ -61,6 +62,8 @@ def learned_in_time(
         As for `pliant.solver.model.shape_covariance.learned`.
     support : Support
         Modes at most, and the noise to begin with.
+    seed : int
+        Deals out the points.
     should_stop : callable, optional
         Asked between rounds; once it says True, no more of them are judged.
     """
@@ -68,7 +71,9 @@ def learned_in_time(
     if FEWEST <= count < min(2 * frames, SAMPLE):
         points = sample.transpose(0, 2, 1).reshape(2 * frames, count)
         ways = [(each, floors) for each in sorted({support.most, MOST_MODES}) for floors in (ANNEALED, COLD)]
-        paths = [_judged(points, pairs, replace(support, most=most), floors, should_stop) for most, floors in ways]
+        paths = [
+            _judged(points, pairs, replace(support, most=most), floors, seed, should_stop) for most, floors in ways
+        ]
         best = min(paths, key=min)
         if min(best) < min(path[-1] for path in paths) - GAIN:
             most, floors = ways[paths.index(best)]
@@ -79,7 +84,7 @@ def learned_in_time(
             covariance = next(islice(path, number - 1, None))
             return covariance, described(covariance, told)
     told = f"more than {support.most} modes, learned from some points, do not make the others more probable."
-    covariance = learned(gram, pairs, most=support.most, noisy=support.noisy)
+    covariance = learned(gram, pairs, most=support.most, noisy=support.noisy, should_stop=should_stop)
     return covariance, described(covariance, told if support.most < MOST_MODES else "")
 
 
@@ -90,10 +95,15 @@ def described(covariance: ShapeCovariance, more: str = "") -> str:
 
 
 def _judged(
-    points: Floats, pairs: Floats, support: Support, floors: Floats, should_stop: Callable[[], bool] | None
+    points: Floats,
+    pairs: Floats,
+    support: Support,
+    floors: Floats,
+    seed: int,
+    should_stop: Callable[[], bool] | None,
 ) -> list[float]:
     """Return how improbable points that were not learned from are after every round, until it is hopeless."""
-    part = np.random.default_rng(0).permutation(points.shape[1]) % FOLDS
+    part = np.random.default_rng(seed).permutation(points.shape[1]) % FOLDS
     paths, others = [], []
     for fold in range(FOLDS):
         own = points[:, part != fold]

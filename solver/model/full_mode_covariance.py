@@ -24,7 +24,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from pliant.solver.model.camera_motion_prior import unevenness, unsteadiness
-from pliant.solver.model.marginal_likelihood import UNLIKELY, Scene, cameras_of, inverted, root_matrix
+from pliant.solver.model.image_density import ImageModel, terms
+from pliant.solver.model.marginal_likelihood import UNLIKELY, Scene, cameras_of, root_matrix
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import left_jacobian, vee
 from pliant.solver.records import Floats
@@ -99,7 +100,8 @@ def begin(scene: Scene, scales: Floats, covariance: ShapeCovariance) -> Basis:
     return Basis(np.zeros((frames, 3)), np.log(scales), weights, root, 0.5 * np.log([noise, covariance.drift]))
 
 
-@np.errstate(over="ignore", invalid="ignore")  # a line search may try a step far too long: that energy is `UNLIKELY`
+# A line search may try a step far too long: that energy is `UNLIKELY`.
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
 def energy(scene: Scene, play: Floats, basis: Basis) -> tuple[float, Basis]:
     """Return the energy with the terms for the camera's steadiness, and its gradient, analytic in every parameter.
 
@@ -115,26 +117,16 @@ def energy(scene: Scene, play: Floats, basis: Basis) -> tuple[float, Basis]:
     frames, size = basis.weights.shape
     rotations, scales = cameras_of(scene, basis)
     pairs = rotations[:, :2] * scales[:, None, None]
-    rows = pairs.reshape(2 * frames, 3)
+    root = root_matrix(play)
     shapes = np.einsum("fk,fid->fikd", basis.weights, pairs).reshape(2 * frames, 3 * size)
-    seen = shapes @ basis.root
     noise, drift = np.exp(2 * basis.logs)
-    walk = np.repeat(np.repeat(scene.walk, 2, axis=0), 2, axis=1)
-    played = rows @ play
-    strayed = (played @ rows.T) * walk
-    covariance = seen @ seen.T + drift * strayed
-    covariance[np.diag_indices(2 * frames)] += noise + scene.noise_floor**2
-    inverse, log_det = inverted(covariance)
-    if inverse is None or not np.isfinite(log_det):
+    model = ImageModel(shapes @ basis.root, pairs @ root, float(noise) + scene.noise_floor**2, float(drift))
+    try:
+        found = terms(model, scene.factor)
+    except np.linalg.LinAlgError:
         return UNLIKELY, Basis.unflat(np.zeros_like(basis.flat()), frames, size)
-    explained = inverse @ scene.gram
-    value = 0.5 * (log_det + float(np.trace(explained))) / frames
-    slope = 0.5 * (inverse - explained @ inverse) / frames
-    slope = (slope + slope.T) / 2
-    by_seen = 2 * slope @ seen
-    by_shapes = (by_seen @ basis.root.T).reshape(frames, 2, size, 3)
-    by_pairs = np.einsum("fikd,fk->fid", by_shapes, basis.weights)
-    by_pairs += 2 * drift * ((slope * walk) @ played).reshape(frames, 2, 3)
+    by_shapes = (found.by_columns @ basis.root.T).reshape(frames, 2, size, 3)
+    by_pairs = np.einsum("fikd,fk->fid", by_shapes, basis.weights) + found.by_walk @ root.T
     uneven, by_logs = unevenness(np.log(scales))
     by_logs = scene.steadiness * by_logs + np.einsum("fij,fij->f", by_pairs, pairs)
     unsteady, by_rotations = unsteadiness(rotations)
@@ -144,10 +136,10 @@ def energy(scene: Scene, play: Floats, basis: Basis) -> tuple[float, Basis]:
         np.einsum("fji,fj->fi", left_jacobian(basis.turns), vee(by_rotations @ np.swapaxes(rotations, 1, 2))),
         (by_logs - by_logs.mean()) * scene.with_scales,
         np.einsum("fikd,fid->fk", by_shapes, pairs),
-        shapes.T @ by_seen,
-        2 * np.array([np.trace(slope) * noise, float((slope * strayed).sum()) * drift]),
+        shapes.T @ found.by_columns,
+        2 * np.array([found.by_noise * noise, found.by_drift * drift]),
     )
-    return value + scene.steadiness * (uneven + unsteady), gradient
+    return found.value + scene.steadiness * (uneven + unsteady), gradient
 
 
 def refined(

@@ -19,14 +19,15 @@ and a talking face nods with its jaw. What binds the cameras is in
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
 from pliant.solver.model.camera_motion_prior import unevenness, unsteadiness
+from pliant.solver.model.image_density import ImageModel, factor_of, inverted, terms
 from pliant.solver.model.so3 import exponential, left_jacobian, vee
 from pliant.solver.records import Floats
-from scipy.linalg import lapack
 from scipy.optimize import minimize
 
 NOISE_FLOOR = 3e-3
@@ -100,9 +101,6 @@ class Scene:
     with_scales: bool
     """False: every s_f is 1."""
 
-    walk: Floats
-    """T, shape `(F, F)`, mean of the diagonal 1."""
-
     steadiness: float
     """Weight of the camera's unsteadiness."""
 
@@ -111,6 +109,13 @@ class Scene:
 
     smoothness: float = SMOOTHNESS
     """κ."""
+
+    factor: Floats = field(init=False)
+    """F₀ with F₀F₀ᵀ = G, shape `(2F, r)`."""
+
+    def __post_init__(self) -> None:
+        """Factor the Gram matrix."""
+        object.__setattr__(self, "factor", factor_of(self.gram))
 
     @classmethod
     def of(
@@ -123,10 +128,7 @@ class Scene:
         noise_floor: float = NOISE_FLOOR,
     ) -> Scene:
         """Return the scene for a Gram matrix and starting cameras."""
-        frames = len(rotations)
-        steps = np.diff(np.eye(frames), axis=0)
-        walk = np.linalg.inv(steps.T @ steps + np.eye(frames) * 10.0 / frames**2)
-        return cls(gram, rotations, with_scales, walk / (np.trace(walk) / frames), steadiness, noise_floor)
+        return cls(gram, rotations, with_scales, steadiness, noise_floor)
 
 
 def start(scene: Scene, scales: Floats, *, num_modes: int = NUM_MODES) -> Motion:
@@ -174,34 +176,46 @@ def covariances_of(scene: Scene, motion: Motion) -> tuple[Floats, Floats, float,
     return root0 @ root0.T, root1 @ root1.T, float(noise) + scene.noise_floor**2, float(drift)
 
 
-@np.errstate(over="ignore", invalid="ignore")  # a line search may try a step far too long: that energy is `UNLIKELY`
+def image_of(scene: Scene, motion: Motion) -> ImageModel:
+    """Return the covariance of the images, by its parts."""
+    rotations, scales = cameras_of(scene, motion)
+    pairs = rotations[:, :2] * scales[:, None, None]
+    root0, root1 = _root(motion.extent), _root(motion.play)
+    noise, drift = np.exp(2 * motion.logs)
+    walk = pairs @ root1
+    columns = np.concatenate([(pairs @ root0)[:, :, None], motion.modes[:, None, :, None] * walk[:, :, None]], axis=2)
+    return ImageModel(columns.reshape(2 * len(pairs), -1), walk, float(noise) + scene.noise_floor**2, float(drift))
+
+
+def energy_with_inverse(scene: Scene, motion: Motion) -> tuple[float, Motion, Floats | None]:
+    """Return E, its gradient and M⁻¹, shape `(2F, 2F)`, for ∂E/∂G = M⁻¹/2F; None where M is not positive definite."""
+    value, gradient = energy(scene, motion)
+    if value == UNLIKELY:
+        return value, gradient, None
+    return value, gradient, inverted(image_of(scene, motion).covariance())[0]
+
+
+# A line search may try a step far too long: that energy is `UNLIKELY`.
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
 def energy(scene: Scene, motion: Motion) -> tuple[float, Motion]:
     """Return E with the penalties on modes, turns and scales, and its gradient, analytic in every parameter.
 
-    With D = ∂E/∂M = (M⁻¹ − M⁻¹ G M⁻¹)/2F, everything follows from D and the blocks of M. Turns move on SO(3)^F by the
-    exponential map, whose left Jacobian carries the gradient from the rotation to its vector.
+    With s_f R_f as Π_f and B_f = Π_f A₁^½, the columns of the image are Π_f A₀^½ and l_fk B_f (`model.image_density`). Turns move on
+    SO(3)^F by the exponential map, whose left Jacobian carries the gradient from the rotation to its vector.
     """
     frames = len(scene.rotations)
     rotations, scales = cameras_of(scene, motion)
     pairs = rotations[:, :2] * scales[:, None, None]
-    rows = pairs.reshape(2 * frames, 3)
     root0, root1 = _root(motion.extent), _root(motion.play)
-    rows0, rows1 = rows @ (root0 @ root0.T), rows @ (root1 @ root1.T)
     noise, drift = np.exp(2 * motion.logs)
-    wide = np.repeat(np.repeat(motion.modes @ motion.modes.T + drift * scene.walk, 2, axis=0), 2, axis=1)
-    deform = rows1 @ rows.T
-    covariance = rows0 @ rows.T + deform * wide
-    covariance[np.diag_indices(2 * frames)] += noise + scene.noise_floor**2
-    inverse, log_det = inverted(covariance)
-    if inverse is None or not np.isfinite(log_det):
+    try:
+        model = image_of(scene, motion)
+        found = terms(model, scene.factor)
+    except np.linalg.LinAlgError:
         return UNLIKELY, Motion.unflat(np.zeros_like(motion.flat()), frames)
-    explained = inverse @ scene.gram
-    value = 0.5 * (log_det + float(np.trace(explained))) / frames
-    slope = 0.5 * (inverse - explained @ inverse) / frames
-    slope = (slope + slope.T) / 2
-    widened = slope * wide
-    by_pairs = 2 * (slope @ rows0 + widened @ rows1).reshape(frames, 2, 3)
-    by_frames = (slope * deform).reshape(frames, 2, frames, 2).sum(axis=(1, 3))
+    by_columns = found.by_columns.reshape(frames, 2, -1, 3)
+    by_walk = found.by_walk + np.einsum("fk,fikc->fic", motion.modes, by_columns[:, :, 1:])
+    by_pairs = by_columns[:, :, 0] @ root0.T + by_walk @ root1.T
     rough, by_modes = _roughness(motion.modes, scene.smoothness / frames)
     uneven, by_logs = unevenness(np.log(scales))
     by_logs = scene.steadiness * by_logs + np.einsum("fij,fij->f", by_pairs, pairs)
@@ -212,18 +226,21 @@ def energy(scene: Scene, motion: Motion) -> tuple[float, Motion]:
     gradient = Motion(
         np.einsum("fji,fj->fi", left_jacobian(motion.turns), turned),
         (by_logs - by_logs.mean()) * scene.with_scales,
-        by_modes + 2 * by_frames @ motion.modes,
-        2 * (rows.T @ slope @ rows @ root0)[LOWER],
-        2 * (rows.T @ widened @ rows @ root1)[LOWER],
-        2 * np.array([np.trace(slope) * noise, (by_frames * scene.walk).sum() * drift]),
+        by_modes + np.einsum("fikc,fic->fk", by_columns[:, :, 1:], model.walk),
+        np.einsum("fic,fid->cd", pairs, by_columns[:, :, 0])[LOWER],
+        np.einsum("fic,fid->cd", pairs, by_walk)[LOWER],
+        2 * np.array([found.by_noise * noise, found.by_drift * drift]),
     )
-    return value + rough + scene.steadiness * (uneven + unsteady), gradient
+    return found.value + rough + scene.steadiness * (uneven + unsteady), gradient
 
 
-def fit(scene: Scene, motion: Motion, *, iterations: int, turning: bool) -> tuple[Motion, float]:
+def fit(
+    scene: Scene, motion: Motion, *, iterations: int, turning: bool, should_stop: Callable[[], bool] | None = None
+) -> tuple[Motion, float]:
     """Return the parameters that minimise the energy from `motion` on, by L-BFGS, and the energy reached.
 
-    With `turning` False the rotations stay; everything else, scales included, is fitted.
+    With `turning` False the rotations stay; everything else, scales included, is fitted. Once `should_stop`, called after every
+    iteration, returns True, the parameters reached are returned.
     """
     frames = len(scene.rotations)
     held = 0 if turning else 3 * frames
@@ -233,9 +250,14 @@ def fit(scene: Scene, motion: Motion, *, iterations: int, turning: bool) -> tupl
         value, gradient = energy(scene, Motion.unflat(np.concatenate([given[:held], free]), frames))
         return value, gradient.flat()[held:]
 
+    def asked(xk: Floats) -> None:  # noqa: ARG001 - SciPy calls it by this name
+        if should_stop is not None and should_stop():
+            raise StopIteration
+
     found = minimize(
-        objective, given[held:], jac=True, method="L-BFGS-B", options={"maxiter": iterations, "maxcor": 20}
-    )
+        objective, given[held:], jac=True, method="L-BFGS-B", callback=asked,
+        options={"maxiter": iterations, "maxcor": 20},
+    )  # fmt: skip
     return Motion.unflat(np.concatenate([given[:held], np.asarray(found.x)]), frames), float(found.fun)
 
 
@@ -267,13 +289,3 @@ def _roughness(values: Floats, weight: float) -> tuple[float, Floats]:
     gradient[1:] += weight * steps
     gradient[:-1] -= weight * steps
     return 0.5 * weight * float((steps**2).sum()), gradient
-
-
-def inverted(matrix: Floats) -> tuple[Floats | None, float]:
-    """Return inverse and log-determinant of a positive definite matrix, or None where rounding left it indefinite."""
-    factor, failed = lapack.dpotrf(matrix, lower=1)
-    if failed:
-        return None, np.inf
-    log_det = 2 * float(np.log(np.diag(factor)).sum())
-    inverse = np.asarray(lapack.dpotri(factor, lower=1)[0])
-    return np.asarray(np.tril(inverse) + np.tril(inverse, -1).T), log_det

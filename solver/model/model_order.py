@@ -11,6 +11,7 @@ Without noise more modes do no harm, and keep deformation out of the cameras: me
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,7 +48,14 @@ class Support:
     """Whether to begin with all that is rough in the tracks as noise."""
 
 
-def supported(sample: Floats, pairs: Floats, *, spoiled: bool = False) -> Support:
+def supported(
+    sample: Floats,
+    pairs: Floats,
+    *,
+    spoiled: bool = False,
+    seed: int = 0,
+    should_stop: Callable[[], bool] | None = None,
+) -> Support:
     """Return what the sample supports: all modes where there is neither noise nor what is left of outliers to mistake for one.
 
     Parameters
@@ -58,16 +66,24 @@ def supported(sample: Floats, pairs: Floats, *, spoiled: bool = False) -> Suppor
         s_f times the first two rows of R_f.
     spoiled : bool
         Outliers were found: some that were not are still in the sample.
+    seed : int
+        Deals the points into halves.
+    should_stop : callable, optional
+        Asked after every round of learning; once it returns True, what was not judged counts as improbable.
     """
     frames, count = sample.shape[:2]
     if count < FEWEST or not (spoiled or typical_roughness(sample) >= NOISE_FLOOR):
         return Support()
     used = np.unique(np.linspace(0, frames - 1, min(frames, JUDGED_FRAMES)).round().astype(np.intp))
     rows = sample[used].transpose(0, 2, 1).reshape(2 * len(used), count)
-    order = np.random.default_rng(0).permutation(count)
+    order = np.random.default_rng(seed).permutation(count)
     one, other = rows[:, order[0::2]], rows[:, order[1::2]]
     quiet, noisy = (
-        (_judged(one, other, pairs[used], noisy=each) + _judged(other, one, pairs[used], noisy=each)) / 2
+        (
+            _judged(one, other, pairs[used], noisy=each, should_stop=should_stop)
+            + _judged(other, one, pairs[used], noisy=each, should_stop=should_stop)
+        )
+        / 2
         for each in (False, True)
     )
     enough = min(float(quiet.min()), float(noisy.min())) + GAIN
@@ -80,14 +96,19 @@ def _counts(frames: int) -> list[int]:
     return [count for count in COUNTS[:-1] if count < frames - 1] + [MOST_MODES]
 
 
-def _judged(points: Floats, other: Floats, pairs: Floats, *, noisy: bool) -> Floats:
+def _judged(
+    points: Floats, other: Floats, pairs: Floats, *, noisy: bool, should_stop: Callable[[], bool] | None
+) -> Floats:
     """Return how improbable other points are for each count of modes."""
     frames = len(pairs)
     gram = points @ points.T / points.shape[1]
     counts = _counts(frames)
     energies = np.full(len(counts), np.inf)
     for index, most in enumerate(counts):
-        energies[index] = improbability(annealed(gram, pairs, most=most, noisy=noisy, iterations=ROUNDS), pairs, other)
+        if index and should_stop is not None and should_stop():
+            break
+        found = annealed(gram, pairs, most=most, noisy=noisy, iterations=ROUNDS, should_stop=should_stop)
+        energies[index] = improbability(found, pairs, other)
     return energies
 
 

@@ -15,12 +15,21 @@ makes everything a matter of the 2F×2F Gram matrix W Wᵀ / P and independent o
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.solver.operators.finite_differences import difference_bands
+from pliant.solver.model.image_density import Explained, ImageModel, factor_of, inverted
+from pliant.solver.model.marginal_likelihood import root_matrix
+from pliant.solver.model.random_walk import (
+    coloured,
+    random_walk,
+    walk_bands,
+    walk_precision,
+    whitened,
+    whitener,
+)
 from pliant.solver.operators.gauss_markov import PathPrior
 from pliant.solver.records import Floats
 from pliant.solver.tracks.noise import roughness
@@ -55,6 +64,13 @@ NOISE_FLOOR = 1e-8
 
 QUIET = 1e-5
 """σ² to start from: less than any tracker's."""
+
+
+DENSE_FRAMES = 160
+"""Frames up to which a round of expectation maximisation works on 2F×2F matrices, which is then faster."""
+
+GUARD = 8
+"""Eigenvectors beyond the modes that are followed from round to round, in which new modes appear."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,29 +132,14 @@ class ShapeCovariance:
         return replace(self, modes=np.stack(modes, axis=1) if modes else np.zeros((num_frames, 0)))
 
 
-def random_walk(num_frames: int) -> Floats:
-    """Return T, the covariance of a random walk, mean of the diagonal 1, shape `(F, F)`."""
-    inverse, norm = _walk_precision(num_frames)
-    return np.asarray(np.linalg.inv(inverse) / norm)
-
-
-def _walk_precision(num_frames: int) -> tuple[Floats, float]:
-    """Return HᵀH with enough on its diagonal to be invertible, and the mean of its inverse's diagonal."""
-    bands, norm = walk_bands(num_frames)
-    return np.diag(bands[0]) + np.diag(bands[1, :-1], 1) + np.diag(bands[1, :-1], -1), norm
-
-
-def walk_bands(num_frames: int) -> tuple[Floats, float]:
-    """Return the same by its upper bands, shape `(2, F)`."""
-    bands = np.zeros((2, num_frames))
-    differences = difference_bands(num_frames, 1)
-    bands[: len(differences)] = differences
-    bands[0] += 10.0 / num_frames**2
-    upper = np.stack([np.roll(bands[1], 1), bands[0]])
-    return bands, float(np.trace(linalg.solveh_banded(upper, np.eye(num_frames)))) / num_frames
-
-
-def learned(gram: Floats, pairs: Floats, *, most: int = MOST_MODES, noisy: bool = False) -> ShapeCovariance:
+def learned(
+    gram: Floats,
+    pairs: Floats,
+    *,
+    most: int = MOST_MODES,
+    noisy: bool = False,
+    should_stop: Callable[[], bool] | None = None,
+) -> ShapeCovariance:
     """Return the most probable of the covariances that expectation maximisation finds from scratch in two ways.
 
     Annealed, and then once more without, from a start whose mean positions may also be a mode: annealing that has taken the turn
@@ -153,22 +154,33 @@ def learned(gram: Floats, pairs: Floats, *, most: int = MOST_MODES, noisy: bool 
         Columns of L at most.
     noisy : bool
         Begin with all that is rough in the tracks as noise, not with hardly any.
+    should_stop : callable, optional
+        Asked after every round; once it returns True, the best so far is returned.
     """
     count = min(ITERATIONS, max(FEWEST, FRAMES // len(pairs)))
-    warm = freed(annealed(gram, pairs, most=most, noisy=noisy, iterations=count))
+    warm = freed(annealed(gram, pairs, most=most, noisy=noisy, iterations=count, should_stop=should_stop))
     runs = (
-        improve(warm, gram, pairs, iterations=count // 2, most=most),
-        improve(scratch(gram, pairs, most, noisy=noisy), gram, pairs, iterations=count, most=most),
-    )
+        improve(warm, gram, pairs, iterations=count // 2, most=most, should_stop=should_stop),
+        improve(
+            scratch(gram, pairs, most, noisy=noisy), gram, pairs,
+            iterations=count, most=most, should_stop=should_stop,
+        ),
+    )  # fmt: skip
     return min(runs, key=lambda run: run.likelihood)
 
 
 def annealed(
-    gram: Floats, pairs: Floats, *, most: int = MOST_MODES, noisy: bool = False, iterations: int
+    gram: Floats,
+    pairs: Floats,
+    *,
+    most: int = MOST_MODES,
+    noisy: bool = False,
+    iterations: int,
+    should_stop: Callable[[], bool] | None = None,
 ) -> ShapeCovariance:
     """Return the covariance that so many annealed rounds find from scratch."""
     start = scratch(gram, pairs, most, noisy=noisy)
-    return improve(start, gram, pairs, iterations=iterations, warm=WARM, most=most)
+    return improve(start, gram, pairs, iterations=iterations, warm=WARM, most=most, should_stop=should_stop)
 
 
 def freed(covariance: ShapeCovariance) -> ShapeCovariance:
@@ -197,7 +209,7 @@ def begin(gram: Floats, pairs: Floats, *, noise: float = QUIET, most: int = MOST
         Columns of L at most.
     """
     frames = len(pairs)
-    walk, _ = _walk_precision(frames)
+    walk, _ = walk_precision(frames)
     normal = np.kron(1e-3 * walk, np.eye(3)).reshape(frames, 3, frames, 3)
     index = np.arange(frames)
     normal[index, :, index, :] += np.einsum("fic,fid->fcd", pairs, pairs)
@@ -221,6 +233,7 @@ def improve(
     iterations: int,
     warm: float = DRIFT_FLOOR,
     most: int = MOST_MODES,
+    should_stop: Callable[[], bool] | None = None,
 ) -> ShapeCovariance:
     """Return the covariance after rounds of expectation maximisation, with a floor of τ that falls from `warm` to `DRIFT_FLOOR`.
 
@@ -229,6 +242,8 @@ def improve(
     floors = np.geomspace(warm, DRIFT_FLOOR, iterations)
     for better in rounds(covariance, gram, pairs, floors=floors, most=most):
         covariance = better
+        if should_stop is not None and should_stop():
+            break
     return covariance
 
 
@@ -239,41 +254,153 @@ def rounds(
 
     With V = ΠΣΠᵀ + σ²I and K = V⁻¹(G − V)V⁻¹ every second moment of the posterior is a contraction of K: for a component with
     covariance D and image ΠD, E[xxᵀ] = D + (ΠD)ᵀ K (ΠD). Modes and drift are then the probabilistic principal components
-    (Tipping, Bishop 1999) of C seen relative to the random walk.
+    (Tipping, Bishop 1999) of C seen relative to the random walk. `DENSE_FRAMES` says in which form K is.
     """
+    factor, subspace = factor_of(gram), None
+    for number, floor in enumerate(floors):
+        if len(pairs) <= DENSE_FRAMES:
+            covariance = _round(covariance, factor, pairs, floor, most)
+        else:
+            covariance, subspace = _linear_round(covariance, factor, pairs, floor, most, subspace)
+            subspace = np.hstack([subspace, _cosines(len(pairs), GUARD, first=number * GUARD)])
+        yield covariance
+
+
+def _round(covariance: ShapeCovariance, factor: Floats, pairs: Floats, floor: float, most: int) -> ShapeCovariance:
+    """Return the covariance after one round, K dense."""
     frames = len(pairs)
     rows = pairs.reshape(2 * frames, 3)
-    for floor in floors:
-        over_frames = covariance.over_frames()
-        wide = np.repeat(np.repeat(over_frames, 2, axis=0), 2, axis=1)
-        by_extent, by_play = rows @ covariance.extent, rows @ covariance.play
-        deform = by_play @ rows.T
-        image = by_extent @ rows.T + deform * wide
-        image[np.diag_indices(2 * frames)] += covariance.noise
-        factor = linalg.cho_factor(image, lower=True)
-        inverse = linalg.cho_solve(factor, np.eye(2 * frames))
-        explained = inverse @ gram
-        surplus = explained @ inverse - inverse
-        log_det = 2 * float(np.log(np.diag(factor[0])).sum())
-        play = covariance.play + by_play.T @ (surplus * wide) @ by_play / frames
-        moved = (surplus * deform).reshape(frames, 2, frames, 2).sum(axis=(1, 3))
-        modes, drift = _split(over_frames + over_frames @ moved @ over_frames / 3, floor, most)
-        covariance = ShapeCovariance(
-            extent=_symmetric(covariance.extent + by_extent.T @ surplus @ by_extent),
-            play=_symmetric(play * (3 / np.trace(play)) + FLATTEST * np.eye(3)) / (1 + FLATTEST),
-            modes=modes,
-            drift=drift,
-            noise=max(covariance.noise * (1 + covariance.noise * float(np.trace(surplus)) / (2 * frames)), NOISE_FLOOR),
-            likelihood=0.5 * (log_det + float(np.trace(explained))) / frames,
-        )
-        yield covariance
+    over_frames = covariance.over_frames()
+    wide = np.repeat(np.repeat(over_frames, 2, axis=0), 2, axis=1)
+    by_extent, by_play = rows @ covariance.extent, rows @ covariance.play
+    deform = by_play @ rows.T
+    image = deform * wide
+    image += by_extent @ rows.T
+    image[np.diag_indices(2 * frames)] += covariance.noise
+    inverse, log_det = inverted(image)
+    explained = inverse @ factor
+    surplus = explained @ explained.T
+    surplus -= inverse
+    wide *= surplus
+    deform *= surplus
+    moved = deform[0::2, 0::2] + deform[0::2, 1::2] + deform[1::2, 0::2] + deform[1::2, 1::2]
+    modes, drift = _split(over_frames + over_frames @ moved @ over_frames / 3, floor, most)
+    return _improved(
+        covariance, modes, drift,
+        extent=covariance.extent + by_extent.T @ surplus @ by_extent,
+        play=covariance.play + by_play.T @ wide @ by_play / frames,
+        surplus=float(np.trace(surplus)) / (2 * frames),
+        nll=0.5 * (log_det + float((explained * factor).sum())) / frames,
+    )  # fmt: skip
+
+
+def _linear_round(
+    covariance: ShapeCovariance, factor: Floats, pairs: Floats, floor: float, most: int, subspace: Floats | None
+) -> tuple[ShapeCovariance, Floats]:
+    """Return the covariance after one round in time linear in the frames, and the subspace to begin the next one with.
+
+    All contractions but the modes are derivatives of `image_density` already. With root rootᵀ = T⁻¹ and C̃ = rootᵀ C root the modes are the
+    leading eigenvectors of C̃ + C̃ m C̃/3, of which only products and the trace are needed: one step of Nyström's method a round, from the
+    eigenvectors of the round before and `GUARD` more.
+    """
+    frames, count = covariance.modes.shape
+    root0, root1 = root_matrix(covariance.extent), root_matrix(covariance.play)
+    walk = pairs @ root1
+    columns = np.concatenate(
+        [(pairs @ root0)[:, :, None], covariance.modes[:, None, :, None] * walk[:, :, None]], axis=2
+    )
+    model = ImageModel(columns.reshape(2 * frames, -1), walk, covariance.noise, covariance.drift)
+    seen = Explained.of(model, factor)
+    found = seen.terms()
+    by_columns = -frames * found.by_columns.reshape(columns.shape)
+    by_walk = -frames * found.by_walk  # [K B (τT ⊗ I)]_ff
+    extents = np.einsum("fic,fid->cd", columns[:, :, 0], by_columns[:, :, 0])
+    plays = np.einsum("fikc,fikd->cd", columns[:, :, 1:], by_columns[:, :, 1:]) + np.einsum(
+        "fic,fid->cd", walk, by_walk
+    )
+    along = whitened(covariance.modes)
+
+    def spread(vectors: Floats) -> Floats:  # C̃ times them
+        result: Floats = along @ (along.T @ vectors) + covariance.drift * vectors
+        return result
+
+    def product(vectors: Floats) -> Floats:
+        wide = spread(vectors)
+        images = walk[:, :, :, None] * coloured(wide)[:, None, None]
+        moved = seen.surplus(images.reshape(2 * frames, -1)).reshape(images.shape)
+        return wide + spread(coloured(np.einsum("fic,fick->fk", walk, moved), transposed=True)) / 3
+
+    inner = np.einsum("fikc,filc->kl", columns[:, :, 1:], by_columns[:, :, 1:])
+    square = along.T @ along + 2 * covariance.drift * np.eye(count)
+    total = float((along**2).sum()) + frames * covariance.drift
+    total += (float((square * inner).sum()) + covariance.drift * float((walk * by_walk).sum())) / 3
+    values, vectors = _nystrom(product, np.hstack([along, _cosines(frames, most)]) if subspace is None else subspace)
+    modes, drift = _kept(values, vectors, total, floor, min(most, frames - 1))
+    better = _improved(
+        covariance, coloured(modes), drift,
+        extent=root0 @ (np.eye(3) + extents) @ root0.T,
+        play=root1 @ (np.eye(3) + plays / frames) @ root1.T,
+        surplus=-found.by_noise,
+        nll=found.value,
+    )  # fmt: skip
+    return better, vectors[:, : modes.shape[1] + GUARD]
+
+
+def _cosines(frames: int, count: int, *, first: int = 0) -> Floats:
+    """Return `count` cosines of rising frequency, orthonormal but for the constant, shape `(F, count)`; after the last comes the first."""
+    frequencies = (first + np.arange(min(count, frames))) % frames
+    return np.asarray(np.cos(np.pi * np.outer(np.arange(frames) + 0.5, frequencies) / frames) * (2 / frames) ** 0.5)
+
+
+def _nystrom(product: Callable[[Floats], Floats], begun: Floats) -> tuple[Floats, Floats]:
+    """Return leading eigenvalues, falling, and eigenvectors of a positive semidefinite matrix, given its product with a basis.
+
+    Williams and Seeger (2001), "Using the Nyström method to speed up kernel machines", for a basis of any columns.
+    """
+    basis, _ = np.linalg.qr(begun)
+    image = product(basis)
+    held, turn = np.linalg.eigh(_symmetric(basis.T @ image))
+    usable = held > 1e-12 * held[-1]
+    root = (image @ turn[:, usable]) / np.sqrt(held[usable])
+    values, turn = np.linalg.eigh(root.T @ root)
+    values, vectors = values[::-1], (root @ turn)[:, ::-1]
+    return values, vectors / np.linalg.norm(vectors, axis=0)
+
+
+def _kept(values: Floats, vectors: Floats, total: float, floor: float, most: int) -> tuple[Floats, float]:
+    """Return L in white coordinates and τ as `_split` does, from leading eigenvalues, eigenvectors, and the sum of all."""
+    frames, most = len(vectors), min(most, len(values))
+    drift = max((total - float(values[:most].sum())) / (frames - most), floor)
+    count = min(most, int((values > ABOVE * drift).sum()))
+    drift = max((total - float(values[:count].sum())) / (frames - count), floor)
+    return vectors[:, :count] * np.sqrt(np.maximum(values[:count] - drift, 0.0)), drift
+
+
+def _improved(
+    covariance: ShapeCovariance,
+    modes: Floats,
+    drift: float,
+    *,
+    extent: Floats,
+    play: Floats,
+    surplus: float,
+    nll: float,
+) -> ShapeCovariance:
+    """Return the covariance with new moments; `surplus`: mean of K's diagonal, `nll`: of the covariance before."""
+    return ShapeCovariance(
+        extent=_symmetric(extent),
+        play=_symmetric(play * (3 / np.trace(play)) + FLATTEST * np.eye(3)) / (1 + FLATTEST),
+        modes=modes,
+        drift=drift,
+        noise=max(covariance.noise * (1 + covariance.noise * surplus), NOISE_FLOOR),
+        likelihood=nll,
+    )
 
 
 def _split(over_frames: Floats, floor: float, most: int) -> tuple[Floats, float]:
     """Return L and τ with C ≈ L Lᵀ + τ T: principal components in coordinates in which the random walk is white."""
     frames = len(over_frames)
-    inverse, norm = _walk_precision(frames)
-    root = np.linalg.cholesky(inverse * norm)  # T⁻¹ = root rootᵀ
+    root = whitener(frames)
     values, vectors = np.linalg.eigh(_symmetric(root.T @ over_frames @ root))
     values, vectors = values[::-1], vectors[:, ::-1]
     most = min(most, frames - 1)

@@ -56,9 +56,7 @@ def test_a_required_page_that_cannot_be_built_stops_the_build(
         builder.provide_page()
 
 
-def test_a_registry_that_does_not_answer_is_said_in_a_sentence(
-    builder: ModuleType, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_registry_that_does_not_answer_is_reported(builder: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
     use_commands(builder, monkeypatch, "", "import sys; sys.exit('ETIMEDOUT')")
     with pytest.raises(builder.PageNotBuilt, match=r"connection to the npm registry.*exit code 1: ETIMEDOUT"):
         builder.build_page()
@@ -68,7 +66,7 @@ def test_a_registry_that_does_not_answer_is_said_in_a_sentence(
         builder.build_page()
 
 
-def test_a_failing_bundler_is_said(builder: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failing_bundler_is_reported(builder: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
     use_commands(builder, monkeypatch, "import sys; sys.exit('src/main.ts:1: unexpected token')")
     with pytest.raises(builder.PageNotBuilt, match=r"could not be bundled \(exit code 1: src/main.ts:1: unexpected"):
         builder.build_page()

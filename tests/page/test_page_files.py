@@ -67,7 +67,7 @@ def test_nothing_but_the_page_is_served(built: TestClient, name: str) -> None:
     assert answer.status_code == 404
 
 
-def test_head_tells_the_same_without_a_body(built: TestClient) -> None:
+def test_head_returns_the_same_headers_without_a_body(built: TestClient) -> None:
     head = built.head("/page/main-ABC.js", headers={"Accept-Encoding": "identity"})
     assert (head.status_code, head.content) == (200, b"")
     assert head.headers["content-length"] == str(len(SCRIPT))

@@ -69,7 +69,7 @@ def test_the_list_follows_a_running_job_that_is_not_shown(
     until(lambda: float(row.get_by_role("progressbar", include_hidden=True).evaluate("(it) => it.value")) > before)
 
 
-def test_a_service_that_is_away_is_said_and_its_return_noticed(page: Page, url: str, finished: str) -> None:
+def test_an_outage_is_reported_and_its_end_noticed(page: Page, url: str, finished: str) -> None:
     page.route("**/v1/**", lambda route: route.abort())
     page.goto(f"{url}/#job={finished}")
     page.reload()

@@ -116,7 +116,7 @@ def test_waiting_ends_when_the_job_does_or_patience_does(running: Running, http:
     timer.join()
 
 
-def test_every_answer_tells_the_browser_to_be_careful(http: httpx.Client) -> None:
+def test_every_answer_has_the_security_headers(http: httpx.Client) -> None:
     for answer in (http.get("/healthz"), http.get("/nowhere"), http.get("/v1/jobs/nobody")):
         assert answer.headers["content-security-policy"].startswith("default-src 'none'")
         assert answer.headers["x-content-type-options"] == "nosniff"

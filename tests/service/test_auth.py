@@ -54,7 +54,7 @@ def addresses(running: Running) -> list[tuple[str, str]]:
     return found
 
 
-def test_every_address_but_the_public_ones_asks_for_a_token(guarded: Running) -> None:
+def test_every_path_but_the_public_ones_needs_a_token(guarded: Running) -> None:
     asked = {"nothing": {}, "basic": {"Authorization": "Basic YTpi"}, "empty": {"Authorization": "Bearer"}}
     with httpx.Client(base_url=guarded.url) as http:
         open_to_all = set()
@@ -72,7 +72,7 @@ def test_every_address_but_the_public_ones_asks_for_a_token(guarded: Running) ->
             assert http.get(path).status_code == 200
 
 
-def test_a_token_in_the_address_counts_for_nothing(guarded: Running) -> None:
+def test_a_token_in_the_query_is_ignored(guarded: Running) -> None:
     _, text = guarded.tokens.create("ada")
     for name in ("token", "access_token", "authorization"):
         assert httpx.get(f"{guarded.url}/v1/jobs", params={name: text}).status_code == 401
@@ -81,13 +81,13 @@ def test_a_token_in_the_address_counts_for_nothing(guarded: Running) -> None:
 
 
 @pytest.mark.parametrize("scheme", ["Bearer", "bearer", "BEARER"])
-def test_a_good_token_is_let_in(guarded: Running, scheme: str) -> None:
+def test_a_valid_token_is_accepted(guarded: Running, scheme: str) -> None:
     _, text = guarded.tokens.create("ada")
     answer = httpx.get(f"{guarded.url}/v1/jobs", headers={"Authorization": f"{scheme} {text}"})
     assert (answer.status_code, answer.json()["jobs"]) == (200, [])
 
 
-def test_wrong_revoked_and_expired_tokens_are_told_apart_from_none(guarded: Running) -> None:
+def test_wrong_revoked_and_expired_tokens_have_codes_of_their_own(guarded: Running) -> None:
     token, text = guarded.tokens.create("gone")
     _, short = guarded.tokens.create("short", expires=timedelta(seconds=0.05))
     time.sleep(0.1)
@@ -104,7 +104,7 @@ def test_wrong_revoked_and_expired_tokens_are_told_apart_from_none(guarded: Runn
     assert said(text) == (401, "invalid_token", True)
 
 
-def test_the_body_of_a_stranger_is_never_read(guarded: Running) -> None:
+def test_the_body_of_a_request_without_a_token_is_never_read(guarded: Running) -> None:
     """The answer comes although not one byte of the body was sent, and nothing is written."""
     host, port = guarded.url.removeprefix("http://").split(":")
     head = (
@@ -121,7 +121,7 @@ def test_the_body_of_a_stranger_is_never_read(guarded: Running) -> None:
     ("scopes", "read", "write"),
     [((Scope.READ,), 200, 403), ((Scope.SUBMIT,), 403, 415), ((Scope.ADMIN,), 200, 415)],
 )
-def test_a_scope_bounds_what_a_token_may(guarded: Running, scopes: tuple[Scope, ...], read: int, write: int) -> None:
+def test_a_scope_limits_what_a_token_can_do(guarded: Running, scopes: tuple[Scope, ...], read: int, write: int) -> None:
     with guarded.client(*scopes) as http:
         answers = {"read": http.get("/v1/jobs"), "write": http.post("/v1/jobs", content=b"x")}
         assert (answers["read"].status_code, answers["write"].status_code) == (read, write)
@@ -172,7 +172,7 @@ def test_to_another_token_a_job_is_not_there_on_any_route(
     assert ada.get(f"/v1/jobs/{queued.id}").json()["status"] == "queued"
 
 
-def test_another_tokens_id_is_taken_and_nothing_is_said_of_its_job(
+def test_an_id_of_another_token_is_taken_and_its_job_stays_hidden(
     guarded: Running, ada: httpx.Client, bob: httpx.Client
 ) -> None:
     body = tracks(seed=3)
@@ -201,7 +201,7 @@ def test_idempotency_keys_are_each_tokens_own(ada: httpx.Client, bob: httpx.Clie
     assert first.json()["id"] == again.json()["id"] != other.json()["id"]
 
 
-def test_admin_sees_everybodys_jobs_and_a_sharing_token_its_fellows(guarded: Running, ada: httpx.Client) -> None:
+def test_admin_sees_all_jobs_and_a_sharing_token_those_of_its_owner(guarded: Running, ada: httpx.Client) -> None:
     job = submit(ada, name="seen")
     owner = guarded.jobs.records.get(job.id).owner
     with guarded.client(Scope.ADMIN) as admin, guarded.client(sharing=owner) as fellow:
@@ -213,7 +213,7 @@ def test_admin_sees_everybodys_jobs_and_a_sharing_token_its_fellows(guarded: Run
         assert ada.get(f"/v1/jobs/{again.id}").status_code == 200, "what an admin runs again stays its owner's"
 
 
-def test_the_sdk_and_its_twin_work_with_a_token_and_say_what_is_wrong_without(guarded: Running) -> None:
+def test_the_sdk_works_with_a_token_and_explains_a_missing_one(guarded: Running) -> None:
     _, text = guarded.tokens.create("sdk")
     points = np.random.default_rng(0).normal(size=(6, 12, 2)) * 100
     with Client(guarded.url, token=text) as client:
@@ -234,7 +234,7 @@ def test_the_sdk_and_its_twin_work_with_a_token_and_say_what_is_wrong_without(gu
         stranger.get(job.id)
 
 
-def test_a_store_that_is_away_lets_nobody_in(serve: Serve, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_without_the_store_no_token_is_accepted(serve: Serve, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     running = serve(redis_url=f"unix://{tmp_path}/nobody.sock", auth="required")
     headers = {"Authorization": f"Bearer pliant_{'0' * 12}_{'a' * 43}"}
     answer = httpx.get(f"{running.url}/v1/limits", headers=headers, timeout=30)
@@ -261,7 +261,7 @@ def test_a_preflight_needs_no_token_and_a_refusal_can_be_read(serve: Serve) -> N
     assert "access-control-allow-origin" not in strange.headers
 
 
-def test_tokens_are_off_on_loopback_and_on_elsewhere_unless_told(valkey_url: str) -> None:
+def test_tokens_are_off_on_loopback_and_on_elsewhere_by_default(valkey_url: str) -> None:
     def asks(**env: str) -> bool:
         return settings_from(**env).asks_for_tokens
 

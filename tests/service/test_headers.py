@@ -28,7 +28,7 @@ def user(guarded: Running) -> Iterator[httpx.Client]:
         yield client
 
 
-def test_every_kind_of_answer_tells_the_browser_to_be_careful(guarded: Running, user: httpx.Client) -> None:
+def test_every_kind_of_answer_has_the_security_headers(guarded: Running, user: httpx.Client) -> None:
     job = submit(user)
     finish(guarded, job.id, b"result")
     file = f"/v1/jobs/{job.id}/artifacts/shapes.npz"

@@ -93,7 +93,7 @@ def test_each_token_has_its_own_rate(serve: Serve) -> None:
         assert fourth.get("/v1/limits").json()["requests_per_minute"] == 3
 
 
-def test_the_sdk_waits_as_it_is_told_and_gets_through(serve: Serve) -> None:
+def test_the_sdk_honours_retry_after_and_succeeds(serve: Serve) -> None:
     running = serve(requests_per_minute=60)
     with Client(running.url) as client:
         begun = time.monotonic()
@@ -172,7 +172,7 @@ def test_a_token_may_have_a_smaller_body_than_the_service_allows(serve: Serve) -
         submit(large)
 
 
-def test_the_usual_rate_holds_where_strangers_may_come() -> None:
+def test_the_default_rate_applies_where_the_service_is_reachable_from_outside() -> None:
     def rate(own: int | None = None, **env: str) -> int:
         return settings_from(**env).rate_of(own)
 
@@ -194,7 +194,7 @@ def test_no_more_of_a_tokens_jobs_are_queued_for_the_workers_than_may_run(serve:
         assert places == [0, None, 1, 2], "null: held back"
 
 
-def test_admins_jobs_are_counted_as_nobodys(serve: Serve) -> None:
+def test_jobs_of_an_admin_count_for_no_owner(serve: Serve) -> None:
     running: Running = serve(auth="required", max_queued=1)
     with running.client() as ada, running.client(Scope.ADMIN) as admin:
         submit(ada)

@@ -97,7 +97,7 @@ def test_a_wish_that_is_none_is_passed_over(http: httpx.Client, wish: str) -> No
     assert time.monotonic() - begun < 8
 
 
-def test_nobody_waits_longer_than_the_service_lets_him(serve: Serve) -> None:
+def test_a_wait_is_capped_by_the_service(serve: Serve) -> None:
     running = serve(max_wait_seconds=1)
     with httpx.Client(base_url=running.url, timeout=10) as http:
         job = submit(http)
@@ -123,7 +123,7 @@ def test_an_impossible_event_id_is_refused(http: httpx.Client, id: str) -> None:
     assert (answer.status_code, answer.json()["code"]) == (422, "invalid_event_id")
 
 
-def test_a_log_is_what_the_attempts_said_line_by_line(running: Running, http: httpx.Client) -> None:
+def test_the_log_has_the_lines_of_all_attempts(running: Running, http: httpx.Client) -> None:
     job = submit(http, name="logged")
     empty = http.get(f"/v1/jobs/{job.id}/log")
     assert (empty.status_code, empty.text) == (200, "")
@@ -221,7 +221,7 @@ raise SystemExit(main())
 
 
 @pytest.mark.parametrize("process", [("-c", STOPPED_BETWEEN_LOOK_AND_WAIT)], indirect=True, ids=["between"])
-def test_a_stream_that_has_just_looked_whether_to_end_is_told_all_the_same(
+def test_a_stream_between_check_and_wait_still_ends_on_shutdown(
     process: tuple[subprocess.Popen[bytes], str, Path],
 ) -> None:
     service, url, log = process

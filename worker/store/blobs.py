@@ -75,6 +75,9 @@ class Blob:
                 yield bytes(whole[offset : offset + CHUNK])
 
 
+Entries = list[Any]
+
+
 class Blobs:
     """A store of files under slash-separated keys. Every method may raise `StoreUnavailable`.
 
@@ -179,9 +182,9 @@ class Blobs:
         plain = all(part not in ("", ".", "..") for part in key.split("/"))
         return self.directory / key if self.directory is not None and plain else None
 
-    def _entries(self, prefix: str) -> list[Any]:
+    def _entries(self, prefix: str) -> Entries:
         batches = iter(obstore.list(self._store, prefix.rstrip("/") or None))
-        found: list[Any] = []
+        found: Entries = []
         while batch := self._call(lambda: next(batches, None)):
             found += batch
         return found

@@ -9,7 +9,7 @@ import pytest
 from pliant.solver import Mesh
 from pliant.solver.energy.objective import objective, residuals
 from pliant.solver.energy.problem import Problem
-from pliant.solver.model.shape_covariance import walk_bands
+from pliant.solver.model.random_walk import walk_bands
 from pliant.solver.operators.gauss_markov import PathPrior
 from pliant.solver.operators.mesh_laplacian import build_laplacian
 from pliant.solver.shapes import irls

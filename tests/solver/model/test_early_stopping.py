@@ -9,7 +9,8 @@ import pytest
 from pliant.solver.model import early_stopping
 from pliant.solver.model.early_stopping import learned_in_time
 from pliant.solver.model.model_order import FEWEST, Support, improbability
-from pliant.solver.model.shape_covariance import ShapeCovariance, learned, random_walk
+from pliant.solver.model.random_walk import random_walk
+from pliant.solver.model.shape_covariance import ShapeCovariance, learned
 from pliant.solver.model.so3 import exponential
 
 FRAMES = 40

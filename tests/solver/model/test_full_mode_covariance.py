@@ -19,7 +19,8 @@ from pliant.solver.model.full_mode_covariance import (
 )
 from pliant.solver.model.marginal_likelihood import Scene, cameras_of
 from pliant.solver.model.model_order import Support
-from pliant.solver.model.shape_covariance import ShapeCovariance, random_walk
+from pliant.solver.model.random_walk import random_walk
+from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import angles_between, exponential, nearest
 
 FRAMES = 16
@@ -32,8 +33,7 @@ def covariance(frames: int = FRAMES, modes: int = 2, noise: float = 1e-6) -> Sha
 
 
 def scene(gram: np.ndarray, rotations: np.ndarray, *, with_scales: bool, steadiness: float) -> Scene:
-    walk = random_walk(len(rotations))
-    return Scene(gram, rotations, with_scales, walk, steadiness, noise_floor=1e-4, smoothness=0.0)
+    return Scene(gram, rotations, with_scales, steadiness, noise_floor=1e-4, smoothness=0.0)
 
 
 def a_scene(*, with_scales: bool, steadiness: float = 0.01) -> tuple[Scene, Basis]:

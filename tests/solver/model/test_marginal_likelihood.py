@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from pliant.solver.model.marginal_likelihood import Motion, Scene, cameras_of, covariances_of, energy, start
+from pliant.solver.model.random_walk import random_walk
 from pliant.solver.model.so3 import exponential
 
 
@@ -15,7 +16,7 @@ def test_the_covariances_reported_are_those_of_the_energy(floor: float) -> None:
     gram = tracks @ tracks.T / 40
     rotations = exponential(random.normal(0, 0.4, (frames, 3)))
     scene = Scene.of(gram, rotations, with_scales=True, steadiness=0.0, noise_floor=floor)
-    scene = Scene(gram, rotations, True, scene.walk, 0.0, floor, smoothness=0.0)
+    scene = Scene(gram, rotations, True, 0.0, floor, smoothness=0.0)
     flat = start(scene, np.exp(random.normal(0, 0.1, frames))).flat()
     motion = Motion.unflat(flat + random.normal(0, 0.1, flat.size), frames)
     extent, play, noise, drift = covariances_of(scene, motion)
@@ -23,7 +24,7 @@ def test_the_covariances_reported_are_those_of_the_energy(floor: float) -> None:
     seen = np.zeros((2 * frames, 3 * frames))
     for frame in range(frames):
         seen[2 * frame : 2 * frame + 2, 3 * frame : 3 * frame + 3] = scales[frame] * turned[frame, :2]
-    over_frames = motion.modes @ motion.modes.T + drift * scene.walk
+    over_frames = motion.modes @ motion.modes.T + drift * random_walk(frames)
     world = np.kron(np.ones((frames, frames)), extent) + np.kron(over_frames, play)
     image = seen @ world @ seen.T + noise * np.eye(2 * frames)
     expected = (np.linalg.slogdet(image)[1] + np.trace(np.linalg.solve(image, gram))) / (2 * frames)

@@ -10,6 +10,7 @@ from pliant.solver import KnownCamera, Settings, gallery, solve
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.cameras.joint_refinement import learn, telling_frames
 from pliant.solver.evaluation import metrics
+from pliant.solver.model.random_walk import random_walk
 from pliant.solver.model.shape_covariance import (
     DRIFT_FLOOR,
     FREED,
@@ -20,7 +21,6 @@ from pliant.solver.model.shape_covariance import (
     freed,
     improve,
     learned,
-    random_walk,
 )
 from pliant.solver.model.so3 import exponential
 

@@ -10,7 +10,7 @@ from pliant.solver import gallery, threads_limited
 from pliant.solver.linear.deflation import build_coarse
 from pliant.solver.linear.preconditioner import build_preconditioner
 from pliant.solver.linear.woodbury import MeanModes
-from pliant.solver.model.shape_covariance import walk_bands
+from pliant.solver.model.random_walk import walk_bands
 from pliant.solver.operators import gauss_markov
 from pliant.solver.operators.gauss_markov import PathPrior
 from pliant.solver.operators.normal_equations import Operator

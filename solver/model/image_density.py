@@ -1,0 +1,233 @@
+"""The Gaussian density of a point's images over all frames, with what is unknown about the point integrated out.
+
+The image positions of one point, w ∈ R^{2F}, are N(0, V) with
+
+    V = σ² I + Q Qᵀ + τ B (T ⊗ I₃) Bᵀ,
+
+Q (2F×q) the images of a few columns (mean position, modes), B = blockdiag(B_f) those of a random walk (`model.random_walk`). With the Gram
+matrix G = W Wᵀ / P of all points the negative log-likelihood of one point and frame is E = (log det V + tr V⁻¹G) / 2F, up to a constant,
+and everything that fits cameras, modes and variances follows from Δ = ∂E/∂V = (V⁻¹ − V⁻¹GV⁻¹)/2F:
+
+    ∂E/∂Q = 2ΔQ,    ∂E/∂B_f = 2τ [Δ B (T ⊗ I₃)]_ff,    ∂E/∂σ² = tr Δ,    ∂E/∂τ = tr Δ B (T ⊗ I₃) Bᵀ.
+
+Two forms, equal to rounding. `dense_terms` factors V: (2F)³. `woodbury_terms` never forms a 2F×2F matrix: with D = V − QQᵀ, linear in F,
+C = I + QᵀD⁻¹Q and any F₀ with G = F₀F₀ᵀ, M = C⁻¹QᵀD⁻¹F₀ is what the columns explain, Y = D⁻¹(F₀ − QM) = V⁻¹F₀, and
+
+    tr V⁻¹G = tr (F₀ − QM)ᵀY + ‖M‖²,    V⁻¹Q = D⁻¹Q C⁻¹,    QᵀY = M:
+
+residuals instead of differences of large numbers, so that a small σ costs no digits. `terms` takes the form that is faster.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from pliant.solver.model.random_walk import WalkPosterior, random_walk
+from pliant.solver.records import Floats
+from scipy import linalg
+from scipy.linalg import lapack
+
+DENSE_ROWS = 180
+"""2F up to which V is factored whatever q: below, calls cost more than arithmetic."""
+
+DENSE_SHARE = 0.55
+"""Share of q and of the columns of F₀, together, in 2F above which factoring V is faster: measured for 2F = 240 … 714."""
+
+RANK = 2.0
+"""Pivots of G below this many roundings of its largest entry are rounding."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImageModel:
+    """V by its parts."""
+
+    columns: Floats
+    """Q, shape `(2F, q)`."""
+
+    walk: Floats
+    """B_f, shape `(F, 2, 3)`."""
+
+    noise_variance: float
+    """σ²."""
+
+    walk_variance: float
+    """τ."""
+
+    def covariance(self) -> Floats:
+        """Return V, shape `(2F, 2F)`."""
+        rows = self.walk.reshape(-1, 3)
+        image: Floats = self.columns @ self.columns.T
+        image += (rows @ rows.T) * _doubled(self.walk_variance * random_walk(len(self.walk)))
+        image[np.diag_indices(len(rows))] += self.noise_variance
+        return image
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Terms:
+    """E and its derivatives."""
+
+    value: float
+    by_columns: Floats
+    """∂E/∂Q, shape `(2F, q)`."""
+
+    by_walk: Floats
+    """∂E/∂B_f, shape `(F, 2, 3)`."""
+
+    by_noise: float
+    """∂E/∂σ²."""
+
+    by_drift: float
+    """∂E/∂τ."""
+
+
+def factor_of(gram: Floats) -> Floats:
+    """Return F₀ with F₀F₀ᵀ = G to rounding, as many columns as G has rank: a pivoted Cholesky factor."""
+    size, largest = len(gram), float(np.diag(gram).max(initial=0.0))
+    factor, pivots, rank, _ = lapack.dpstrf(gram, lower=1, tol=RANK * float(np.finfo(np.float64).eps) * largest)
+    root = np.zeros((size, rank))
+    root[pivots - 1] = np.tril(factor)[:, :rank]
+    return root
+
+
+def terms(model: ImageModel, factor: Floats) -> Terms:
+    """Return E and its derivatives for G = F₀F₀ᵀ, F₀ of shape `(2F, r)`, in the faster form.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        V is not positive definite to rounding, or not finite.
+    """
+    rows, count = model.columns.shape
+    dense = rows <= DENSE_ROWS or count + factor.shape[1] > DENSE_SHARE * rows
+    found = dense_terms(model, factor) if dense else woodbury_terms(model, factor)
+    if not np.isfinite(found.value):
+        raise np.linalg.LinAlgError("the density of the images is not finite")
+    return found
+
+
+def dense_terms(model: ImageModel, factor: Floats) -> Terms:
+    """Return the same by a Cholesky factor of V."""
+    frames = len(model.walk)
+    inverse, log_det = inverted(model.covariance())
+    explained = inverse @ factor
+    value = 0.5 * (log_det + float(np.einsum("ij,ij->", explained, factor))) / frames
+    slope = (inverse - explained @ explained.T) * (0.5 / frames)
+    walked = slope * _doubled(model.walk_variance * random_walk(frames))
+    by_walk = 2 * (walked @ model.walk.reshape(-1, 3)).reshape(frames, 2, 3)
+    return Terms(
+        value, 2 * slope @ model.columns, by_walk, float(np.trace(slope)),
+        0.5 * float((by_walk * model.walk).sum()) / model.walk_variance,
+    )  # fmt: skip
+
+
+def woodbury_terms(model: ImageModel, factor: Floats) -> Terms:
+    """Return the same by Woodbury's identity, linear in the frames."""
+    return Explained.of(model, factor).terms()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Explained:
+    """What the columns and the walk explain of tracks F₀."""
+
+    model: ImageModel
+    walk: WalkPosterior
+
+    solved: Floats
+    """D⁻¹Q, shape `(2F, q)`."""
+
+    walked: Floats
+    """Λ⁻¹BᵀQ/σ², shape `(F, 3, q)`."""
+
+    root: Floats
+    """Lower triangular root of C, shape `(q, q)`."""
+
+    means: Floats
+    """M, shape `(q, r)`."""
+
+    left: Floats
+    """Y = V⁻¹F₀, shape `(2F, r)`."""
+
+    strayed: Floats
+    """The walk's mean given F₀, shape `(F, 3, r)`."""
+
+    value: float
+    """E."""
+
+    @classmethod
+    def of(cls, model: ImageModel, factor: Floats) -> Explained:
+        """Solve for G = F₀F₀ᵀ, F₀ of shape `(2F, r)`.
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            V is not positive definite to rounding, or not finite.
+        """
+        frames, noise, columns = len(model.walk), model.noise_variance, model.columns
+        walk = WalkPosterior.of(model.walk, noise_variance=noise, walk_variance=model.walk_variance)
+        solved, walked = _solved(walk, model, columns)
+        root = np.asarray(np.linalg.cholesky(np.eye(columns.shape[1]) + columns.T @ solved), dtype=np.float64)
+        means = linalg.cho_solve((root, True), solved.T @ factor, check_finite=False)
+        rest = factor - columns @ means
+        left, strayed = _solved(walk, model, rest)
+        log_det = 2 * frames * float(np.log(noise)) + walk.log_det + 2 * float(np.log(np.diag(root)).sum())
+        trace = float(np.einsum("ij,ij->", rest, left)) + float((means**2).sum())
+        return cls(model, walk, solved, walked, root, means, left, strayed, 0.5 * (log_det + trace) / frames)
+
+    def terms(self) -> Terms:
+        """Return E and its derivatives."""
+        model, frames, noise = self.model, len(self.model.walk), self.model.noise_variance
+        inner = linalg.cho_solve((self.root, True), self.solved.T, check_finite=False).T  # V⁻¹Q
+        seen = model.walk @ self.walk.variances / noise
+        by_walk = seen - inner.reshape(frames, 2, -1) @ self.walked.transpose(0, 2, 1)
+        by_walk -= self.left.reshape(frames, 2, -1) @ self.strayed.transpose(0, 2, 1)
+        by_walk /= frames
+        inverse_trace = (2 * frames - float((seen * model.walk).sum())) / noise - float((inner * self.solved).sum())
+        return Terms(
+            self.value,
+            (inner - self.left @ self.means.T) / frames,
+            by_walk,
+            0.5 * (inverse_trace - float((self.left**2).sum())) / frames,
+            0.5 * float((by_walk * model.walk).sum()) / model.walk_variance,
+        )
+
+    def surplus(self, columns: Floats) -> Floats:
+        """Return V⁻¹(G − V)V⁻¹ times columns of shape `(2F, c)`."""
+        means = linalg.cho_solve((self.root, True), self.solved.T @ columns, check_finite=False)
+        inverse, _ = _solved(self.walk, self.model, columns - self.model.columns @ means)
+        result: Floats = self.left @ (self.left.T @ columns)
+        result -= inverse
+        return result
+
+
+def inverted(matrix: Floats) -> tuple[Floats, float]:
+    """Return inverse and log-determinant of a positive definite matrix.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        Rounding left it indefinite, or it is not finite.
+    """
+    factor, failed = lapack.dpotrf(matrix, lower=1)
+    log_det = np.inf if failed else 2 * float(np.log(np.diag(factor)).sum())
+    if not np.isfinite(log_det):
+        raise np.linalg.LinAlgError("the covariance of the images is not positive definite")
+    inverse = np.asarray(lapack.dpotri(factor, lower=1, overwrite_c=1)[0])
+    lower = np.tril(inverse)
+    return lower + np.tril(inverse, -1).T, log_det
+
+
+def _solved(walk: WalkPosterior, model: ImageModel, columns: Floats) -> tuple[Floats, Floats]:
+    """Return D⁻¹ times columns `(2F, r)`, and Λ⁻¹Bᵀ/σ² times them, shape `(F, 3, r)`."""
+    frames, noise = len(model.walk), model.noise_variance
+    split = columns.reshape(frames, 2, -1)
+    means = walk.solve(model.walk.transpose(0, 2, 1) @ split)
+    means /= noise
+    rest = split - model.walk @ means
+    rest /= noise
+    return rest.reshape(columns.shape), means
+
+
+def _doubled(matrix: Floats) -> Floats:
+    """Return the matrix over frames as one over image coordinates, shape `(2F, 2F)`."""
+    return np.repeat(np.repeat(matrix, 2, axis=0), 2, axis=1)
