@@ -204,11 +204,7 @@ def _linked(source: Path, target: Path) -> bool:
         target.parent.mkdir(parents=True, exist_ok=True)
         os.link(source, fresh)
         fresh.replace(target)
-    except FileNotFoundError:
-        if not source.exists():
-            raise
-        return False
-    except OSError:
+    except OSError:  # or there is no such source, which the store reports
         return False
     with suppress(FileNotFoundError):  # if both names were one file already, `replace` did nothing
         fresh.unlink()

@@ -284,12 +284,12 @@ def test_wrong_arguments_and_settings_are_said() -> None:
 
     wrong = run("dance")
     assert (wrong.returncode, "usage" in wrong.stderr) == (2, True)
-    unset = run("keep", PLIANT_WORKERS="none")
+    unset = run("reconcile", PLIANT_WORKERS="none")
     assert (unset.returncode, unset.stderr.count("\n")) == (1, 1)
     assert "PLIANT_WORKERS: expected a whole number" in unset.stderr
 
 
-def test_the_audit_is_a_command(house: House) -> None:
+def test_fsck_is_a_command(house: House) -> None:
     command = [sys.executable, "-m", "pliant.worker", "fsck"]
     env = {**os.environ, **house.settings.to_environment()}
     clean = subprocess.run(command, capture_output=True, text=True, check=False, env=env)
