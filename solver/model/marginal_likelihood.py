@@ -175,8 +175,10 @@ def covariances_of(scene: Scene, motion: Motion) -> tuple[Floats, Floats, float,
 
 
 @np.errstate(over="ignore", invalid="ignore")  # a line search may try a step far too long: that energy is `UNLIKELY`
-def energy(scene: Scene, motion: Motion) -> tuple[float, Motion]:
-    """Return E with the penalties on modes, turns and scales, and its gradient, analytic in every parameter.
+def energy_with_inverse(scene: Scene, motion: Motion) -> tuple[float, Motion, Floats | None]:
+    """Return E with the penalties on modes, turns and scales, its gradient, analytic in every parameter, and M⁻¹.
+
+    M⁻¹ is None where M is not positive definite. ∂E/∂G = M⁻¹/2F.
 
     With D = ∂E/∂M = (M⁻¹ − M⁻¹ G M⁻¹)/2F, everything follows from D and the blocks of M. Turns move on SO(3)^F by the
     exponential map, whose left Jacobian carries the gradient from the rotation to its vector.
@@ -194,7 +196,7 @@ def energy(scene: Scene, motion: Motion) -> tuple[float, Motion]:
     covariance[np.diag_indices(2 * frames)] += noise + scene.noise_floor**2
     inverse, log_det = inverted(covariance)
     if inverse is None or not np.isfinite(log_det):
-        return UNLIKELY, Motion.unflat(np.zeros_like(motion.flat()), frames)
+        return UNLIKELY, Motion.unflat(np.zeros_like(motion.flat()), frames), None
     explained = inverse @ scene.gram
     value = 0.5 * (log_det + float(np.trace(explained))) / frames
     slope = 0.5 * (inverse - explained @ inverse) / frames
@@ -217,7 +219,13 @@ def energy(scene: Scene, motion: Motion) -> tuple[float, Motion]:
         2 * (rows.T @ widened @ rows @ root1)[LOWER],
         2 * np.array([np.trace(slope) * noise, (by_frames * scene.walk).sum() * drift]),
     )
-    return value + rough + scene.steadiness * (uneven + unsteady), gradient
+    return value + rough + scene.steadiness * (uneven + unsteady), gradient, inverse
+
+
+def energy(scene: Scene, motion: Motion) -> tuple[float, Motion]:
+    """Return E and its gradient."""
+    value, gradient, _ = energy_with_inverse(scene, motion)
+    return value, gradient
 
 
 def fit(scene: Scene, motion: Motion, *, iterations: int, turning: bool) -> tuple[Motion, float]:
