@@ -168,7 +168,9 @@ def check_pinhole(settings: Settings) -> None:
     if size is not None and not (len(size) == 2 and all(math.isfinite(each) and each > 0 for each in size)):
         raise _out_of_range("image_size", "two positive numbers, width and height, or None", size)
     if focal is not None and angle is not None:
-        raise _contradiction("field_of_view", "either focal or field_of_view", f"both: {focal} and {angle}", "Leave one out.")
+        raise _contradiction(
+            "field_of_view", "either focal or field_of_view", f"both: {focal} and {angle}", "Leave one out."
+        )
     if angle is not None and size is None:
         raise _contradiction(
             "field_of_view", "image_size beside field_of_view", "no image_size", "Give the picture's width and height."

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.cameras.estimation import CameraEstimate
-from pliant.solver.cameras.focal_length import GAIN, refined_with_focal, search
+from pliant.solver.cameras.focal_length import refined_with_focal, search
 from pliant.solver.cameras.learned import Learned
 from pliant.solver.cameras.perspective import (
     MIRROR,
@@ -72,7 +72,7 @@ def settled(
     if not view.bends:
         return replace(estimate, perspective=view)
     if view.curvature * view.signs[0] < 0:
-        view = replace(view, curvature=-view.curvature)
+        view = replace(view, curvature=-view.curvature, flipped=-1)
         covariance = mirrored(rotations, covariance)[1]
         rotations = MIRROR @ rotations @ MIRROR
         estimate = replace(estimate, rotations=rotations)
@@ -159,38 +159,3 @@ def _applied(
 def between(used: NDArray[np.intp], values: Floats, frames: int) -> Floats:
     """Return values of all frames, interpolated between those of the frames used, shape `(F, n)`."""
     return np.stack([np.interp(np.arange(frames), used, each) for each in values.T], axis=1)
-
-
-def described(view: Perspective, unit: float) -> str:
-    """Return a sentence about the choice between orthography and perspective."""
-    nll = {each.curvature: each.nll for each in view.candidates}
-    if not view.bends:
-        best = min((each for each in nll if each != 0), key=lambda each: nll[each], default=None)
-        if best is None:
-            return "Orthography: perspective was not compared."
-        return (
-            f"Orthography: the best perspective compared, focal length {unit / abs(best):.4g}, changes the log likelihood per point "
-            f"and frame by {nll[0.0] - nll[best]:+.3f}; more than {GAIN} is asked for, and a clear sign of depth."
-        )
-    gain = nll[0.0] - min((value for each, value in nll.items() if each != 0), default=nll[0.0])
-    how = "as given" if view.given is not None else f"± {unit * view.curvature_std / view.curvature**2:.2g}"
-    return (
-        f"Perspective with focal length {unit / abs(view.curvature):.4g} {how}: gains {gain:.3f} in the log likelihood per point and frame "
-        "over orthography."
-    )
-
-
-def improbable(view: Perspective, unit: float) -> str | None:
-    """Return a warning if a focal length that was given is less probable than another or than orthography."""
-    if view.given is None:
-        return None
-    nll = {each.curvature: each.nll for each in view.candidates}
-    own = min((nll[each] for each in (view.given, -view.given) if each in nll), default=np.inf)
-    best = min(nll, key=lambda each: nll[each], default=0.0)
-    if not own - nll.get(best, np.inf) > GAIN:
-        return None
-    rival = "orthography" if best == 0 else f"a focal length of {unit / abs(best):.4g}"
-    return (
-        f"The focal length given, {unit / view.given:.4g}, is improbable: {rival} gains {own - nll[best]:.3f} in the log likelihood per "
-        "point and frame."
-    )

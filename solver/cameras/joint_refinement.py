@@ -92,7 +92,7 @@ def learn(
         Asked between refinements; once it says True, the best so far is returned.
     """
     frames, spoiled = len(estimate.rotations), estimate.outliers > SPOILED
-    used = _some(np.flatnonzero(shown), LEARNED_FRAMES)
+    used = learned_frames(shown)
     start = np.asarray(estimate.scales)
     unscaled, sample = _of_corrected(estimate, start, used)
     support = supported(sample, np.asarray(estimate.rotations)[used, :2], spoiled=spoiled and not turning)
@@ -255,6 +255,11 @@ def _of_frames(gram: Floats, used: NDArray[np.intp]) -> Floats:
     """Return the Gram matrix of some frames."""
     rows = np.stack([2 * used, 2 * used + 1], axis=1).ravel()
     return gram[np.ix_(rows, rows)]
+
+
+def learned_frames(shown: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Return the frames to learn from: at most `LEARNED_FRAMES` of those that show enough."""
+    return _some(np.flatnonzero(shown), LEARNED_FRAMES)
 
 
 def telling_frames(visible: Floats) -> NDArray[np.bool_]:

@@ -75,6 +75,9 @@ class Perspective:
     required: bool = False
     """True: the camera model is `perspective`, and κ = 0 is only compared with."""
 
+    flipped: int = 1
+    """−1 if depths were mirrored for `curvature` after the candidates were compared."""
+
     settled: bool = False
     """Whether the sign of depth is known."""
 
@@ -195,8 +198,18 @@ def posterior_depths(view: Perspective, normalised: Normalised) -> Floats:
     return found
 
 
-def without_perspective(normalised: Normalised, view: Perspective, depths: Floats) -> Normalised:
-    """Return the tracks corrected for perspective, still relative to the centroids of the tracks as they were."""
+def orthographic(normalised: Normalised, view: Perspective | None) -> Normalised:
+    """Return the tracks corrected with posterior depths, still relative to the centroids of the tracks as they were.
+
+    They are the same record where there is no perspective to correct.
+    """
+    if view is None or not view.bends:
+        return normalised
+    return corrected_tracks(normalised, view, posterior_depths(view, normalised))
+
+
+def corrected_tracks(normalised: Normalised, view: Perspective, depths: Floats) -> Normalised:
+    """Return the tracks corrected with depths `(F, P)`, relative to the centroids of the tracks as they were."""
     views = normalised.points + view.offsets[:, None]
     points = corrected(views, depths, view.curvature) - view.offsets[:, None]
     return replace(normalised, points=np.where(normalised.visible[..., None] > 0, points, 0.0))
