@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import TYPE_CHECKING, Literal
 
@@ -228,6 +228,12 @@ class Camera:
             return np.asarray(image)
         nearer = 1 + self.depths(shapes) / self.focal
         return np.asarray(self.principal_point + (image - self.principal_point) / nearer[..., None])
+
+    def at(self, frames: slice) -> Camera:
+        """Return the cameras of some frames."""
+        return replace(
+            self, rotations=self.rotations[frames], scales=self.scales[frames], translations=self.translations[frames]
+        )
 
     @property
     def positions(self) -> Floats | None:
