@@ -118,21 +118,25 @@ def test_the_gradient_of_the_focal_length_is_that_of_finite_differences() -> Non
 
 
 def test_focal_length_sign_of_depth_and_shapes_are_found(close: Solution) -> None:
-    assert close.choices.camera == "perspective" and close.choices.depth_sign == "settled"
+    assert close.choices.camera == "perspective"
+    assert close.choices.depth_sign == "settled"
     assert focal_error(close.camera, FOCAL) < 0.1
-    assert close.camera.focal_std is not None and 0 < close.camera.focal_std < 0.3 * FOCAL
+    assert close.camera.focal_std is not None
+    assert 0 < close.camera.focal_std < 0.3 * FOCAL
     assert e3d_frame_scaled(close.shapes, SEEN) < 0.03
     turned = np.einsum("fpi,fpj->fij", SEEN, close.shapes)
     assert (np.linalg.det(turned) > 0).all(), "the shapes are mirrored"
     candidates = close.choices.focal_candidates
     assert min(candidates, key=lambda each: each.nll).mirrored is False
-    assert any(each.focal is None for each in candidates) and any(each.mirrored for each in candidates)
+    assert any(each.focal is None for each in candidates)
+    assert any(each.mirrored for each in candidates)
 
 
 def test_the_cameras_project_to_the_pixels_given(close: Solution) -> None:
     tracks = pinhole(SEEN, FOCAL)
     left = np.linalg.norm(tracks.points - close.camera.project(close.shapes), axis=2)
-    assert close.residuals == pytest.approx(left) and reprojection(tracks, close).rms < 1.0
+    assert close.residuals == pytest.approx(left)
+    assert reprojection(tracks, close).rms < 1.0
     assert close.camera.principal_point == pytest.approx(CENTRE)
 
 
@@ -141,7 +145,8 @@ def test_mirrored_input_gives_mirrored_shapes(close: Solution) -> None:
     other = SEEN * [1, 1, -1]
     found = solve(pinhole(other, FOCAL), settings=Settings(image_size=PICTURE, focal=FOCAL))
     assert (np.linalg.det(np.einsum("fpi,fpj->fij", other, found.shapes)) > 0).all()
-    assert e3d_frame_scaled(found.shapes, other) < 0.04 and found.camera.focal == pytest.approx(FOCAL)
+    assert e3d_frame_scaled(found.shapes, other) < 0.04
+    assert found.camera.focal == pytest.approx(FOCAL)
     assert found.camera.focal_std == 0.0
     assert not any("improbable" in warning for warning in found.choices.warnings)
 
@@ -160,9 +165,10 @@ def test_tracks_with_y_up_are_the_same_scene_in_other_axes(close: Solution) -> N
 @pytest.mark.slow
 def test_a_principal_point_off_centre_is_used() -> None:
     corner = np.array([200.0, 650.0])
-    views = pinhole(SEEN + [150.0, -200.0, 0.0], FOCAL, corner)
+    views = pinhole([*SEEN, 150.0, -200.0, 0.0], FOCAL, corner)
     found = solve(views, settings=Settings(camera="perspective", focal=FOCAL, principal_point=(200.0, 650.0)))
-    assert e3d_frame_scaled(found.shapes, SEEN) < 0.03 and reprojection(views, found).rms < 1.0
+    assert e3d_frame_scaled(found.shapes, SEEN) < 0.03
+    assert reprojection(views, found).rms < 1.0
     assert found.camera.principal_point == pytest.approx(corner)
 
 
@@ -182,16 +188,20 @@ def test_a_field_of_view_is_a_focal_length() -> None:
 def test_orthographic_tracks_give_the_orthographic_result_to_the_bit() -> None:
     plain = solve(FACE.tracks, settings=Settings(camera="scaled_orthographic"))
     chosen = solve(FACE.tracks, settings=Settings())
-    assert chosen.choices.camera == "scaled_orthographic" and chosen.choices.depth_sign == "ambiguous"
-    assert np.array_equal(chosen.shapes, plain.shapes) and np.array_equal(chosen.residuals, plain.residuals)
+    assert chosen.choices.camera == "scaled_orthographic"
+    assert chosen.choices.depth_sign == "ambiguous"
+    assert np.array_equal(chosen.shapes, plain.shapes)
+    assert np.array_equal(chosen.residuals, plain.residuals)
     assert np.array_equal(chosen.camera.rotations, plain.camera.rotations)
-    assert "Orthography" in chosen.choices.reasons["camera_model"] and chosen.camera.focal is None
+    assert "Orthography" in chosen.choices.reasons["camera_model"]
+    assert chosen.camera.focal is None
 
 
 def test_given_cameras_may_be_perspective() -> None:
     cameras = KnownCamera.from_arrays(FACE.rotations, np.ones(8), focal=FOCAL, principal_point=(640.0, 360.0))
     found = solve(pinhole(SEEN, FOCAL), cameras=cameras)
-    assert found.camera.focal == pytest.approx(FOCAL) and found.choices.depth_sign == "settled"
+    assert found.camera.focal == pytest.approx(FOCAL)
+    assert found.choices.depth_sign == "settled"
     assert e3d_frame_scaled(found.shapes, SEEN) < 0.03
 
 
@@ -199,7 +209,8 @@ def test_given_cameras_may_be_perspective() -> None:
 def test_other_priors_take_a_given_focal_length() -> None:
     found = solve(pinhole(SEEN, FOCAL), settings=Settings(prior="smooth", camera="perspective", image_size=PICTURE))
     flat = solve(pinhole(SEEN, FOCAL), settings=Settings(prior="smooth"))
-    assert found.choices.camera == "perspective" and flat.choices.camera == "scaled_orthographic"
+    assert found.choices.camera == "perspective"
+    assert flat.choices.camera == "scaled_orthographic"
     assert reprojection(pinhole(SEEN, FOCAL), found).rms < 3.0
 
 
