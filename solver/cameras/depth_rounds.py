@@ -27,8 +27,8 @@ from pliant.solver.model.so3 import exponential, logarithm
 from pliant.solver.records import Floats, read_only
 from pliant.solver.tracks.normalization import Normalised
 
-ROUNDS = 2
-"""Updates of depths, covariance and κ on all frames before cameras are refined, and afterwards."""
+ROUNDS = 3
+"""Updates of depths, covariance, cameras and κ every time that cameras were found or refined."""
 
 LEARNING = 60
 """Rounds of expectation maximisation of an update."""
@@ -92,6 +92,7 @@ def settled_again(
     found: Learned,
     scales: Floats,
     *,
+    support: Support,
     should_stop: Callable[[], bool] | None = None,
 ) -> tuple[CameraEstimate, Learned]:
     """Return the estimate with tracks corrected anew, now that cameras and covariance are refined, and both refined once more.
@@ -104,6 +105,7 @@ def settled_again(
     for _ in range(ROUNDS):
         if should_stop is not None and should_stop():
             break
+        whole = _relearned(view, whole, used, support)
         whole, view = _with_focal(view, whole, used, turning=True)
     return _applied(estimate, normalised, used, whole, view), replace(whole, scales=whole.scales / scales)
 

@@ -115,12 +115,22 @@ def learn(
             unscaled, before, scales if zoom is None else zoom, with_scales=zoom is not None,
             rounds=ROUNDS, support=support, should_stop=should_stop,
         )  # fmt: skip
+        bends = estimate.perspective is not None and estimate.perspective.bends
+
+        def again(found: Learned) -> tuple[CameraEstimate, Learned, Floats, Floats]:
+            assert normalised is not None
+            better, moved = settled_again(
+                estimate, normalised, used, found, start[used], support=support, should_stop=should_stop
+            )
+            return better, moved, *_of_corrected(better, start, used)
+
+        if bends:
+            estimate, found, unscaled, sample = again(found)
         if support == Support() and full_mode_covariance.telling(found.covariance, estimate.sample.shape[1]):
             found = _coupled(unscaled, found, with_scales=zoom is not None, should_stop=should_stop)
-        if normalised is not None and estimate.perspective is not None and estimate.perspective.bends:
-            estimate, found = settled_again(estimate, normalised, used, found, start[used], should_stop=should_stop)
-            unscaled, sample = _of_corrected(estimate, start, used)
-            before = found.rotations
+            if bends:
+                estimate, found, unscaled, sample = again(found)
+        before = np.asarray(estimate.rotations)[used] if bends else before
         rotations, scales = found.rotations, found.scales
     if found is not None and not np.isfinite(found.energy):  # stopped
         covariance, modes = found.covariance, described(found.covariance)
