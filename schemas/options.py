@@ -12,8 +12,12 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 SOLVER_FIELDS = (
     "method", "camera", "basis_size", "refine_rotations", "preset", "temporal_weight", "spatial_weight", "robust_scale",
     "temporal_order", "loss", "laplacian", "prior", "low_rank_weight", "max_reweightings", "tolerance", "precision", "seed",
+    "focal", "field_of_view", "principal_point", "image_size",
 )  # fmt: skip
 """The fields that go to the solver; the others say how to read the input or write the result."""
+
+POINT = r"^-?\d{1,7}(\.\d{1,9})?,-?\d{1,7}(\.\d{1,9})?$"
+"""Two numbers with a comma between them."""
 
 Weight = Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
 
@@ -44,9 +48,21 @@ class Options(BaseModel):
         description="pseudo_inverse: rotations' pseudo-inverse times the tracks. temporal: closed form with smoothness in time. "
         "spatio_temporal: smoothness in time and space, least squares. robust: in time and space, with a loss that resists outliers.",
     )
-    camera: Literal["scaled_orthographic", "orthographic"] = Field(
-        "scaled_orthographic",
-        description="scaled_orthographic estimates one scale per frame (real video); orthographic has none.",
+    camera: Literal["auto", "perspective", "scaled_orthographic", "orthographic"] = Field(
+        "auto",
+        description="perspective: a pinhole camera. scaled_orthographic: no perspective, one scale per frame. orthographic: no scales. "
+        "auto: perspective where the tracks are clearly more probable with it, else scaled_orthographic.",
+    )
+    focal: Annotated[float, Field(gt=0, le=1e9, allow_inf_nan=False)] | None = Field(
+        None, description="Focal length in pixels of the tracks; null: estimated where the camera is perspective."
+    )
+    field_of_view: Annotated[float, Field(gt=0, lt=180, allow_inf_nan=False)] | None = Field(
+        None,
+        description="Horizontal angle of view in degrees, instead of focal: focal = width / (2 tan(angle / 2)). Needs image_size.",
+    )
+    principal_point: Annotated[str, Field(pattern=POINT)] | None = Field(
+        None,
+        description="Principal point X,Y in pixels, e.g. 319.5,239.5; null: the centre of image_size, or of the tracks without it.",
     )
     basis_size: Annotated[int, Field(ge=1, le=100)] | None = Field(
         None,
@@ -144,7 +160,8 @@ class Options(BaseModel):
     )
     image_size: Annotated[str, Field(pattern=r"^[1-9]\d{0,5}x[1-9]\d{0,5}$")] | None = Field(
         None,
-        description="WIDTHxHEIGHT of the picture in pixels, e.g. 640x480; needed where coordinates are fractions of it.",
+        description="WIDTHxHEIGHT of the picture in pixels, e.g. 640x480; needed where coordinates are fractions of it. Its centre is the "
+        "principal point of a perspective camera.",
     )
     coordinate_order: Literal["auto", "xy", "yx"] = Field(
         "auto", description="Order of a point's two coordinates. auto: x, y, unless only y, x lies inside image_size."

@@ -7,8 +7,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from pliant.solver.cameras.camera_choice import with_camera_choice
+from pliant.solver.cameras.depth_rounds import settled
 from pliant.solver.cameras.estimation import CameraEstimate, estimate_cameras, given_cameras
-from pliant.solver.cameras.joint_refinement import LEARNED_FRAMES, learn, telling_frames
+from pliant.solver.cameras.joint_refinement import LEARNED_FRAMES, learn, learned_frames, telling_frames
+from pliant.solver.cameras.lens import given_lens
+from pliant.solver.cameras.perspective import Perspective, orthographic
 from pliant.solver.cameras.planar_ambiguity import is_flat
 from pliant.solver.energy.hyperparameters import FINEST
 from pliant.solver.energy.objective import residuals
@@ -16,6 +20,7 @@ from pliant.solver.energy.problem import Problem
 from pliant.solver.energy.robust_loss import largest_weight
 from pliant.solver.errors import InvalidInput
 from pliant.solver.evaluation.trust import assess
+from pliant.solver.model.model_order import Support
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.monitor import Monitor
 from pliant.solver.records import (
@@ -36,6 +41,7 @@ from pliant.solver.settings import Settings
 from pliant.solver.shapes.initialization import pseudo_inverse, uniform_solution
 from pliant.solver.shapes.irls import init, no_higher, step, terminate
 from pliant.solver.shapes.outlier_rejection import without_outliers
+from pliant.solver.shapes.perspective_shapes import corrected_again, seen_in_perspective
 from pliant.solver.shapes.setup import build_problem, with_bending
 from pliant.solver.shapes.sparsely_observed import SELDOM, OftenSeen, draw_the_rest, often_seen
 from pliant.solver.shapes.state import State
@@ -50,6 +56,10 @@ CAMERA_UNITS, KNOWN_UNITS = 7000, 800
 UNIT_SECONDS, FRAME_SECONDS, POINT_SECONDS = 2e-4, 1.2e-5, 8e-6
 """Seconds of one of them, beside those for each frame learned from, and of the shapes for each frame of each point: measured with
 10 to 357 frames on one core. Only their ratios count, for the share of progress that cameras get."""
+
+DEPTH_ROUNDS, DEPTH_SETTLED = 4, 1e-4
+"""Times that tracks are corrected with the depths of the shapes found, at most, and the RMS change of the corrected tracks, normalised
+units, below which they are not corrected again."""
 
 
 def solve(
@@ -93,33 +103,46 @@ def solve(
     on_step, should_stop, tell = monitor.tell, monitor, monitor.tell
     began = time.perf_counter()
     normalised = normalise(tracks)
-    estimate, covariance = _learned(normalised, cameras, settings, on_step=on_step, should_stop=should_stop)
+    lens = given_lens(tracks, normalised, settings, cameras)
+    estimate, covariance = _learned(normalised, cameras, settings, lens, on_step=on_step, should_stop=should_stop)
     tell(Step("cameras", 0.0, max_reweightings=settings.max_reweightings))
     seconds = {"cameras": time.perf_counter() - began}
 
     began = time.perf_counter()
-    start, outliers = _initialised(normalised, estimate, covariance, mesh, settings), estimate.outliers
+    flat = orthographic(normalised, estimate.perspective)
+    start, outliers = _initialised(flat, estimate, covariance, mesh, settings), estimate.outliers
     if outliers > SPOILED and _resists(start.problem):
         start = _trimmed(start, outliers, should_stop)
         cleaned = _cleaned(tracks, start)
         if cleaned is not None and not (should_stop is not None and should_stop()):
             again = time.perf_counter()
             estimate, covariance = _learned(
-                cleaned, cameras, settings, on_step=None, should_stop=should_stop, before=estimate
-            )
+                cleaned, cameras, settings, given_lens(tracks, cleaned, settings, cameras),
+                on_step=None, should_stop=should_stop, before=estimate,
+            )  # fmt: skip
             seconds["cameras"] += time.perf_counter() - again
             began += time.perf_counter() - again
-            normalised = cleaned
-            start = _initialised(normalised, estimate, covariance, mesh, settings)
+            normalised, flat = cleaned, orthographic(cleaned, estimate.perspective)
+            start = _initialised(flat, estimate, covariance, mesh, settings)
         start = _told_of_outliers(start, tracks, outliers)
     part, problem, choices, state = start.part, start.problem, start.choices, start.state
     tell(_told("initialise", state, settings, normalised.unit))
     seconds["initialise"] = time.perf_counter() - began
 
     began = time.perf_counter()
-    history, outcome = _loop(problem, state, settings, normalised.unit, tell, should_stop)
+    kept = None if part is None else part.kept
+    history, outcome = _loop(problem, [state], settings, normalised.unit, tell, should_stop)
+    for _ in range(DEPTH_ROUNDS if estimate.perspective is not None and estimate.perspective.bends else 0):
+        if outcome is Outcome.STOPPED:
+            break
+        problem, flat, changed = corrected_again(problem, history[-1], normalised, flat, estimate, kept)
+        corrected = init(problem, history[-1].shapes, history[-1].translations)
+        history.append(replace(corrected, reweighting=history[-1].reweighting))
+        history, outcome = _loop(problem, history, settings, normalised.unit, tell, should_stop)
+        if changed < DEPTH_SETTLED:
+            break
     if part is not None and covariance is not None:
-        whole, _ = build_problem(normalised, estimate, mesh, settings, covariance)
+        whole, _ = build_problem(flat, estimate, mesh, settings, covariance)
         problem, choices, history[-1] = _with_the_rest(part, whole, covariance, problem, choices, history[-1], outliers)
     seconds["shapes"] = time.perf_counter() - began
 
@@ -130,9 +153,14 @@ def solve(
             problem, points=np.ascontiguousarray(normalised.points.transpose(0, 2, 1), dtype=problem.points.dtype)
         )
     outcome = Outcome.STOPPED if monitor.stopped else outcome
+    choices = with_camera_choice(
+        choices, estimate.perspective, settings, unit=normalised.unit, given=cameras is not None
+    )
     solution = finish(
         problem, history, outcome, normalised=normalised, estimate=estimate, choices=choices, seconds=seconds
     )
+    if estimate.perspective is not None:
+        solution = seen_in_perspective(solution, tracks, estimate.perspective, normalised.unit, kept)
     solution = assessed(solution, problem, estimate, covariance, normalised.unit, seed=settings.seed)
     seconds["finish"] = time.perf_counter() - began
     tell(_told("finish", history[-1], settings, normalised.unit, fraction=1.0))
@@ -155,6 +183,7 @@ def _learned(
     normalised: Normalised,
     cameras: KnownCamera | None,
     settings: Settings,
+    lens: Perspective | None,
     *,
     on_step: Callable[[Step], None] | None,
     should_stop: Callable[[], bool] | None,
@@ -168,16 +197,24 @@ def _learned(
         estimate = estimate_cameras(normalised, settings, on_step=on_step, should_stop=should_stop, rank=rank)
     if before is not None:
         estimate = replace(estimate, outliers=max(estimate.outliers, before.outliers))
+    estimate = replace(estimate, perspective=lens)
+    shown = telling_frames(normalised.visible)
     if not settings.gaussian:
+        if lens is not None:
+            estimate = settled(
+                estimate, normalised, learned_frames(shown), support=Support(), turning=cameras is None and settings.refine_rotations,
+                should_stop=should_stop,
+            )  # fmt: skip
         return estimate, None
     # The sides of a thin sheet hang on little; what completion puts in the place of outliers is enough to turn them over.
     spoiled_sheet = estimate.outliers > SPOILED and is_flat(estimate.gram)
     return learn(
         estimate,
-        telling_frames(normalised.visible),
+        shown,
         turning=cameras is None and settings.refine_rotations and not spoiled_sheet,
-        zooming=settings.camera == "scaled_orthographic",
+        zooming=settings.zooming,
         seed=settings.seed,
+        normalised=normalised,
         should_stop=should_stop,
     )
 
@@ -266,14 +303,13 @@ def _with_the_rest(
 
 def _loop(
     problem: Problem,
-    state: State,
+    history: list[State],
     settings: Settings,
     unit: float,
     tell: Callable[[Step], None],
     should_stop: Callable[[], bool] | None,
 ) -> tuple[list[State], Outcome]:
     """Step until `terminate` says how it ended. Only the newest state keeps its arrays."""
-    history = [state]
     if settings.method == "pseudo_inverse":
         return history, Outcome.CONVERGED
     while True:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -191,16 +191,57 @@ class Mesh:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Camera:
-    """The estimated camera of every frame: points = scales · shapes · rotations[:, :2]ᵀ + translations."""
+    """The estimated camera of every frame; `project` states how it maps shapes to the image."""
 
     rotations: Floats
-    """Camera from world, shape `(F, 3, 3)`; orthographic: the first two rows project."""
+    """Camera from world, shape `(F, 3, 3)`; the third axis points away from the camera, or to it if `y_up`."""
 
     scales: Floats
-    """Image units per world unit, shape `(F,)`; mean of the logarithm is 0; all 1 for plain orthography."""
+    """Image units per world unit at the shape's origin, shape `(F,)`; mean of the logarithm 0 unless given or perspective; all 1 for
+    plain orthography. With a focal length φ the origin's depth is φ/s_f."""
 
     translations: Floats
     """Image position of each frame's shape origin, shape `(F, 2)`, the tracks' unit."""
+
+    focal: float | None = None
+    """φ, focal length, the tracks' unit; None: orthographic."""
+
+    focal_std: float | None = None
+    """Standard deviation of an estimated φ; 0 for a given one, None for orthographic cameras."""
+
+    principal_point: Floats = field(default_factory=lambda: np.zeros(2))
+    """c, shape `(2,)`, the tracks' unit; without effect for orthographic cameras."""
+
+    y_up: bool = False
+    """Whether y of the tracks grows upwards, so that depth is minus the third coordinate."""
+
+    def depths(self, shapes: Floats) -> Floats:
+        """Return z = ± s_f R_f[2] x, the depth beyond each frame's origin in image units, shape `(F, P)`."""
+        sign = -1.0 if self.y_up else 1.0
+        return np.asarray(sign * self.scales[:, None] * np.einsum("fpi,fi->fp", shapes, self.rotations[:, 2]))
+
+    def project(self, shapes: Floats) -> Floats:
+        """Return the image of shapes `(F, P, 3)`: c + (s_f R_f[:2] x + t_f − c) / (1 + z/φ), shape `(F, P, 2)`, the tracks' unit."""
+        flat = self.scales[:, None, None] * (shapes @ self.rotations[:, :2].transpose(0, 2, 1))
+        image = flat + self.translations[:, None]
+        if self.focal is None:
+            return np.asarray(image)
+        nearer = 1 + self.depths(shapes) / self.focal
+        return np.asarray(self.principal_point + (image - self.principal_point) / nearer[..., None])
+
+    def at(self, frames: slice) -> Camera:
+        """Return the cameras of some frames."""
+        return replace(
+            self, rotations=self.rotations[frames], scales=self.scales[frames], translations=self.translations[frames]
+        )
+
+    @property
+    def positions(self) -> Floats | None:
+        """T_f with camera coordinates R_f x + T_f, shape `(F, 3)`, world units; None for orthographic cameras."""
+        if self.focal is None:
+            return None
+        away = (-1.0 if self.y_up else 1.0) * self.focal / self.scales
+        return np.column_stack([(self.translations - self.principal_point) / self.scales[:, None], away])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -211,17 +252,39 @@ class KnownCamera:
     """Shape `(F, 3, 3)`, camera from world."""
 
     scales: Floats | None = None
-    """Shape `(F,)`, or None: estimated when the camera model has scales."""
+    """Shape `(F,)`, or None: estimated when the camera model has scales. For a perspective camera φ over the depth of the shape's
+    origin."""
+
+    focal: float | None = None
+    """φ, the tracks' unit; None: as the settings say."""
+
+    principal_point: tuple[float, float] | None = None
+    """(x, y), the tracks' unit; None: as the settings say."""
 
     @classmethod
-    def from_arrays(cls, rotations: ArrayLike, scales: ArrayLike | None = None) -> KnownCamera:
+    def from_arrays(
+        cls,
+        rotations: ArrayLike,
+        scales: ArrayLike | None = None,
+        *,
+        focal: float | None = None,
+        principal_point: tuple[float, float] | None = None,
+    ) -> KnownCamera:
         """Check cameras as users have them: `(F, 3, 3)`, or `(F, 2, 3)`, completed by the cross product.
 
         Raises
         ------
         InvalidInput
-            Wrong shape, not finite, rows not orthonormal to 1e-3, or a scale that is not positive.
+            Wrong shape, not finite, rows not orthonormal to 1e-3, or a scale or focal length that is not positive.
         """
+        if focal is not None and not (np.isfinite(focal) and focal > 0):
+            raise _wrong(
+                "cameras.focal", "out_of_range", "a positive, finite length", str(focal), "Give it in the tracks' unit."
+            )
+        if principal_point is not None and not np.isfinite(principal_point).all():
+            raise _wrong(
+                "cameras.principal_point", "not_finite", "two finite numbers", str(principal_point), "Give x and y."
+            )
         given = np.asarray(rotations, dtype=np.float64)
         if given.ndim != 3 or given.shape[1:] not in ((2, 3), (3, 3)):
             raise _wrong(
@@ -243,14 +306,14 @@ class KnownCamera:
         complete = np.concatenate([rows, np.cross(rows[:, 0], rows[:, 1])[:, None]], axis=1)
         read_only(complete)
         if scales is None:
-            return cls(complete)
+            return cls(complete, None, focal, principal_point)
         factors = np.array(scales, dtype=np.float64)
         if factors.shape != (len(given),) or not np.isfinite(factors).all() or not (factors > 0).all():
             raise _wrong(
                 "scales", "wrong_shape", f"{len(given)} positive numbers", _shape(factors), "Give one scale a frame."
             )
         read_only(factors)
-        return cls(complete, factors)
+        return cls(complete, factors, focal, principal_point)
 
 
 class Outcome(StrEnum):
@@ -304,13 +367,27 @@ class Trace:
     """Per-reweighting history, arrays of equal length; entry 0 is the initialisation."""
 
     objective: Floats
-    """E, normalised units; never rises."""
+    """E, normalised units; never rises, but where tracks are corrected anew for perspective."""
 
     residual: Floats
     """Median visible reprojection residual, the tracks' unit."""
 
     iterations: Ints
     """Inner conjugate-gradient iterations spent."""
+
+
+@dataclass(frozen=True, slots=True)
+class FocalCandidate:
+    """One focal length that was compared."""
+
+    focal: float | None
+    """Focal length, the tracks' unit; None: orthography."""
+
+    mirrored: bool
+    """Whether depths had the sign that was not chosen."""
+
+    nll: float
+    """Negative log likelihood of the tracks per point and frame."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -328,6 +405,12 @@ class Choices:
     """RMS radius of the centred tracks, the tracks' unit: one normalised unit."""
     noise: float
     """Estimated standard deviation of the track noise, the tracks' unit."""
+    camera: str = "scaled_orthographic"
+    """Camera model used: `perspective`, `scaled_orthographic` or `orthographic`."""
+    depth_sign: Literal["settled", "ambiguous"] = "ambiguous"
+    """Whether the sign of depth is known: from given cameras, or by evidence under perspective. Orthography leaves it open."""
+    focal_candidates: tuple[FocalCandidate, ...] = ()
+    """Focal lengths that were compared; empty where perspective was not considered."""
     reasons: dict[str, str] = field(default_factory=dict)
     """One sentence for each automatic choice, by name."""
     warnings: tuple[str, ...] = ()

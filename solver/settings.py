@@ -12,13 +12,14 @@ alike, and neither H nor λ3 has a part in it.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
 from pliant.solver.errors import InvalidSettings
 
 Method = Literal["pseudo_inverse", "temporal", "spatio_temporal", "robust"]
-CameraModel = Literal["scaled_orthographic", "orthographic"]
+CameraModel = Literal["auto", "perspective", "scaled_orthographic", "orthographic"]
 Preset = Literal["auto", "paper"]
 Loss = Literal["l1", "l2", "huber"]
 Prior = Literal["gaussian", "smooth+low_rank", "smooth"]
@@ -32,8 +33,25 @@ class Settings:
     method: Method = "robust"
     """`pseudo_inverse` R†W; `temporal` closed form (eq. 5); `spatio_temporal` eq. 7 with L2; `robust` eq. 7 with `loss`."""
 
-    camera: CameraModel = "scaled_orthographic"
-    """Scaled orthography estimates s_f per frame (gauge: mean of log s_f = 0); orthography has s_f = 1."""
+    camera: CameraModel = "auto"
+    """`perspective`: a pinhole camera, u = c + (s_f R_f x + t_f) / (1 + z/φ); `scaled_orthographic`: φ = ∞, s_f per frame (gauge: mean of
+    log s_f = 0); `orthographic`: also s_f = 1; `auto`: `perspective` where the tracks are clearly more probable with it, else
+    `scaled_orthographic` (always without the Gaussian prior, unless a focal length is given)."""
+
+    focal: float | None = None
+    """φ, focal length in the tracks' unit (pixels); None estimates it. Unused with the orthographic models."""
+
+    field_of_view: float | None = None
+    """Horizontal angle of view in degrees, instead of `focal`: φ = width / (2 tan(angle/2)). Needs `image_size`."""
+
+    principal_point: tuple[float, float] | None = None
+    """c as (x, y) in the tracks' unit; None: the centre of the picture, or of the tracks where `image_size` is not given."""
+
+    image_size: tuple[float, float] | None = None
+    """(width, height) of the picture in the tracks' unit."""
+
+    y_up: bool = False
+    """True: y of the tracks grows upwards. The third axis of the camera then points to the viewer instead of away."""
 
     basis_size: int | None = None
     """K of the rank-3K factorization; None chooses it from the data and reports why."""
@@ -90,7 +108,20 @@ class Settings:
         """True if the shapes get the Gaussian prior."""
         return self.prior == "gaussian" and self.method == "robust" and self.preset == "auto"
 
+    @property
+    def zooming(self) -> bool:
+        """True if every frame may have its own scale."""
+        return self.camera != "orthographic"
+
+    @property
+    def focal_length(self) -> float | None:
+        """φ as given by `focal` or `field_of_view`, the tracks' unit; None: to be estimated."""
+        if self.field_of_view is None or self.image_size is None:
+            return self.focal
+        return self.image_size[0] / (2 * math.tan(math.radians(self.field_of_view) / 2))
+
     def __post_init__(self) -> None:
+        check_pinhole(self)
         _check_choice("method", self.method, Method)
         _check_choice("camera", self.camera, CameraModel)
         _check_choice("preset", self.preset, Preset)
@@ -114,6 +145,57 @@ class Settings:
             raise _out_of_range("tolerance", "a number between 0 and 1", self.tolerance)
         if not 0 <= self.seed < 2**32:
             raise _out_of_range("seed", "a whole number from 0 to 4294967295", self.seed)
+
+
+FARTHEST = 10.0
+"""Pictures that the principal point may lie beyond the border: what a crop leaves may be a tenth of the picture."""
+
+
+def check_pinhole(settings: Settings) -> None:
+    """Check what is given about a pinhole camera.
+
+    Raises
+    ------
+    InvalidSettings
+        A focal length or size that is not positive and finite, both `focal` and `field_of_view`, an angle without `image_size` or outside
+        0 to 180 degrees, or a principal point that is not finite or outside any picture.
+    """
+    focal, angle, centre, size = settings.focal, settings.field_of_view, settings.principal_point, settings.image_size
+    if focal is not None and not (math.isfinite(focal) and focal > 0):
+        raise _out_of_range("focal", "a positive, finite length in pixels, or None", focal)
+    if angle is not None and not 0 < angle < 180:
+        raise _out_of_range("field_of_view", "an angle between 0 and 180 degrees, or None", angle)
+    if size is not None and not (len(size) == 2 and all(math.isfinite(each) and each > 0 for each in size)):
+        raise _out_of_range("image_size", "two positive numbers, width and height, or None", size)
+    if focal is not None and angle is not None:
+        raise _contradiction(
+            "field_of_view", "either focal or field_of_view", f"both: {focal} and {angle}", "Leave one out."
+        )
+    if angle is not None and size is None:
+        raise _contradiction(
+            "field_of_view", "image_size beside field_of_view", "no image_size", "Give the picture's width and height."
+        )
+    if (focal is not None or angle is not None) and settings.camera in ("orthographic", "scaled_orthographic"):
+        given = "focal" if focal is not None else "field_of_view"
+        raise _contradiction(
+            given, f"no focal length with camera {settings.camera}", f"{given} = {focal or angle}",
+            "Choose camera perspective or auto, or leave the focal length out.",
+        )  # fmt: skip
+    if centre is None:
+        return
+    if not (len(centre) == 2 and all(math.isfinite(each) for each in centre)):
+        raise _out_of_range("principal_point", "two finite numbers x, y in pixels, or None", centre)
+    if size is not None and any(
+        not -FARTHEST * side <= each <= (1 + FARTHEST) * side for each, side in zip(centre, size, strict=True)
+    ):
+        raise _contradiction(
+            "principal_point", f"a point within {FARTHEST:.0f} pictures of size {size[0]:g}x{size[1]:g}", f"{centre}",
+            "Give x, y in pixels from the picture's upper left corner.",
+        )  # fmt: skip
+
+
+def _contradiction(name: str, expected: str, got: str, hint: str) -> InvalidSettings:
+    return InvalidSettings("invalid_option", field=f"options.{name}", expected=expected, got=got, hint=hint)
 
 
 def _check_choice(name: str, value: str, choices: object) -> None:

@@ -8,12 +8,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from pliant.solver.cameras.factorization import Upgrade, upgrade
 from pliant.solver.cameras.multistart import CANDIDATES, Candidate, carried, depth, frames_used, gram_of, held, race
+from pliant.solver.cameras.perspective import Perspective
 from pliant.solver.cameras.planar_ambiguity import is_flat, on_its_sides
 from pliant.solver.cameras.scale import rigid_evidence, rigid_scales
 from pliant.solver.model.so3 import angles_between, start_at_identity
 from pliant.solver.records import Floats, KnownCamera, Step, read_only
 from pliant.solver.settings import Settings
-from pliant.solver.tracks.completion import Completed, complete
+from pliant.solver.tracks.completion import Completed, Filling, complete
 from pliant.solver.tracks.normalization import Normalised
 
 SHARE = 0.03
@@ -61,6 +62,13 @@ class CameraEstimate:
 
     rank: int = 0
     """Columns of the basis that filled the holes; 0 when nothing was filled."""
+
+    filling: Filling | None = None
+    """How hidden entries and outliers were replaced; None: nothing was."""
+
+    perspective: Perspective | None = None
+    """What is known about perspective; None: it is not considered. With κ ≠ 0, `gram`, `sample` and `translations` are those of the
+    corrected tracks."""
 
     reasons: dict[str, str] = field(default_factory=dict)
     """One sentence for each choice."""
@@ -129,7 +137,7 @@ def estimate_cameras(
     reasons = {"basis_size": _why(ran, best, settings), "scales": scale_reason, "rotations": refined}
     return CameraEstimate(
         rotations, scales, completed.translations, best.basis_size, completed.gram, completed.sample,
-        rivals, completed.outliers, completed.rank, reasons, _warnings(rotations),
+        rivals, completed.outliers, completed.rank, completed.filling, None, reasons, _warnings(rotations),
     )  # fmt: skip
 
 
@@ -192,7 +200,7 @@ def given_cameras(normalised: Normalised, known: KnownCamera, settings: Settings
         completed = complete(normalised, seed=settings.seed, rank=rank)
     if known.scales is not None:
         scales, reason = np.array(known.scales), "Rotations and scales were given."
-    elif settings.camera == "scaled_orthographic":
+    elif settings.zooming:
         scales = rigid_scales(completed.gram, known.rotations)
         reason = "Rotations were given; scales were estimated."
     else:
@@ -206,6 +214,7 @@ def given_cameras(normalised: Normalised, known: KnownCamera, settings: Settings
         completed.sample,
         outliers=completed.outliers,
         rank=completed.rank,
+        filling=completed.filling,
         reasons={"camera": reason},
     )
 

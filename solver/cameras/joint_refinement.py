@@ -8,26 +8,27 @@ without its penalty on rough modes: the random walk is penalty enough), and both
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from pliant.solver.cameras.depth_rounds import settled, settled_again, with_depth_map
 from pliant.solver.cameras.estimation import CameraEstimate, restarted
+from pliant.solver.cameras.learned import Learned, motion_of, moved_to, scene_at
 from pliant.solver.cameras.scale import WIDEST, rigid_scales
 from pliant.solver.model import full_mode_covariance
 from pliant.solver.model.early_stopping import described, learned_in_time
-from pliant.solver.model.marginal_likelihood import Motion, Scene, cameras_of, covariances_of, fit, root_of
+from pliant.solver.model.marginal_likelihood import fit
 from pliant.solver.model.model_order import Support, supported
 from pliant.solver.model.shape_covariance import (
-    FLATTEST,
     MOST_MODES,
-    NOISE_FLOOR,
     ShapeCovariance,
     learned,
 )
 from pliant.solver.model.so3 import angles_between, exponential
 from pliant.solver.records import Floats, read_only
 from pliant.solver.tracks.noise import SPOILED
+from pliant.solver.tracks.normalization import Normalised
 from scipy.spatial.transform import Rotation
 
 LEARNED_FRAMES = 360
@@ -37,14 +38,8 @@ ROUNDS = 5
 """Refinements of rotations and covariance, each with a fresh memory of the curvature. Expectation maximisation between them would undo
 a part, for it keeps modes and random walk apart, which L-BFGS does not."""
 
-STEADY = 0.01
-"""Weight of the camera's unsteadiness: less is needed once the covariance is known."""
-
 TURNS = 60
 """L-BFGS iterations of one refinement of the rotations."""
-
-LEAST_NOISE = 1e-12
-"""What is left of σ² where it lies at its floor, which the likelihood adds again."""
 
 START_FRAMES, START_ROUNDS = 40, 2
 """Frames and refinements on which it is decided from which cameras to start."""
@@ -70,22 +65,6 @@ ZOOM_LEAST = 0.01
 """And where the standard deviation of their logarithm is above this: less is not worth a parameter per frame."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Learned:
-    """Cameras and covariance that belong together."""
-
-    rotations: Floats
-    """Shape `(F, 3, 3)`."""
-
-    scales: Floats
-    """Shape `(F,)`, mean of the logarithm 0."""
-
-    covariance: ShapeCovariance
-
-    energy: float
-    """Of `model.marginal_likelihood`, without a penalty on modes; infinite before the first refinement."""
-
-
 def learn(
     estimate: CameraEstimate,
     shown: NDArray[np.bool_],
@@ -93,6 +72,7 @@ def learn(
     turning: bool,
     zooming: bool = False,
     seed: int = 0,
+    normalised: Normalised | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> tuple[CameraEstimate, ShapeCovariance]:
     """Return the cameras, refined if `turning`, and the shape covariance of all frames.
@@ -109,14 +89,15 @@ def learn(
         True: scales that are all 1 are refined with the rotations, if that makes the tracks more probable than chance does.
     seed : int
         Deals the points out where some are held back to judge what was learned from the others.
+    normalised : Normalised, optional
+        The tracks themselves, needed where `estimate.perspective` says that perspective is possible.
     should_stop : callable, optional
         Asked between refinements; once it says True, the best so far is returned.
     """
     frames, spoiled = len(estimate.rotations), estimate.outliers > SPOILED
-    used = _some(np.flatnonzero(shown), LEARNED_FRAMES)
+    used = learned_frames(shown)
     start = np.asarray(estimate.scales)
-    unscaled = _of_frames(estimate.gram / np.outer(np.repeat(start, 2), np.repeat(start, 2)), used)
-    sample = (estimate.sample / start[:, None, None])[used]
+    unscaled, sample = _of_corrected(estimate, start, used)
     support = supported(
         sample,
         np.asarray(estimate.rotations)[used, :2],
@@ -129,7 +110,11 @@ def learn(
         support = replace(support, most=MOST_MODES)
     if turning and estimate.rivals:
         estimate = _started(estimate, unscaled, used, support, should_stop)
-    before = np.asarray(estimate.rotations)[used]
+    if estimate.perspective is not None and normalised is not None:
+        estimate = settled(estimate, normalised, used, support=support, turning=turning, should_stop=should_stop)
+        unscaled, sample = _of_corrected(estimate, start, used)
+    at_first = np.asarray(estimate.rotations)
+    before = at_first[used]
     zoom, why = None, None
     if turning and zooming and (start == 1).all():
         zoom, why = _zoom(unscaled, before, support, should_stop)
@@ -139,8 +124,22 @@ def learn(
             unscaled, before, scales if zoom is None else zoom, with_scales=zoom is not None,
             rounds=ROUNDS, support=support, should_stop=should_stop,
         )  # fmt: skip
+        bends = estimate.perspective is not None and estimate.perspective.bends
+
+        def again(found: Learned) -> tuple[CameraEstimate, Learned, Floats, Floats]:
+            assert normalised is not None
+            better, moved = settled_again(
+                estimate, normalised, used, found, start[used], support=support, should_stop=should_stop
+            )
+            return better, moved, *_of_corrected(better, start, used)
+
+        if bends:
+            estimate, found, unscaled, sample = again(found)
         if support == Support() and full_mode_covariance.telling(found.covariance, estimate.sample.shape[1]):
             found = _coupled(unscaled, found, with_scales=zoom is not None, should_stop=should_stop)
+            if bends:
+                estimate, found, unscaled, sample = again(found)
+        before = np.asarray(estimate.rotations)[used] if bends else before
         rotations, scales = found.rotations, found.scales
     if found is not None and not np.isfinite(found.energy):  # stopped
         covariance, modes = found.covariance, described(found.covariance)
@@ -154,7 +153,7 @@ def learn(
         covariance = covariance.stretched(used, frames)
     estimate = replace(estimate, reasons={**estimate.reasons, "modes": modes})
     if not turning:
-        return estimate, covariance
+        return with_depth_map(estimate, covariance), covariance
     turns = Rotation.from_matrix(rotations @ before.transpose(0, 2, 1)).as_rotvec()
     whole = exponential(_between(used, turns, frames)) @ estimate.rotations
     if why is not None:
@@ -164,7 +163,14 @@ def learn(
         scales = np.exp(logs - logs.mean())
         read_only(scales)
         estimate = replace(estimate, scales=scales)
-    return _told(estimate, whole), _seen_from(covariance, whole[0])
+    estimate = with_depth_map(replace(estimate, rotations=whole), covariance)
+    return _told(estimate, whole, at_first), _seen_from(covariance, whole[0])
+
+
+def _of_corrected(estimate: CameraEstimate, scales: Floats, used: NDArray[np.intp]) -> tuple[Floats, Floats]:
+    """Return Gram matrix and sample of the frames used, scales undone."""
+    unscaled = _of_frames(estimate.gram / np.outer(np.repeat(scales, 2), np.repeat(scales, 2)), used)
+    return unscaled, (estimate.sample / scales[:, None, None])[used]
 
 
 def refined(
@@ -270,6 +276,11 @@ def _of_frames(gram: Floats, used: NDArray[np.intp]) -> Floats:
     return gram[np.ix_(rows, rows)]
 
 
+def learned_frames(shown: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Return the frames to learn from: at most `LEARNED_FRAMES` of those that show enough."""
+    return _some(np.flatnonzero(shown), LEARNED_FRAMES)
+
+
 def telling_frames(visible: Floats) -> NDArray[np.bool_]:
     """Return which frames show at least a tenth of what the others show, shape `(F,)`; all if hardly any does."""
     seen = (visible > 0).sum(axis=1)
@@ -279,21 +290,9 @@ def telling_frames(visible: Floats) -> NDArray[np.bool_]:
 
 def _turn(gram: Floats, found: Learned, *, with_scales: bool, should_stop: Callable[[], bool] | None) -> Learned:
     """Return cameras and covariance of higher likelihood."""
-    frames, covariance = len(found.rotations), found.covariance
-    scene = _scene(gram, found.rotations, with_scales=with_scales)
-    started = Motion(
-        np.zeros((frames, 3)), np.log(found.scales), covariance.modes,
-        root_of(covariance.extent), root_of(covariance.play),
-        0.5 * np.log([max(covariance.noise - scene.noise_floor**2, LEAST_NOISE), covariance.drift]),
-    )  # fmt: skip
-    moved, energy = fit(scene, started, iterations=TURNS, turning=True, should_stop=should_stop)
-    extent, play, noise, drift = covariances_of(scene, moved)
-    play = play + FLATTEST * np.trace(play) / 3 * np.eye(3)
-    size = np.trace(play) / 3
-    better = replace(
-        covariance, extent=extent, play=play / size, modes=moved.modes * np.sqrt(size), drift=drift * size, noise=noise
-    )
-    return Learned(*cameras_of(scene, moved), better, energy)
+    scene = scene_at(gram, found.rotations, with_scales=with_scales)
+    moved = fit(scene, motion_of(scene, found), iterations=TURNS, turning=True, should_stop=should_stop)
+    return moved_to(scene, found, *moved)
 
 
 def _coupled(gram: Floats, found: Learned, *, with_scales: bool, should_stop: Callable[[], bool] | None) -> Learned:
@@ -301,19 +300,12 @@ def _coupled(gram: Floats, found: Learned, *, with_scales: bool, should_stop: Ca
 
     Measured: without the comparison, 150 frames of an animated head seen in one sweep go from .0007 to .017.
     """
-    scene = _scene(gram, found.rotations, with_scales=with_scales)
+    scene = scene_at(gram, found.rotations, with_scales=with_scales)
     rotations, scales = full_mode_covariance.refined(scene, found.scales, found.covariance, should_stop=should_stop)
     again = refined(
         gram, rotations, scales, with_scales=with_scales, rounds=START_ROUNDS, support=Support(), should_stop=should_stop
     )  # fmt: skip
     return again if again.energy < found.energy else found
-
-
-def _scene(gram: Floats, rotations: Floats, *, with_scales: bool) -> Scene:
-    return Scene(
-        gram, rotations, with_scales=with_scales, steadiness=STEADY,
-        noise_floor=NOISE_FLOOR**0.5, smoothness=0.0,
-    )  # fmt: skip
 
 
 def _between(used: NDArray[np.intp], turns: Floats, frames: int) -> Floats:
@@ -326,10 +318,10 @@ def _seen_from(covariance: ShapeCovariance, first: Floats) -> ShapeCovariance:
     return replace(covariance, extent=first @ covariance.extent @ first.T, play=first @ covariance.play @ first.T)
 
 
-def _told(estimate: CameraEstimate, rotations: Floats) -> CameraEstimate:
+def _told(estimate: CameraEstimate, rotations: Floats, before: Floats) -> CameraEstimate:
     """Return the estimate with new rotations, the first of them the identity, and a sentence about it."""
     rotations = rotations @ rotations[0].T
-    turn = float(np.degrees(angles_between(rotations, np.asarray(estimate.rotations)).mean()))
+    turn = float(np.degrees(angles_between(rotations, before).mean()))
     sentence = f"Then refined together with the covariance of the shapes; rotations moved by {turn:.2f}° on average."
     known = estimate.reasons.get("rotations", "")
     read_only(rotations)

@@ -1,4 +1,4 @@
-"""Bring a reconstruction into the axes of the truth, in the three ways that the literature's error metrics ask for.
+"""Bring a reconstruction into the axes of the truth, in the ways that the literature's error metrics ask for.
 
 Each is an orthogonal Procrustes problem (Schönemann 1966): with both shapes centred, `Q = U Vᵀ` from the singular value
 decomposition of the 3×3 matrix `Gᵀ S` minimises `‖S Qᵀ − G‖_F` over O(3); for a rotation the smallest singular
@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from pliant.solver.errors import InvalidInput
 from pliant.solver.records import Floats
 
-Kind = Literal["sequence", "frame", "frame_similarity"]
+Kind = Literal["sequence", "frame", "frame_scaled", "frame_similarity"]
 
 MIRROR = np.diag([1.0, 1.0, -1.0])
 """The one mirror that orthographic views leave open: depth changes sign (the bas-relief flip)."""
@@ -35,7 +35,7 @@ class Aligned:
     """Orthogonal matrices that were applied, shape `(F, 3, 3)`; the same in every frame for `sequence`."""
 
     scales: Floats
-    """Shape `(F,)`; 1 unless the alignment is `frame_similarity`."""
+    """Shape `(F,)`; 1 unless the alignment is `frame_scaled` or `frame_similarity`."""
 
     @property
     def distances(self) -> Floats:
@@ -55,9 +55,10 @@ def align(shapes: ArrayLike, truth: ArrayLike, *, kind: Kind = "frame") -> Align
     ----------
     shapes, truth : array_like, shape (F, P, 3)
         Reconstruction and ground truth, any unit (the same one, unless `kind` is `frame_similarity`).
-    kind : {'sequence', 'frame', 'frame_similarity'}
+    kind : {'sequence', 'frame', 'frame_scaled', 'frame_similarity'}
         `sequence`: one matrix of O(3) for the whole sequence, minimising `Σ_f ‖S_f Qᵀ − G_f‖²`.
         `frame`: a rotation for every frame, and one mirror for the sequence (the better of the two).
+        `frame_scaled`: as `frame`, and one scale for the sequence, minimising `Σ_f ‖k S_f Q_fᵀ − G_f‖²`.
         `frame_similarity`: rotation, mirror and scale free in every frame.
 
     Raises
@@ -70,8 +71,10 @@ def align(shapes: ArrayLike, truth: ArrayLike, *, kind: Kind = "frame") -> Align
         one = procrustes(np.einsum("fpi,fpj->ij", fixed, moved))
         transforms = np.broadcast_to(one, (len(moved), 3, 3)).copy()
         return Aligned(moved @ transforms.transpose(0, 2, 1), fixed, transforms, np.ones(len(moved)))
-    if kind == "frame":
+    if kind in ("frame", "frame_scaled"):
         plain, mirrored = (_rotate_frames(moved, fixed, mirror=mirror) for mirror in (np.eye(3), MIRROR))
+        if kind == "frame_scaled":
+            plain, mirrored = _scaled(plain), _scaled(mirrored)
         return plain if plain.relative.mean() <= mirrored.relative.mean() else mirrored
     products = fixed.transpose(0, 2, 1) @ moved
     transforms = procrustes(products)
@@ -113,6 +116,15 @@ def _rotate_frames(moved: Floats, fixed: Floats, *, mirror: Floats) -> Aligned:
     products = fixed.transpose(0, 2, 1) @ moved @ mirror
     transforms = procrustes(products, proper=True) @ mirror
     return Aligned(moved @ transforms.transpose(0, 2, 1), fixed, transforms, np.ones(len(moved)))
+
+
+def _scaled(aligned: Aligned) -> Aligned:
+    """Return the same with the one scale that fits the sequence best in the least-squares sense."""
+    energy = float(np.vdot(aligned.shapes, aligned.shapes))
+    scale = float(np.vdot(aligned.shapes, aligned.truth)) / energy if energy > 0 else 0.0
+    return Aligned(
+        scale * aligned.shapes, aligned.truth, aligned.transforms, np.full(len(aligned.shapes), scale)
+    )  # fmt: skip
 
 
 def _centred_pair(shapes: ArrayLike, truth: ArrayLike) -> tuple[Floats, Floats]:

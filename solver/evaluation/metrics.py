@@ -7,12 +7,15 @@ With S the reconstruction and G the ground truth, both centred in every frame:
 `e3d_frame`                a rotation per frame and one mirror for the sequence; the same mean
 `e3d_frame_similarity`     rotation, mirror and scale free in every frame; the same mean. Kumar et al. (2018, 2019) and
                            later dense papers print numbers that reproduce with this one
+`e3d_frame_scaled`         a rotation per frame, one mirror and one scale k for the sequence, k least squares:
+                           mean over frames of ‖k S_f Q_fᵀ − G_f‖_F / ‖G_f‖_F with k = Σ_f ⟨S_f Q_fᵀ, G_f⟩ / Σ_f ‖S_f‖²
 `e3d_mocap`                Akhter et al. (2011), Gotardo and Martinez (2011): one Q in O(3);
                            `1/(σ F P) Σ_fp ‖Q s_fp − g_fp‖` with `σ = 1/(3F) Σ_f (σ_fx + σ_fy + σ_fz)`, the population
                            standard deviations of the true coordinates
-`reprojection_median`,     of `‖w_fp − c_f R_f s_fp − t_f‖` over the visible entries (the RMS weighted with confidence),
-`reprojection_rms`         in the tracks' unit
+`reprojection_median`,     of `‖w_fp − project(s_fp)‖` over the visible entries (the RMS weighted with confidence), in the
+`reprojection_rms`         tracks' unit; `Camera.project` includes perspective
 `rotation_degrees`         mean angle between estimated and true rotations after one alignment of the world axes
+`focal_error`              |φ − φ*| / φ* of the estimated φ and the true φ*; infinite where φ is infinite (orthography)
 =========================  =============================================================================================
 
 A low `e3d_frame_similarity` beside a high `e3d_sequence` means frames that flip or drift: look at both.
@@ -26,7 +29,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pliant.solver.errors import InvalidInput
 from pliant.solver.evaluation.alignment import MIRROR, Aligned, Kind, align, procrustes
-from pliant.solver.records import Floats, Solution, Tracks
+from pliant.solver.records import Camera, Floats, Solution, Tracks
 
 
 class Reprojection(NamedTuple):
@@ -54,6 +57,27 @@ def e3d_frame_similarity(shapes: ArrayLike, truth: ArrayLike) -> float:
     return float(align(shapes, truth, kind="frame_similarity").relative.mean())
 
 
+def e3d_frame_scaled(shapes: ArrayLike, truth: ArrayLike) -> float:
+    """Relative error after a rotation per frame, one mirror and one scale for the sequence, see the table above."""
+    return float(align(shapes, truth, kind="frame_scaled").relative.mean())
+
+
+def focal_error(camera: Camera, truth: float) -> float:
+    """Relative error of the focal length, see the table above.
+
+    Raises
+    ------
+    InvalidInput
+        The true focal length is not positive and finite.
+    """
+    if not (np.isfinite(truth) and truth > 0):
+        raise InvalidInput(
+            "out_of_range", field="ground_truth.focal", expected="a positive, finite length", got=str(truth),
+            hint="Give the focal length in the tracks' unit.",
+        )  # fmt: skip
+    return np.inf if camera.focal is None else abs(camera.focal - truth) / truth
+
+
 def e3d_mocap(shapes: ArrayLike, truth: ArrayLike) -> float:
     """Akhter's error: mean point distance over mean per-frame, per-axis spread, see the table above."""
     return _mocap(align(shapes, truth, kind="sequence"))
@@ -75,10 +99,7 @@ def reprojection(tracks: Tracks, solution: Solution) -> Reprojection:
     Recomputed from shapes and camera, so that it checks `Solution.residuals` instead of repeating them. Frames or
     points that nobody saw do not count; with nothing visible both values would have no meaning, which `Tracks` refuses.
     """
-    camera = solution.camera
-    projected = solution.shapes @ camera.rotations[:, :2].transpose(0, 2, 1)
-    projected = camera.scales[:, None, None] * projected + camera.translations[:, None]
-    squared = np.square(tracks.points - projected).sum(axis=2)
+    squared = np.square(tracks.points - solution.camera.project(solution.shapes)).sum(axis=2)
     median = np.median(np.sqrt(squared[tracks.visible > 0]))
     return Reprojection(float(median), float(np.sqrt(np.average(squared, weights=tracks.visible))))
 
@@ -113,6 +134,7 @@ def evaluate(
     tracks: Tracks,
     truth: ArrayLike | None = None,
     true_rotations: ArrayLike | None = None,
+    true_focal: float | None = None,
 ) -> dict[str, float]:
     """Every metric that the inputs allow, by its documented name.
 
@@ -125,6 +147,8 @@ def evaluate(
         camera axes, the metrics per frame hold and the two for the whole sequence mean nothing.
     true_rotations : array_like, shape (F, 3, 3), optional
         Ground truth cameras.
+    true_focal : float, optional
+        Ground truth focal length, the tracks' unit.
 
     Raises
     ------
@@ -137,10 +161,13 @@ def evaluate(
         whole = align(solution.shapes, truth, kind="sequence")
         values["e3d_sequence"] = float(whole.relative.mean())
         values["e3d_frame"] = e3d_frame(solution.shapes, truth)
+        values["e3d_frame_scaled"] = e3d_frame_scaled(solution.shapes, truth)
         values["e3d_frame_similarity"] = e3d_frame_similarity(solution.shapes, truth)
         values["e3d_mocap"] = _mocap(whole)
     if true_rotations is not None:
         values["rotation_degrees"] = rotation_degrees(solution.camera.rotations, true_rotations)
+    if true_focal is not None:
+        values["focal_error"] = focal_error(solution.camera, true_focal)
     return values
 
 

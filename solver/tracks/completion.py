@@ -9,6 +9,7 @@ the cost does not depend on P; one pass then carries every point onto the basis.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,6 +52,20 @@ RIDGE = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Filling:
+    """The low-rank factor that fills holes."""
+
+    basis: Floats
+    """Shape `(F, 2, r)`, last column the translation."""
+
+    spread: Floats
+    """Covariance of the coefficients, shape `(r − 1, r − 1)`."""
+
+    scale: float
+    """Standard deviation of the residuals, normalised units."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Completed:
     """Tracks with every entry filled, centred per frame."""
 
@@ -68,6 +83,9 @@ class Completed:
 
     outliers: float
     """Share of the seen entries of the sample that was replaced."""
+
+    filling: Filling | None = None
+    """How hidden entries and outliers were replaced; None: nothing was."""
 
 
 def complete(normalised: Normalised, *, seed: int = 0, rank: int = 0) -> Completed:
@@ -99,8 +117,9 @@ def complete(normalised: Normalised, *, seed: int = 0, rank: int = 0) -> Complet
     basis, spread, scale = fit_basis(points, weight, random, rank)
     outliers = fill(points, weight, basis, spread, scale)[1]
     clean = outliers == 0.0 and bool((normalised.visible > 0).all())
-    gram, translations, sample = _carry(normalised, None if clean else basis, spread, scale, chosen)
-    return Completed(gram, sample, translations, 0 if clean else basis.shape[2], outliers)
+    filling = None if clean else Filling(basis, spread, scale)
+    gram, translations, sample = _carry(normalised, filling, chosen)
+    return Completed(gram, sample, translations, 0 if clean else basis.shape[2], outliers, filling)
 
 
 def seen_again(visible: Floats) -> int:
@@ -222,26 +241,30 @@ def gross(points: Floats, weight: Floats, predicted: Floats, scale: float) -> ND
     return np.asarray((weight > 0) & (_lengths(points - predicted) > max(OUTLIER * scale, GROSS)))
 
 
-def _carry(
-    normalised: Normalised, basis: Floats | None, spread: Floats, scale: float, chosen: NDArray[np.intp]
-) -> tuple[Floats, Floats, Floats]:
-    """Return Gram matrix, translations and centred sample, filling all points chunk by chunk."""
-    frames, count = normalised.visible.shape
-    gram, total = np.zeros((2 * frames, 2 * frames)), np.zeros((frames, 2))
-    sample = np.zeros((frames, len(chosen), 2))
-    used = 0
+def spans(normalised: Normalised, filling: Filling | None) -> Iterator[tuple[NDArray[np.intp], Floats]]:
+    """Yield the points that are seen at all, completed, a chunk at a time: their indices, and positions `(F, n, 2)`."""
+    count = normalised.visible.shape[1]
     for start in range(0, count, CHUNK):
         span = slice(start, min(start + CHUNK, count))
         points, weight = normalised.points[:, span], normalised.visible[:, span]
         shown = (weight > 0).any(axis=0)
         points, weight = points[:, shown], weight[:, shown]
-        if basis is not None:
-            points, _ = fill(points, weight, basis, spread, scale)
+        if filling is not None:
+            points, _ = fill(points, weight, filling.basis, filling.spread, filling.scale)
+        yield np.flatnonzero(shown) + span.start, points
+
+
+def _carry(normalised: Normalised, filling: Filling | None, chosen: NDArray[np.intp]) -> tuple[Floats, Floats, Floats]:
+    """Return Gram matrix, translations and centred sample, filling all points chunk by chunk."""
+    frames = len(normalised.points)
+    gram, total = np.zeros((2 * frames, 2 * frames)), np.zeros((frames, 2))
+    sample = np.zeros((frames, len(chosen), 2))
+    used = 0
+    for places, points in spans(normalised, filling):
         stacked = points.transpose(0, 2, 1).reshape(2 * frames, -1)
         gram += stacked @ stacked.T
         total += points.sum(axis=1)
         used += points.shape[1]
-        places = np.flatnonzero(shown) + span.start
         inside = np.isin(places, chosen, assume_unique=True)
         sample[:, np.isin(chosen, places, assume_unique=True)] = points[:, inside]
     mean = total / used

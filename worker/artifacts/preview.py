@@ -154,11 +154,8 @@ def _onto(shapes: Floats, truth: Floats) -> tuple[Floats | None, bool]:
 
 
 def _residual(tracks: Tracks, solution: Solution, frame: int) -> Floats:
-    camera = solution.camera
-    projected = (
-        camera.scales[frame] * solution.shapes[frame] @ camera.rotations[frame, :2].T + camera.translations[frame]
-    )
-    return np.asarray(tracks.points[frame] - projected)
+    one = slice(frame, frame + 1)
+    return np.asarray(tracks.points[frame] - solution.camera.at(one).project(solution.shapes[one])[0])
 
 
 def _largest_residual(tracks: Tracks, solution: Solution) -> float:

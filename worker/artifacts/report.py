@@ -39,6 +39,8 @@ def build_report(
     """
     choices = asdict(solution.choices)
     reasons, warnings = choices.pop("reasons"), choices.pop("warnings")
+    for name in ("camera", "depth_sign", "focal_candidates"):
+        del choices[name]  # in the section `camera`
     report = {
         "report_version": REPORT_VERSION,
         "outcome": solution.outcome.value,
@@ -50,6 +52,7 @@ def build_report(
             for name, value in choices.items()
         },
         "reasons": reasons,
+        "camera": _camera(solution),
         "options": options.model_dump(mode="json"),
         "interpretation": inputs.interpretation.model_dump(mode="json"),
         "trace": {
@@ -63,6 +66,20 @@ def build_report(
     }
     plain: dict[str, Any] = _plain(report)
     return plain
+
+
+def _camera(solution: Solution) -> dict[str, Any]:
+    """Return what is the same in all frames: model, focal length in the tracks' unit, principal point, and how they were chosen."""
+    camera, choices = solution.camera, solution.choices
+    return {
+        "model": choices.camera,
+        "focal": camera.focal,
+        "focal_std": camera.focal_std,
+        "principal_point": camera.principal_point.tolist(),
+        "depth_sign": choices.depth_sign,
+        "candidates": [asdict(each) for each in choices.focal_candidates],
+        "reason": choices.reasons.get("camera_model"),
+    }
 
 
 def peak_memory() -> int:

@@ -38,9 +38,20 @@ class Finished:
     """The files, named as they lie in the directory."""
 
 
-def solver_settings(options: Options) -> Settings:
-    """Return the solver's part of a job's options."""
-    return Settings(**{name: getattr(options, name) for name in SOLVER_FIELDS})
+def solver_settings(options: Options, *, y_up: bool = False) -> Settings:
+    """Return the solver's part of a job's options; `y_up` as the tracks were read."""
+    values = {name: getattr(options, name) for name in SOLVER_FIELDS}
+    values["image_size"] = _pair(options.image_size, "x")
+    values["principal_point"] = _pair(options.principal_point, ",")
+    return Settings(**values, y_up=y_up)
+
+
+def _pair(text: str | None, between: str) -> tuple[float, float] | None:
+    """Return two numbers written with a separator between them."""
+    if text is None:
+        return None
+    first, second = text.split(between)
+    return float(first), float(second)
 
 
 def reconstruct(
@@ -89,7 +100,7 @@ def reconstruct(
         inputs.tracks,
         inputs.mesh,
         cameras=inputs.cameras,
-        settings=solver_settings(options),
+        settings=solver_settings(options, y_up=inputs.interpretation.y_axis == "up"),
         on_step=lambda step: _told(reporter, step),
         should_stop=halt.asked,
     )

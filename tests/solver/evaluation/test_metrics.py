@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from pliant.solver import InvalidInput, Tracks
+from pliant.solver import Camera, InvalidInput, Tracks
 from pliant.solver.evaluation.alignment import MIRROR, align, procrustes
 from pliant.solver.evaluation.metrics import (
     e3d_frame,
+    e3d_frame_scaled,
     e3d_frame_similarity,
     e3d_mocap,
     e3d_sequence,
     evaluate,
+    focal_error,
     frame_errors,
     point_errors,
     reprojection,
@@ -30,7 +33,7 @@ TURNS = Rotation.random(6, rng=random).as_matrix()
 
 def solution_of(shapes, rotations=None, scales=None, translations=None):
     frames = len(shapes)
-    camera = SimpleNamespace(
+    camera = Camera(
         rotations=np.tile(np.eye(3), (frames, 1, 1)) if rotations is None else rotations,
         scales=np.ones(frames) if scales is None else scales,
         translations=np.zeros((frames, 2)) if translations is None else translations,
@@ -146,7 +149,7 @@ def test_evaluate_names_what_the_inputs_allow():
     rotations = np.tile(np.eye(3), (6, 1, 1))
     fit = {"reprojection_median", "reprojection_rms"}
     assert set(evaluate(solution_of(TRUTH), tracks)) == fit
-    shapes = {"e3d_sequence", "e3d_frame", "e3d_frame_similarity", "e3d_mocap"}
+    shapes = {"e3d_sequence", "e3d_frame", "e3d_frame_scaled", "e3d_frame_similarity", "e3d_mocap"}
     both = evaluate(solution_of(TRUTH), tracks, TRUTH, rotations)
     assert set(both) == fit | shapes | {"rotation_degrees"}
     assert max(both.values()) < 1e-12
@@ -174,3 +177,21 @@ def test_unusable_truth_is_refused(ours, truth, code):
 def test_rotations_of_another_shape_are_refused():
     with pytest.raises(InvalidInput, match=r"expected \(frames, 3, 3\)"):
         rotation_degrees(TURNS, TURNS[:, :2])
+
+
+def test_one_scale_for_the_sequence_is_free_and_no_more() -> None:
+    turned = 3.0 * np.einsum("fpi,fji->fpj", TRUTH, TURNS)
+    assert e3d_frame_scaled(turned, TRUTH) == pytest.approx(0, abs=1e-9)
+    growing = np.linspace(0.5, 1.5, 6)[:, None, None] * TRUTH
+    scale = np.vdot(growing - growing.mean(axis=1, keepdims=True), TRUTH - TRUTH.mean(axis=1, keepdims=True))
+    scale /= np.square(growing - growing.mean(axis=1, keepdims=True)).sum()
+    assert e3d_frame_scaled(growing, TRUTH) == pytest.approx(np.abs(scale * np.linspace(0.5, 1.5, 6) - 1).mean())
+    assert e3d_frame_similarity(growing, TRUTH) == pytest.approx(0, abs=1e-9)
+
+
+def test_the_error_of_a_focal_length_is_relative() -> None:
+    camera = solution_of(TRUTH).camera
+    assert focal_error(camera, 900.0) == np.inf
+    assert focal_error(replace(camera, focal=990.0), 900.0) == pytest.approx(0.1)
+    with pytest.raises(InvalidInput):
+        focal_error(camera, 0.0)

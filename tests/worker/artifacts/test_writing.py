@@ -6,6 +6,7 @@ import hashlib
 import io
 import json
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from khronos import assert_valid
 from pliant.schemas.options import Options
 from pliant.solver import Solution
 from pliant.solver.evaluation.metrics import point_errors
+from pliant.solver.records import FocalCandidate
 from pliant.worker.artifacts import build_report, write_artifacts
 from pliant.worker.artifacts.animation import animate
 from pliant.worker.artifacts.colours import linear, shade
@@ -87,6 +89,8 @@ def test_npz_holds_the_solution_bit_for_bit(tmp_path: Path) -> None:
         np.testing.assert_array_equal(got["rotations"], solution.camera.rotations)
         np.testing.assert_array_equal(got["scales"], solution.camera.scales)
         np.testing.assert_array_equal(got["translations"], solution.camera.translations)
+        assert got["focal"] == np.inf
+        assert np.isnan(got["focal_std"])
         assert inputs.mesh is not None
         np.testing.assert_array_equal(got["faces"], inputs.mesh.faces)
         np.testing.assert_allclose(got["residuals"], solution.residuals, rtol=1e-6)
@@ -221,6 +225,30 @@ def test_equal_results_are_equal_files(tmp_path: Path) -> None:
     first, second = write(tmp_path / "a", make_result()), write(tmp_path / "b", make_result())
     for name in ("shapes.npz", "shapes.glb", "shapes_ply.zip"):
         assert first[name].read_bytes() == second[name].read_bytes()
+
+
+def test_a_perspective_camera_is_in_the_arrays_and_the_report(tmp_path: Path) -> None:
+    inputs, solution, options = make_result()
+    camera = replace(solution.camera, focal=900.0, focal_std=12.0, principal_point=np.array([640.0, 360.0]))
+    candidates = (
+        FocalCandidate(None, False, -1.0),
+        FocalCandidate(900.0, True, -0.5),
+        FocalCandidate(900.0, False, -2.0),
+    )
+    choices = replace(
+        solution.choices, camera="perspective", depth_sign="settled", focal_candidates=candidates,
+        reasons={"camera_model": "Perspective."},
+    )  # fmt: skip
+    files = write(tmp_path, (inputs, replace(solution, camera=camera, choices=choices), options))
+    with np.load(files["shapes.npz"], allow_pickle=False) as got:
+        assert (got["focal"], got["focal_std"]) == (900.0, 12.0)
+        np.testing.assert_array_equal(got["principal_point"], [640.0, 360.0])
+    report = json.loads(files["report.json"].read_text())["camera"]
+    assert {name: report[name] for name in ("model", "focal", "focal_std", "depth_sign", "reason")} == {
+        "model": "perspective", "focal": 900.0, "focal_std": 12.0, "depth_sign": "settled", "reason": "Perspective.",
+    }  # fmt: skip
+    assert report["principal_point"] == [640.0, 360.0]
+    assert report["candidates"][0] == {"focal": None, "mirrored": False, "nll": -1.0}
 
 
 def test_the_report_says_how_it_came_to_be(tmp_path: Path) -> None:

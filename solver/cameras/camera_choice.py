@@ -1,0 +1,85 @@
+"""What a report says about the choice between orthography and perspective."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from pliant.solver.cameras.focal_length import GAIN
+from pliant.solver.cameras.perspective import Perspective
+from pliant.solver.records import Choices, FocalCandidate
+from pliant.solver.settings import Settings
+
+
+def with_camera_choice(
+    choices: Choices, view: Perspective | None, settings: Settings, *, unit: float, given: bool
+) -> Choices:
+    """Return the choices with the camera model, its reason, the focal lengths compared, and the sign of depth.
+
+    Parameters
+    ----------
+    choices : Choices
+        All others.
+    view : Perspective, optional
+        What was found; None where perspective was not considered.
+    settings : Settings
+        Of the solve.
+    unit : float
+        One normalised unit in the tracks' unit.
+    given : bool
+        Whether rotations were given, which settles the sign of depth.
+    """
+    plain = settings.camera if settings.camera == "orthographic" else "scaled_orthographic"
+    if view is None:
+        return replace(choices, camera=plain, depth_sign="settled" if given else "ambiguous")
+    chosen = view.signs[0] if not view.bends else float(np.sign(view.flipped * view.curvature))
+    candidates = tuple(
+        FocalCandidate(
+            unit / abs(each.curvature) if each.curvature else None, bool(each.curvature * chosen < 0), each.nll
+        )
+        for each in view.candidates
+    )
+    warning = improbable(view, unit)
+    return replace(
+        choices,
+        camera="perspective" if view.bends else plain,
+        depth_sign="settled" if given or (view.bends and view.settled) else "ambiguous",
+        focal_candidates=candidates,
+        reasons={**choices.reasons, "camera_model": described(view, unit)},
+        warnings=choices.warnings if warning is None else (*choices.warnings, warning),
+    )
+
+
+def described(view: Perspective, unit: float) -> str:
+    """Return a sentence about the choice between orthography and perspective."""
+    nll = {each.curvature: each.nll for each in view.candidates}
+    if not view.bends:
+        best = min((each for each in nll if each != 0), key=lambda each: nll[each], default=None)
+        if best is None:
+            return "Orthography: perspective was not compared."
+        return (
+            f"Orthography: the best perspective compared, focal length {unit / abs(best):.4g}, changes the log likelihood per point "
+            f"and frame by {nll[0.0] - nll[best]:+.3f}; more than {GAIN} is asked for, and a clear sign of depth."
+        )
+    gain = nll[0.0] - min((value for each, value in nll.items() if each != 0), default=nll[0.0])
+    how = "as given" if view.given is not None else f"± {unit * view.curvature_std / view.curvature**2:.2g}"
+    return (
+        f"Perspective with focal length {unit / abs(view.curvature):.4g} {how}: gains {gain:.3f} in the log likelihood per point and frame "
+        "over orthography."
+    )
+
+
+def improbable(view: Perspective, unit: float) -> str | None:
+    """Return a warning if a focal length that was given is less probable than another or than orthography."""
+    if view.given is None:
+        return None
+    nll = {each.curvature: each.nll for each in view.candidates}
+    own = min((nll[each] for each in (view.given, -view.given) if each in nll), default=np.inf)
+    best = min(nll, key=lambda each: nll[each], default=0.0)
+    if not own - nll.get(best, np.inf) > GAIN:
+        return None
+    rival = "orthography" if best == 0 else f"a focal length of {unit / abs(best):.4g}"
+    return (
+        f"The focal length given, {unit / view.given:.4g}, is improbable: {rival} gains {own - nll[best]:.3f} in the log likelihood per "
+        "point and frame."
+    )

@@ -1,0 +1,299 @@
+"""Focal length and sign of depth by the marginal likelihood of tracks corrected for perspective.
+
+For every κ = 1/φ that is compared the tracks are corrected with posterior depths, and a covariance of the shapes is learned anew from them
+with the cameras as they are (`cameras.perspective`, `model.shape_covariance`). Perspective that is not corrected passes for deformation
+and needs modes; corrected with the wrong κ or the wrong sign of depth it needs more. The likelihood of the corrected tracks, with the
+density of the correction, therefore has its maximum near the true κ; κ < 0 stands for mirrored depths, and κ = 0 is orthography.
+
+The comparison needs few frames. What it finds is then refined on all of them together with cameras and modes: between two updates of the
+depths z the corrected tracks v + κ v z are linear in κ, so that their Gram matrix is G₀ + κ G₁ + κ² G₂, and κ is one more parameter of
+L-BFGS with the gradient
+
+    ∂E/∂κ = tr M⁻¹(G₁ + 2κ G₂) / 2F − 2 mean z/(1 + κz).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from pliant.solver.cameras.learned import Learned, motion_of, moved_to, scene_at
+from pliant.solver.cameras.perspective import (
+    NEAREST,
+    Candidate,
+    Perspective,
+    centred,
+    columns,
+    corrected,
+    density,
+    depth_map,
+    depths_of,
+)
+from pliant.solver.model.marginal_likelihood import STEADINESS, UNLIKELY, Motion, energy_with_inverse
+from pliant.solver.model.model_order import Support
+from pliant.solver.model.shape_covariance import ShapeCovariance, annealed
+from pliant.solver.records import Floats
+from scipy.optimize import minimize
+
+GRID = (0.02, 0.035, 0.06, 0.1, 0.16, 0.25, 0.38)
+"""κ compared, in inverse RMS radii of the tracks, each with both signs. At .02 the correction is 1 % to 2 % of a position; at .38 an object
+fills 80° of the view."""
+
+SEARCH_FRAMES = 32
+"""Frames on which values of κ are compared, evenly spread; fewer where there are fewer than two points for each."""
+
+UPDATES = 2
+"""Updates of depths and covariance for every κ."""
+
+ROUNDS = 40
+"""Rounds of expectation maximisation of an update, from scratch, so that all values of κ are judged alike."""
+
+POLISHES = 3
+"""Values of κ that are compared between the best of the grid and its neighbours."""
+
+GAIN = 0.02
+"""Likelihood per point and frame, as a logarithm, by which perspective must be more probable than orthography, and one sign of depth than
+the other. Equal κ from different starts differ by up to .01."""
+
+WRONG = 1.6
+"""A given focal length is compared with ones that are longer and shorter by this factor."""
+
+ITERATIONS = 60
+"""L-BFGS iterations of κ, cameras and modes between two updates of the depths."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Trial:
+    """What one κ led to."""
+
+    curvature: float
+    nll: float
+    depths: Floats
+    covariance: ShapeCovariance
+
+
+def search(
+    views: Floats,
+    rotations: Floats,
+    scales: Floats,
+    view: Perspective,
+    *,
+    support: Support,
+    should_stop: Callable[[], bool] | None = None,
+) -> tuple[Perspective, ShapeCovariance]:
+    """Return what comparing values of κ shows, κ = 0 unless the tracks need perspective, and the covariance learned with it.
+
+    Parameters
+    ----------
+    views : array, shape (F, S, 2)
+        Complete tracks of some points relative to the principal point, normalised units.
+    rotations, scales : arrays, shapes (F, 3, 3) and (F,)
+        Cameras found under orthography.
+    view : Perspective
+        What is given; `curvature` of the result is negative if the depths of these cameras have to be mirrored.
+    support : Support
+        Modes at most, and the noise to begin with.
+    should_stop : callable, optional
+        Asked between values of κ; once it says True, the best so far counts.
+    """
+    count = max(min(SEARCH_FRAMES, len(views), views.shape[1] // 2), 3)
+    used = np.unique(np.linspace(0, len(views) - 1, min(count, len(views))).round().astype(np.intp))
+    some, pairs = views[used], rotations[used, :2] * scales[used, None, None]
+    flat = _learn(some, np.zeros(some.shape[:2]), 0.0, pairs, support)
+    trials = {0.0: _Trial(0.0, flat.likelihood, np.zeros(some.shape[:2]), flat)}
+
+    def judge(curvature: float) -> None:
+        trial = trials[0.0]
+        for _ in range(UPDATES):
+            depth = depth_map(rotations[used], scales[used], trial.covariance)
+            depths = depths_of(depth, some, curvature, start=trial.depths)
+            covariance = _learn(some, depths, curvature, pairs, support)
+            trial = _Trial(curvature, covariance.likelihood + density(depths, curvature), depths, covariance)
+        trials[curvature] = trial
+
+    def stopped() -> bool:
+        return should_stop is not None and should_stop()
+
+    for size, sign in _walk(view, trials):
+        if stopped():
+            break
+        judge(sign * size)
+    for _ in range(POLISHES if view.given is None and _promising(view, trials) else 0):
+        between = _between(trials)
+        if between is None or stopped():
+            break
+        judge(between)
+    view = _decided(view, trials, len(used), some.shape[1])
+    covariance = trials[view.curvature if view.curvature in trials else 0.0].covariance
+    return view, covariance if len(used) == len(views) else covariance.stretched(used, len(views))
+
+
+def _walk(view: Perspective, trials: dict[float, _Trial]) -> Iterator[tuple[float, int]]:
+    """Yield sizes and signs of κ to compare, given what was found so far.
+
+    A given focal length is compared with two others. Otherwise sizes rise; where the smallest two gain nothing the rest is not looked
+    at, a sign is given up when the other is clearly better, and the way ends beyond its minimum.
+    """
+    if view.given is not None:
+        yield from ((view.given * factor, sign) for factor in (1, 1 / WRONG, WRONG) for sign in view.signs)
+        return
+    signs = list(view.signs)
+    for index, size in enumerate(GRID):
+        for sign in signs:
+            yield size, sign
+        done = [trials[sign * size].nll for sign in signs if sign * size in trials]
+        if len(done) < len(signs) or (index == 1 and not _promising(view, trials)):
+            return
+        if len(signs) == 2 and abs(done[0] - done[1]) > GAIN and index > 0:
+            signs = [signs[int(np.argmin(done))]]
+            done = [min(done)]
+        if index > 1 and min(done) > trials[_best(trials)].nll + GAIN:
+            return
+
+
+def _promising(view: Perspective, trials: dict[float, _Trial]) -> bool:
+    return view.required or trials[_best(trials)].nll < trials[0.0].nll
+
+
+def _learn(views: Floats, depths: Floats, curvature: float, pairs: Floats, support: Support) -> ShapeCovariance:
+    rows = columns(centred(corrected(views, depths, curvature)))
+    return annealed(
+        rows @ rows.T / rows.shape[1], pairs, most=support.most, noisy=support.noisy, iterations=ROUNDS
+    )  # fmt: skip
+
+
+def _best(trials: dict[float, _Trial]) -> float:
+    """Return the most probable κ that is not 0."""
+    return min((each for each in trials if each != 0), key=lambda each: trials[each].nll, default=0.0)
+
+
+def _around(trials: dict[float, _Trial]) -> tuple[Floats, Floats] | None:
+    """Return the best κ ≠ 0 and its neighbours, and how improbable they are; None where it lies at the end of what was compared."""
+    values = np.array(sorted(trials))
+    place = int(np.searchsorted(values, _best(trials)))
+    if not 0 < place < len(values) - 1:
+        return None
+    three = values[place - 1 : place + 2]
+    return three, np.array([trials[float(each)].nll for each in three])
+
+
+def _parabola(three: Floats, nll: Floats) -> tuple[float, float]:
+    """Return the place of the minimum of the parabola through three points, and its second derivative."""
+    curve, slope, _ = np.polyfit(three - three[1], nll, 2)
+    return float(three[1] - slope / (2 * curve)) if curve > 0 else float(three[1]), 2 * float(curve)
+
+
+def _between(trials: dict[float, _Trial]) -> float | None:
+    """Return the κ to compare next: the parabola's minimum, or the middle of the wider side where that is known already."""
+    found = _around(trials)
+    if found is None:
+        return None
+    three, nll = found
+    best, _ = _parabola(three, nll)
+    low, high = three[0] + 0.1 * (three[1] - three[0]), three[2] - 0.1 * (three[2] - three[1])
+    best = float(np.clip(best, low, high))
+    if abs(best - three[1]) < 0.05 * abs(three[1]):
+        wide = three[2] - three[1] > three[1] - three[0]
+        best = float(three[1] + (three[2] - three[1] if wide else three[0] - three[1]) / 3)
+    return best
+
+
+def _decided(view: Perspective, trials: dict[float, _Trial], frames: int, points: int) -> Perspective:
+    """Return κ by evidence, its standard deviation, and whether the sign of depth is settled.
+
+    The points of a surface move together; they count as 1/`STEADINESS` independent ones at most.
+    """
+    candidates = tuple(Candidate(each, trials[each].nll) for each in sorted(trials))
+    if view.given is not None:
+        signed = [sign * view.given for sign in view.signs if sign * view.given in trials]
+        best = min(signed, key=lambda each: trials[each].nll, default=view.signs[0] * view.given)
+    else:
+        best = _best(trials)
+    if best not in trials or best == 0:  # stopped
+        return replace(view, curvature=best, candidates=candidates)
+    nll = trials[best].nll
+    opposite = min((each.nll for each in candidates if each.curvature * best < 0), default=np.inf)
+    settled = len(view.signs) == 1 or bool(np.isfinite(opposite) and opposite - nll > GAIN)
+    needed = trials[0.0].nll - nll > GAIN and settled
+    if not (needed or view.required or view.given is not None):
+        return replace(view, curvature=0.0, candidates=candidates)
+    std, found = 0.0, _around(trials)
+    if view.given is None and found is not None:
+        bend = max(_parabola(*found)[1], 1e-12)
+        std = float(1 / np.sqrt(bend * frames * min(points, 1 / STEADINESS)))
+    return replace(view, curvature=best, curvature_std=std, candidates=candidates, settled=settled)
+
+
+def refined_with_focal(
+    views: Floats,
+    found: Learned,
+    curvature: float,
+    *,
+    free: bool,
+    turning: bool,
+    with_scales: bool,
+    iterations: int = ITERATIONS,
+) -> tuple[Learned, float]:
+    """Return cameras, covariance and κ of higher likelihood, after one update of the depths.
+
+    Parameters
+    ----------
+    views : array, shape (F, S, 2)
+        Complete tracks relative to the principal point, normalised units.
+    found : Learned
+        Cameras and covariance to start from.
+    curvature : float
+        κ to start from.
+    free : bool
+        False keeps κ.
+    turning : bool
+        False keeps the rotations.
+    with_scales : bool
+        False keeps the scales at 1.
+    iterations : int
+        Of L-BFGS.
+    """
+    depths = depths_of(depth_map(found.rotations, found.scales, found.covariance), views, curvature)
+    energy = corrected_energy(views, depths, found, with_scales=with_scales)
+    motion = motion_of(energy.scene, found)
+    held = 0 if turning else 3 * len(views)
+    given = np.append(motion.flat(), curvature)
+
+    def objective(moving: Floats) -> tuple[float, Floats]:
+        value, gradient = energy(np.concatenate([given[:held], moving]))
+        gradient[-1] *= free
+        return value, gradient[held:]
+
+    result = minimize(
+        objective, given[held:], jac=True, method="L-BFGS-B", options={"maxiter": iterations, "maxcor": 20}
+    )
+    flat = np.concatenate([given[:held], np.asarray(result.x)])
+    moved = Motion.unflat(flat[:-1], len(views))
+    return moved_to(energy.scene, found, moved, float(result.fun)), float(flat[-1])
+
+
+class corrected_energy:  # noqa: N801
+    """E of tracks corrected with fixed depths, as a function of all parameters of the likelihood and, last, κ."""
+
+    def __init__(self, views: Floats, depths: Floats, found: Learned, *, with_scales: bool) -> None:
+        count = views.shape[1]
+        plain, along = columns(centred(views)), columns(centred(views * depths[..., None]))
+        self.depths = depths
+        self.grams = (plain @ plain.T / count, (plain @ along.T + along @ plain.T) / count, along @ along.T / count)
+        self.scene = scene_at(self.grams[0], found.rotations, with_scales=with_scales)
+
+    def __call__(self, flat: Floats) -> tuple[float, Floats]:
+        """Return E and its gradient."""
+        frames, curvature = len(self.depths), float(flat[-1])
+        constant, linear, square = self.grams
+        nearer = 1 + curvature * self.depths
+        if nearer.min() < NEAREST:
+            return UNLIKELY, np.zeros_like(flat)
+        scene = replace(self.scene, gram=constant + curvature * linear + curvature**2 * square)
+        value, gradient, inverse = energy_with_inverse(scene, Motion.unflat(flat[:-1], frames))
+        if inverse is None:
+            return value, np.zeros_like(flat)
+        slope = 0.5 * float(np.vdot(inverse, linear + 2 * curvature * square)) / frames
+        slope -= 2 * float((self.depths / nearer).mean())
+        return value + density(self.depths, curvature), np.append(gradient.flat(), slope)

@@ -1,0 +1,66 @@
+"""Cameras and shape covariance that belong together, and the way from there to the parameters of the likelihood and back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from pliant.solver.model.marginal_likelihood import Motion, Scene, cameras_of, covariances_of, root_of
+from pliant.solver.model.shape_covariance import FLATTEST, NOISE_FLOOR, ShapeCovariance
+from pliant.solver.records import Floats
+
+STEADY = 0.01
+"""Weight of the camera's unsteadiness: less is needed once the covariance is known."""
+
+LEAST_NOISE = 1e-12
+"""What is left of σ² where it lies at its floor, which the likelihood adds again."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Learned:
+    """Cameras and covariance that belong together."""
+
+    rotations: Floats
+    """Shape `(F, 3, 3)`."""
+
+    scales: Floats
+    """Shape `(F,)`, mean of the logarithm 0."""
+
+    covariance: ShapeCovariance
+
+    energy: float
+    """Of `model.marginal_likelihood`, without a penalty on modes; infinite before the first refinement."""
+
+
+def scene_at(gram: Floats, rotations: Floats, *, with_scales: bool) -> Scene:
+    """Return the scene whose cameras at zero turn are these."""
+    return Scene(
+        gram, rotations, with_scales=with_scales, steadiness=STEADY,
+        noise_floor=NOISE_FLOOR**0.5, smoothness=0.0,
+    )  # fmt: skip
+
+
+def motion_of(scene: Scene, found: Learned) -> Motion:
+    """Return the parameters of the likelihood that describe `found`."""
+    covariance = found.covariance
+    return Motion(
+        np.zeros((len(found.rotations), 3)), np.log(found.scales), covariance.modes,
+        root_of(covariance.extent), root_of(covariance.play),
+        0.5 * np.log([max(covariance.noise - scene.noise_floor**2, LEAST_NOISE), covariance.drift]),
+    )  # fmt: skip
+
+
+def moved_to(scene: Scene, found: Learned, moved: Motion, energy: float) -> Learned:
+    """Return what the parameters of the likelihood describe."""
+    extent, play, noise, drift = covariances_of(scene, moved)
+    play = play + FLATTEST * np.trace(play) / 3 * np.eye(3)
+    size = np.trace(play) / 3
+    better = replace(
+        found.covariance,
+        extent=extent,
+        play=play / size,
+        modes=moved.modes * np.sqrt(size),
+        drift=drift * size,
+        noise=noise,
+    )
+    return Learned(*cameras_of(scene, moved), better, energy)

@@ -1,0 +1,215 @@
+"""Perspective as one scalar around a scaled-orthographic estimator: tracks corrected for depth.
+
+A pinhole camera with focal length φ sees a point of a shape whose origin lies at depth φ/s_f (camera axes x right, y down, z away) at
+
+    u = c + (s_f R_f[:2] x + t_f) / (1 + z/φ),    z = s_f R_f[2] x,
+
+with c the principal point, t_f the image of the shape's origin relative to c, and z the depth beyond the origin in image units. So
+
+    (u − c) (1 + z/φ) = s_f R_f[:2] x + t_f
+
+is exactly a scaled-orthographic track of the same shape. Depths follow from the shapes, shapes from the corrected tracks; κ = 1/φ is
+the only new unknown, and κ = 0 is scaled orthography. Reversing the sign of κ is the same as mirroring all depths, x → J x, R → J R J
+with J = diag(1, 1, −1), which orthography cannot tell apart.
+
+Here depths are posterior means under the Gaussian of `pliant.solver.model.shape_covariance`. They are linear in the corrected tracks,
+
+    z = D w,    D = E Σ Πᵀ (Π Σ Πᵀ + σ²I)⁻¹,    E = blockdiag(s_f R_f[2]),
+
+so that w = v ∘ (1 + κ D w), v the tracks about the principal point, is a fixed point of cheap steps in 2F dimensions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from pliant.solver.model.shape_covariance import ShapeCovariance
+from pliant.solver.records import Floats
+from pliant.solver.tracks.completion import Filling, spans
+from pliant.solver.tracks.normalization import Normalised
+from scipy import linalg
+
+STEPS = 8
+"""Steps of the fixed point for the depths; each leaves about κ|v| ≤ .3 of the error: 1e-4 of a depth at the end."""
+
+NEAREST = 0.2
+"""Least 1 + κz: no point comes nearer to the camera than a fifth of the distance of the shape's origin."""
+
+MIRROR = np.diag([1.0, 1.0, -1.0])
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """One value of κ that was compared."""
+
+    curvature: float
+    """κ, inverse normalised units; negative: with all depths mirrored."""
+
+    nll: float
+    """Negative log likelihood of the tracks per point and frame, density of the correction included."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Perspective:
+    """What the tracks say about perspective."""
+
+    offsets: Floats
+    """Centroid of each frame relative to the principal point, normalised units, shape `(F, 2)`."""
+
+    principal_point: Floats
+    """Shape `(2,)`, the tracks' unit."""
+
+    curvature: float = 0.0
+    """κ = 1/φ, inverse normalised units; 0: orthography. It gets the sign of `signs[0]`: that of the third axis, away or towards."""
+
+    curvature_std: float = 0.0
+    """Its standard deviation; 0 where the focal length was given."""
+
+    given: float | None = None
+    """κ of a focal length that was given."""
+
+    signs: tuple[int, ...] = (1, -1)
+    """Signs of κ that are compared; only the first is possible where cameras are given."""
+
+    required: bool = False
+    """True: the camera model is `perspective`, and κ = 0 is only compared with."""
+
+    flipped: int = 1
+    """−1 if depths were mirrored for `curvature` after the candidates were compared."""
+
+    settled: bool = False
+    """Whether the sign of depth is known."""
+
+    candidates: tuple[Candidate, ...] = ()
+    """Every κ that was compared, by size."""
+
+    filling: Filling | None = None
+    """How hidden entries are completed; None: all are seen."""
+
+    sample: Floats = field(default_factory=lambda: np.zeros((0, 0, 2)))
+    """Some complete tracks as they are, relative to the principal point, shape `(F, S, 2)`, normalised units."""
+
+    depth: Floats = field(default_factory=lambda: np.zeros((0, 0)))
+    """D of the cameras and the covariance found last, shape `(F, 2F)`."""
+
+    @property
+    def bends(self) -> bool:
+        """True if tracks are corrected."""
+        return self.curvature != 0
+
+
+def depth_map(rotations: Floats, scales: Floats, covariance: ShapeCovariance) -> Floats:
+    """Return D, shape `(F, 2F)`, for points whose centred image coordinates x1, y1, x2 … are one column."""
+    pairs = rotations[:, :2] * scales[:, None, None]
+    away, rows = rotations[:, 2] * scales[:, None], pairs.reshape(-1, 3)
+    wide = np.repeat(covariance.over_frames(), 2, axis=1)
+    cross = away @ covariance.extent @ rows.T + (away @ covariance.play @ rows.T) * wide
+    return np.asarray(linalg.solve(covariance.of_image(pairs), cross.T, assume_a="pos").T)
+
+
+def columns(points: Floats) -> Floats:
+    """Return points `(F, P, 2)` as a matrix `(2F, P)` with rows x1, y1, x2 and so on."""
+    return np.asarray(points.transpose(0, 2, 1).reshape(2 * len(points), -1))
+
+
+def centred(points: Floats) -> Floats:
+    """Subtract each frame's mean point."""
+    return np.asarray(points - points.mean(axis=1, keepdims=True))
+
+
+def depths_of(depth: Floats, views: Floats, curvature: float, *, start: Floats | None = None) -> Floats:
+    """Return posterior mean depths of the sampled points, mean 0 in every frame, shape `(F, P)`.
+
+    Parameters
+    ----------
+    depth : array, shape (F, 2F)
+        From `depth_map`.
+    views : array, shape (F, P, 2)
+        Complete tracks relative to the principal point, normalised units.
+    curvature : float
+        κ.
+    start : array, shape (F, P), optional
+        Depths to start the fixed point from; 0 without it.
+    """
+    depths = np.zeros(views.shape[:2]) if start is None else start
+    for _ in range(STEPS if curvature else 1):
+        depths = depth @ columns(centred(corrected(views, depths, curvature)))
+        depths -= depths.mean(axis=1, keepdims=True)
+    return depths
+
+
+def corrected(views: Floats, depths: Floats, curvature: float) -> Floats:
+    """Return v (1 + κz): the scaled-orthographic tracks of the same shapes, about the principal point, shape `(F, P, 2)`."""
+    return np.asarray(views * np.maximum(1 + curvature * depths, NEAREST)[..., None])
+
+
+def density(depths: Floats, curvature: float) -> float:
+    """Return −2 mean log(1 + κz): what the change of variables u → u (1 + κz) adds to the negative log likelihood."""
+    return -2 * float(np.log(np.maximum(1 + curvature * depths, NEAREST)).mean())
+
+
+def mirrored(rotations: Floats, covariance: ShapeCovariance) -> tuple[Floats, ShapeCovariance]:
+    """Return cameras and covariance with all depths reversed: the same under orthography."""
+    turned = replace(
+        covariance, extent=MIRROR @ covariance.extent @ MIRROR, play=MIRROR @ covariance.play @ MIRROR
+    )  # fmt: skip
+    return MIRROR @ rotations @ MIRROR, turned
+
+
+def corrected_moments(view: Perspective, normalised: Normalised) -> tuple[Floats, Floats, Floats]:
+    """Return what completion returns of tracks, of the corrected ones: Gram matrix, translations and centred sample.
+
+    Parameters
+    ----------
+    view : Perspective
+        With κ, the sample and D.
+    normalised : Normalised
+        The tracks as they are.
+
+    Returns
+    -------
+    gram (2F, 2F), translations (F, 2), sample (F, S, 2)
+        Translations are relative to the centroids of the visible points.
+    """
+    frames = len(normalised.points)
+    gram, total, used = np.zeros((2 * frames, 2 * frames)), np.zeros((frames, 2)), 0
+    for _, points in spans(normalised, view.filling):
+        changed = _corrected_by(view, points + view.offsets[:, None]) - view.offsets[:, None]
+        stacked = columns(changed)
+        gram += stacked @ stacked.T
+        total += changed.sum(axis=1)
+        used += points.shape[1]
+    mean = total / used
+    flat = mean.reshape(-1)
+    return gram / used - np.outer(flat, flat), mean, centred(_corrected_by(view, view.sample))
+
+
+def _corrected_by(view: Perspective, views: Floats) -> Floats:
+    return corrected(views, depths_of(view.depth, views, view.curvature), view.curvature)
+
+
+def posterior_depths(view: Perspective, normalised: Normalised) -> Floats:
+    """Return the depth of every point and frame, shape `(F, P)`; 0 for points that no frame shows."""
+    found = np.zeros(normalised.visible.shape)
+    for places, points in spans(normalised, view.filling):
+        views = points + view.offsets[:, None]
+        found[:, places] = depths_of(view.depth, views, view.curvature)
+    return found
+
+
+def orthographic(normalised: Normalised, view: Perspective | None) -> Normalised:
+    """Return the tracks corrected with posterior depths, still relative to the centroids of the tracks as they were.
+
+    They are the same record where there is no perspective to correct.
+    """
+    if view is None or not view.bends:
+        return normalised
+    return corrected_tracks(normalised, view, posterior_depths(view, normalised))
+
+
+def corrected_tracks(normalised: Normalised, view: Perspective, depths: Floats) -> Normalised:
+    """Return the tracks corrected with depths `(F, P)`, relative to the centroids of the tracks as they were."""
+    views = normalised.points + view.offsets[:, None]
+    points = corrected(views, depths, view.curvature) - view.offsets[:, None]
+    return replace(normalised, points=np.where(normalised.visible[..., None] > 0, points, 0.0))

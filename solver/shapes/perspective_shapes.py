@@ -1,0 +1,80 @@
+"""Shapes under perspective: tracks corrected with the depths of the shapes found, and cameras that project to pixels."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from pliant.solver.cameras.estimation import CameraEstimate
+from pliant.solver.cameras.perspective import Perspective, corrected_tracks
+from pliant.solver.energy.problem import Problem
+from pliant.solver.records import Camera, Floats, Solution, Tracks, read_only
+from pliant.solver.shapes.state import State
+from pliant.solver.tracks.normalization import Normalised
+
+
+def corrected_again(
+    problem: Problem,
+    state: State,
+    normalised: Normalised,
+    flat: Normalised,
+    estimate: CameraEstimate,
+    kept: NDArray[np.intp] | None,
+) -> tuple[Problem, Normalised, float]:
+    """Return problem and tracks corrected with the depths of the state, and the RMS change of the corrected tracks.
+
+    Parameters
+    ----------
+    problem, state
+        Of the points `kept`, all of them for None.
+    normalised, flat : Normalised
+        The tracks as they are, and as they were corrected so far.
+    estimate : CameraEstimate
+        With κ and the cameras.
+    kept : array of int, optional
+        Points of the problem; the others keep the correction that they have.
+    """
+    view = estimate.perspective
+    assert view is not None
+    places = np.arange(normalised.points.shape[1]) if kept is None else kept
+    rows = np.asarray(estimate.scales)[:, None] * np.asarray(estimate.rotations)[:, 2] @ problem.axes
+    depths = np.einsum("fi,fip->fp", rows, state.shapes.astype(np.float64))
+    part = replace(normalised, points=normalised.points[:, places], visible=normalised.visible[:, places])
+    points = corrected_tracks(part, view, depths).points
+    seen = problem.confidence > 0
+    squared = np.square(points - flat.points[:, places]).sum(axis=2)
+    changed = float(np.sqrt(squared[seen].mean())) if seen.any() else 0.0
+    whole = flat.points.copy()
+    whole[:, places] = points
+    problem = replace(problem, points=np.ascontiguousarray(points.transpose(0, 2, 1), dtype=problem.points.dtype))
+    return problem, replace(flat, points=whole), changed
+
+
+def seen_in_perspective(
+    solution: Solution, tracks: Tracks, view: Perspective, unit: float, kept: NDArray[np.intp] | None
+) -> Solution:
+    """Return the solution with a camera that projects to the tracks as they are, and residuals measured there.
+
+    Tracks were corrected with depths relative to the mean of the points `kept`; shapes may be centred on the mean of all points. With c the
+    depth of one beyond the other, 1 + κ(z + c) = (1 + κc)(1 + κz/(1 + κc)): scales and translations are divided by 1 + κc.
+    """
+    camera = replace(solution.camera, principal_point=np.array(view.principal_point), y_up=view.signs[0] < 0)
+    if not view.bends:
+        read_only(camera.principal_point)
+        return replace(solution, camera=camera)
+    focal = unit / abs(view.curvature)
+    scales, translations = camera.scales, camera.translations
+    if kept is not None:
+        nearer = 1 - camera.depths(solution.shapes)[:, kept].mean(axis=1) / focal
+        scales = scales / nearer
+        translations = camera.principal_point + (translations - camera.principal_point) / nearer[:, None]
+    std = 0.0 if view.given is not None else focal * view.curvature_std / abs(view.curvature)
+    camera = Camera(
+        camera.rotations, scales, translations, focal, std, camera.principal_point, camera.y_up
+    )  # fmt: skip
+    left = tracks.points - camera.project(solution.shapes)
+    residuals: Floats = np.where(tracks.visible > 0, np.hypot(left[..., 0], left[..., 1]), 0.0)
+    for array in (camera.scales, camera.translations, camera.principal_point, residuals):
+        read_only(array)
+    return replace(solution, camera=camera, residuals=residuals)

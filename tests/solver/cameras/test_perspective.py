@@ -1,0 +1,282 @@
+"""Perspective: projection, the corrected tracks' identity, κ's gradient, focal length and sign of depth by evidence, bad input."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pliant.solver import Camera, InvalidInput, InvalidSettings, KnownCamera, Settings, Solution, Tracks, gallery, solve
+from pliant.solver.cameras.focal_length import corrected_energy
+from pliant.solver.cameras.learned import Learned, motion_of
+from pliant.solver.cameras.lens import given_lens
+from pliant.solver.cameras.perspective import corrected, density, depth_map, depths_of, mirrored
+from pliant.solver.evaluation.metrics import e3d_frame_scaled, focal_error, reprojection
+from pliant.solver.model.shape_covariance import ShapeCovariance
+from pliant.solver.model.so3 import exponential
+from pliant.solver.shapes import perspective_shapes
+from pliant.solver.tracks.normalization import normalise
+
+PICTURE = (1280.0, 720.0)
+CENTRE = np.array(PICTURE) / 2
+FOCAL = 900.0
+FACE = gallery.face(8, 60, degrees=70)
+
+
+def in_camera(shapes: np.ndarray, rotations: np.ndarray) -> np.ndarray:
+    """Shapes in camera axes, centred, half-size 300 px."""
+    seen = (shapes - shapes.mean(axis=1, keepdims=True)) @ rotations.transpose(0, 2, 1)
+    return np.asarray(300 * seen / np.abs(seen).max())
+
+
+SEEN = in_camera(FACE.shapes, FACE.rotations)
+
+
+def pinhole(seen: np.ndarray, focal: float, centre: np.ndarray = CENTRE) -> Tracks:
+    """Tracks of points (F, P, 3) in camera axes, their origin at depth φ."""
+    return Tracks.from_arrays(centre + seen[..., :2] / (1 + seen[..., 2:] / focal))
+
+
+@pytest.fixture(scope="module")
+def close() -> Solution:
+    """A face at three half-sizes' distance, φ unknown."""
+    return solve(pinhole(SEEN, FOCAL), settings=Settings(image_size=PICTURE))
+
+
+def a_camera(*, y_up: bool = False) -> Camera:
+    random = np.random.default_rng(2)
+    return Camera(
+        exponential(0.3 * random.normal(size=(5, 3))), random.uniform(0.8, 1.2, 5), random.normal(size=(5, 2)) * 50,
+        400.0, 1.0, np.array([20.0, -10.0]), y_up,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("y_up", [False, True])
+def test_projection_is_that_of_a_pinhole_at_the_camera_position(y_up: bool) -> None:
+    camera, shapes = a_camera(y_up=y_up), np.random.default_rng(3).normal(size=(5, 20, 3)) * 40
+    assert camera.positions is not None
+    points = shapes @ camera.rotations.transpose(0, 2, 1) + camera.positions[:, None]
+    depth = -points[..., 2] if y_up else points[..., 2]
+    image = camera.principal_point + 400.0 * points[..., :2] / depth[..., None]
+    assert camera.project(shapes) == pytest.approx(image, abs=1e-9)
+    assert camera.at(slice(2, 3)).project(shapes[2:3]) == pytest.approx(image[2:3], abs=1e-9)
+
+
+def test_an_orthographic_camera_projects_as_one_infinitely_far_away() -> None:
+    shapes = np.random.default_rng(3).normal(size=(5, 20, 3)) * 40
+    far, never = replace(a_camera(), focal=1e12), replace(a_camera(), focal=None)
+    assert never.project(shapes) == pytest.approx(far.project(shapes), abs=1e-6)
+    assert never.positions is None
+
+
+def test_corrected_tracks_are_orthographic_ones_exactly() -> None:
+    views = pinhole(SEEN, FOCAL).points - CENTRE
+    assert corrected(views, SEEN[..., 2], 1 / FOCAL) == pytest.approx(SEEN[..., :2], abs=1e-9)
+
+
+def test_density_is_the_logarithm_of_the_jacobian() -> None:
+    depths, curvature = np.random.default_rng(1).normal(size=(4, 6)) * 0.5, 0.3
+    jacobian = np.array([np.linalg.det((1 + curvature * each) * np.eye(2)) for each in depths.ravel()])
+    assert density(depths, curvature) == pytest.approx(-np.log(jacobian).mean())
+
+
+def a_covariance(frames: int = 6) -> tuple[np.ndarray, ShapeCovariance]:
+    random = np.random.default_rng(4)
+    rotations = exponential(np.linspace(-0.6, 0.6, frames)[:, None] * np.array([[0.3, 1.0, 0.1]]))
+    root = random.normal(size=(3, 3))
+    play = root @ root.T + np.eye(3)
+    modes = 0.1 * random.normal(size=(frames, 2))
+    return rotations, ShapeCovariance(np.diag([1.0, 0.8, 0.5]), 3 * play / np.trace(play), modes, 1e-4, 1e-6, np.inf)
+
+
+def test_depths_are_those_of_the_shapes_where_noise_is_small() -> None:
+    rotations, covariance = a_covariance(20)
+    covariance = replace(covariance, modes=0 * covariance.modes, drift=1e-9)
+    shape = np.random.default_rng(5).normal(size=(40, 3)) * [1.0, 0.8, 0.6]
+    seen = in_camera(np.broadcast_to(shape, (20, 40, 3)), rotations) / 200
+    views = seen[..., :2] / (1 + 0.2 * seen[..., 2:]) + 0.1
+    depth = depth_map(rotations, np.ones(20), covariance)
+    found = depths_of(depth, (views - 0.1), 0.2)
+    assert np.abs(found - seen[..., 2]).max() < 1e-3
+    turned, other = mirrored(rotations, covariance)
+    assert depth_map(turned, np.ones(20), other) == pytest.approx(-depth)
+
+
+def test_the_gradient_of_the_focal_length_is_that_of_finite_differences() -> None:
+    rotations, covariance = a_covariance()
+    random = np.random.default_rng(6)
+    views, depths = random.normal(size=(6, 30, 2)), 0.5 * random.normal(size=(6, 30))
+    found = Learned(rotations, np.ones(6), replace(covariance, noise=0.5), np.inf)
+    energy = corrected_energy(views, depths, found, with_scales=False)
+    flat = np.append(motion_of(energy.scene, found).flat(), 0.15)
+    _, gradient = energy(flat)
+    for place in (0, 7, 25, len(flat) - 1):
+        step = np.zeros_like(flat)
+        step[place] = 1e-5
+        slope = (energy(flat + step)[0] - energy(flat - step)[0]) / 2e-5
+        assert gradient[place] == pytest.approx(slope, rel=1e-4, abs=1e-7)
+
+
+def test_focal_length_sign_of_depth_and_shapes_are_found(close: Solution) -> None:
+    assert close.choices.camera == "perspective"
+    assert close.choices.depth_sign == "settled"
+    assert focal_error(close.camera, FOCAL) < 0.1
+    assert close.camera.focal_std is not None
+    assert 0 < close.camera.focal_std < 0.3 * FOCAL
+    assert e3d_frame_scaled(close.shapes, SEEN) < 0.03
+    turned = np.einsum("fpi,fpj->fij", SEEN, close.shapes)
+    assert (np.linalg.det(turned) > 0).all(), "the shapes are mirrored"
+    candidates = close.choices.focal_candidates
+    assert min(candidates, key=lambda each: each.nll).mirrored is False
+    assert any(each.focal is None for each in candidates)
+    assert any(each.mirrored for each in candidates)
+
+
+def test_the_cameras_project_to_the_pixels_given(close: Solution) -> None:
+    tracks = pinhole(SEEN, FOCAL)
+    left = np.linalg.norm(tracks.points - close.camera.project(close.shapes), axis=2)
+    assert close.residuals == pytest.approx(left)
+    assert reprojection(tracks, close).rms < 1.0
+    assert close.camera.principal_point == pytest.approx(CENTRE)
+
+
+def test_mirrored_input_gives_mirrored_shapes(close: Solution) -> None:
+    """The picture of the mirrored shape is not that of the shape: depth comes out with the other sign."""
+    other = SEEN * [1, 1, -1]
+    found = solve(pinhole(other, FOCAL), settings=Settings(image_size=PICTURE, focal=FOCAL))
+    assert (np.linalg.det(np.einsum("fpi,fpj->fij", other, found.shapes)) > 0).all()
+    assert e3d_frame_scaled(found.shapes, other) < 0.04
+    assert found.camera.focal == pytest.approx(FOCAL)
+    assert found.camera.focal_std == 0.0
+    assert not any("improbable" in warning for warning in found.choices.warnings)
+
+
+@pytest.mark.slow
+def test_tracks_with_y_up_are_the_same_scene_in_other_axes(close: Solution) -> None:
+    tracks = pinhole(SEEN, FOCAL)
+    up = Tracks.from_arrays(np.array([0.0, PICTURE[1]]) + tracks.points * [1, -1])
+    found = solve(up, settings=Settings(image_size=PICTURE, y_up=True))
+    assert found.camera.focal == pytest.approx(close.camera.focal, rel=0.05)
+    seen = SEEN * [1, -1, -1]
+    assert (np.linalg.det(np.einsum("fpi,fpj->fij", seen, found.shapes)) > 0).all()
+    assert reprojection(up, found).rms < 1.0
+
+
+@pytest.mark.slow
+def test_a_principal_point_off_centre_is_used() -> None:
+    corner = np.array([200.0, 650.0])
+    views = pinhole([*SEEN, 150.0, -200.0, 0.0], FOCAL, corner)
+    found = solve(views, settings=Settings(camera="perspective", focal=FOCAL, principal_point=(200.0, 650.0)))
+    assert e3d_frame_scaled(found.shapes, SEEN) < 0.03
+    assert reprojection(views, found).rms < 1.0
+    assert found.camera.principal_point == pytest.approx(corner)
+
+
+@pytest.mark.slow
+def test_a_wrong_focal_length_is_used_and_reported_as_improbable() -> None:
+    found = solve(pinhole(SEEN, FOCAL), settings=Settings(image_size=PICTURE, focal=3 * FOCAL))
+    assert found.camera.focal == pytest.approx(3 * FOCAL)
+    assert any("improbable" in warning for warning in found.choices.warnings)
+
+
+def test_a_field_of_view_is_a_focal_length() -> None:
+    angle = float(np.degrees(2 * np.arctan(PICTURE[0] / 2 / FOCAL)))
+    assert Settings(field_of_view=angle, image_size=PICTURE).focal_length == pytest.approx(FOCAL)
+
+
+@pytest.mark.slow
+def test_orthographic_tracks_give_the_orthographic_result_to_the_bit() -> None:
+    plain = solve(FACE.tracks, settings=Settings(camera="scaled_orthographic"))
+    chosen = solve(FACE.tracks, settings=Settings())
+    assert chosen.choices.camera == "scaled_orthographic"
+    assert chosen.choices.depth_sign == "ambiguous"
+    assert np.array_equal(chosen.shapes, plain.shapes)
+    assert np.array_equal(chosen.residuals, plain.residuals)
+    assert np.array_equal(chosen.camera.rotations, plain.camera.rotations)
+    assert "Orthography" in chosen.choices.reasons["camera_model"]
+    assert chosen.camera.focal is None
+
+
+def test_given_cameras_may_be_perspective() -> None:
+    cameras = KnownCamera.from_arrays(FACE.rotations, np.ones(8), focal=FOCAL, principal_point=(640.0, 360.0))
+    found = solve(pinhole(SEEN, FOCAL), cameras=cameras)
+    assert found.camera.focal == pytest.approx(FOCAL)
+    assert found.choices.depth_sign == "settled"
+    assert e3d_frame_scaled(found.shapes, SEEN) < 0.03
+
+
+@pytest.mark.slow
+def test_other_priors_take_a_given_focal_length() -> None:
+    found = solve(pinhole(SEEN, FOCAL), settings=Settings(prior="smooth", camera="perspective", image_size=PICTURE))
+    flat = solve(pinhole(SEEN, FOCAL), settings=Settings(prior="smooth"))
+    assert found.choices.camera == "perspective"
+    assert flat.choices.camera == "scaled_orthographic"
+    assert reprojection(pinhole(SEEN, FOCAL), found).rms < 3.0
+
+
+@pytest.mark.parametrize(
+    ("wrong", "name"),
+    [
+        ({"focal": 0.0}, "focal"),
+        ({"focal": -500.0}, "focal"),
+        ({"focal": float("nan")}, "focal"),
+        ({"focal": 900.0, "field_of_view": 60.0, "image_size": PICTURE}, "field_of_view"),
+        ({"field_of_view": 60.0}, "field_of_view"),
+        ({"field_of_view": 180.0, "image_size": PICTURE}, "field_of_view"),
+        ({"focal": 900.0, "camera": "orthographic"}, "focal"),
+        ({"image_size": (0.0, 720.0)}, "image_size"),
+        ({"principal_point": (float("inf"), 0.0)}, "principal_point"),
+        ({"principal_point": (-1e5, 0.0), "image_size": PICTURE}, "principal_point"),
+    ],
+)
+def test_settings_that_no_camera_has_are_refused(wrong: dict[str, object], name: str) -> None:
+    with pytest.raises(InvalidSettings) as refused:
+        Settings(**wrong)  # type: ignore[arg-type]
+    assert refused.value.field == f"options.{name}"
+
+
+def test_a_picture_beside_the_tracks_is_refused() -> None:
+    with pytest.raises(InvalidInput, match="most positions within") as refused:
+        solve(pinhole(SEEN, FOCAL), settings=Settings(image_size=(64.0, 48.0)))
+    assert refused.value.code == "outside_picture"
+
+
+def test_a_principal_point_absurdly_far_away_is_refused() -> None:
+    tracks = pinhole(SEEN, FOCAL)
+    with pytest.raises(InvalidInput) as refused:
+        given_lens(tracks, normalise(tracks), Settings(principal_point=(1e7, 0.0)))
+    assert refused.value.code == "principal_point_far"
+
+
+def test_two_focal_lengths_are_refused() -> None:
+    cameras = KnownCamera.from_arrays(FACE.rotations, focal=FOCAL)
+    with pytest.raises(InvalidInput) as refused:
+        solve(FACE.tracks, cameras=cameras, settings=Settings(focal=500.0))
+    assert refused.value.field == "cameras.focal"
+
+
+@pytest.mark.parametrize("wrong", [{"focal": 0.0}, {"focal": float("nan")}, {"principal_point": (0.0, float("nan"))}])
+def test_given_cameras_with_an_impossible_lens_are_refused(wrong: dict[str, object]) -> None:
+    with pytest.raises(InvalidInput):
+        KnownCamera.from_arrays(FACE.rotations, **wrong)  # type: ignore[arg-type]
+
+
+def test_shapes_centred_on_more_points_keep_their_image() -> None:
+    """Where depths were relative to the mean of some points, scales and translations are changed so that pixels stay."""
+    tracks = pinhole(SEEN, FOCAL)
+    normalised = normalise(tracks)
+    view = given_lens(tracks, normalised, Settings(focal=FOCAL, image_size=PICTURE))
+    assert view is not None
+    kept = np.arange(20)
+    middle = SEEN[:, kept].mean(axis=1)
+    about = SEEN - middle[:, None]  # centred on the kept points
+    truth = Camera(np.tile(np.eye(3), (8, 1, 1)), np.ones(8), CENTRE + middle[:, :2], FOCAL, 0.0, CENTRE)
+    image = Tracks.from_arrays(truth.project(about))
+    whole = about.mean(axis=1)
+    camera = Camera(truth.rotations, truth.scales, truth.translations + whole[:, :2])
+    flat = np.zeros(SEEN.shape[:2])
+    given = Solution(about - whole[:, None], camera, flat, flat, None, None, None, {})  # type: ignore[arg-type]
+    found = perspective_shapes.seen_in_perspective(
+        given, image, replace(view, curvature=normalised.unit / FOCAL), normalised.unit, kept
+    )
+    assert found.residuals.max() < 1e-6
