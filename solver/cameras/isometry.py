@@ -1,0 +1,391 @@
+"""A sheet that bends without stretching, seen by a pinhole camera: its shapes and, where it is not given, the focal length.
+
+Maximum depth (`inextensible`) gives a start, refinement on the isometry itself (`isometric_refinement`) the depths of some anchors, splines
+(`isometric_extension`) those of all points. The isometric inconsistency I, the share of the edges' length that changes from frame
+to frame, is computed without ground truth. As a function of the focal length it has its minimum at the true one wherever perspective is
+strong enough for the method to work, and is large or flat elsewhere. Isometry is therefore accepted only where I is small and
+clearly smaller than at the neighbouring focal lengths. The order of the frames has no effect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from pliant.solver.cameras.inextensible import SurfaceGraph, maximum_depth
+from pliant.solver.cameras.isometric_extension import Extended, complete_anchors, extend, flatten
+from pliant.solver.cameras.isometric_refinement import Isometry, refine
+from pliant.solver.cameras.surface_anchors import Anchors, choose_anchors, connected, nearest_neighbours, spread_frames
+from pliant.solver.records import Floats, Tracks
+
+ANCHORS = 60
+"""Points that the conic program places; its time grows with their number times the frames."""
+
+SOLVED_FRAMES = 24
+"""Frames of the conic program and of the focal lengths' comparison; the others start from the most similar one of these."""
+
+SHEETLIKE = 0.03
+"""Third over second singular value, squared, of the centred tracks below which `auto` tries isometry. Measured: paper .004, a comic page
+.019; bodies above .05, a nearly rigid head, for which I has false minima, .08."""
+
+SMALL = 0.012
+"""Largest I that is accepted. Measured: paper .002 and, with 1 px of noise, .003; a comic page .005; faces, bodies .035 to .07."""
+
+CLEAR = 1.25
+"""How many times larger I must be at the neighbouring focal lengths. Measured: paper and page 1.8 to 2.9; faces at most 1.1."""
+
+HOPELESS = 0.03
+"""I at the first focal length above which `auto` tries no other. Measured: paper and page at four times the true one .009 to .018."""
+
+STEP = 1.5
+"""Ratio of neighbouring focal lengths."""
+
+TYPICAL_FOCAL = 0.8
+"""First focal length tried, over the image's diagonal: about 64° across it."""
+
+FOCAL_RANGE = (0.2, 6.0)
+"""Focal lengths searched, over the image's diagonal."""
+
+GOLDEN_STEPS = 4
+"""Golden-section steps within the bracket, which leave 6 % of uncertainty either way before the parabola."""
+
+MARGIN = 1.3
+"""Image diagonal over that of the box around all tracks, where the image's size is not given."""
+
+FEWEST_ANCHORS = 6
+"""Anchors below which there is no surface to speak of."""
+
+
+@dataclass(frozen=True, slots=True)
+class FocalCandidate:
+    """One focal length that was tried."""
+
+    focal: float
+    """Pixels."""
+
+    inconsistency: float
+    """I, see the module."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class IsometricVerdict:
+    """Whether the tracks are those of an isometric surface, and the surface if they are."""
+
+    reason: str
+    """One sentence for the report."""
+
+    candidates: tuple[FocalCandidate, ...] = ()
+    """In the order in which they were tried."""
+
+    surface: IsometricSurface | None = None
+    """None where isometry is not taken."""
+
+    warnings: tuple[str, ...] = ()
+    """Sentences the user should read."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class IsometricSurface:
+    """Shapes before each frame's camera."""
+
+    points: Floats
+    """Camera axes, x right, y down, z away, shape `(F, P, 3)`; one free scale for the sequence."""
+
+    outliers: NDArray[np.bool_]
+    """Observations that contradict the surface, shape `(F, P)`."""
+
+    placed: NDArray[np.bool_]
+    """Points with a place on the surface, shape `(P,)`."""
+
+    focal: float
+    """Pixels, given or found."""
+
+    principal_point: tuple[float, float]
+    """Pixels, given or assumed."""
+
+    inconsistency: float
+    """I of the anchors over all frames."""
+
+    noise_std: float
+    """Robust standard deviation of the tracks about small affine patches, the tracks' unit."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Search:
+    """What stays the same for all focal lengths."""
+
+    anchors: Anchors
+    edges: NDArray[np.intp]
+    seen: NDArray[np.bool_]
+    frames: NDArray[np.intp]
+    centre: Floats
+    should_stop: Callable[[], bool] | None
+
+    def graph(self, focal: float, frames: NDArray[np.intp] | slice = slice(None)) -> SurfaceGraph:
+        rays = (self.anchors.points[frames] - self.centre) / focal
+        rays = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=2)
+        return SurfaceGraph(rays, self.seen[frames], self.edges)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Tried:
+    focal: float
+    found: Isometry
+
+
+def isometric_surface(
+    tracks: Tracks,
+    *,
+    focal: float | None = None,
+    principal_point: tuple[float, float] | None = None,
+    image_size: tuple[float, float] | None = None,
+    required: bool = False,
+    should_stop: Callable[[], bool] | None = None,
+) -> IsometricVerdict:
+    """Decide whether the tracks are those of an isometric surface, and reconstruct it.
+
+    Parameters
+    ----------
+    tracks : Tracks
+        Pixels, x right, y down.
+    focal : float, optional
+        Focal length in pixels; None searches it.
+    principal_point : (x, y), optional
+        Pixels; None takes the centre of the image, or that of the tracks where `image_size` is not given.
+    image_size : (width, height), optional
+        Pixels.
+    required : bool
+        Return the surface even if the evidence is weak, with a warning; only where there is none at all, none is returned.
+    should_stop : callable, optional
+        Called between units of work; once it returns True, the verdict is that isometry is not taken.
+    """
+    seen = tracks.visible > 0
+    search = _prepared(tracks, seen, _centre(tracks, principal_point, image_size), should_stop)
+    if search is None:
+        return IsometricVerdict("Too few points are seen together for an isometric surface.")
+    flatness = sheetlike(search.anchors)
+    if not required and flatness > SHEETLIKE:
+        return IsometricVerdict(
+            f"Not tried as an isometric sheet: the third singular value of the tracks is {np.sqrt(flatness):.2f} of the second."
+        )
+    tried = _sweep(search, focal, _diagonal(tracks, image_size), required)
+    if not tried or _stopped(should_stop):
+        return IsometricVerdict("No isometric surface was found: the conic program has no solution.", _trace(tried))
+    least = min(tried, key=lambda each: each.found.inconsistency)
+    clear, why = _judged(tried, least)
+    if not clear and not required:
+        return IsometricVerdict(why, _trace(tried))
+    chosen = least if focal is None else tried[0]
+    surface = _everywhere(search, tracks, seen, chosen)
+    if surface is None:
+        return IsometricVerdict("No isometric surface was found: its points do not hang together.", _trace(tried))
+    return IsometricVerdict(why, _trace(tried), surface, _warnings(clear, focal, least, chosen))
+
+
+def sheetlike(anchors: Anchors) -> float:
+    """Return the third eigenvalue over the second of the centred tracks' Gram matrix; hidden entries are filled with rank 3."""
+    known = np.repeat(anchors.seen, 2, axis=0)
+    matrix = anchors.points.transpose(0, 2, 1).reshape(len(known), -1)
+    rows = np.maximum(known.sum(axis=1, keepdims=True), 1)
+    matrix = np.where(known, matrix - (matrix * known).sum(axis=1, keepdims=True) / rows, 0.0)
+    for _ in range(1 if known.all() else 20):
+        left, values, right = np.linalg.svd(matrix - matrix.mean(axis=1, keepdims=True), full_matrices=False)
+        low = (left[:, :3] * values[:3]) @ right[:3] + matrix.mean(axis=1, keepdims=True)
+        matrix = np.where(known, matrix, low)
+    return float((values[2] / max(values[1], np.finfo(np.float64).tiny)) ** 2) if len(values) > 2 else 0.0
+
+
+def _prepared(
+    tracks: Tracks, seen: NDArray[np.bool_], centre: Floats, should_stop: Callable[[], bool] | None
+) -> _Search | None:
+    if (seen.sum(axis=0) >= 2).sum() < FEWEST_ANCHORS:
+        return None
+    anchors = choose_anchors(tracks.points, seen, ANCHORS)
+    edges = nearest_neighbours(anchors)
+    if anchors.points.shape[1] < FEWEST_ANCHORS or len(edges) == 0:
+        return None
+    known = connected(anchors.seen, edges)
+    if (known.sum(axis=1) >= FEWEST_ANCHORS).sum() < 2:
+        return None
+    weight = known[..., None]
+    middle = (anchors.points * weight).sum(axis=1, keepdims=True) / np.maximum(weight.sum(axis=1, keepdims=True), 1)
+    frames = spread_frames(np.where(weight, anchors.points - middle, 0.0), known, SOLVED_FRAMES)
+    return _Search(anchors, edges, known, frames, centre, should_stop)
+
+
+def _sweep(search: _Search, focal: float | None, diagonal: float, required: bool) -> list[_Tried]:
+    """Return the focal lengths tried: the given or typical one, then downhill by `STEP`, then within the bracket."""
+    first = _tried(search, focal if focal is not None else TYPICAL_FOCAL * diagonal, None)
+    if first is None:
+        return []
+    tried = [first]
+    if not required and first.found.inconsistency > HOPELESS:
+        return tried
+    low, high = FOCAL_RANGE[0] * diagonal, FOCAL_RANGE[1] * diagonal
+    while not _stopped(search.should_stop):
+        least = min(tried, key=lambda each: each.found.inconsistency)
+        ahead = [least.focal * STEP, least.focal / STEP]
+        wanted = [f for f in ahead if low <= f <= high and not any(abs(np.log(t.focal / f)) < 1e-6 for t in tried)]
+        if not wanted:
+            break
+        tried += [each for each in (_tried(search, f, least) for f in wanted) if each is not None]
+    if focal is None:
+        tried += _golden(search, min(tried, key=lambda each: each.found.inconsistency))
+    return tried
+
+
+def _golden(search: _Search, middle: _Tried) -> list[_Tried]:
+    """Return what golden-section search tries within a step of the least focal length, and the vertex of a parabola at the end."""
+    share = (np.sqrt(5) - 1) / 2
+    low, high = np.log(middle.focal / STEP), np.log(middle.focal * STEP)
+    made: list[_Tried] = []
+
+    def at(place: float) -> float:
+        found = _tried(search, float(np.exp(place)), middle)
+        if found is not None:
+            made.append(found)
+        return found.found.inconsistency if found is not None else np.inf
+
+    left, right = high - share * (high - low), low + share * (high - low)
+    at_left, at_right = at(left), at(right)
+    for _ in range(GOLDEN_STEPS - 2):
+        if _stopped(search.should_stop):
+            return made
+        if at_left <= at_right:
+            high, right, at_right = right, left, at_left
+            left = high - share * (high - low)
+            at_left = at(left)
+        else:
+            low, left, at_left = left, right, at_right
+            right = low + share * (high - low)
+            at_right = at(right)
+    around = sorted([middle, *made], key=lambda each: each.focal)
+    best = min(range(len(around)), key=lambda index: around[index].found.inconsistency)
+    if 0 < best < len(around) - 1:
+        three = around[best - 1 : best + 2]
+        x, y = np.log([t.focal for t in three]), np.square([t.found.inconsistency for t in three])
+        bend, slope, _ = np.polyfit(x - x[1], y, 2)
+        if bend > 0:
+            at(float(np.clip(x[1] - slope / (2 * bend), x[0], x[2])))
+    return made
+
+
+def _tried(search: _Search, focal: float, near: _Tried | None) -> _Tried | None:
+    """Return the isometry at a focal length, from a neighbouring one's depths or from the conic program."""
+    graph = search.graph(focal, search.frames)
+    if near is None:
+        depths = maximum_depth(graph)
+    else:
+        depths = _carried(near.found.depths, graph.seen, focal / near.focal)
+    return _Tried(focal, refine(graph, depths, should_stop=search.should_stop)) if depths is not None else None
+
+
+def _carried(depths: Floats, seen: NDArray[np.bool_], ratio: float) -> Floats:
+    """Return depths for a focal length `ratio` times as long: the same relief, further away."""
+    mean = depths.sum(axis=1, keepdims=True) / np.maximum(seen.sum(axis=1, keepdims=True), 1)
+    return np.where(seen, np.maximum(ratio * mean + (depths - mean), 0.05 * ratio * mean), 0.0)
+
+
+def _judged(tried: list[_Tried], least: _Tried) -> tuple[bool, str]:
+    """Return whether I is small and clearly smaller than at the neighbouring focal lengths, and the sentence."""
+    value = least.found.inconsistency
+    sides = [
+        min((t.found.inconsistency for t in tried if (t.focal - least.focal) * side > 0
+             and abs(np.log(t.focal / least.focal)) >= 0.6 * np.log(STEP)), default=0.0)
+        for side in (-1, 1)
+    ]  # fmt: skip
+    ratio = min(sides) / value if value > 0 else np.inf
+    if value > SMALL:
+        return False, f"Not an isometric sheet: edge lengths change by {value:.1%} or more, whatever the focal length."
+    if not ratio >= CLEAR:
+        return False, "Not taken as an isometric sheet: its edge lengths do not single out a focal length."
+    return True, (
+        f"Taken as an isometric sheet: at a focal length of {least.focal:.0f} px edge lengths change by {value:.2%}, "
+        f"{ratio:.1f} times as much at neighbouring focal lengths."
+    )
+
+
+def _everywhere(search: _Search, tracks: Tracks, seen: NDArray[np.bool_], chosen: _Tried) -> IsometricSurface | None:
+    """Return the surface of all frames and points, from the anchors of some frames at the chosen focal length."""
+    part = search.graph(chosen.focal, search.frames)
+    whole = search.graph(chosen.focal)
+    afresh = maximum_depth(part)
+    found = chosen.found if afresh is None else refine(part, afresh, should_stop=search.should_stop)
+    found = min(found, chosen.found, key=lambda each: each.inconsistency)
+    if len(search.frames) < tracks.num_frames:
+        found = refine(whole, _from_similar(whole, search, found.depths), should_stop=search.should_stop)
+    else:
+        found = replace(found, depths=found.depths[np.argsort(search.frames)])
+    template = flatten(search.edges, found.lengths, search.seen.shape[1])
+    if template is None:
+        return None
+    points = complete_anchors(found.depths[..., None] * whole.rays, search.seen, template)
+    all_of_it: Extended = extend(
+        tracks.points, seen, images=search.anchors.points, known=search.seen, anchors=points, template=template,
+        focal=chosen.focal, centre=search.centre,
+    )  # fmt: skip
+    if not np.isfinite(all_of_it.points).all():
+        return None
+    return IsometricSurface(
+        all_of_it.points, all_of_it.outliers, all_of_it.placed, chosen.focal,
+        (float(search.centre[0]), float(search.centre[1])), found.inconsistency, search.anchors.noise_std,
+    )  # fmt: skip
+
+
+def _from_similar(graph: SurfaceGraph, search: _Search, depths: Floats) -> Floats:
+    """Return depths `(F, A)` for all frames, those of the solved frame whose image is most alike."""
+    start = np.zeros(graph.seen.shape)
+    rays, seen = graph.rays[search.frames], graph.seen[search.frames]
+    for frame in range(len(start)):
+        both = seen & graph.seen[frame]
+        off = np.where(both[..., None], rays - graph.rays[frame], 0.0)
+        count = np.maximum(both.sum(axis=1), 1)
+        off -= np.where(both[..., None], off.sum(axis=1, keepdims=True) / count[:, None, None], 0.0)
+        unlike = np.where(both.sum(axis=1) >= 2, np.square(off).sum(axis=(1, 2)) / count, np.inf)
+        like = int(unlike.argmin())
+        mean = float(depths[like][seen[like]].mean()) if seen[like].any() else 1.0
+        start[frame] = np.where(graph.seen[frame], np.where(seen[like], depths[like], mean), 0.0)
+    return start
+
+
+def _centre(
+    tracks: Tracks, principal_point: tuple[float, float] | None, image_size: tuple[float, float] | None
+) -> Floats:
+    if principal_point is not None:
+        return np.array(principal_point, dtype=np.float64)
+    if image_size is not None:
+        return np.array(image_size, dtype=np.float64) / 2
+    return np.asarray(np.median(tracks.points[tracks.visible > 0], axis=0))
+
+
+def _diagonal(tracks: Tracks, image_size: tuple[float, float] | None) -> float:
+    """Return the image's diagonal, or a guess from the middle 98 % of the tracks."""
+    if image_size is not None:
+        return float(np.hypot(*image_size))
+    low, high = np.quantile(tracks.points[tracks.visible > 0], [0.01, 0.99], axis=0)
+    return MARGIN * float(np.hypot(*(high - low)))
+
+
+def _warnings(clear: bool, focal: float | None, least: _Tried, chosen: _Tried) -> tuple[str, ...]:
+    warnings = []
+    if not clear:
+        warnings.append(
+            f"The surface was required to be isometric, but the tracks hardly support it: edge lengths change by "
+            f"{chosen.found.inconsistency:.1%}. Compare with surface=free."
+        )
+    if focal is not None and chosen.found.inconsistency > CLEAR * least.found.inconsistency:
+        warnings.append(
+            f"The given focal length of {focal:.0f} px is improbable: edge lengths change {chosen.found.inconsistency:.2%} with it, "
+            f"{least.found.inconsistency:.2%} at {least.focal:.0f} px. Check focal, field_of_view and principal_point."
+        )
+    return tuple(warnings)
+
+
+def _trace(tried: list[_Tried]) -> tuple[FocalCandidate, ...]:
+    return tuple(FocalCandidate(each.focal, each.found.inconsistency) for each in tried)
+
+
+def _stopped(should_stop: Callable[[], bool] | None) -> bool:
+    return should_stop is not None and should_stop()
