@@ -8,13 +8,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from pliant.solver.cameras.estimation import CameraEstimate, estimate_cameras, given_cameras
+from pliant.solver.cameras.isometry import IsometricVerdict, isometric_surface
 from pliant.solver.cameras.joint_refinement import learn, telling_frames
 from pliant.solver.cameras.planar_ambiguity import is_flat
 from pliant.solver.energy.hyperparameters import FINEST
 from pliant.solver.energy.objective import residuals
 from pliant.solver.energy.problem import Problem
 from pliant.solver.energy.robust_loss import largest_weight
-from pliant.solver.errors import InvalidInput
+from pliant.solver.errors import InvalidInput, InvalidSettings
 from pliant.solver.evaluation.trust import assess
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.records import (
@@ -34,6 +35,7 @@ from pliant.solver.records import (
 from pliant.solver.settings import Settings
 from pliant.solver.shapes.initialization import pseudo_inverse, uniform_solution
 from pliant.solver.shapes.irls import init, no_higher, step, terminate
+from pliant.solver.shapes.isometric_solution import isometric_solution
 from pliant.solver.shapes.outlier_rejection import without_outliers
 from pliant.solver.shapes.setup import build_problem, with_bending
 from pliant.solver.shapes.sparsely_observed import SELDOM, OftenSeen, draw_the_rest, often_seen
@@ -87,6 +89,11 @@ def solve(
     tell = on_step if on_step is not None else _silent
     began = time.perf_counter()
     normalised = normalise(tracks)
+    verdict = _isometric(tracks, cameras, settings, should_stop)
+    if verdict is not None and verdict.surface is not None:
+        seconds = {"cameras": time.perf_counter() - began}
+        tell(Step("finish", 1.0, max_reweightings=settings.max_reweightings))
+        return isometric_solution(tracks, verdict, unit=normalised.unit, seconds=seconds)
     estimate, covariance = _learned(normalised, cameras, settings, on_step=on_step, should_stop=should_stop)
     tell(Step("cameras", CAMERA_SHARE, max_reweightings=settings.max_reweightings))
     seconds = {"cameras": time.perf_counter() - began}
@@ -127,9 +134,40 @@ def solve(
         problem, history, outcome, normalised=normalised, estimate=estimate, choices=choices, seconds=seconds
     )
     solution = assessed(solution, problem, estimate, covariance, normalised.unit, seed=settings.seed)
+    if verdict is not None:
+        solution = replace(solution, choices=_with_verdict(solution.choices, verdict, settings))
     seconds["finish"] = time.perf_counter() - began
     tell(_told("finish", history[-1], settings, normalised.unit, fraction=1.0))
     return solution
+
+
+def _isometric(
+    tracks: Tracks, cameras: KnownCamera | None, settings: Settings, should_stop: Callable[[], bool] | None
+) -> IsometricVerdict | None:
+    """Return whether the surface is isometric; None where that is not asked."""
+    if settings.surface == "isometric" and cameras is not None:
+        raise InvalidSettings(
+            "invalid_option", field="options.surface", expected="auto or free where rotations are given", got="'isometric'",
+            hint="Leave the rotations out: an isometric surface gives its own cameras.",
+        )  # fmt: skip
+    usual = settings.gaussian and cameras is None and settings.camera in {Settings().camera, "perspective"}
+    if settings.surface == "free" or (settings.surface == "auto" and not usual):
+        return None
+    return isometric_surface(
+        tracks, focal=settings.focal_length, principal_point=settings.principal_point, image_size=settings.image_size,
+        required=settings.surface == "isometric", should_stop=should_stop,
+    )  # fmt: skip
+
+
+def _with_verdict(choices: Choices, verdict: IsometricVerdict, settings: Settings) -> Choices:
+    """Return the choices with why the surface is free; a warning where it was required not to be."""
+    warnings = choices.warnings
+    if settings.surface == "isometric":
+        warnings = (*warnings, f"The surface could not be taken as isometric and is free. {verdict.reason}")
+    tried = tuple((each.focal, each.inconsistency) for each in verdict.candidates)
+    return replace(
+        choices, reasons={**choices.reasons, "surface": verdict.reason}, warnings=warnings, focal_lengths=tried
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

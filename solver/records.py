@@ -191,7 +191,10 @@ class Mesh:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Camera:
-    """The estimated camera of every frame: points = scales · shapes · rotations[:, :2]ᵀ + translations."""
+    """The estimated camera of every frame: points = scales · shapes · rotations[:, :2]ᵀ + translations.
+
+    With a focal length φ and principal point c, y = scales · shapes · rotationsᵀ: points = c + (y₁₂ + translations − c) / (1 + y₃/φ).
+    """
 
     rotations: Floats
     """Camera from world, shape `(F, 3, 3)`; orthographic: the first two rows project."""
@@ -201,6 +204,21 @@ class Camera:
 
     translations: Floats
     """Image position of each frame's shape origin, shape `(F, 2)`, the tracks' unit."""
+
+    focal: float | None = None
+    """Focal length, the tracks' unit; None: scaled orthography."""
+
+    principal_point: tuple[float, float] | None = None
+    """The tracks' unit; None where `focal` is."""
+
+    def project(self, shapes: Floats) -> Floats:
+        """Return the image positions `(F, P, 2)` of shapes `(F, P, 3)`."""
+        turned = self.scales[:, None, None] * (shapes @ self.rotations.transpose(0, 2, 1))
+        flat = turned[..., :2] + self.translations[:, None]
+        if self.focal is None or self.principal_point is None:
+            return np.asarray(flat)
+        centre = np.array(self.principal_point)
+        return np.asarray(centre + (flat - centre) / (1 + turned[..., 2:] / self.focal))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -332,6 +350,8 @@ class Choices:
     """One sentence for each automatic choice, by name."""
     warnings: tuple[str, ...] = ()
     """Sentences the user should read, e.g. that the camera hardly moved."""
+    focal_lengths: tuple[tuple[float, float], ...] = ()
+    """Focal lengths that were compared for an isometric surface, pixels, each with its isometric inconsistency I; empty if none were."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -13,6 +13,7 @@ alike, and neither H nor λ3 has a part in it.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import isfinite, radians, tan
 from typing import Literal
 
 from pliant.solver.errors import InvalidSettings
@@ -22,6 +23,7 @@ CameraModel = Literal["scaled_orthographic", "orthographic"]
 Preset = Literal["auto", "paper"]
 Loss = Literal["l1", "l2", "huber"]
 Prior = Literal["gaussian", "smooth+low_rank", "smooth"]
+Surface = Literal["auto", "isometric", "free"]
 Laplacian = Literal["auto", "grid8", "uniform", "cotangent"]
 
 
@@ -34,6 +36,22 @@ class Settings:
 
     camera: CameraModel = "scaled_orthographic"
     """Scaled orthography estimates s_f per frame (gauge: mean of log s_f = 0); orthography has s_f = 1."""
+
+    surface: Surface = "auto"
+    """`isometric`: a sheet that bends without stretching, seen in perspective; `free`: none of that; `auto`: isometric where the tracks
+    are those of a sheet and its edge lengths single out a focal length, with the default camera model, method and prior only."""
+
+    focal: float | None = None
+    """Focal length in the tracks' unit; None estimates it where it matters."""
+
+    field_of_view: float | None = None
+    """Horizontal field of view, degrees, in place of `focal`; needs `image_size`."""
+
+    principal_point: tuple[float, float] | None = None
+    """x, y in the tracks' unit; None: the centre of the image, or of the tracks where `image_size` is not given."""
+
+    image_size: tuple[int, int] | None = None
+    """Width and height of the image, the tracks' unit."""
 
     basis_size: int | None = None
     """K of the rank-3K factorization; None chooses it from the data and reports why."""
@@ -86,6 +104,13 @@ class Settings:
     """Seed of every random choice (restarts, sampled points). The same seed and thread count give the same bits."""
 
     @property
+    def focal_length(self) -> float | None:
+        """φ from `focal` or from `field_of_view`; None if neither is given."""
+        if self.field_of_view is None or self.image_size is None:
+            return self.focal
+        return self.image_size[0] / (2 * tan(radians(self.field_of_view) / 2))
+
+    @property
     def gaussian(self) -> bool:
         """True if the shapes get the Gaussian prior."""
         return self.prior == "gaussian" and self.method == "robust" and self.preset == "auto"
@@ -93,6 +118,8 @@ class Settings:
     def __post_init__(self) -> None:
         _check_choice("method", self.method, Method)
         _check_choice("camera", self.camera, CameraModel)
+        _check_choice("surface", self.surface, Surface)
+        self._check_image()
         _check_choice("preset", self.preset, Preset)
         _check_choice("loss", self.loss, Loss)
         _check_choice("laplacian", self.laplacian, Laplacian)
@@ -114,6 +141,23 @@ class Settings:
             raise _out_of_range("tolerance", "a number between 0 and 1", self.tolerance)
         if not 0 <= self.seed < 2**32:
             raise _out_of_range("seed", "a whole number from 0 to 4294967295", self.seed)
+
+    def _check_image(self) -> None:
+        if self.focal is not None and not 0 < self.focal < 1e9:
+            raise _out_of_range("focal", "a positive number of pixels, or None", self.focal)
+        if self.field_of_view is not None and not 1 <= self.field_of_view <= 170:
+            raise _out_of_range("field_of_view", "degrees from 1 to 170, or None", self.field_of_view)
+        if self.field_of_view is not None and self.focal is not None:
+            raise _out_of_range("field_of_view", "either focal or field_of_view, not both", self.field_of_view)
+        if self.image_size is not None and not (
+            len(self.image_size) == 2 and all(0 < n < 1e6 for n in self.image_size)
+        ):
+            raise _out_of_range("image_size", "width and height in pixels", self.image_size)
+        if self.field_of_view is not None and self.image_size is None:
+            raise _out_of_range("field_of_view", "image_size beside it, for its width in pixels", self.field_of_view)
+        point = self.principal_point
+        if point is not None and not (len(point) == 2 and all(isfinite(n) and abs(n) < 1e9 for n in point)):
+            raise _out_of_range("principal_point", "two finite numbers x, y in pixels", point)
 
 
 def _check_choice(name: str, value: str, choices: object) -> None:

@@ -125,9 +125,7 @@ def spline(source: Floats, values: Floats, target: Floats) -> Floats:
     matrix[:count, count:], matrix[count:, :count] = affine, affine.T
     matrix[count:, count:] = -1e-9 * np.eye(3)  # sources on one line leave the affine part open
     weights = np.linalg.solve(matrix, np.concatenate([values, np.zeros((3, values.shape[1]))]))
-    return np.asarray(
-        _kernel(target, source) @ weights[:count] + weights[count] + target @ weights[count + 1 :]
-    )
+    return np.asarray(_kernel(target, source) @ weights[:count] + weights[count] + target @ weights[count + 1 :])
 
 
 def _kernel(target: Floats, source: Floats) -> Floats:

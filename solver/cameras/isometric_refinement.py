@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from pliant.solver.cameras.inextensible import SurfaceGraph
@@ -170,7 +171,7 @@ def _step(normal: sparse.csr_matrix, gradient: Floats, damping: float, counts: F
     diagonal = normal.diagonal()
     added = damping * diagonal + 1e-12 * float(diagonal.max())
     bounds = np.concatenate([[0], np.cumsum(counts)])
-    spans = [slice(a, b) for a, b in zip(bounds[:-1], bounds[1:], strict=True) if b > a]
+    spans = [slice(int(a), int(b)) for a, b in pairwise(bounds) if b > a]
     blocks = [
         splu((normal[s, s] + sparse.diags(added[s])).tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
              options={"SymmetricMode": True})
@@ -191,4 +192,3 @@ def _step(normal: sparse.csr_matrix, gradient: Floats, damping: float, counts: F
     inverse = LinearOperator(shape, matvec=precondition, dtype=np.float64)
     move, _ = cg(operator, -gradient, rtol=1e-3, maxiter=100, M=inverse)
     return np.asarray(move)
-

@@ -75,10 +75,7 @@ def reprojection(tracks: Tracks, solution: Solution) -> Reprojection:
     Recomputed from shapes and camera, so that it checks `Solution.residuals` instead of repeating them. Frames or
     points that nobody saw do not count; with nothing visible both values would have no meaning, which `Tracks` refuses.
     """
-    camera = solution.camera
-    projected = solution.shapes @ camera.rotations[:, :2].transpose(0, 2, 1)
-    projected = camera.scales[:, None, None] * projected + camera.translations[:, None]
-    squared = np.square(tracks.points - projected).sum(axis=2)
+    squared = np.square(tracks.points - solution.camera.project(solution.shapes)).sum(axis=2)
     median = np.median(np.sqrt(squared[tracks.visible > 0]))
     return Reprojection(float(median), float(np.sqrt(np.average(squared, weights=tracks.visible))))
 

@@ -1,0 +1,87 @@
+"""A Solution from an isometric surface: camera axes become cameras that move around shapes in one world.
+
+The surface is known in each frame's camera axes. A rigid motion per frame brings it onto the mean shape (generalised Procrustes analysis;
+Gower 1975), so that what is left between frames is deformation and what was taken out is the camera's rotation. Shapes are in image units
+at the mean depth, as under scaled orthography.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from pliant.solver.cameras.isometry import IsometricSurface, IsometricVerdict
+from pliant.solver.evaluation.alignment import procrustes
+from pliant.solver.records import Camera, Choices, Floats, Outcome, Solution, Trace, Tracks, read_only
+
+ROUNDS = 5
+"""Alternations between mean shape and rotations; each starts from the last, and the third changes angles by less than 1e-3 already."""
+
+
+def isometric_solution(
+    tracks: Tracks, verdict: IsometricVerdict, *, unit: float, seconds: dict[str, float]
+) -> Solution:
+    """Return the solution that an accepted verdict stands for.
+
+    Parameters
+    ----------
+    tracks : Tracks
+        What the surface was computed from.
+    verdict : IsometricVerdict
+        With a surface.
+    unit : float
+        RMS radius of the centred tracks, reported with the choices.
+    seconds : dict
+        Wall time per stage.
+    """
+    surface = verdict.surface
+    assert surface is not None
+    shapes, camera = in_world_axes(surface)
+    seen = tracks.visible > 0
+    residual = np.where(seen, np.linalg.norm(camera.project(shapes) - tracks.points, axis=2), 0.0)
+    weights = np.where(seen & ~surface.outliers & surface.placed, tracks.visible, 0.0)
+    median = float(np.median(residual[seen]))
+    for array in (shapes, residual, weights):
+        read_only(array)
+    trace = Trace(np.array([surface.inconsistency]), np.array([median]), np.zeros(1, dtype=np.int32))
+    choices = _choices(verdict, surface, unit, float(surface.outliers.sum() / seen.sum()))
+    return Solution(shapes, camera, residual, weights, trace, Outcome.CONVERGED, choices, seconds)
+
+
+def in_world_axes(surface: IsometricSurface) -> tuple[Floats, Camera]:
+    """Return shapes `(F, P, 3)`, centred, and the cameras that see them where the surface was."""
+    origin = surface.points.mean(axis=1)
+    centred = surface.points - origin[:, None]
+    rotations = _rotations(centred[:, surface.placed])
+    scales = surface.focal / origin[:, 2]
+    unit = float(np.exp(np.log(scales).mean()))
+    shapes = unit * (centred @ rotations)
+    point = np.array(surface.principal_point)
+    translations = point + scales[:, None] * origin[:, :2]
+    for array in (rotations, scales, translations):
+        read_only(array)
+    return shapes, Camera(rotations, scales / unit, translations, surface.focal, surface.principal_point)
+
+
+def _rotations(centred: Floats) -> Floats:
+    """Return camera from world, `(F, 3, 3)`: S_f R_f is nearest to the mean shape; the first is the identity."""
+    mean = centred[int(np.square(centred - centred.mean(axis=0)).sum(axis=(1, 2)).argmin())]
+    rotations = np.tile(np.eye(3), (len(centred), 1, 1))
+    for _ in range(ROUNDS):
+        rotations = procrustes(centred.transpose(0, 2, 1) @ mean, proper=True)
+        mean = (centred @ rotations).mean(axis=0)
+    return np.asarray(rotations @ rotations[0].T)
+
+
+def _choices(verdict: IsometricVerdict, surface: IsometricSurface, unit: float, outliers: float) -> Choices:
+    reasons = {
+        "surface": verdict.reason,
+        "outliers": f"{outliers:.1%} of what was seen contradicts the surface and was not used.",
+    }
+    warnings = list(verdict.warnings)
+    if not surface.placed.all():
+        share = 1 - float(surface.placed.mean())
+        warnings.append(f"{share:.1%} of the points were never seen on the surface; they lie in its middle.")
+    return Choices(
+        basis_size=0, temporal_weight=0.0, spatial_weight=0.0, robust_scale=0.0, temporal_order=1, low_rank_weight=0.0,
+        laplacian="none", unit=unit, noise=surface.noise_std, reasons=reasons, warnings=tuple(warnings),
+        focal_lengths=tuple((each.focal, each.inconsistency) for each in verdict.candidates),
+    )  # fmt: skip
