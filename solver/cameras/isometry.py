@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pliant.solver.cameras.inextensible import SurfaceGraph, maximum_depth
 from pliant.solver.cameras.isometric_extension import Extended, complete_anchors, extend, flatten
 from pliant.solver.cameras.isometric_refinement import Isometry, refine
-from pliant.solver.cameras.surface_anchors import Anchors, choose_anchors, connected, nearest_neighbours, spread_frames
+from pliant.solver.cameras.surface_anchors import Anchors, choose_anchors, connected, nearest_neighbours, unlike_frames
 from pliant.solver.records import Floats, Tracks
 
 ANCHORS = 60
@@ -57,6 +57,11 @@ GOLDEN_STEPS = 4
 
 MARGIN = 1.3
 """Image diagonal over that of the box around all tracks, where the image's size is not given."""
+
+FIRST_LOOK = 200
+"""Points that say which frames differ most."""
+
+TOO_LITTLE = "Too few points are seen together for an isometric surface."
 
 FEWEST_ANCHORS = 6
 """Anchors below which there is no surface to speak of."""
@@ -165,19 +170,19 @@ def isometric_surface(
     should_stop : callable, optional
         Called between units of work; once it returns True, the verdict is that isometry is not taken.
     """
-    seen = tracks.visible > 0
-    search = _prepared(tracks, seen, _centre(tracks, principal_point, image_size), should_stop)
-    if search is None:
-        return IsometricVerdict("Too few points are seen together for an isometric surface.")
-    flatness = sheetlike(search.anchors)
-    if not required and flatness > SHEETLIKE:
-        return IsometricVerdict(
-            f"Not tried as an isometric sheet: the third singular value of the tracks is {np.sqrt(flatness):.2f} of the second."
-        )
-    first = focal if focal is not None else TYPICAL_FOCAL * _diagonal(tracks, image_size)
-    if not required and (least_hope := _glance(search, first)) > HOPELESS:
-        return IsometricVerdict(f"Not an isometric sheet: edge lengths of a part of it change by {least_hope:.1%}.")
-    tried = _sweep(search, focal, _diagonal(tracks, image_size))
+    seen, centre, diagonal = (
+        tracks.visible > 0,
+        _centre(tracks, principal_point, image_size),
+        _diagonal(tracks, image_size),
+    )
+    part = _some_frames(tracks.points, seen)
+    search = _prepared(tracks.points[part], seen[part], centre, should_stop)
+    against = _implausible(search, focal if focal is not None else TYPICAL_FOCAL * diagonal, required)
+    if against is None and len(part) < tracks.num_frames:
+        search = _prepared(tracks.points, seen, centre, should_stop)
+    if against is not None or search is None:
+        return IsometricVerdict(against or TOO_LITTLE)
+    tried = _sweep(search, focal, diagonal)
     if not tried or _stopped(should_stop):
         return IsometricVerdict("No isometric surface was found: the conic program has no solution.", _trace(tried))
     least = min(tried, key=lambda each: each.found.inconsistency)
@@ -189,6 +194,27 @@ def isometric_surface(
     if surface is None:
         return IsometricVerdict("No isometric surface was found: its points do not hang together.", _trace(tried))
     return IsometricVerdict(why, _trace(tried), surface, _warnings(clear, focal, least, chosen))
+
+
+def _implausible(search: _Search | None, focal: float, required: bool) -> str | None:
+    """Return why there is no isometric sheet to look for; None if there may be one."""
+    if search is None:
+        return TOO_LITTLE
+    if required:
+        return None
+    flatness = sheetlike(search.anchors)
+    if flatness > SHEETLIKE:
+        return f"Not tried as an isometric sheet: the third singular value of the tracks is {np.sqrt(flatness):.2f} of the second."
+    changes = _glance(search, focal)
+    return (
+        f"Not an isometric sheet: edge lengths of a part of it change by {changes:.1%}." if changes > HOPELESS else None
+    )
+
+
+def _some_frames(points: Floats, seen: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Return the frames of the first look, from some of the points."""
+    often = np.argsort(-seen.sum(axis=0), kind="stable")[:: max(1, seen.shape[1] // FIRST_LOOK)]
+    return unlike_frames(points[:, often], seen[:, often], SOLVED_FRAMES)
 
 
 def sheetlike(anchors: Anchors) -> float:
@@ -205,20 +231,18 @@ def sheetlike(anchors: Anchors) -> float:
 
 
 def _prepared(
-    tracks: Tracks, seen: NDArray[np.bool_], centre: Floats, should_stop: Callable[[], bool] | None
+    points: Floats, seen: NDArray[np.bool_], centre: Floats, should_stop: Callable[[], bool] | None
 ) -> _Search | None:
     if (seen.sum(axis=0) >= 2).sum() < FEWEST_ANCHORS:
         return None
-    anchors = choose_anchors(tracks.points, seen, ANCHORS)
+    anchors = choose_anchors(points, seen, ANCHORS)
     edges = nearest_neighbours(anchors)
     if anchors.points.shape[1] < FEWEST_ANCHORS or len(edges) == 0:
         return None
     known = connected(anchors.seen, edges)
     if (known.sum(axis=1) >= FEWEST_ANCHORS).sum() < 2:
         return None
-    weight = known[..., None]
-    middle = (anchors.points * weight).sum(axis=1, keepdims=True) / np.maximum(weight.sum(axis=1, keepdims=True), 1)
-    frames = spread_frames(np.where(weight, anchors.points - middle, 0.0), known, SOLVED_FRAMES)
+    frames = unlike_frames(anchors.points, known, SOLVED_FRAMES)
     return _Search(anchors, edges, known, frames, centre, should_stop)
 
 

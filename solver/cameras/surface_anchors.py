@@ -17,7 +17,7 @@ from pliant.solver.records import Floats
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-POOL = 2400
+POOL = 1800
 """Points, of the well-seen ones, that anchors and patches are taken from; bounds time and memory."""
 
 VIEWS = 24
@@ -81,7 +81,7 @@ def choose_anchors(points: Floats, seen: NDArray[np.bool_], count: int) -> Ancho
         Anchors wanted; fewer where there are fewer points.
     """
     pool = _pool(seen)
-    views = _views(points[:, pool], seen[:, pool])
+    views = unlike_frames(points[:, pool], seen[:, pool], VIEWS)
     spread = farthest_points(points[views][:, pool], seen[views][:, pool], min(2 * count, len(pool)))
     share = len(pool) // max(count, 1)
     size = min(max(share, PATCH[0]), PATCH[1], len(pool))
@@ -149,27 +149,22 @@ def _pool(seen: NDArray[np.bool_]) -> Indices:
     return usable[np.unique(np.linspace(0, len(usable) - 1, min(POOL, len(usable))).round().astype(int))]
 
 
-def _views(points: Floats, seen: NDArray[np.bool_]) -> Indices:
-    """Return the frames in which most is seen and that differ most from each other, whatever their order."""
-    centred = _centred(points, seen)
-    return spread_frames(centred, seen, VIEWS)
-
-
-def spread_frames(centred: Floats, seen: NDArray[np.bool_], count: int) -> Indices:
+def unlike_frames(points: Floats, seen: NDArray[np.bool_], count: int) -> Indices:
     """Return up to `count` frames, first the one nearest to the mean image, then each as unlike as possible to those before it.
 
     Parameters
     ----------
-    centred : shape (F, N, 2)
-        Image positions about each frame's mean, 0 where hidden.
+    points : shape (F, N, 2)
+        Image positions; each frame's mean is subtracted first.
     seen : shape (F, N)
         Which of them count.
     count : int
         Frames wanted.
     """
-    frames = len(centred)
+    frames = len(points)
     if frames <= count:
         return np.arange(frames)
+    centred = _centred(points, seen)
     weight = seen.astype(np.float64)
     total = np.maximum(weight.sum(axis=0), 1.0)
     mean = (centred * weight[..., None]).sum(axis=0) / total[:, None]
