@@ -14,9 +14,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from pliant.solver.cameras.focal_sweep import CLEAR, FocalSearch, Tried, judged, sweep
 from pliant.solver.cameras.inextensible import SurfaceGraph, maximum_depth
 from pliant.solver.cameras.isometric_extension import Extended, complete_anchors, extend, flatten
-from pliant.solver.cameras.isometric_refinement import Isometry, refine
+from pliant.solver.cameras.isometric_refinement import refine
 from pliant.solver.cameras.surface_anchors import Anchors, choose_anchors, connected, nearest_neighbours, unlike_frames
 from pliant.solver.records import Floats, Tracks
 
@@ -30,12 +31,6 @@ SHEETLIKE = 0.03
 """Third over second singular value, squared, of the centred tracks below which `auto` tries isometry. Measured: paper .004, a comic page
 .019; bodies above .05, a nearly rigid head, for which I has false minima, .08."""
 
-SMALL = 0.012
-"""Largest I that is accepted. Measured: paper .002 and, with 1 px of noise, .003; a comic page .005; faces, bodies .035 to .07."""
-
-CLEAR = 1.25
-"""How many times larger I must be at the neighbouring focal lengths. Measured: paper and page 1.8 to 2.9; faces at most 1.1."""
-
 HOPELESS = 0.03
 """I of a small part at the first focal length above which `auto` tries no more. Measured: paper and page from half to four times the true
 one .003 to .022; faces .037 to .068."""
@@ -43,17 +38,8 @@ one .003 to .022; faces .037 to .068."""
 SMALL_PART = (30, 12, 10)
 """Anchors, frames and neighbours of that part."""
 
-STEP = 1.5
-"""Ratio of neighbouring focal lengths."""
-
 TYPICAL_FOCAL = 0.8
 """First focal length tried, over the image's diagonal: about 64° across it."""
-
-FOCAL_RANGE = (0.2, 6.0)
-"""Focal lengths searched, over the image's diagonal."""
-
-GOLDEN_STEPS = 4
-"""Golden-section steps within the bracket, which leave 6 % of uncertainty either way before the parabola."""
 
 MARGIN = 1.3
 """Image diagonal over that of the box around all tracks, where the image's size is not given."""
@@ -121,29 +107,6 @@ class IsometricSurface:
     """Robust standard deviation of the tracks about small affine patches, the tracks' unit."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Search:
-    """What stays the same for all focal lengths."""
-
-    anchors: Anchors
-    edges: NDArray[np.intp]
-    seen: NDArray[np.bool_]
-    frames: NDArray[np.intp]
-    centre: Floats
-    should_stop: Callable[[], bool] | None
-
-    def graph(self, focal: float, frames: NDArray[np.intp] | slice = slice(None)) -> SurfaceGraph:
-        rays = (self.anchors.points[frames] - self.centre) / focal
-        rays = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=2)
-        return SurfaceGraph(rays, self.seen[frames], self.edges)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Tried:
-    focal: float
-    found: Isometry
-
-
 def isometric_surface(
     tracks: Tracks,
     *,
@@ -170,23 +133,21 @@ def isometric_surface(
     should_stop : callable, optional
         Called between units of work; once it returns True, the verdict is that isometry is not taken.
     """
-    seen, centre, diagonal = (
-        tracks.visible > 0,
-        _centre(tracks, principal_point, image_size),
-        _diagonal(tracks, image_size),
-    )
+    seen, diagonal = tracks.visible > 0, _diagonal(tracks, image_size)
+    centre = _centre(tracks, principal_point, image_size)
     part = _some_frames(tracks.points, seen)
     search = _prepared(tracks.points[part], seen[part], centre, should_stop)
-    against = _implausible(search, focal if focal is not None else TYPICAL_FOCAL * diagonal, required)
+    first = focal if focal is not None else TYPICAL_FOCAL * diagonal
+    against = _implausible(search, first, required)
     if against is None and len(part) < tracks.num_frames:
         search = _prepared(tracks.points, seen, centre, should_stop)
     if against is not None or search is None:
         return IsometricVerdict(against or TOO_LITTLE)
-    tried = _sweep(search, focal, diagonal)
-    if not tried or _stopped(should_stop):
+    tried = sweep(search, first, diagonal, given=focal is not None)
+    if not tried or search.stopped:
         return IsometricVerdict("No isometric surface was found: the conic program has no solution.", _trace(tried))
     least = min(tried, key=lambda each: each.found.inconsistency)
-    clear, why = _judged(tried, least)
+    clear, why = judged(tried, least)
     if not clear and not required:
         return IsometricVerdict(why, _trace(tried))
     chosen = least if focal is None else tried[0]
@@ -196,7 +157,7 @@ def isometric_surface(
     return IsometricVerdict(why, _trace(tried), surface, _warnings(clear, focal, least, chosen))
 
 
-def _implausible(search: _Search | None, focal: float, required: bool) -> str | None:
+def _implausible(search: FocalSearch | None, focal: float, required: bool) -> str | None:
     """Return why there is no isometric sheet to look for; None if there may be one."""
     if search is None:
         return TOO_LITTLE
@@ -232,7 +193,7 @@ def sheetlike(anchors: Anchors) -> float:
 
 def _prepared(
     points: Floats, seen: NDArray[np.bool_], centre: Floats, should_stop: Callable[[], bool] | None
-) -> _Search | None:
+) -> FocalSearch | None:
     if (seen.sum(axis=0) >= 2).sum() < FEWEST_ANCHORS:
         return None
     anchors = choose_anchors(points, seen, ANCHORS)
@@ -243,10 +204,10 @@ def _prepared(
     if (known.sum(axis=1) >= FEWEST_ANCHORS).sum() < 2:
         return None
     frames = unlike_frames(anchors.points, known, SOLVED_FRAMES)
-    return _Search(anchors, edges, known, frames, centre, should_stop)
+    return FocalSearch(anchors, edges, known, frames, centre, should_stop)
 
 
-def _glance(search: _Search, focal: float) -> float:
+def _glance(search: FocalSearch, focal: float) -> float:
     """Return I of some anchors and frames at one focal length; infinite if there is no surface."""
     some, frames, neighbours = SMALL_PART
     part = replace(search.anchors, points=search.anchors.points[:, :some], seen=search.seen[:, :some])
@@ -258,97 +219,7 @@ def _glance(search: _Search, focal: float) -> float:
     return refine(graph, depths, iterations=10).inconsistency if depths is not None else float("inf")
 
 
-def _sweep(search: _Search, focal: float | None, diagonal: float) -> list[_Tried]:
-    """Return the focal lengths tried: the given or typical one, then downhill by `STEP`, then within the bracket."""
-    first = _tried(search, focal if focal is not None else TYPICAL_FOCAL * diagonal, None)
-    if first is None:
-        return []
-    tried = [first]
-    low, high = FOCAL_RANGE[0] * diagonal, FOCAL_RANGE[1] * diagonal
-    while not _stopped(search.should_stop):
-        least = min(tried, key=lambda each: each.found.inconsistency)
-        ahead = [least.focal * STEP, least.focal / STEP]
-        wanted = [f for f in ahead if low <= f <= high and not any(abs(np.log(t.focal / f)) < 1e-6 for t in tried)]
-        if not wanted:
-            break
-        tried += [each for each in (_tried(search, f, least) for f in wanted) if each is not None]
-    if focal is None:
-        tried += _golden(search, min(tried, key=lambda each: each.found.inconsistency))
-    return tried
-
-
-def _golden(search: _Search, middle: _Tried) -> list[_Tried]:
-    """Return what golden-section search tries within a step of the least focal length, and the vertex of a parabola at the end."""
-    share = (np.sqrt(5) - 1) / 2
-    low, high = np.log(middle.focal / STEP), np.log(middle.focal * STEP)
-    made: list[_Tried] = []
-
-    def at(place: float) -> float:
-        found = _tried(search, float(np.exp(place)), middle)
-        if found is not None:
-            made.append(found)
-        return found.found.inconsistency if found is not None else np.inf
-
-    left, right = high - share * (high - low), low + share * (high - low)
-    at_left, at_right = at(left), at(right)
-    for _ in range(GOLDEN_STEPS - 2):
-        if _stopped(search.should_stop):
-            return made
-        if at_left <= at_right:
-            high, right, at_right = right, left, at_left
-            left = high - share * (high - low)
-            at_left = at(left)
-        else:
-            low, left, at_left = left, right, at_right
-            right = low + share * (high - low)
-            at_right = at(right)
-    around = sorted([middle, *made], key=lambda each: each.focal)
-    best = min(range(len(around)), key=lambda index: around[index].found.inconsistency)
-    if 0 < best < len(around) - 1:
-        three = around[best - 1 : best + 2]
-        x, y = np.log([t.focal for t in three]), np.square([t.found.inconsistency for t in three])
-        bend, slope, _ = np.polyfit(x - x[1], y, 2)
-        if bend > 0:
-            at(float(np.clip(x[1] - slope / (2 * bend), x[0], x[2])))
-    return made
-
-
-def _tried(search: _Search, focal: float, near: _Tried | None) -> _Tried | None:
-    """Return the isometry at a focal length, from a neighbouring one's depths or from the conic program."""
-    graph = search.graph(focal, search.frames)
-    if near is None:
-        depths = maximum_depth(graph)
-    else:
-        depths = _carried(near.found.depths, graph.seen, focal / near.focal)
-    return _Tried(focal, refine(graph, depths, should_stop=search.should_stop)) if depths is not None else None
-
-
-def _carried(depths: Floats, seen: NDArray[np.bool_], ratio: float) -> Floats:
-    """Return depths for a focal length `ratio` times as long: the same relief, further away."""
-    mean = depths.sum(axis=1, keepdims=True) / np.maximum(seen.sum(axis=1, keepdims=True), 1)
-    return np.where(seen, np.maximum(ratio * mean + (depths - mean), 0.05 * ratio * mean), 0.0)
-
-
-def _judged(tried: list[_Tried], least: _Tried) -> tuple[bool, str]:
-    """Return whether I is small and clearly smaller than at the neighbouring focal lengths, and the sentence."""
-    value = least.found.inconsistency
-    sides = [
-        min((t.found.inconsistency for t in tried if (t.focal - least.focal) * side > 0
-             and abs(np.log(t.focal / least.focal)) >= 0.6 * np.log(STEP)), default=0.0)
-        for side in (-1, 1)
-    ]  # fmt: skip
-    ratio = min(sides) / value if value > 0 else np.inf
-    if value > SMALL:
-        return False, f"Not an isometric sheet: edge lengths change by {value:.1%} or more, whatever the focal length."
-    if not ratio >= CLEAR:
-        return False, "Not taken as an isometric sheet: its edge lengths do not single out a focal length."
-    return True, (
-        f"Taken as an isometric sheet: at a focal length of {least.focal:.0f} px edge lengths change by {value:.2%}, "
-        f"{ratio:.1f} times as much at neighbouring focal lengths."
-    )
-
-
-def _everywhere(search: _Search, tracks: Tracks, seen: NDArray[np.bool_], chosen: _Tried) -> IsometricSurface | None:
+def _everywhere(search: FocalSearch, tracks: Tracks, seen: NDArray[np.bool_], chosen: Tried) -> IsometricSurface | None:
     """Return the surface of all frames and points, from the anchors of some frames at the chosen focal length."""
     part = search.graph(chosen.focal, search.frames)
     whole = search.graph(chosen.focal)
@@ -375,7 +246,7 @@ def _everywhere(search: _Search, tracks: Tracks, seen: NDArray[np.bool_], chosen
     )  # fmt: skip
 
 
-def _from_similar(graph: SurfaceGraph, search: _Search, depths: Floats) -> Floats:
+def _from_similar(graph: SurfaceGraph, search: FocalSearch, depths: Floats) -> Floats:
     """Return depths `(F, A)` for all frames, those of the solved frame whose image is most alike."""
     start = np.zeros(graph.seen.shape)
     rays, seen = graph.rays[search.frames], graph.seen[search.frames]
@@ -409,7 +280,7 @@ def _diagonal(tracks: Tracks, image_size: tuple[float, float] | None) -> float:
     return MARGIN * float(np.hypot(*(high - low)))
 
 
-def _warnings(clear: bool, focal: float | None, least: _Tried, chosen: _Tried) -> tuple[str, ...]:
+def _warnings(clear: bool, focal: float | None, least: Tried, chosen: Tried) -> tuple[str, ...]:
     warnings = []
     if not clear:
         warnings.append(
@@ -424,9 +295,5 @@ def _warnings(clear: bool, focal: float | None, least: _Tried, chosen: _Tried) -
     return tuple(warnings)
 
 
-def _trace(tried: list[_Tried]) -> tuple[FocalCandidate, ...]:
+def _trace(tried: list[Tried]) -> tuple[FocalCandidate, ...]:
     return tuple(FocalCandidate(each.focal, each.found.inconsistency) for each in tried)
-
-
-def _stopped(should_stop: Callable[[], bool] | None) -> bool:
-    return should_stop is not None and should_stop()
