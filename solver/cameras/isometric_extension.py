@@ -26,7 +26,7 @@ STIFF = 1e-3
 WRONG = 8.0
 """Robust standard deviations from the surface's image beyond which an observation is an outlier."""
 
-FINEST = 1e-3
+FINEST = 3e-3
 """Smallest such standard deviation, as a share of the image's spread: the splines are no better."""
 
 
@@ -67,7 +67,7 @@ def complete_anchors(points: Floats, seen: NDArray[np.bool_], template: Floats) 
     filled = points.copy()
     for frame in np.flatnonzero(~seen.all(axis=1)):
         missing = ~seen[frame]
-        for other in _alike(points, seen, frame):
+        for other in _alike(points, seen, int(frame)):
             both, gained = seen[frame] & seen[other], missing & seen[other]
             if gained.any() and both.sum() >= FEWEST:
                 moved = _moved(points[other], points[frame], both)
@@ -101,7 +101,7 @@ def extend(
         Focal length and principal point `(2,)`, pixels.
     """
     place = _placed(tracks, seen, images, known, template)
-    placed = np.isfinite(place).all(axis=1)
+    placed: NDArray[np.bool_] = np.asarray(np.isfinite(place).all(axis=1))
     flat = anchors.transpose(1, 0, 2).reshape(len(template), -1)
     space = spline(template, flat, np.where(placed[:, None], place, 0.0))
     space = space.reshape(-1, len(anchors), 3).transpose(1, 0, 2).copy()
@@ -110,7 +110,7 @@ def extend(
     off = np.linalg.norm(focal * space[..., :2] / space[..., 2:] + centre - tracks, axis=2)
     compared = seen & placed
     limit = WRONG * max(float(np.median(off[compared])) / 1.1774, FINEST * float(images[known].std()))
-    outliers = compared & (off > limit)
+    outliers: NDArray[np.bool_] = np.asarray(compared & (off > limit))
     own = compared & ~outliers
     rays = np.concatenate([(tracks - centre) / focal, np.ones((*seen.shape, 1))], axis=2)
     return Extended(np.where(own[..., None], rays * space[..., 2:], space), outliers, placed)

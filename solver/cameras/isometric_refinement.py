@@ -149,7 +149,7 @@ def _at(graph: SurfaceGraph, log_depths: Floats, lengths: Floats, ease: float) -
 def _lower(graph: SurfaceGraph, here: _Point, damping: float, ease: float) -> tuple[_Point | None, float]:
     """Return the iterate after one step that lowers the cost, None if no step does, and the damping for the next."""
     weight = 1 / np.hypot(1.0, here.residuals / ease)
-    weighted = here.jacobian.multiply(weight[:, None]).tocsr()
+    weighted = sparse.csr_matrix(sparse.diags(weight) @ here.jacobian)
     normal = (here.jacobian.T @ weighted).tocsr()
     gradient = weighted.T @ here.residuals
     while damping <= MOST_DAMPED:

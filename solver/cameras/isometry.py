@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pliant.solver.cameras.focal_sweep import CLEAR, FocalSearch, Tried, judged, sweep
 from pliant.solver.cameras.inextensible import SurfaceGraph, maximum_depth
 from pliant.solver.cameras.isometric_extension import Extended, complete_anchors, extend, flatten
-from pliant.solver.cameras.isometric_refinement import refine
+from pliant.solver.cameras.isometric_refinement import Isometry, edge_lengths, inconsistency, refine, typical
 from pliant.solver.cameras.surface_anchors import Anchors, choose_anchors, connected, nearest_neighbours, unlike_frames
 from pliant.solver.records import Floats, Tracks
 
@@ -40,6 +40,10 @@ SMALL_PART = (30, 12, 10)
 
 TYPICAL_FOCAL = 0.8
 """First focal length tried, over the image's diagonal: about 64° across it."""
+
+SHORT = 8
+"""Neighbours in the last refinement. Measured, error of a cylinder rolled ever tighter .015 → .007, a cone .084 → .054, paper .0187 →
+.0179; with 5 no less."""
 
 MARGIN = 1.3
 """Image diagonal over that of the box around all tracks, where the image's size is not given."""
@@ -230,6 +234,11 @@ def _everywhere(search: FocalSearch, tracks: Tracks, seen: NDArray[np.bool_], ch
         found = refine(whole, _from_similar(whole, search, found.depths), should_stop=search.should_stop)
     else:
         found = replace(found, depths=found.depths[np.argsort(search.frames)])
+    if not search.stopped:  # the chord of a long edge is shorter than the surface between its ends
+        near = replace(whole, edges=nearest_neighbours(replace(search.anchors, seen=search.seen), neighbours=SHORT))
+        depths = refine(near, found.depths, should_stop=search.should_stop).depths
+        lengths = edge_lengths(whole, depths)
+        found = Isometry(depths, typical(lengths), inconsistency(lengths))
     template = flatten(search.edges, found.lengths, search.seen.shape[1])
     if template is None:
         return None

@@ -146,7 +146,7 @@ def _pool(seen: NDArray[np.bool_]) -> Indices:
     """Return at most `POOL` points, evenly among those seen at least half as often as the one seen most."""
     often = seen.sum(axis=0)
     usable = np.flatnonzero(2 * often >= often.max())
-    return usable[np.unique(np.linspace(0, len(usable) - 1, min(POOL, len(usable))).round().astype(int))]
+    return np.asarray(usable[np.unique(np.linspace(0, len(usable) - 1, min(POOL, len(usable))).round().astype(int))])
 
 
 def unlike_frames(points: Floats, seen: NDArray[np.bool_], count: int) -> Indices:
