@@ -10,10 +10,13 @@ from typing import Annotated, Literal, get_args
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
 SOLVER_FIELDS = (
-    "method", "camera", "basis_size", "refine_rotations", "preset", "temporal_weight", "spatial_weight", "robust_scale",
+    "method", "camera", "surface", "focal", "field_of_view", "principal_point", "basis_size", "refine_rotations", "preset", "temporal_weight", "spatial_weight", "robust_scale",
     "temporal_order", "loss", "laplacian", "prior", "low_rank_weight", "max_reweightings", "tolerance", "precision", "seed",
 )  # fmt: skip
-"""The fields that go to the solver; the others say how to read the input or write the result."""
+"""The fields that go to the solver as they are; `image_size` goes there as two numbers. The others say how to read the input or write
+the result."""
+
+PixelPosition = Annotated[float, Field(gt=-1e9, lt=1e9, allow_inf_nan=False)]
 
 Weight = Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
 
@@ -24,6 +27,11 @@ Output = Literal["glb", "ply", "obj", "usd", "mat", "csv"]
 def _listed(given: object) -> object:
     """Take `"glb,mat"` for `["glb", "mat"]`, as command lines and forms send it."""
     return [word.strip() for word in given.split(",") if word.strip()] if isinstance(given, str) else given
+
+
+def _pair(given: object) -> object:
+    """Take `"320,240"` for `[320, 240]`, as command lines and forms send it."""
+    return given.split(",") if isinstance(given, str) else given
 
 
 def _in_order(given: tuple[Output, ...]) -> tuple[Output, ...]:
@@ -47,6 +55,21 @@ class Options(BaseModel):
     camera: Literal["scaled_orthographic", "orthographic"] = Field(
         "scaled_orthographic",
         description="scaled_orthographic estimates one scale per frame (real video); orthographic has none.",
+    )
+    surface: Literal["auto", "isometric", "free"] = Field(
+        "auto",
+        description="isometric: a sheet that bends without stretching, such as paper or cloth, seen in perspective. free: no such "
+        "assumption. auto: isometric where the tracks are those of a sheet and its edge lengths single out a focal length.",
+    )
+    focal: Annotated[float, Field(gt=0, lt=1e9, allow_inf_nan=False)] | None = Field(
+        None, description="Focal length in pixels; null: estimated where it matters."
+    )
+    field_of_view: Annotated[float, Field(ge=1, le=170)] | None = Field(
+        None, description="Horizontal field of view in degrees, in place of focal; needs image_size."
+    )
+    principal_point: Annotated[tuple[PixelPosition, PixelPosition], BeforeValidator(_pair)] | None = Field(
+        None,
+        description="x and y of the optical axis in pixels; null: the centre of the image, or of the tracks without image_size.",
     )
     basis_size: Annotated[int, Field(ge=1, le=100)] | None = Field(
         None,

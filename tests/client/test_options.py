@@ -10,7 +10,7 @@ from pliant.solver import Settings
 
 
 def test_options_mirror_the_settings_name_for_name_and_default_for_default() -> None:
-    settings = {field.name: field.default for field in dataclasses.fields(Settings)}
+    settings = {field.name: field.default for field in dataclasses.fields(Settings) if field.name != "image_size"}
     options = {name: Options.model_fields[name].default for name in SOLVER_FIELDS}
     assert options == settings
 
@@ -23,6 +23,13 @@ def test_every_option_says_what_it_means() -> None:
 def test_outputs_are_a_list_or_words_between_commas(given: object) -> None:
     assert Options(outputs=given).outputs == ("glb", "usd")
     assert Options.model_validate_json(Options(outputs=given).model_dump_json()).outputs == ("glb", "usd")
+
+
+def test_a_principal_point_is_two_numbers_or_words_between_commas() -> None:
+    assert Options.model_validate({"principal_point": "320,240"}).principal_point == (320.0, 240.0)
+    assert Options.model_validate({"principal_point": [320, 240.5]}).principal_point == (320.0, 240.5)
+    with pytest.raises(ValueError, match="principal_point"):
+        Options.model_validate({"principal_point": "320"})
 
 
 def test_an_unknown_output_is_refused_by_the_names_there_are() -> None:

@@ -40,7 +40,8 @@ class Finished:
 
 def solver_settings(options: Options) -> Settings:
     """Return the solver's part of a job's options."""
-    return Settings(**{name: getattr(options, name) for name in SOLVER_FIELDS})
+    size = None if options.image_size is None else tuple(int(side) for side in options.image_size.split("x"))
+    return Settings(**{name: getattr(options, name) for name in SOLVER_FIELDS}, image_size=size)
 
 
 def reconstruct(

@@ -73,13 +73,15 @@ def test_a_job_keeps_to_its_own_time_limit(inputs: Inputs, tmp_path: Path) -> No
 
 def test_every_option_of_the_solver_reaches_it() -> None:
     chosen = {
-        "method": "spatio_temporal", "camera": "orthographic", "basis_size": 2, "refine_rotations": False, "preset": "paper",
+        "method": "spatio_temporal", "camera": "orthographic", "surface": "free", "focal": 500.0, "field_of_view": None,
+        "principal_point": (3.0, 4.0), "basis_size": 2, "refine_rotations": False, "preset": "paper",
         "temporal_weight": 0.5, "spatial_weight": 0.25, "robust_scale": 0.125, "temporal_order": 2, "loss": "huber",
         "laplacian": "uniform", "prior": "smooth+low_rank", "low_rank_weight": 3.0, "max_reweightings": 7, "tolerance": 0.5,
         "precision": "float32", "seed": 9,
     }  # fmt: skip
     assert set(chosen) == set(SOLVER_FIELDS)
     assert solver_settings(Options.model_validate(chosen)) == Settings(**chosen)  # type: ignore[arg-type]
+    assert solver_settings(Options(image_size="640x480", field_of_view=60)).image_size == (640, 480)
 
 
 def test_what_does_not_fit_is_refused_before_a_file_is_written(inputs: Inputs, tmp_path: Path) -> None:
