@@ -10,7 +10,8 @@ from typing import Annotated, Literal, get_args
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
 SOLVER_FIELDS = (
-    "method", "camera", "surface", "focal", "field_of_view", "principal_point", "basis_size", "refine_rotations", "preset", "temporal_weight", "spatial_weight", "robust_scale",
+    "method", "camera", "surface", "focal", "field_of_view", "principal_point", "basis_size",
+    "refine_rotations", "preset", "temporal_weight", "spatial_weight", "robust_scale",
     "temporal_order", "loss", "laplacian", "prior", "low_rank_weight", "max_reweightings", "tolerance", "precision", "seed",
 )  # fmt: skip
 """The fields that go to the solver as they are; `image_size` goes there as two numbers. The others say how to read the input or write

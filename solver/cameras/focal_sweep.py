@@ -23,6 +23,13 @@ SMALL = 0.012
 CLEAR = 1.25
 """How many times larger I must be at the neighbouring focal lengths. Measured: paper and page 1.8 to 2.9; faces at most 1.1."""
 
+RISE = 0.002
+"""By how much I must be larger at the neighbouring focal lengths. Measured: paper and page .003 to .006; a shallow face seen without
+perspective, which some false focal length bends into an isometric one, at most .0008."""
+
+DIP = 0.8
+"""Going away from the least, I must not fall below this share of what it was: several minima are no evidence."""
+
 STEP = 1.5
 """Ratio of neighbouring focal lengths."""
 
@@ -154,9 +161,19 @@ def judged(tried: list[Tried], least: Tried) -> tuple[bool, str]:
     ratio = min(sides) / value if value > 0 else np.inf
     if value > SMALL:
         return False, f"Not an isometric sheet: edge lengths change by {value:.1%} or more, whatever the focal length."
-    if not ratio >= CLEAR:
+    if not (ratio >= CLEAR and min(sides) - value >= RISE and _single(tried, least)):
         return False, "Not taken as an isometric sheet: its edge lengths do not single out a focal length."
     return True, (
         f"Taken as an isometric sheet: at a focal length of {least.focal:.0f} px edge lengths change by {value:.2%}, "
         f"{ratio:.1f} times as much at neighbouring focal lengths."
     )
+
+
+def _single(tried: list[Tried], least: Tried) -> bool:
+    """Return whether I rises on both sides of its minimum."""
+    for side in (-1, 1):
+        away = sorted((t for t in tried if (t.focal - least.focal) * side > 0), key=lambda each: side * each.focal)
+        values = np.array([each.found.inconsistency for each in away])
+        if bool((values < DIP * np.maximum.accumulate(values)).any()):
+            return False
+    return True

@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 from pliant.solver.cameras.isometry import IsometricSurface, IsometricVerdict
 from pliant.solver.evaluation.alignment import procrustes
+from pliant.solver.evaluation.trust import Trust, Verdict, turned
 from pliant.solver.records import Camera, Choices, Floats, Outcome, Solution, Trace, Tracks, read_only
 
 ROUNDS = 5
@@ -43,7 +44,10 @@ def isometric_solution(
         read_only(array)
     trace = Trace(np.array([surface.inconsistency]), np.array([median]), np.zeros(1, dtype=np.int32))
     choices = _choices(verdict, surface, unit, float(surface.outliers.sum() / seen.sum()))
-    return Solution(shapes, camera, residual, weights, trace, Outcome.CONVERGED, choices, seconds)
+    trust = Trust(
+        Verdict.WITH_CARE if verdict.warnings else Verdict.GOOD, verdict.warnings, None, None, turned(camera.rotations)
+    )  # isometry is no Gaussian model: there is no posterior to give an interval
+    return Solution(shapes, camera, residual, weights, trace, Outcome.CONVERGED, choices, seconds, None, trust)
 
 
 def in_world_axes(surface: IsometricSurface) -> tuple[Floats, Camera]:
