@@ -93,7 +93,8 @@ def sweep(search: FocalSearch, focal: float, diagonal: float, *, given: bool) ->
         if not wanted:
             break
         tried += [each for each in (tried_at(search, f, least) for f in wanted) if each is not None]
-    if not given:
+    values = [each.found.inconsistency for each in tried]
+    if not given and max(values) - min(values) >= RISE:
         tried += _golden(search, min(tried, key=lambda each: each.found.inconsistency))
     return tried
 

@@ -44,10 +44,16 @@ def isometric_solution(
         read_only(array)
     trace = Trace(np.array([surface.inconsistency]), np.array([median]), np.zeros(1, dtype=np.int32))
     choices = _choices(verdict, surface, unit, float(surface.outliers.sum() / seen.sum()))
-    trust = Trust(
-        Verdict.WITH_CARE if verdict.warnings else Verdict.GOOD, verdict.warnings, None, None, turned(camera.rotations)
-    )  # isometry is no Gaussian model: there is no posterior to give an interval
-    return Solution(shapes, camera, residual, weights, trace, Outcome.CONVERGED, choices, seconds, None, trust)
+    return Solution(
+        shapes, camera, residual, weights, trace, Outcome.CONVERGED, choices, seconds,
+        trust=_trust(verdict, camera, median / unit, float((weights == 0).mean())),
+    )  # fmt: skip
+
+
+def _trust(verdict: IsometricVerdict, camera: Camera, residual: float, hidden: float) -> Trust:
+    """Return the verdict without an expected error: isometry is no Gaussian model and has no posterior."""
+    grade = Verdict.WITH_CARE if verdict.warnings else Verdict.GOOD
+    return Trust(grade, verdict.warnings, None, None, turned(camera.rotations), residual, hidden)
 
 
 def in_world_axes(surface: IsometricSurface) -> tuple[Floats, Camera]:
