@@ -96,6 +96,11 @@ def sweep(search: FocalSearch, focal: float, diagonal: float, *, given: bool) ->
     values = [each.found.inconsistency for each in tried]
     if not given and max(values) - min(values) >= RISE:
         tried += _golden(search, min(tried, key=lambda each: each.found.inconsistency))
+        least = min(tried, key=lambda each: each.found.inconsistency)
+        for side in (-1, 1):  # the search may have moved away from the neighbours it began with
+            if not any(side * np.log(t.focal / least.focal) >= 0.9 * np.log(STEP) for t in tried):
+                further = tried_at(search, least.focal * STEP**side, least)
+                tried += [further] if further is not None else []
     return tried
 
 
@@ -156,7 +161,7 @@ def judged(tried: list[Tried], least: Tried) -> tuple[bool, str]:
     value = least.found.inconsistency
     sides = [
         min((t.found.inconsistency for t in tried if (t.focal - least.focal) * side > 0
-             and abs(np.log(t.focal / least.focal)) >= 0.6 * np.log(STEP)), default=0.0)
+             and abs(np.log(t.focal / least.focal)) >= 0.9 * np.log(STEP)), default=0.0)
         for side in (-1, 1)
     ]  # fmt: skip
     ratio = min(sides) / value if value > 0 else np.inf
