@@ -150,7 +150,10 @@ def _isometric(
             "invalid_option", field="options.surface", expected="auto or free where rotations are given", got="'isometric'",
             hint="Leave the rotations out: an isometric surface gives its own cameras.",
         )  # fmt: skip
-    usual = settings.gaussian and cameras is None and settings.camera in {Settings().camera, "perspective"}
+    pinhole = (
+        settings.focal_length is not None or settings.image_size is not None
+    )  # without either, I has false minima on cloth seen from afar
+    usual = settings.gaussian and pinhole and cameras is None and settings.camera in {Settings().camera, "perspective"}
     if settings.surface == "free" or (settings.surface == "auto" and not usual):
         return None
     return isometric_surface(

@@ -39,7 +39,8 @@ class Settings:
 
     surface: Surface = "auto"
     """`isometric`: a sheet that bends without stretching, seen in perspective; `free`: none of that; `auto`: isometric where the tracks
-    are those of a sheet and its edge lengths single out a focal length, with the default camera model, method and prior only."""
+    are those of a sheet and its edge lengths single out a focal length; tried only where `image_size` or the focal length is given, with
+    the default camera model, method and prior."""
 
     focal: float | None = None
     """Focal length in the tracks' unit; None estimates it where it matters."""
