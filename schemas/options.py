@@ -60,7 +60,8 @@ class Options(BaseModel):
     surface: Literal["auto", "isometric", "free"] = Field(
         "auto",
         description="isometric: a sheet that bends without stretching, such as paper or cloth, seen in perspective. free: no such "
-        "assumption. auto: isometric where the tracks are those of a sheet and its edge lengths single out a focal length; needs image_size or focal.",
+        "assumption. auto: isometric where the tracks are those of a sheet and its edge lengths single out a focal length; "
+        "needs image_size or focal.",
     )
     focal: Annotated[float, Field(gt=0, lt=1e9, allow_inf_nan=False)] | None = Field(
         None, description="Focal length in pixels; null: estimated where it matters."
