@@ -10,7 +10,7 @@ from typing import Annotated, Literal, get_args
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
 SOLVER_FIELDS = (
-    "method", "camera", "basis_size", "refine_rotations", "preset", "temporal_weight", "spatial_weight", "robust_scale",
+    "method", "camera", "surface", "basis_size", "refine_rotations", "preset", "temporal_weight", "spatial_weight", "robust_scale",
     "temporal_order", "loss", "laplacian", "prior", "low_rank_weight", "max_reweightings", "tolerance", "precision", "seed",
     "focal", "field_of_view", "principal_point", "image_size",
 )  # fmt: skip
@@ -63,6 +63,12 @@ class Options(BaseModel):
     principal_point: Annotated[str, Field(pattern=POINT)] | None = Field(
         None,
         description="Principal point X,Y in pixels, e.g. 319.5,239.5; null: the centre of image_size, or of the tracks without it.",
+    )
+    surface: Literal["auto", "isometric", "free"] = Field(
+        "auto",
+        description="isometric: a sheet that bends without stretching, such as paper or cloth, seen in perspective. free: no such "
+        "assumption. auto: isometric where the tracks are those of a sheet and its edge lengths single out a focal length; "
+        "needs image_size or focal.",
     )
     basis_size: Annotated[int, Field(ge=1, le=100)] | None = Field(
         None,

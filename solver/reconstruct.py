@@ -10,6 +10,7 @@ import numpy as np
 from pliant.solver.cameras.camera_choice import with_camera_choice
 from pliant.solver.cameras.depth_rounds import settled
 from pliant.solver.cameras.estimation import CameraEstimate, estimate_cameras, given_cameras
+from pliant.solver.cameras.isometry import IsometricVerdict, isometric_surface
 from pliant.solver.cameras.joint_refinement import LEARNED_FRAMES, learn, learned_frames, telling_frames
 from pliant.solver.cameras.lens import given_lens
 from pliant.solver.cameras.perspective import Perspective, orthographic
@@ -18,7 +19,7 @@ from pliant.solver.energy.hyperparameters import FINEST
 from pliant.solver.energy.objective import residuals
 from pliant.solver.energy.problem import Problem
 from pliant.solver.energy.robust_loss import largest_weight
-from pliant.solver.errors import InvalidInput
+from pliant.solver.errors import InvalidInput, InvalidSettings
 from pliant.solver.evaluation.trust import assess
 from pliant.solver.model.model_order import Support
 from pliant.solver.model.shape_covariance import ShapeCovariance
@@ -40,6 +41,7 @@ from pliant.solver.records import (
 from pliant.solver.settings import Settings
 from pliant.solver.shapes.initialization import pseudo_inverse, uniform_solution
 from pliant.solver.shapes.irls import init, no_higher, step, terminate
+from pliant.solver.shapes.isometric_solution import centre_downwards, downwards, isometric_solution
 from pliant.solver.shapes.outlier_rejection import without_outliers
 from pliant.solver.shapes.perspective_shapes import corrected_again, seen_in_perspective
 from pliant.solver.shapes.setup import build_problem, with_bending
@@ -104,6 +106,12 @@ def solve(
     began = time.perf_counter()
     normalised = normalise(tracks)
     lens = given_lens(tracks, normalised, settings, cameras)
+    verdict = _isometric(tracks, cameras, settings, should_stop)
+    if verdict is not None and verdict.surface is not None:
+        seconds = {"cameras": time.perf_counter() - began}
+        solution = isometric_solution(tracks, verdict, settings, unit=normalised.unit, seconds=seconds)
+        tell(Step("finish", 1.0, max_reweightings=settings.max_reweightings))
+        return solution
     estimate, covariance = _learned(normalised, cameras, settings, lens, on_step=on_step, should_stop=should_stop)
     tell(Step("cameras", 0.0, max_reweightings=settings.max_reweightings))
     seconds = {"cameras": time.perf_counter() - began}
@@ -162,9 +170,43 @@ def solve(
     if estimate.perspective is not None:
         solution = seen_in_perspective(solution, tracks, estimate.perspective, normalised.unit, kept)
     solution = assessed(solution, problem, estimate, covariance, normalised.unit, seed=settings.seed)
+    if verdict is not None:
+        solution = replace(solution, choices=_with_verdict(solution.choices, verdict, settings))
     seconds["finish"] = time.perf_counter() - began
     tell(_told("finish", history[-1], settings, normalised.unit, fraction=1.0))
     return solution
+
+
+def _isometric(
+    tracks: Tracks, cameras: KnownCamera | None, settings: Settings, should_stop: Callable[[], bool] | None
+) -> IsometricVerdict | None:
+    """Return whether the surface is isometric; None where that is not asked."""
+    if settings.surface == "isometric" and cameras is not None:
+        raise InvalidSettings(
+            "invalid_option", field="options.surface", expected="auto or free where rotations are given", got="'isometric'",
+            hint="Leave the rotations out: an isometric surface gives its own cameras.",
+        )  # fmt: skip
+    pinhole = (
+        settings.focal_length is not None or settings.image_size is not None
+    )  # without either, I has false minima on cloth seen from afar
+    usual = settings.gaussian and pinhole and cameras is None and settings.camera in {Settings().camera, "perspective"}
+    if settings.surface == "free" or (settings.surface == "auto" and not usual):
+        return None
+    return isometric_surface(
+        downwards(tracks) if settings.y_up else tracks, focal=settings.focal_length, principal_point=centre_downwards(settings),
+        image_size=settings.image_size, required=settings.surface == "isometric", should_stop=should_stop,
+    )  # fmt: skip
+
+
+def _with_verdict(choices: Choices, verdict: IsometricVerdict, settings: Settings) -> Choices:
+    """Return the choices with why the surface is free; a warning where it was required not to be."""
+    warnings = choices.warnings
+    if settings.surface == "isometric":
+        warnings = (*warnings, f"The surface could not be taken as isometric and is free. {verdict.reason}")
+    tried = tuple((each.focal, each.inconsistency) for each in verdict.candidates)
+    return replace(
+        choices, reasons={**choices.reasons, "surface": verdict.reason}, warnings=warnings, focal_lengths=tried
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -415,6 +415,8 @@ class Choices:
     """One sentence for each automatic choice, by name."""
     warnings: tuple[str, ...] = ()
     """Sentences the user should read, e.g. that the camera hardly moved."""
+    focal_lengths: tuple[tuple[float, float], ...] = ()
+    """Focal lengths that were compared for an isometric surface, pixels, each with its isometric inconsistency I; empty if none were."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

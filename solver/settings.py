@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from math import radians, tan
 from typing import Literal
 
 from pliant.solver.errors import InvalidSettings
@@ -23,6 +24,7 @@ CameraModel = Literal["auto", "perspective", "scaled_orthographic", "orthographi
 Preset = Literal["auto", "paper"]
 Loss = Literal["l1", "l2", "huber"]
 Prior = Literal["gaussian", "smooth+low_rank", "smooth"]
+Surface = Literal["auto", "isometric", "free"]
 Laplacian = Literal["auto", "grid8", "uniform", "cotangent"]
 
 
@@ -52,6 +54,11 @@ class Settings:
 
     y_up: bool = False
     """True: y of the tracks grows upwards. The third axis of the camera then points to the viewer instead of away."""
+
+    surface: Surface = "auto"
+    """`isometric`: a sheet that bends without stretching, seen in perspective; `free`: none of that; `auto`: isometric where the tracks
+    are those of a sheet and its edge lengths single out a focal length; tried only where `image_size` or the focal length is given, with
+    the default camera model, method and prior."""
 
     basis_size: int | None = None
     """K of the rank-3K factorization; None chooses it from the data and reports why."""
@@ -104,6 +111,13 @@ class Settings:
     """Seed of every random choice (restarts, sampled points). The same seed and thread count give the same bits."""
 
     @property
+    def focal_length(self) -> float | None:
+        """φ from `focal` or from `field_of_view`; None if neither is given."""
+        if self.field_of_view is None or self.image_size is None:
+            return self.focal
+        return self.image_size[0] / (2 * tan(radians(self.field_of_view) / 2))
+
+    @property
     def gaussian(self) -> bool:
         """True if the shapes get the Gaussian prior."""
         return self.prior == "gaussian" and self.method == "robust" and self.preset == "auto"
@@ -113,17 +127,11 @@ class Settings:
         """True if every frame may have its own scale."""
         return self.camera != "orthographic"
 
-    @property
-    def focal_length(self) -> float | None:
-        """φ as given by `focal` or `field_of_view`, the tracks' unit; None: to be estimated."""
-        if self.field_of_view is None or self.image_size is None:
-            return self.focal
-        return self.image_size[0] / (2 * math.tan(math.radians(self.field_of_view) / 2))
-
     def __post_init__(self) -> None:
         check_pinhole(self)
         _check_choice("method", self.method, Method)
         _check_choice("camera", self.camera, CameraModel)
+        _check_choice("surface", self.surface, Surface)
         _check_choice("preset", self.preset, Preset)
         _check_choice("loss", self.loss, Loss)
         _check_choice("laplacian", self.laplacian, Laplacian)

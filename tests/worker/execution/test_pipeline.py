@@ -73,7 +73,8 @@ def test_a_job_keeps_to_its_own_time_limit(inputs: Inputs, tmp_path: Path) -> No
 
 def test_every_option_of_the_solver_reaches_it() -> None:
     chosen = {
-        "method": "spatio_temporal", "camera": "perspective", "basis_size": 2, "refine_rotations": False, "preset": "paper",
+        "method": "spatio_temporal", "camera": "perspective", "surface": "free", "basis_size": 2, "refine_rotations": False,
+        "preset": "paper",
         "temporal_weight": 0.5, "spatial_weight": 0.25, "robust_scale": 0.125, "temporal_order": 2, "loss": "huber",
         "laplacian": "uniform", "prior": "smooth+low_rank", "low_rank_weight": 3.0, "max_reweightings": 7, "tolerance": 0.5,
         "precision": "float32", "seed": 9, "focal": 900.0, "field_of_view": None, "principal_point": "319.5,-2",

@@ -1,0 +1,109 @@
+"""Depths of an inextensible surface seen by pinhole cameras: the maximum-depth heuristic as one convex problem.
+
+Chhatkuli, Pizarro, Collins and Bartoli, "Inextensible non-rigid structure-from-motion by second-order cone programming"
+(TPAMI 2018): with viewing rays r_fi and depths z_fi, maximise Σ z_fi subject to
+
+    ‖z_fi r_fi − z_fj r_fj‖ ≤ d_ij   for neighbours i, j seen together in frame f,    Σ d_ij = 1,    z ≥ 0.
+
+A surface that bends without stretching keeps its geodesic distances d_ij, which bound every Euclidean distance. Neither a start
+nor a template is needed. A hidden observation has no variable and no cone. The frames are exchangeable: their order has no effect.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pliant.solver.records import Floats
+from scipy import sparse
+
+Indices = NDArray[np.intp]
+
+SOLVED = ("Solved", "AlmostSolved")
+"""Results of Clarabel that are used."""
+
+ACCURACY = 1e-5
+"""Relative gap and feasibility at which the conic program ends; the refinement that follows moves depths by 1e-2."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SurfaceGraph:
+    """Rays of one set of points, and the edges that keep their lengths."""
+
+    rays: Floats
+    """Viewing rays, shape `(F, A, 3)`, third coordinate 1."""
+
+    seen: NDArray[np.bool_]
+    """Observations that count, shape `(F, A)`."""
+
+    edges: Indices
+    """Neighbours, shape `(E, 2)`."""
+
+    @property
+    def pairs(self) -> tuple[Indices, Indices]:
+        """Frame and edge of every edge whose two ends are seen in that frame, in the order of the frames."""
+        frame, edge = np.nonzero(self.seen[:, self.edges[:, 0]] & self.seen[:, self.edges[:, 1]])
+        return frame, edge
+
+    @property
+    def ends(self) -> tuple[Indices, Indices]:
+        """For every pair, the numbers of its two observations among the seen ones, frame by frame."""
+        number = np.cumsum(self.seen.ravel()).reshape(self.seen.shape) - 1
+        frame, edge = self.pairs
+        return number[frame, self.edges[edge, 0]], number[frame, self.edges[edge, 1]]
+
+
+def maximum_depth(graph: SurfaceGraph, *, seconds: float = 60.0) -> Floats | None:
+    """Return depths `(F, A)` of the deepest inextensible surface, 0 where hidden; the unit makes Σ d_ij = 1.
+
+    None if no two neighbours are seen together, or if Clarabel finds no solution within `seconds`.
+    """
+    if len(graph.pairs[0]) == 0:
+        return None
+    found = _solved(*_program(graph), observations=int(graph.seen.sum()), cones=len(graph.pairs[0]), seconds=seconds)
+    if found is None:
+        return None
+    depths = np.zeros(graph.seen.shape)
+    depths[graph.seen] = np.maximum(found, 0.0)
+    return depths if bool((found > 0).any()) else None
+
+
+def _program(graph: SurfaceGraph) -> tuple[sparse.csc_matrix, Floats]:
+    """Return matrix and bound of s = b − A x ∈ K, x = (depths, d): Σ d = 1, then z ≥ 0, then one cone of size 4 a pair."""
+    _, edge = graph.pairs
+    rays, (first, second) = graph.rays[graph.seen], graph.ends
+    count, edges, pairs = len(rays), len(graph.edges), len(edge)
+    cone = 1 + count + 4 * np.arange(pairs)
+    blocks = [
+        (np.zeros(edges, dtype=np.intp), count + np.arange(edges), np.ones(edges)),
+        (1 + np.arange(count), np.arange(count), -np.ones(count)),
+        (cone, count + edge, -np.ones(pairs)),
+    ]
+    for axis in range(3):
+        blocks.append((cone + 1 + axis, first, -rays[first, axis]))
+        blocks.append((cone + 1 + axis, second, rays[second, axis]))
+    row, column, value = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
+    bound = np.zeros(1 + count + 4 * pairs)
+    bound[0] = 1.0
+    return sparse.csc_matrix((value, (row, column)), shape=(len(bound), count + edges)), bound
+
+
+def _solved(
+    matrix: sparse.csc_matrix, bound: Floats, *, observations: int, cones: int, seconds: float
+) -> Floats | None:
+    """Return the depths of the seen observations."""
+    import clarabel  # only sequences that look like a sheet need it
+
+    variables = matrix.shape[1]
+    cost = np.zeros(variables)
+    cost[:observations] = -1.0
+    kinds = [clarabel.ZeroConeT(1), clarabel.NonnegativeConeT(observations), *[clarabel.SecondOrderConeT(4)] * cones]
+    options = clarabel.DefaultSettings()
+    options.verbose = False
+    options.max_threads = 1
+    options.time_limit = seconds
+    options.tol_gap_rel = options.tol_gap_abs = options.tol_feas = ACCURACY
+    nothing = sparse.csc_matrix((variables, variables))
+    solved = clarabel.DefaultSolver(nothing, cost, matrix, bound, kinds, options).solve()
+    return np.asarray(solved.x)[:observations] if str(solved.status) in SOLVED else None

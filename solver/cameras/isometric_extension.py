@@ -1,0 +1,169 @@
+"""From anchors to every point: a flat template of the surface and thin-plate splines over it.
+
+The template flattens the graph of edge lengths (Isomap: shortest paths, then classical scaling; Tenenbaum, de Silva and Langford 2000).
+In every frame a spline from image to template places the points seen there; a point's median over frames is its template position, which
+outliers do not move. A second spline, from template to space, gives every point of every frame its place, hidden ones included.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pliant.solver.cameras.inextensible import Indices
+from pliant.solver.evaluation.alignment import procrustes
+from pliant.solver.records import Floats
+from scipy import sparse
+from scipy.sparse.csgraph import shortest_path
+
+FEWEST = 6
+"""Seen anchors below which a frame's image is not used to place points in the template."""
+
+STIFF = 1e-3
+"""Smoothing of the splines, in units of the template's squared spread: the anchors' depths are not exact."""
+
+WRONG = 8.0
+"""Robust standard deviations from the surface's image beyond which an observation is an outlier."""
+
+FINEST = 3e-3
+"""Smallest such standard deviation, as a share of the image's spread: the splines are no better."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Extended:
+    """Every point in every frame."""
+
+    points: Floats
+    """Camera axes, shape `(F, P, 3)`, z away from the camera, the depths' unit."""
+
+    outliers: NDArray[np.bool_]
+    """Observations that contradict the surface, shape `(F, P)`."""
+
+    placed: NDArray[np.bool_]
+    """Points that were seen somewhere near an anchor, shape `(P,)`; the others lie in the middle of the surface."""
+
+
+def flatten(edges: Indices, lengths: Floats, count: int) -> Floats | None:
+    """Return template positions `(A, 2)`, spread 1, or None if the edges leave the anchors in several parts."""
+    used = lengths > 0
+    graph = sparse.csr_matrix((lengths[used], (edges[used, 0], edges[used, 1])), shape=(count, count))
+    paths = shortest_path(graph, directed=False)
+    if not np.isfinite(paths).all():
+        return None
+    centring = np.eye(count) - 1 / count
+    values, vectors = np.linalg.eigh(-0.5 * centring @ np.square(paths) @ centring)
+    template = vectors[:, :-3:-1] * np.sqrt(np.maximum(values[:-3:-1], 0.0))
+    spread = float(template.std())
+    return template / spread if spread > 0 else None
+
+
+def complete_anchors(points: Floats, seen: NDArray[np.bool_], template: Floats) -> Floats:
+    """Return anchors `(F, A, 3)` without gaps.
+
+    A hidden anchor is taken from the frame whose seen anchors are most alike after a rigid motion, moved by that motion and by a
+    spline, over the template, of what the motion leaves.
+    """
+    filled = points.copy()
+    for frame in np.flatnonzero(~seen.all(axis=1)):
+        missing = ~seen[frame]
+        for other in _alike(points, seen, int(frame)):
+            both, gained = seen[frame] & seen[other], missing & seen[other]
+            if gained.any() and both.sum() >= FEWEST:
+                moved = _moved(points[other], points[frame], both)
+                left = spline(template[both], (points[frame] - moved)[both], template[gained])
+                filled[frame, gained] = moved[gained] + left
+                missing &= ~gained
+            if not missing.any():
+                break
+        if missing.any() and (~missing).sum() >= FEWEST:
+            filled[frame, missing] = spline(template[~missing], filled[frame, ~missing], template[missing])
+    return filled
+
+
+def extend(
+    tracks: Floats, seen: NDArray[np.bool_], *, images: Floats, known: NDArray[np.bool_], anchors: Floats,
+    template: Floats, focal: float, centre: Floats,
+) -> Extended:  # fmt: skip
+    """Return every point in every frame.
+
+    Parameters
+    ----------
+    tracks, seen : shapes (F, P, 2) and (F, P)
+        Image positions and which of them count.
+    images, known : shapes (F, A, 2) and (F, A)
+        The anchors' image positions and which of them count.
+    anchors : shape (F, A, 3)
+        The anchors in space, without gaps.
+    template : shape (A, 2)
+        From `flatten`.
+    focal, centre
+        Focal length and principal point `(2,)`, pixels.
+    """
+    place = _placed(tracks, seen, images, known, template)
+    placed: NDArray[np.bool_] = np.asarray(np.isfinite(place).all(axis=1))
+    flat = anchors.transpose(1, 0, 2).reshape(len(template), -1)
+    space = spline(template, flat, np.where(placed[:, None], place, 0.0))
+    space = space.reshape(-1, len(anchors), 3).transpose(1, 0, 2).copy()
+    nearest = 1e-3 * float(np.median(anchors[..., 2]))
+    space[..., 2] = np.maximum(space[..., 2], nearest)
+    off = np.linalg.norm(focal * space[..., :2] / space[..., 2:] + centre - tracks, axis=2)
+    compared = seen & placed
+    limit = WRONG * max(float(np.median(off[compared])) / 1.1774, FINEST * float(images[known].std()))
+    outliers: NDArray[np.bool_] = np.asarray(compared & (off > limit))
+    own = compared & ~outliers
+    rays = np.concatenate([(tracks - centre) / focal, np.ones((*seen.shape, 1))], axis=2)
+    return Extended(np.where(own[..., None], rays * space[..., 2:], space), outliers, placed)
+
+
+def spline(source: Floats, values: Floats, target: Floats) -> Floats:
+    """Return the thin-plate spline through `values (N, k)` at `source (N, 2)`, evaluated at `target (M, 2)`."""
+    count = len(source)
+    affine = np.concatenate([np.ones((count, 1)), source], axis=1)
+    matrix = np.zeros((count + 3, count + 3))
+    matrix[:count, :count] = _kernel(source, source) + STIFF * np.eye(count)
+    matrix[:count, count:], matrix[count:, :count] = affine, affine.T
+    matrix[count:, count:] = -1e-9 * np.eye(3)  # sources on one line leave the affine part open
+    weights = np.linalg.solve(matrix, np.concatenate([values, np.zeros((3, values.shape[1]))]))
+    return np.asarray(_kernel(target, source) @ weights[:count] + weights[count] + target @ weights[count + 1 :])
+
+
+def _kernel(target: Floats, source: Floats) -> Floats:
+    """Return r² log r between all pairs."""
+    square = np.square(target[:, None, 0] - source[:, 0]) + np.square(target[:, None, 1] - source[:, 1])
+    return np.asarray(0.5 * square * np.log(np.maximum(square, np.finfo(np.float64).tiny)))
+
+
+def _placed(
+    tracks: Floats, seen: NDArray[np.bool_], images: Floats, known: NDArray[np.bool_], template: Floats
+) -> Floats:
+    """Return template positions `(P, 2)`: the median over frames; NaN for points that no usable frame shows."""
+    found = np.full((*seen.shape, 2), np.nan)
+    for frame in np.flatnonzero(known.sum(axis=1) >= FEWEST):
+        source = images[frame, known[frame]]
+        middle, size = source.mean(axis=0), max(float(source.std()), np.finfo(np.float64).tiny)
+        target = (tracks[frame, seen[frame]] - middle) / size
+        found[frame, seen[frame]] = spline((source - middle) / size, template[known[frame]], target)
+    place = np.full((seen.shape[1], 2), np.nan)
+    ever = np.isfinite(found[..., 0]).any(axis=0)
+    place[ever] = np.nanmedian(found[:, ever], axis=0)
+    # beyond the anchors by more than the template's width is not on the surface
+    return np.where(np.abs(place).max(axis=1, keepdims=True) <= 3 * np.abs(template).max(), place, np.nan)
+
+
+def _alike(points: Floats, seen: NDArray[np.bool_], frame: int) -> Indices:
+    """Return the other frames, most alike first: least distance between seen anchors after a rigid motion."""
+    distance = np.full(len(points), np.inf)
+    for other in range(len(points)):
+        both = seen[frame] & seen[other]
+        if other != frame and both.sum() >= FEWEST:
+            moved = _moved(points[other], points[frame], both)
+            distance[other] = np.square(moved - points[frame])[both].mean()
+    return np.argsort(distance, kind="stable")[: int(np.isfinite(distance).sum())]
+
+
+def _moved(source: Floats, target: Floats, used: NDArray[np.bool_]) -> Floats:
+    """Return all of `source (A, 3)` after the rigid motion that brings its used points nearest to those of `target`."""
+    here, there = source[used].mean(axis=0), target[used].mean(axis=0)
+    turn = procrustes((target[used] - there).T @ (source[used] - here), proper=True)
+    return np.asarray((source - here) @ turn.T + there)

@@ -1,0 +1,194 @@
+"""Refine depths so that edges keep their lengths from frame to frame.
+
+Minimise Σ_fe ρ(‖x_fi − x_fj‖ − l_e) over log depths ζ and edge lengths l, x_fi = exp(ζ_fi) r_fi. ρ is the soft-L1 loss
+ε² (√(1 + (r/ε)²) − 1), so that an observation which does not move with the surface loses its influence. Σ l_e stays what it was,
+which fixes the free scale. Gauss–Newton steps with Levenberg–Marquardt damping; the normal equations are solved by conjugate gradients
+whose preconditioner inverts each frame's own block, because only the lengths couple the frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from pliant.solver.cameras.inextensible import SurfaceGraph
+from pliant.solver.records import Floats
+from scipy import sparse
+from scipy.sparse.linalg import LinearOperator, cg, splu
+
+CONVERGED = 1e-4
+"""Relative decrease of the objective below which refinement ends."""
+
+EASE = 0.75
+"""ε over the median |residual| at the start: where the loss turns from L2 to L1."""
+
+FINEST = 1e-4
+"""Smallest ε, as a share of the mean edge length: exact data are fitted by plain least squares."""
+
+MOST_DAMPED = 1e4
+"""Damping, relative to the diagonal, at which no smaller step is tried."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Isometry:
+    """Depths, and how well they keep lengths."""
+
+    depths: Floats
+    """Shape `(F, A)`; 0 where hidden."""
+
+    lengths: Floats
+    """l_e, shape `(E,)`, the depths' unit; 0 where the ends are never seen together."""
+
+    inconsistency: float
+    """I = Σ |L_fe − median_f L_e| / Σ L_fe."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Point:
+    """One iterate."""
+
+    log_depths: Floats
+    lengths: Floats
+    residuals: Floats
+    jacobian: sparse.csr_matrix
+    cost: float
+
+
+def edge_lengths(graph: SurfaceGraph, depths: Floats) -> Floats:
+    """Return L_fe = ‖x_fi − x_fj‖, shape `(F, E)`, NaN where an end is hidden."""
+    points = depths[..., None] * graph.rays
+    lengths = np.linalg.norm(points[:, graph.edges[:, 0]] - points[:, graph.edges[:, 1]], axis=2)
+    return np.where(graph.seen[:, graph.edges[:, 0]] & graph.seen[:, graph.edges[:, 1]], lengths, np.nan)
+
+
+def typical(lengths: Floats) -> Floats:
+    """Return the median over frames of lengths `(F, E)` with NaN where hidden; 0 for edges that are never seen."""
+    result = np.zeros(lengths.shape[1])
+    ever = np.isfinite(lengths).any(axis=0)
+    result[ever] = np.nanmedian(lengths[:, ever], axis=0)
+    return result
+
+
+def inconsistency(lengths: Floats) -> float:
+    """Return I = Σ |L_fe − median_f L_e| / Σ L_fe of lengths `(F, E)`; edges seen once do not count, infinite if none is left."""
+    used = lengths[:, np.isfinite(lengths).sum(axis=0) >= 2]
+    total = float(np.nansum(used))
+    return float(np.nansum(np.abs(used - typical(used)))) / total if total > 0 else float("inf")
+
+
+def residuals(graph: SurfaceGraph, log_depths: Floats, lengths: Floats) -> tuple[Floats, sparse.csr_matrix]:
+    """Return ‖x_fi − x_fj‖ − l_e of every pair `(N,)`, and its Jacobian `(N, O + E)` by the O seen log depths and the lengths.
+
+    Parameters
+    ----------
+    graph : SurfaceGraph
+        F frames of A points.
+    log_depths : shape (O,)
+        ζ of the seen observations, frame by frame.
+    lengths : shape (E,)
+        l_e.
+    """
+    _, edge = graph.pairs
+    first, second = graph.ends
+    points = np.exp(log_depths)[:, None] * graph.rays[graph.seen]
+    apart = points[first] - points[second]
+    length = np.maximum(np.linalg.norm(apart, axis=1), np.finfo(np.float64).tiny)
+    along = apart / length[:, None]
+    towards = (np.einsum("ni,ni->n", along, points[first]), -np.einsum("ni,ni->n", along, points[second]))
+    row = np.arange(len(edge))
+    values = np.concatenate([*towards, -np.ones(len(edge))])
+    columns = np.concatenate([first, second, len(log_depths) + edge])
+    size = (len(edge), len(log_depths) + len(lengths))
+    return length - lengths[edge], sparse.csr_matrix((values, (np.tile(row, 3), columns)), shape=size)
+
+
+def refine(
+    graph: SurfaceGraph, depths: Floats, *, iterations: int = 30, should_stop: Callable[[], bool] | None = None
+) -> Isometry:
+    """Return depths of unchanging edge lengths near the given ones.
+
+    Parameters
+    ----------
+    graph : SurfaceGraph
+        At least one edge is seen.
+    depths : shape (F, A)
+        Start, positive where seen.
+    iterations : int
+        Gauss–Newton steps at most.
+    should_stop : callable, optional
+        Called between steps; once it returns True, the best so far is returned.
+    """
+    lengths = typical(edge_lengths(graph, depths))
+    floor = 1e-6 * float(depths.max())
+    log_depths = np.log(np.maximum(depths[graph.seen], floor))
+    first, _ = residuals(graph, log_depths, lengths)
+    ease = max(EASE * float(np.median(np.abs(first))), FINEST * float(lengths[lengths > 0].mean()))
+    here, damping = _at(graph, log_depths, lengths, ease), 1e-3
+    for _ in range(iterations):
+        if should_stop is not None and should_stop():
+            break
+        after, damping = _lower(graph, here, damping, ease)
+        if after is None:
+            break
+        settled = here.cost - after.cost <= CONVERGED * here.cost
+        here = after
+        if settled:
+            break
+    found = np.zeros(depths.shape)
+    found[graph.seen] = np.exp(here.log_depths)
+    return Isometry(found, here.lengths, inconsistency(edge_lengths(graph, found)))
+
+
+def _at(graph: SurfaceGraph, log_depths: Floats, lengths: Floats, ease: float) -> _Point:
+    left, jacobian = residuals(graph, log_depths, lengths)
+    return _Point(log_depths, lengths, left, jacobian, float(ease**2 * (np.hypot(1.0, left / ease) - 1).sum()))
+
+
+def _lower(graph: SurfaceGraph, here: _Point, damping: float, ease: float) -> tuple[_Point | None, float]:
+    """Return the iterate after one step that lowers the cost, None if no step does, and the damping for the next."""
+    weight = 1 / np.hypot(1.0, here.residuals / ease)
+    weighted = sparse.csr_matrix(sparse.diags(weight) @ here.jacobian)
+    normal = (here.jacobian.T @ weighted).tocsr()
+    gradient = weighted.T @ here.residuals
+    while damping <= MOST_DAMPED:
+        move = _step(normal, gradient, damping, graph.seen.sum(axis=1))
+        log_depths = here.log_depths + move[: len(here.log_depths)]
+        lengths = here.lengths + move[len(here.log_depths) :]
+        total = float(lengths.sum())
+        if total > 0:  # back to the scale of the start
+            scale = float(here.lengths.sum()) / total
+            after = _at(graph, log_depths + np.log(scale), lengths * scale, ease)
+            if after.cost < here.cost:
+                return after, max(damping / 10, 1e-8)
+        damping *= 10
+    return None, damping
+
+
+def _step(normal: sparse.csr_matrix, gradient: Floats, damping: float, counts: Floats) -> Floats:
+    """Solve (N + damping · diag N) x = −g by preconditioned conjugate gradients."""
+    diagonal = normal.diagonal()
+    added = damping * diagonal + 1e-12 * float(diagonal.max())
+    bounds = np.concatenate([[0], np.cumsum(counts)])
+    spans = [slice(int(a), int(b)) for a, b in pairwise(bounds) if b > a]
+    blocks = [
+        splu((normal[s, s] + sparse.diags(added[s])).tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
+             options={"SymmetricMode": True})
+        for s in spans
+    ]  # fmt: skip
+
+    def precondition(x: Floats) -> Floats:
+        y = x / (diagonal + added)
+        for span, block in zip(spans, blocks, strict=True):
+            y[span] = block.solve(x[span])
+        return y
+
+    def multiply(x: Floats) -> Floats:
+        return np.asarray(normal @ x + added * x)
+
+    shape = normal.shape
+    operator = LinearOperator(shape, matvec=multiply, dtype=np.float64)
+    inverse = LinearOperator(shape, matvec=precondition, dtype=np.float64)
+    move, _ = cg(operator, -gradient, rtol=1e-3, maxiter=100, M=inverse)
+    return np.asarray(move)

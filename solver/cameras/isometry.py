@@ -1,0 +1,308 @@
+"""A sheet that bends without stretching, seen by a pinhole camera: its shapes and, where it is not given, the focal length.
+
+Maximum depth (`inextensible`) gives a start, refinement on the isometry itself (`isometric_refinement`) the depths of some anchors, splines
+(`isometric_extension`) those of all points. The isometric inconsistency I, the share of the edges' length that changes from frame
+to frame, is computed without ground truth. As a function of the focal length it has its minimum at the true one wherever perspective is
+strong enough for the method to work, and is large or flat elsewhere. Isometry is therefore accepted only where I is small and
+clearly smaller than at the neighbouring focal lengths. The order of the frames has no effect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from pliant.solver.cameras.focal_sweep import CLEAR, FocalSearch, Tried, judged, sweep
+from pliant.solver.cameras.inextensible import SurfaceGraph, maximum_depth
+from pliant.solver.cameras.isometric_extension import Extended, complete_anchors, extend, flatten
+from pliant.solver.cameras.isometric_refinement import Isometry, edge_lengths, inconsistency, refine, typical
+from pliant.solver.cameras.surface_anchors import Anchors, choose_anchors, connected, nearest_neighbours, unlike_frames
+from pliant.solver.records import Floats, Tracks
+
+ANCHORS = 60
+"""Points that the conic program places; its time grows with their number times the frames."""
+
+SOLVED_FRAMES = 24
+"""Frames of the conic program and of the focal lengths' comparison; the others start from the most similar one of these."""
+
+SHEETLIKE = 0.03
+"""Third over second singular value, squared, of the centred tracks below which `auto` tries isometry. Measured: paper .004, a comic page
+.019; bodies above .05, a nearly rigid head, for which I has false minima, .08."""
+
+HOPELESS = 0.03
+"""I of a small part at the first focal length above which `auto` tries no more. Measured: paper and page from half to four times the true
+one .003 to .022; faces .037 to .068."""
+
+SMALL_PART = (30, 12, 10)
+"""Anchors, frames and neighbours of that part."""
+
+TYPICAL_FOCAL = 0.8
+"""First focal length tried, over the image's diagonal: about 64° across it."""
+
+SHORT = 8
+"""Neighbours in the last refinement. Measured, error of a cylinder rolled ever tighter .015 → .007, a cone .084 → .054, paper .0187 →
+.0179; with 5 no less."""
+
+MARGIN = 1.3
+"""Image diagonal over that of the box around all tracks, where the image's size is not given."""
+
+FIRST_LOOK = 200
+"""Points that say which frames differ most."""
+
+TOO_LITTLE = "Too few points are seen together for an isometric surface."
+
+FEWEST_ANCHORS = 6
+"""Anchors below which there is no surface to speak of."""
+
+
+@dataclass(frozen=True, slots=True)
+class FocalCandidate:
+    """One focal length that was tried."""
+
+    focal: float
+    """Pixels."""
+
+    inconsistency: float
+    """I, see the module."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class IsometricVerdict:
+    """Whether the tracks are those of an isometric surface, and the surface if they are."""
+
+    reason: str
+    """One sentence for the report."""
+
+    candidates: tuple[FocalCandidate, ...] = ()
+    """In the order in which they were tried."""
+
+    surface: IsometricSurface | None = None
+    """None where isometry is not taken."""
+
+    warnings: tuple[str, ...] = ()
+    """Sentences the user should read."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class IsometricSurface:
+    """Shapes before each frame's camera."""
+
+    points: Floats
+    """Camera axes, x right, y down, z away, shape `(F, P, 3)`; one free scale for the sequence."""
+
+    outliers: NDArray[np.bool_]
+    """Observations that contradict the surface, shape `(F, P)`."""
+
+    placed: NDArray[np.bool_]
+    """Points with a place on the surface, shape `(P,)`."""
+
+    focal: float
+    """Pixels, given or found."""
+
+    principal_point: tuple[float, float]
+    """Pixels, given or assumed."""
+
+    inconsistency: float
+    """I of the anchors over all frames."""
+
+    noise_std: float
+    """Robust standard deviation of the tracks about small affine patches, the tracks' unit."""
+
+
+def isometric_surface(
+    tracks: Tracks,
+    *,
+    focal: float | None = None,
+    principal_point: tuple[float, float] | None = None,
+    image_size: tuple[float, float] | None = None,
+    required: bool = False,
+    should_stop: Callable[[], bool] | None = None,
+) -> IsometricVerdict:
+    """Decide whether the tracks are those of an isometric surface, and reconstruct it.
+
+    Parameters
+    ----------
+    tracks : Tracks
+        Pixels, x right, y down.
+    focal : float, optional
+        Focal length in pixels; None searches it.
+    principal_point : (x, y), optional
+        Pixels; None takes the centre of the image, or that of the tracks where `image_size` is not given.
+    image_size : (width, height), optional
+        Pixels.
+    required : bool
+        Return the surface even if the evidence is weak, with a warning; only where there is none at all, none is returned.
+    should_stop : callable, optional
+        Called between units of work; once it returns True, the verdict is that isometry is not taken.
+    """
+    seen, diagonal = tracks.visible > 0, _diagonal(tracks, image_size)
+    centre = _centre(tracks, principal_point, image_size)
+    part = _some_frames(tracks.points, seen)
+    search = _prepared(tracks.points[part], seen[part], centre, should_stop)
+    first = focal if focal is not None else TYPICAL_FOCAL * diagonal
+    against = _implausible(search, first, required)
+    if against is None and len(part) < tracks.num_frames:
+        search = _prepared(tracks.points, seen, centre, should_stop)
+    if against is not None or search is None:
+        return IsometricVerdict(against or TOO_LITTLE)
+    tried = sweep(search, first, diagonal, given=focal is not None)
+    if not tried or search.stopped:
+        return IsometricVerdict("No isometric surface was found: the conic program has no solution.", _trace(tried))
+    least = min(tried, key=lambda each: each.found.inconsistency)
+    clear, why = judged(tried, least)
+    if not clear and not required:
+        return IsometricVerdict(why, _trace(tried))
+    chosen = least if focal is None else tried[0]
+    surface = _everywhere(search, tracks, seen, chosen)
+    if surface is None:
+        return IsometricVerdict("No isometric surface was found: its points do not hang together.", _trace(tried))
+    return IsometricVerdict(why, _trace(tried), surface, _warnings(clear, focal, least, chosen))
+
+
+def _implausible(search: FocalSearch | None, focal: float, required: bool) -> str | None:
+    """Return why there is no isometric sheet to look for; None if there may be one."""
+    if search is None:
+        return TOO_LITTLE
+    if required:
+        return None
+    flatness = sheetlike(search.anchors)
+    if flatness > SHEETLIKE:
+        return f"Not tried as an isometric sheet: the third singular value of the tracks is {np.sqrt(flatness):.2f} of the second."
+    changes = _glance(search, focal)
+    return (
+        f"Not an isometric sheet: edge lengths of a part of it change by {changes:.1%}." if changes > HOPELESS else None
+    )
+
+
+def _some_frames(points: Floats, seen: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Return the frames of the first look, from some of the points."""
+    often = np.argsort(-seen.sum(axis=0), kind="stable")[:: max(1, seen.shape[1] // FIRST_LOOK)]
+    return unlike_frames(points[:, often], seen[:, often], SOLVED_FRAMES)
+
+
+def sheetlike(anchors: Anchors) -> float:
+    """Return the third eigenvalue over the second of the centred tracks' Gram matrix; hidden entries are filled with rank 3."""
+    known = np.repeat(anchors.seen, 2, axis=0)
+    matrix = anchors.points.transpose(0, 2, 1).reshape(len(known), -1)
+    rows = np.maximum(known.sum(axis=1, keepdims=True), 1)
+    matrix = np.where(known, matrix - (matrix * known).sum(axis=1, keepdims=True) / rows, 0.0)
+    for _ in range(1 if known.all() else 20):
+        left, values, right = np.linalg.svd(matrix - matrix.mean(axis=1, keepdims=True), full_matrices=False)
+        low = (left[:, :3] * values[:3]) @ right[:3] + matrix.mean(axis=1, keepdims=True)
+        matrix = np.where(known, matrix, low)
+    return float((values[2] / max(values[1], np.finfo(np.float64).tiny)) ** 2) if len(values) > 2 else 0.0
+
+
+def _prepared(
+    points: Floats, seen: NDArray[np.bool_], centre: Floats, should_stop: Callable[[], bool] | None
+) -> FocalSearch | None:
+    if (seen.sum(axis=0) >= 2).sum() < FEWEST_ANCHORS:
+        return None
+    anchors = choose_anchors(points, seen, ANCHORS)
+    edges = nearest_neighbours(anchors)
+    if anchors.points.shape[1] < FEWEST_ANCHORS or len(edges) == 0:
+        return None
+    known = connected(anchors.seen, edges)
+    if (known.sum(axis=1) >= FEWEST_ANCHORS).sum() < 2:
+        return None
+    frames = unlike_frames(anchors.points, known, SOLVED_FRAMES)
+    return FocalSearch(anchors, edges, known, frames, centre, should_stop)
+
+
+def _glance(search: FocalSearch, focal: float) -> float:
+    """Return I of some anchors and frames at one focal length; infinite if there is no surface."""
+    some, frames, neighbours = SMALL_PART
+    part = replace(search.anchors, points=search.anchors.points[:, :some], seen=search.seen[:, :some])
+    edges = nearest_neighbours(part, neighbours=neighbours)
+    used = search.frames[:frames]
+    rays = search.graph(focal, used).rays[:, :some]
+    graph = SurfaceGraph(rays, connected(part.seen, edges)[used], edges)
+    depths = maximum_depth(graph)
+    return refine(graph, depths, iterations=10).inconsistency if depths is not None else float("inf")
+
+
+def _everywhere(search: FocalSearch, tracks: Tracks, seen: NDArray[np.bool_], chosen: Tried) -> IsometricSurface | None:
+    """Return the surface of all frames and points, from the anchors of some frames at the chosen focal length."""
+    part = search.graph(chosen.focal, search.frames)
+    whole = search.graph(chosen.focal)
+    afresh = maximum_depth(part)
+    found = chosen.found if afresh is None else refine(part, afresh, should_stop=search.should_stop)
+    found = min(found, chosen.found, key=lambda each: each.inconsistency)
+    if len(search.frames) < tracks.num_frames:
+        found = refine(whole, _from_similar(whole, search, found.depths), should_stop=search.should_stop)
+    else:
+        found = replace(found, depths=found.depths[np.argsort(search.frames)])
+    if not search.stopped:  # the chord of a long edge is shorter than the surface between its ends
+        near = replace(whole, edges=nearest_neighbours(replace(search.anchors, seen=search.seen), neighbours=SHORT))
+        depths = refine(near, found.depths, should_stop=search.should_stop).depths
+        lengths = edge_lengths(whole, depths)
+        found = Isometry(depths, typical(lengths), inconsistency(lengths))
+    template = flatten(search.edges, found.lengths, search.seen.shape[1])
+    if template is None:
+        return None
+    points = complete_anchors(found.depths[..., None] * whole.rays, search.seen, template)
+    all_of_it: Extended = extend(
+        tracks.points, seen, images=search.anchors.points, known=search.seen, anchors=points, template=template,
+        focal=chosen.focal, centre=search.centre,
+    )  # fmt: skip
+    if not np.isfinite(all_of_it.points).all():
+        return None
+    return IsometricSurface(
+        all_of_it.points, all_of_it.outliers, all_of_it.placed, chosen.focal,
+        (float(search.centre[0]), float(search.centre[1])), found.inconsistency, search.anchors.noise_std,
+    )  # fmt: skip
+
+
+def _from_similar(graph: SurfaceGraph, search: FocalSearch, depths: Floats) -> Floats:
+    """Return depths `(F, A)` for all frames, those of the solved frame whose image is most alike."""
+    start = np.zeros(graph.seen.shape)
+    rays, seen = graph.rays[search.frames], graph.seen[search.frames]
+    for frame in range(len(start)):
+        both = seen & graph.seen[frame]
+        off = np.where(both[..., None], rays - graph.rays[frame], 0.0)
+        count = np.maximum(both.sum(axis=1), 1)
+        off -= np.where(both[..., None], off.sum(axis=1, keepdims=True) / count[:, None, None], 0.0)
+        unlike = np.where(both.sum(axis=1) >= 2, np.square(off).sum(axis=(1, 2)) / count, np.inf)
+        like = int(unlike.argmin())
+        mean = float(depths[like][seen[like]].mean()) if seen[like].any() else 1.0
+        start[frame] = np.where(graph.seen[frame], np.where(seen[like], depths[like], mean), 0.0)
+    return start
+
+
+def _centre(
+    tracks: Tracks, principal_point: tuple[float, float] | None, image_size: tuple[float, float] | None
+) -> Floats:
+    if principal_point is not None:
+        return np.array(principal_point, dtype=np.float64)
+    if image_size is not None:
+        return np.array(image_size, dtype=np.float64) / 2
+    return np.asarray(np.median(tracks.points[tracks.visible > 0], axis=0))
+
+
+def _diagonal(tracks: Tracks, image_size: tuple[float, float] | None) -> float:
+    """Return the image's diagonal, or a guess from the middle 98 % of the tracks."""
+    if image_size is not None:
+        return float(np.hypot(*image_size))
+    low, high = np.quantile(tracks.points[tracks.visible > 0], [0.01, 0.99], axis=0)
+    return MARGIN * float(np.hypot(*(high - low)))
+
+
+def _warnings(clear: bool, focal: float | None, least: Tried, chosen: Tried) -> tuple[str, ...]:
+    warnings = []
+    if not clear:
+        warnings.append(
+            f"The surface was required to be isometric, but the tracks hardly support it: edge lengths change by "
+            f"{chosen.found.inconsistency:.1%}. Compare with surface=free."
+        )
+    if focal is not None and chosen.found.inconsistency > CLEAR * least.found.inconsistency:
+        warnings.append(
+            f"The given focal length of {focal:.0f} px is improbable: edge lengths change {chosen.found.inconsistency:.2%} with it, "
+            f"{least.found.inconsistency:.2%} at {least.focal:.0f} px. Check focal, field_of_view and principal_point."
+        )
+    return tuple(warnings)
+
+
+def _trace(tried: list[Tried]) -> tuple[FocalCandidate, ...]:
+    return tuple(FocalCandidate(each.focal, each.found.inconsistency) for each in tried)

@@ -1,0 +1,133 @@
+"""A Solution from an isometric surface: camera axes become cameras that move around shapes in one world.
+
+The surface is known in each frame's camera axes. A rigid motion per frame brings it onto the mean shape (generalised Procrustes analysis;
+Gower 1975), so that what is left between frames is deformation and what was taken out is the camera's rotation. Shapes are in image units
+at the mean depth, as under scaled orthography.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from pliant.solver.cameras.isometry import IsometricSurface, IsometricVerdict
+from pliant.solver.evaluation.alignment import procrustes
+from pliant.solver.evaluation.trust import Trust, Verdict, turned
+from pliant.solver.records import Camera, Choices, Floats, Outcome, Solution, Trace, Tracks, read_only
+from pliant.solver.settings import Settings
+
+ROUNDS = 5
+"""Alternations between mean shape and rotations; each starts from the last, and the third changes angles by less than 1e-3 already."""
+
+
+def isometric_solution(
+    tracks: Tracks, verdict: IsometricVerdict, settings: Settings, *, unit: float, seconds: dict[str, float]
+) -> Solution:
+    """Return the solution that an accepted verdict stands for.
+
+    Parameters
+    ----------
+    tracks : Tracks
+        What the surface was computed from.
+    verdict : IsometricVerdict
+        With a surface, from tracks whose y grows downwards.
+    settings : Settings
+        `y_up` of the tracks, and whether the focal length was given.
+    unit : float
+        RMS radius of the centred tracks, reported with the choices.
+    seconds : dict
+        Wall time per stage.
+    """
+    surface = verdict.surface
+    assert surface is not None
+    shapes, camera = in_world_axes(surface)
+    camera = replace(camera, focal_std=0.0 if settings.focal_length is not None else None)
+    if settings.y_up:
+        camera = upwards(camera)
+    seen = tracks.visible > 0
+    residual = np.where(seen, np.linalg.norm(camera.project(shapes) - tracks.points, axis=2), 0.0)
+    weights = np.where(seen & ~surface.outliers & surface.placed, tracks.visible, 0.0)
+    median = float(np.median(residual[seen]))
+    for array in (shapes, residual, weights):
+        read_only(array)
+    trace = Trace(np.array([surface.inconsistency]), np.array([median]), np.zeros(1, dtype=np.int32))
+    choices = _choices(verdict, surface, unit, float(surface.outliers.sum() / seen.sum()))
+    return Solution(
+        shapes, camera, residual, weights, trace, Outcome.CONVERGED, choices, seconds,
+        trust=_trust(verdict, camera, median / unit, float((weights == 0).mean())),
+    )  # fmt: skip
+
+
+def _trust(verdict: IsometricVerdict, camera: Camera, residual: float, hidden: float) -> Trust:
+    """Return the verdict without an expected error: isometry is no Gaussian model and has no posterior."""
+    grade = Verdict.WITH_CARE if verdict.warnings else Verdict.GOOD
+    return Trust(grade, verdict.warnings, None, None, turned(camera.rotations), residual, hidden)
+
+
+def in_world_axes(surface: IsometricSurface) -> tuple[Floats, Camera]:
+    """Return shapes `(F, P, 3)`, centred, and the cameras that see them where the surface was."""
+    origin = surface.points.mean(axis=1)
+    centred = surface.points - origin[:, None]
+    rotations = _rotations(centred[:, surface.placed])
+    scales = surface.focal / origin[:, 2]
+    unit = float(np.exp(np.log(scales).mean()))
+    shapes = unit * (centred @ rotations)
+    point = np.array(surface.principal_point)
+    translations = point + scales[:, None] * origin[:, :2]
+    for array in (rotations, scales, translations):
+        read_only(array)
+    return shapes, Camera(rotations, scales / unit, translations, surface.focal, principal_point=point)
+
+
+def downwards(tracks: Tracks) -> Tracks:
+    """Return tracks with the other direction of y."""
+    return Tracks.from_arrays(tracks.points * (1.0, -1.0), tracks.visible)
+
+
+def centre_downwards(settings: Settings) -> tuple[float, float] | None:
+    """Return the given principal point, or the centre of the picture, where y grows downwards; None if neither is given."""
+    point = settings.principal_point
+    if point is None and settings.image_size is not None:
+        point = (settings.image_size[0] / 2, settings.image_size[1] / 2)
+    return point if point is None or not settings.y_up else (point[0], -point[1])
+
+
+def upwards(camera: Camera) -> Camera:
+    """Return the same camera for tracks with the other direction of y: half a turn about x."""
+    half_turn = np.diag([1.0, -1.0, -1.0])
+    rotations, translations = half_turn @ camera.rotations, camera.translations * (1.0, -1.0)
+    for array in (rotations, translations):
+        read_only(array)
+    return replace(
+        camera,
+        rotations=rotations,
+        translations=translations,
+        principal_point=camera.principal_point * (1.0, -1.0),
+        y_up=True,
+    )
+
+
+def _rotations(centred: Floats) -> Floats:
+    """Return camera from world, `(F, 3, 3)`: S_f R_f is nearest to the mean shape; the first is the identity."""
+    mean = centred[int(np.square(centred - centred.mean(axis=0)).sum(axis=(1, 2)).argmin())]
+    rotations = np.tile(np.eye(3), (len(centred), 1, 1))
+    for _ in range(ROUNDS):
+        rotations = procrustes(centred.transpose(0, 2, 1) @ mean, proper=True)
+        mean = (centred @ rotations).mean(axis=0)
+    return np.asarray(rotations @ rotations[0].T)
+
+
+def _choices(verdict: IsometricVerdict, surface: IsometricSurface, unit: float, outliers: float) -> Choices:
+    reasons = {
+        "surface": verdict.reason,
+        "outliers": f"{outliers:.1%} of what was seen contradicts the surface and was not used.",
+    }
+    warnings = list(verdict.warnings)
+    if not surface.placed.all():
+        share = 1 - float(surface.placed.mean())
+        warnings.append(f"{share:.1%} of the points were never seen on the surface; they lie in its middle.")
+    return Choices(
+        basis_size=0, temporal_weight=0.0, spatial_weight=0.0, robust_scale=0.0, temporal_order=1, low_rank_weight=0.0,
+        laplacian="none", unit=unit, noise=surface.noise_std, reasons=reasons, warnings=tuple(warnings),
+        focal_lengths=tuple((each.focal, each.inconsistency) for each in verdict.candidates),
+    )  # fmt: skip

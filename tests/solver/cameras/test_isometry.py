@@ -1,0 +1,258 @@
+"""Isometric surfaces: rolled sheets known in closed form, what the method must not depend on, and what it must refuse."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pliant.solver import InvalidInput, InvalidSettings, KnownCamera, Outcome, Settings, Tracks, gallery, solve
+from pliant.solver.cameras.inextensible import SurfaceGraph, maximum_depth
+from pliant.solver.cameras.isometric_extension import complete_anchors, flatten, spline
+from pliant.solver.cameras.isometric_refinement import edge_lengths, inconsistency, refine, residuals, typical
+from pliant.solver.cameras.isometry import isometric_surface
+from pliant.solver.cameras.surface_anchors import Anchors, connected, nearest_neighbours
+from pliant.solver.evaluation.metrics import reprojection
+from rolled_sheets import CENTRE, FOCAL, SIZE, one_scale_error, rolled
+
+
+def graph_of(frames: int = 5, side: int = 5) -> tuple[SurfaceGraph, np.ndarray]:
+    """Exact rays of a cylinder, and its true depths."""
+    sheet = rolled(frames=frames, side=side)
+    anchors = Anchors(sheet.tracks.points, sheet.tracks.visible > 0, 0.0)
+    rays = np.concatenate([(anchors.points - CENTRE) / FOCAL, np.ones((*anchors.seen.shape, 1))], axis=2)
+    return SurfaceGraph(rays, anchors.seen, nearest_neighbours(anchors, neighbours=8)), sheet.points[..., 2]
+
+
+def test_the_jacobian_is_that_of_finite_differences() -> None:
+    graph, depths = graph_of()
+    seen = np.random.default_rng(0).random(graph.seen.shape) < 0.8
+    graph = replace(graph, seen=seen)
+    x = np.concatenate([np.log(depths[seen]), np.random.default_rng(1).random(len(graph.edges))])
+    count = int(seen.sum())
+    jacobian = residuals(graph, x[:count], x[count:])[1].toarray()
+    for column in np.random.default_rng(2).choice(len(x), 25, replace=False):
+        step = 1e-6 * np.eye(len(x))[column]
+        high, low = (residuals(graph, y[:count], y[count:])[0] for y in (x + step, x - step))
+        np.testing.assert_allclose(jacobian[:, column], (high - low) / 2e-6, atol=1e-8)
+
+
+def test_true_depths_of_a_rigid_plane_are_a_minimum_and_refinement_returns_to_it() -> None:
+    sheet = rolled(frames=4, side=5)
+    plane = np.stack([sheet.flat[:, 0], sheet.flat[:, 1], np.zeros(25)], axis=1)
+    turns = [
+        np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
+        for c, s in ((np.cos(a), np.sin(a)) for a in (0.2, 0.5, -0.3, -0.6))
+    ]
+    points = np.array([plane @ turn.T + [0, 0, 4] for turn in turns])
+    edges = np.array([(i, j) for i in range(25) for j in range(i) if np.hypot(*(sheet.flat[i] - sheet.flat[j])) < 0.75])
+    graph = SurfaceGraph(points / points[..., 2:], np.ones((4, 25), dtype=bool), edges)
+    assert inconsistency(edge_lengths(graph, points[..., 2])) < 1e-12
+    moved = points[..., 2] * (1 + 0.02 * np.random.default_rng(0).standard_normal((4, 25)))
+    found = refine(graph, moved, iterations=60)
+    assert found.inconsistency < 1e-3 < 0.2 * inconsistency(edge_lengths(graph, moved))
+    assert one_scale_error(found.depths[..., None] * graph.rays, points) < 5e-3
+    assert found.lengths.sum() == pytest.approx(typical(edge_lengths(graph, moved)).sum())
+    assert refine(graph, moved, should_stop=lambda: True).depths == pytest.approx(moved)
+
+
+def test_maximum_depth_respects_every_cone_and_is_about_the_sheet() -> None:
+    graph, depths = graph_of()
+    found = maximum_depth(graph)
+    assert found is not None
+    assert one_scale_error(found[..., None] * graph.rays, depths[..., None] * graph.rays) < 0.12
+    longest = np.nanmax(edge_lengths(graph, found), axis=0)
+    assert longest.sum() == pytest.approx(1.0, rel=1e-2)  # d_ij are the longest of the frames where they bind
+    hidden = replace(graph, seen=np.zeros_like(graph.seen))
+    assert maximum_depth(hidden) is None
+    assert maximum_depth(graph, seconds=1e-9) is None
+
+
+@pytest.mark.parametrize(("kind", "error"), [("cylinder", 0.015), ("cone", 0.08)])
+def test_a_rolled_sheet_is_recovered_with_the_focal_length_known(kind: str, error: float) -> None:
+    sheet = rolled(kind)
+    verdict = isometric_surface(sheet.tracks, focal=FOCAL, image_size=SIZE)
+    assert verdict.surface is not None, verdict.reason
+    assert verdict.warnings == ()
+    assert one_scale_error(verdict.surface.points, sheet.points) < error
+    assert verdict.surface.principal_point == CENTRE
+    assert verdict.candidates[0].focal == FOCAL == verdict.surface.focal
+    assert min(verdict.candidates, key=lambda each: each.inconsistency) == verdict.candidates[0]
+
+
+def test_a_rolled_sheet_is_recovered_with_the_focal_length_found() -> None:
+    sheet = rolled()
+    verdict = isometric_surface(sheet.tracks, image_size=SIZE)
+    assert verdict.surface is not None, verdict.reason
+    assert verdict.surface.focal == pytest.approx(FOCAL, rel=0.06)
+    assert one_scale_error(verdict.surface.points, sheet.points) < 0.02
+    assert "isometric sheet" in verdict.reason
+
+
+def test_hidden_points_and_outliers_leave_the_sheet_where_it_is() -> None:
+    sheet = rolled(side=24)
+    random = np.random.default_rng(3)
+    visible = (random.random(sheet.tracks.visible.shape) > 0.2).astype(float)
+    points = sheet.tracks.points.copy()
+    wrong = random.random(visible.shape) < 0.05
+    points[wrong] += random.uniform(60, 120, (int(wrong.sum()), 2))
+    verdict = isometric_surface(Tracks.from_arrays(points, visible), focal=FOCAL, image_size=SIZE, required=True)
+    assert verdict.surface is not None, verdict.reason
+    assert one_scale_error(verdict.surface.points, sheet.points) < 0.07
+    judged = wrong & (visible > 0)
+    assert verdict.surface.outliers[judged].mean() > 0.9
+    assert verdict.surface.outliers[~judged].mean() < 0.05
+
+
+def test_the_order_of_the_frames_has_no_effect() -> None:
+    sheet = rolled(frames=6, side=6)
+    order = np.array([3, 0, 5, 1, 4, 2])
+    plain = isometric_surface(sheet.tracks, focal=FOCAL, image_size=SIZE, required=True).surface
+    shuffled = Tracks.from_arrays(sheet.tracks.points[order])
+    other = isometric_surface(shuffled, focal=FOCAL, image_size=SIZE, required=True).surface
+    assert plain is not None
+    assert other is not None
+    assert one_scale_error(other.points, plain.points[order]) < 2e-3
+
+
+@pytest.mark.parametrize("stretch", [0.2])
+def test_a_sheet_that_stretches_is_not_taken(stretch: float) -> None:
+    sheet = rolled("cone", stretch=stretch)
+    for focal in (FOCAL, None):
+        verdict = isometric_surface(sheet.tracks, focal=focal, image_size=SIZE)
+        assert verdict.surface is None
+        assert verdict.reason
+
+
+def test_what_is_no_sheet_is_not_even_tried() -> None:
+    verdict = isometric_surface(gallery.sphere(12, 150).tracks)
+    assert verdict.surface is None
+    assert verdict.candidates == ()
+
+
+def test_a_shallow_face_without_perspective_is_not_taken() -> None:
+    verdict = isometric_surface(gallery.face(6, 60).tracks)
+    assert verdict.surface is None
+    assert verdict.reason
+
+
+def test_outliers_only_end_with_a_warning_and_a_result() -> None:
+    noise = Tracks.from_arrays(np.random.default_rng(0).uniform(0, 400, (4, 12, 2)))
+    assert isometric_surface(noise).surface is None
+    solution = solve(noise, settings=Settings(surface="isometric", max_reweightings=2))
+    assert np.isfinite(solution.shapes).all()
+    assert any("isometric" in warning for warning in solution.choices.warnings)
+
+
+@pytest.mark.parametrize(("frames", "points"), [(3, 8), (3, 4), (4, 5)])
+def test_hardly_anything_is_enough_for_a_verdict(frames: int, points: int) -> None:
+    image = Tracks.from_arrays(rolled(frames=frames, side=3).tracks.points[:, :points])
+    verdict = isometric_surface(image, focal=FOCAL, required=True)
+    assert verdict.reason
+    assert verdict.surface is None or np.isfinite(verdict.surface.points).all()
+    assert (verdict.surface is None) or points >= 6
+
+
+def test_stopping_early_takes_no_isometry() -> None:
+    sheet = rolled(frames=4, side=5)
+    assert isometric_surface(sheet.tracks, focal=FOCAL, image_size=SIZE, should_stop=lambda: True).surface is None
+
+
+def test_the_solution_projects_back_onto_the_tracks_and_turns_a_camera_around_one_world() -> None:
+    sheet = rolled()
+    solution = solve(sheet.tracks, settings=Settings(focal=FOCAL, image_size=SIZE))
+    assert solution.outcome is Outcome.CONVERGED
+    assert solution.camera.focal == FOCAL
+    assert solution.camera.principal_point == CENTRE
+    assert reprojection(sheet.tracks, solution).median < 1e-6
+    assert one_scale_error(solution.shapes, sheet.points) < 0.015
+    rotations = solution.camera.rotations
+    np.testing.assert_allclose(rotations @ rotations.transpose(0, 2, 1), np.tile(np.eye(3), (8, 1, 1)), atol=1e-12)
+    np.testing.assert_allclose(rotations[0], np.eye(3), atol=1e-12)
+    assert np.log(solution.camera.scales).mean() == pytest.approx(0, abs=1e-12)
+    np.testing.assert_allclose(solution.shapes.mean(axis=1), 0, atol=1e-9)
+    assert "isometric" in solution.choices.reasons["surface"]
+    assert len(solution.choices.focal_lengths) >= 3
+    assert solution.weights[solution.residuals > 5].max(initial=0.0) == 0.0
+
+
+def test_a_wrong_focal_length_is_reported_as_improbable() -> None:
+    sheet = rolled()
+    verdict = isometric_surface(sheet.tracks, focal=2 * FOCAL, image_size=SIZE)
+    assert verdict.surface is not None
+    assert verdict.surface.focal == 2 * FOCAL
+    assert any("improbable" in warning for warning in verdict.warnings)
+
+
+def test_field_of_view_stands_for_the_focal_length() -> None:
+    degrees = float(np.degrees(2 * np.arctan(SIZE[0] / 2 / FOCAL)))
+    assert Settings(field_of_view=degrees, image_size=SIZE).focal_length == pytest.approx(FOCAL)
+    assert Settings(focal=FOCAL).focal_length == FOCAL
+    assert Settings().focal_length is None
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"surface": "rubber"}, {"focal": 0.0}, {"focal": -1.0}, {"focal": float("nan")}, {"field_of_view": 60.0},
+        {"field_of_view": 0.5, "image_size": SIZE}, {"field_of_view": 60.0, "image_size": SIZE, "focal": FOCAL},
+        {"image_size": (0, 480)}, {"image_size": (640,)}, {"principal_point": (float("nan"), 0.0)},
+    ],
+)  # fmt: skip
+def test_settings_that_contradict_are_refused(wrong: dict[str, object]) -> None:
+    with pytest.raises(InvalidSettings) as caught:
+        Settings(**wrong)  # type: ignore[arg-type]
+    assert caught.value.field.removeprefix("options.") in wrong
+
+
+def test_given_rotations_and_a_required_isometry_contradict() -> None:
+    sheet = rolled(frames=3, side=3)
+    known = KnownCamera.from_arrays(np.tile(np.eye(3), (3, 1, 1)))
+    with pytest.raises(InvalidInput, match="surface"):
+        solve(sheet.tracks, cameras=known, settings=Settings(surface="isometric"))
+
+
+def test_a_free_surface_is_the_solve_without_isometry() -> None:
+    tracks = gallery.sphere(5, 40).tracks
+    free, auto = (
+        solve(tracks, settings=Settings(surface=kind, image_size=SIZE, max_reweightings=2)) for kind in ("free", "auto")
+    )
+    np.testing.assert_array_equal(free.shapes, auto.shapes)
+    assert "surface" not in free.choices.reasons
+    assert "sheet" in auto.choices.reasons["surface"]
+
+
+def test_anchors_in_several_parts_count_in_the_largest_only() -> None:
+    edges = np.array([[0, 1], [1, 2], [3, 4]])
+    seen = np.array([[True] * 5, [True, False, True, True, True], [False] * 5])
+    np.testing.assert_array_equal(connected(seen, edges), [[1, 1, 1, 0, 0], [0, 0, 0, 1, 1], [0, 0, 0, 0, 0]])
+    assert flatten(edges, np.ones(3), 5) is None
+
+
+def test_flattening_a_rolled_grid_gives_the_grid_back() -> None:
+    side = np.stack(np.meshgrid(np.arange(6.0), np.arange(6.0)), axis=-1).reshape(-1, 2)
+    pairs = [(i, j) for i in range(36) for j in range(i) if np.hypot(*(side[i] - side[j])) < 3.2]
+    edges = np.array(pairs)
+    template = flatten(edges, np.linalg.norm(side[edges[:, 0]] - side[edges[:, 1]], axis=1), 36)
+    assert template is not None
+    flat = np.concatenate([template, np.zeros((36, 1))], axis=1)[None]
+    truth = np.concatenate([side, np.zeros((36, 1))], axis=1)[None]
+    assert one_scale_error(flat, truth) < 0.03
+
+
+def test_splines_reproduce_what_is_affine_and_pass_near_the_rest() -> None:
+    random = np.random.default_rng(0)
+    source, target = random.standard_normal((30, 2)), random.standard_normal((7, 2))
+    np.testing.assert_allclose(
+        spline(source, source @ [[2.0], [-1]] + 3, target), target @ [[2.0], [-1]] + 3, atol=1e-6
+    )
+    np.testing.assert_allclose(spline(source, source**2, source), source**2, atol=0.05)
+
+
+def test_hidden_anchors_follow_the_frame_most_alike() -> None:
+    sheet = rolled(frames=3, side=6)
+    points = np.stack([sheet.points[0], sheet.points[0] + [1.0, 2.0, 3.0]])
+    seen = np.ones((2, 36), dtype=bool)
+    seen[1, [0, 7, 35]] = False
+    spoiled = np.where(seen[..., None], points, 0.0)
+    np.testing.assert_allclose(complete_anchors(spoiled, seen, sheet.flat), points, atol=1e-6)
