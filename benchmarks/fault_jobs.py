@@ -1,4 +1,4 @@
-"""Faults that hit those who do the work: horses, workers, the keeper, Valkey, the job itself."""
+"""Faults that hit those who do the work: job_processes, workers, the reconciler, Valkey, the job itself."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from benchmarks.house import SOON, House, children, running
 from benchmarks.long_jobs import LONG
 
 
-@fault("kill -9 the horse in mid solve")
-def horse(house: House) -> Told:
+@fault("kill -9 the job process in mid solve")
+def job_process(house: House) -> Told:
     id = submitted(house, options=LONG)
     house.midst(id, "reweight")
-    house.kill("horse")
+    house.kill("job process")
     began = time.monotonic()
     job = house.final(id)
     assert job.status is Status.FAILED
@@ -29,12 +29,12 @@ def horse(house: House) -> Told:
     return Told(said(job), time.monotonic() - began)
 
 
-@fault("kill -9 the horse while it writes its files")
-def horse_writing(house: House) -> Told:
+@fault("kill -9 the job process while it writes its files")
+def job_process_writing(house: House) -> Told:
     id = submitted(house, frames=60, points=8000, options=LARGE)
-    token = house.jobs.records.get(id).token
-    house.until(lambda: any((house.settings.work / token).glob("artifacts/*")), "a file is begun")
-    house.kill("horse")
+    attempt_id = house.jobs.records.get(id).attempt_id
+    house.until(lambda: any((house.settings.work / attempt_id).glob("artifacts/*")), "a file is begun")
+    house.kill("job process")
     began = time.monotonic()
     job = house.final(id)
     assert (job.status, job.artifacts) == (Status.FAILED, [])
@@ -45,16 +45,16 @@ TRIES = 8
 """Jobs of which at least one is hit in the moment in which it stores its files."""
 
 
-@fault("kill -9 the horse while it stores its files")
-def horse_storing(house: House) -> Told:
+@fault("kill -9 the job process while it stores its files")
+def job_process_storing(house: House) -> Told:
     for _ in range(TRIES):
         id = submitted(house, frames=60, points=8000, options=LARGE)
         prefix = f"jobs/{id}/"
         blobs = house.settings.data / "blobs"
         house.until(lambda at=blobs, like=f"{prefix}*/artifacts/*": any(at.glob(like)), "the first file is stored")
-        for horse in house.look()["horse"]:
+        for process in house.look()["job process"]:
             with suppress(ProcessLookupError):
-                os.kill(horse, signal.SIGKILL)
+                os.kill(process, signal.SIGKILL)
         began = time.monotonic()
         job = house.final(id)
         if job.status is Status.FAILED:
@@ -76,12 +76,12 @@ def worker(house: House) -> Told:
     return Told("running, attempt 2 (cancelled then)", seconds)
 
 
-@fault("kill -9 the keeper in mid solve")
-def keeper(house: House) -> Told:
+@fault("kill -9 the reconciler in mid solve")
+def reconciler(house: House) -> Told:
     id = submitted(house, options={"max_reweightings": 30})
     house.midst(id, "reweight")
-    old = house.kill("keeper")
-    seconds = house.until(lambda: house.look()["keeper"] not in ([], [old]), "another keeper")
+    old = house.kill("reconciler")
+    seconds = house.until(lambda: house.look()["reconciler"] not in ([], [old]), "another reconciler")
     job = house.final(id)
     assert (job.status, job.attempt) == (Status.SUCCEEDED, 1)
     return Told(said(job), seconds)
@@ -146,10 +146,12 @@ def valkey_down(house: House) -> Told:
     return Told(f"{said(job)}, {AWAY[0]:g} s away; both clients noticed nothing", time.monotonic() - began)
 
 
-@fault("worker and horse frozen beyond the lease while the files are written, thawed when another has finished the job")
+@fault(
+    "worker and job process frozen beyond the lease while the files are written, thawed when another has finished the job"
+)
 def frozen(house: House) -> Told:
     id = submitted(house, frames=60, points=8000, options=LARGE)
-    stale = house.jobs.records.get(id).token
+    stale = house.jobs.records.get(id).attempt_id
     house.until(lambda: any((house.settings.work / stale).glob("artifacts/*")), "a file is begun")
     (old,) = [pid for pid in house.look()["worker"] if children(pid)]
     pids = [old, *children(old)]
@@ -161,7 +163,7 @@ def frozen(house: House) -> Told:
     held = house.jobs.records.get(id)
     for pid in reversed(pids):
         os.kill(pid, signal.SIGCONT)
-    house.until(lambda: not any(running(pid) for pid in pids[1:]), "the stale horse ends")
+    house.until(lambda: not any(running(pid) for pid in pids[1:]), "the stale job process ends")
     time.sleep(0.5)
     assert house.jobs.records.get(id) == held, "the stale attempt wrote nothing"
     assert (job.status, job.attempt) == (Status.SUCCEEDED, 2)
@@ -173,7 +175,7 @@ def twice(house: House) -> Told:
     id = submitted(house, options={"max_reweightings": 30})
     house.midst(id, "reweight")
     began = time.monotonic()
-    house.jobs.queue.push(id, house.jobs.records.get(id).token)
+    house.jobs.queue.push(id, house.jobs.records.get(id).attempt_id)
     job = house.final(id)
     assert (job.status, job.attempt) == (Status.SUCCEEDED, 1), f"{said(job)}\n{house.jobs.log(id)}"
     return Told(said(job), time.monotonic() - began)

@@ -10,7 +10,7 @@ import tempfile
 import time
 
 from pliant.client import Job, Status
-from pliant.client.multipart import Rest
+from pliant.client.multipart import Remainder
 from pliant.solver.gallery import face
 
 from benchmarks.fault_list import LARGE, SHORT, Told, cancelled, fault, said, submitted
@@ -22,9 +22,9 @@ from benchmarks.long_jobs import LONG
 def api_uploading(house: House) -> Told:
     sequence = face(60, 40_000)  # 38 MB, above the SDK's threshold
     began: list[int] = []
-    whole, killed = Rest.pieces, 0.0
+    whole, killed = Remainder.pieces, 0.0
 
-    def pieces(rest: Rest):
+    def pieces(rest: Remainder):
         nonlocal killed
         began.append(rest.offset)
         for number, piece in enumerate(whole(rest)):
@@ -33,12 +33,12 @@ def api_uploading(house: House) -> Told:
                 killed = time.monotonic()
             yield piece
 
-    Rest.pieces = pieces  # type: ignore[method-assign]
+    Remainder.pieces = pieces  # type: ignore[method-assign]
     try:
         with house.client() as client:
             job = client.submit(sequence.tracks.points, mesh="none", options=LARGE, timeout=240)
     finally:
-        Rest.pieces = whole  # type: ignore[method-assign]
+        Remainder.pieces = whole  # type: ignore[method-assign]
     seconds = time.monotonic() - killed
     house.acknowledged.append(job.id)
     assert len(began) == 2

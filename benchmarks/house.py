@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
-from pliant.client import Client, Job, Policy
+from pliant.client import Client, Job, Retry
 from pliant.service.spool import Incoming
 from pliant.worker.errors import StoreUnavailable
 from pliant.worker.jobs.service import Jobs
@@ -27,9 +27,9 @@ SOON = {
 }  # fmt: skip
 """Settings under which faults are noticed within seconds."""
 
-PATIENT = Policy(first_contact=60, shortest_pause=0.05, longest_pause=0.5)
+PATIENT = Retry(first_contact=60, shortest_pause=0.05, longest_pause=0.5)
 
-ROLES = {"service": b"pliant.service", "worker": b"pliant.worker\0work", "keeper": b"pliant.worker\0keep"}
+ROLES = {"service": b"pliant.service", "worker": b"pliant.worker\0work", "reconciler": b"pliant.worker\0reconcile"}
 
 
 @dataclass
@@ -69,7 +69,7 @@ class House:
 
     def client(self) -> Client:
         """A client that waits for a service which is being started again."""
-        return Client(self.url, policy=PATIENT)
+        return Client(self.url, retries=PATIENT)
 
     def start(self) -> None:
         """Start it; while the children of a killed one still hold the port or the directory, again, as a service manager does."""
@@ -117,14 +117,14 @@ class House:
         self._process = None
 
     def look(self) -> dict[str, list[int]]:
-        """Return the processes by role, `horse` among them."""
+        """Return the processes by role, `job process` among them."""
         assert self._process is not None
-        found: dict[str, list[int]] = {role: [] for role in (*ROLES, "valkey", "horse")}
+        found: dict[str, list[int]] = {role: [] for role in (*ROLES, "valkey", "job process")}
         for pid in children(self._process.pid):
             command = _command(pid)
             role = next((role for role, words in ROLES.items() if words in command), "valkey")
             found[role].append(pid)
-        found["horse"] = [pid for worker in found["worker"] for pid in children(worker)]
+        found["job process"] = [pid for worker in found["worker"] for pid in children(worker)]
         self.seen |= {pid for pids in found.values() for pid in pids}
         return found
 
@@ -194,8 +194,8 @@ class House:
             f"Folder incoming/{name} is left." for name in Incoming(self.folder / "data" / "incoming").abandoned()
         ]
         found += [f"Upload {path.name} is left." for path in self.settings.uploads.glob("*/*")]
-        found += [f"Horse {pid} has nothing to do." for pid in self.look()["horse"] if not self._at_work()]
-        return found + findings(jobs, settle=0.3)
+        found += [f"Job process {pid} has nothing to do." for pid in self.look()["job process"] if not self._at_work()]
+        return found + findings(jobs, pause=0.3)
 
     def _at_work(self) -> bool:
         return any(not job.status.final for job in self.jobs.page(limit=200).jobs)

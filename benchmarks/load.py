@@ -20,7 +20,7 @@ from threading import Event, Thread
 import httpx
 import numpy as np
 from pliant.client import AsyncClient, Status
-from pliant.client.upload import LARGE
+from pliant.client.multipart import LARGE
 from pliant.solver.gallery import face
 from pliant.worker.errors import NotAllowedNow
 

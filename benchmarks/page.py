@@ -58,7 +58,7 @@ def frame(page: Page) -> float:
 
 def play_example(page: Page) -> None:
     """Click once, wait until the mesh moves."""
-    page.get_by_role("button", name="Show me with a made-up face").click()
+    page.get_by_role("button", name="Try it with a synthetic face").click()
     page.locator(".view canvas").wait_for(timeout=300_000)
     while frame(page) == 0:
         time.sleep(0.02)
@@ -71,7 +71,7 @@ def first_mesh() -> dict[str, float]:
         ready = time.perf_counter() - began
         page = browser.new_page(viewport={"width": 1280, "height": 900})
         page.goto(url)
-        page.get_by_role("button", name="Show me with a made-up face").wait_for()
+        page.get_by_role("button", name="Try it with a synthetic face").wait_for()
         stands = time.perf_counter() - began
         play_example(page)
         plays = time.perf_counter() - began

@@ -31,12 +31,20 @@ from pliant.worker.processes.supervisor import Supervisor, valkey_child, worker_
 from pliant.worker.processes.valkey import Valkey
 from pliant.worker.settings import Settings
 
-FAULTS = ("kill horse", "kill worker", "stop worker for 5 s", "kill keeper", "kill Valkey", "SIGTERM worker", "cancel")
+FAULTS = (
+    "kill job process",
+    "kill worker",
+    "stop worker for 5 s",
+    "kill reconciler",
+    "kill Valkey",
+    "SIGTERM worker",
+    "cancel",
+)
 OUTAGE = "Valkey hangs for 30 s"
 """Comes by the clock, every five minutes, since it takes so long."""
 OUTAGE_EVERY = 300.0
 
-ALLOWED = {"kill horse": Status.FAILED, "cancel": Status.CANCELLED}
+ALLOWED = {"kill job process": Status.FAILED, "cancel": Status.CANCELLED}
 """How a job may end, besides succeeding, that a fault hit."""
 
 IN_HAND = 6
@@ -112,10 +120,10 @@ class Soak:
                     pass
             return
         victim = self.random.choice(workers) if workers else None
-        if fault == "kill horse":
+        if fault == "kill job process":
             victim = next(iter(_children(victim)), None) if victim is not None else None
-        elif fault == "kill keeper":
-            victim = pids.get("keeper")
+        elif fault == "kill reconciler":
+            victim = pids.get("reconciler")
         elif fault in ("kill Valkey", OUTAGE):
             victim = pids.get("valkey")
         if victim is None:
@@ -194,7 +202,7 @@ def run(soak: Soak, seconds: float, every: float) -> int:
     soak.feeding = False
     ended = soak.wait(120.0, until=lambda: not soak.open)
     soak.wrong += [] if ended else [f"job {id} has not ended" for id in soak.open]
-    soak.wait(100.0, until=lambda: not findings(soak.jobs, settle=0.5))  # the keeper tidies up every half minute
+    soak.wait(100.0, until=lambda: not findings(soak.jobs, pause=0.5))  # the reconciler tidies up every half minute
     soak.wrong += findings(soak.jobs)
     print(f"{sum(soak.ends.values())} jobs acknowledged in {seconds / 60:g} min, {sum(faults.values())} faults")
     print(f"{soak.refused} submissions refused while Valkey was being started again (never acknowledged)\n")

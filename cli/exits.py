@@ -1,43 +1,47 @@
-"""Exit codes of the command line, and which fault ends with which."""
+"""Exit codes of the command line, and which error ends with which."""
 
 from __future__ import annotations
 
+import errno
+import os
 import sys
 from enum import IntEnum
 from importlib import import_module
 from typing import Any
 
+from pliant.cli.extras import SERVER_MODULES, MissingExtra
 from typer.core import TyperGroup
 
 
 class Exit(IntEnum):
-    """How a command ended. Documented in docs/reference/cli.md; a test holds the two together."""
+    """How a command ended. docs/reference/cli.md lists the codes; a test compares the two."""
 
     DONE = 0
-    """Everything asked for was done."""
+    """The command succeeded."""
     FAILED = 1
     """The job failed or was cancelled, or its result is not good enough."""
     USAGE = 2
-    """The command line itself is wrong."""
+    """The command line is invalid."""
     REFUSED = 3
-    """An input or an option is wrong; the message says what was expected and what was got."""
+    """An input, an option or a path is invalid; the message states what was expected."""
     UNREACHABLE = 4
-    """No service answered, or it is at fault."""
+    """No service answered, or the service failed."""
     NOT_FOUND = 5
     """There is no such job, file or token."""
     NOT_NOW = 6
-    """The job's status, the token, or another Pliant on the same data does not allow it."""
-    TIME_IS_UP = 7
-    """The time given was not enough; the job goes on."""
+    """The job's status, the token, or another Pliant on the same data does not allow the command."""
+    TIMEOUT = 7
+    """`--timeout` passed; the job continues."""
     UNHEALTHY = 8
-    """`doctor` found something that has to be put right."""
+    """`doctor` found a fault, or the command needs an extra that is not installed."""
     INTERRUPTED = 130
     """Ctrl-C."""
 
 
 _CODES: tuple[tuple[str, str, Exit], ...] = (
+    ("pliant.cli.extras", "MissingExtra", Exit.UNHEALTHY),
     ("pliant.client.errors", "JobEnded", Exit.FAILED),
-    ("pliant.client.errors", "TimeIsUp", Exit.TIME_IS_UP),
+    ("pliant.client.errors", "WaitTimeout", Exit.TIMEOUT),
     ("pliant.client.errors", "InvalidRequest", Exit.REFUSED),
     ("pliant.client.errors", "BadArgument", Exit.REFUSED),
     ("pliant.client.errors", "NotFound", Exit.NOT_FOUND),
@@ -46,37 +50,65 @@ _CODES: tuple[tuple[str, str, Exit], ...] = (
     ("pliant.client.errors", "PliantError", Exit.UNREACHABLE),
     ("pliant.solver.errors", "InvalidInput", Exit.REFUSED),
     ("pliant.solver.errors", "SolverError", Exit.FAILED),
+    ("pliant.tracking.errors", "TrackingError", Exit.REFUSED),
     ("pliant.worker.errors", "InvalidSetting", Exit.REFUSED),
     ("pliant.worker.errors", "InvalidRequest", Exit.REFUSED),
     ("pliant.worker.errors", "UnknownToken", Exit.NOT_FOUND),
     ("pliant.worker.errors", "DataDirectoryInUse", Exit.NOT_NOW),
     ("pliant.worker.errors", "WorkerError", Exit.UNREACHABLE),
 )
-"""The first line that fits counts. By name, so that nothing is loaded that the command did not load itself."""
+"""The first entry that matches counts. By name, so that only modules that are loaded already are looked at."""
 
 
 def code_of(fault: BaseException) -> Exit | None:
-    """Return the exit code for a fault that has a sentence for the user; None for a defect, which keeps its traceback."""
+    """Return the exit code of an error with a message for the user; None for a defect, which keeps its traceback."""
     if isinstance(fault, KeyboardInterrupt):
         return Exit.INTERRUPTED
     for module, name, code in _CODES:
         if module in sys.modules and isinstance(fault, getattr(import_module(module), name, ())):
             return code
+    if isinstance(fault, OSError) and (fault.filename is not None or fault.errno in (errno.ENOSPC, errno.EDQUOT)):
+        return Exit.REFUSED
     return None
 
 
+def sentence_of(fault: BaseException, job: str | None = None) -> str:
+    """Return the message for an error.
+
+    Parameters
+    ----------
+    fault : BaseException
+        What ended the command.
+    job : str, optional
+        Id of the job that the command was waiting for.
+    """
+    if isinstance(fault, KeyboardInterrupt):
+        if job is None:
+            return "Interrupted."
+        return f"Interrupted. Job {job} continues: `pliant watch {job}` follows it, `pliant cancel {job}` stops it."
+    if isinstance(fault, OSError) and fault.strerror is not None and type(fault).__module__ == "builtins":
+        name = "" if fault.filename is None else f"{os.fsdecode(fault.filename)}: "
+        return f"{name}{fault.strerror}."
+    return str(fault) or type(fault).__name__
+
+
 class Guarded(TyperGroup):
-    """The group of all commands: turns faults into a sentence and an exit code."""
+    """The group of all commands: turns errors into a message and an exit code."""
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command."""
         try:
             return super().invoke(ctx)
-        except (Exception, KeyboardInterrupt) as fault:
+        except (Exception, KeyboardInterrupt) as caught:
+            fault: BaseException = caught
+            if isinstance(fault, ModuleNotFoundError) and (fault.name or "").partition(".")[0] in SERVER_MODULES:
+                fault = MissingExtra(f"pliant {ctx.invoked_subcommand or ''}".strip(), str(fault.name))
             code = code_of(fault)
             if code is None:
                 raise
             from pliant.cli.show import show_fault
 
-            show_fault(fault, code, as_json=bool(ctx.obj is not None and ctx.obj.json))
+            session = ctx.obj
+            sentence = sentence_of(fault, getattr(session, "following", None))
+            show_fault(fault, sentence, code, as_json=bool(session is not None and session.json))
             ctx.exit(code)

@@ -1,14 +1,18 @@
-"""Commands that talk to a service."""
+"""Commands that use a service."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+from pliant.cli.ids import find_job
+from pliant.cli.paths import output_folder
 from pliant.cli.session import (
     HOME,
+    LINE_EVERY,
+    Force,
     GroundTruth,
     JobId,
     Json,
@@ -23,7 +27,10 @@ from pliant.cli.session import (
 )  # fmt: skip
 from pliant.cli.show import err, out, print_json, show_job, show_jobs, show_options
 
-Folder = Annotated[Path | None, typer.Option("--output", "-o", help="Wait, and fetch the files into this folder.")]
+if TYPE_CHECKING:
+    from pliant.schemas.job import Job
+
+Folder = Annotated[Path | None, typer.Option("--output", "-o", help="Wait, then download the files into this folder.")]
 
 
 def submit(
@@ -35,28 +42,35 @@ def submit(
     option: OptionPairs = None,
     name: Annotated[str, typer.Option("--name", "-n", help="Your own label.")] = "",
     job_id: Annotated[
-        str | None, typer.Option("--id", help="Your own id: the same id and content is the same job.")
+        str | None,
+        typer.Option("--id", help="Your own id. Submitting the same content under it again creates no second job."),
     ] = None,
-    key: Annotated[str | None, typer.Option("--key", help="Idempotency key: repeating it makes no second job.")] = None,
+    key: Annotated[
+        str | None, typer.Option("--key", help="Idempotency key: a repeated submission creates no second job.")
+    ] = None,
     webhook: Annotated[
         str | None,
         typer.Option(
-            "--webhook", help="Address that gets the finished job; signed with PLIANT_WEBHOOK_SECRET.", metavar="URL"
+            "--webhook", help="URL that receives the finished job, signed with PLIANT_WEBHOOK_SECRET.", metavar="URL"
         ),
     ] = None,
-    wait: Annotated[bool, typer.Option("--wait", "-w", help="Wait until the job is over.")] = False,
+    wait: Annotated[bool, typer.Option("--wait", "-w", help="Wait until the job is finished.")] = False,
     output: Folder = None,
+    force: Force = False,
     url: Url = HOME,
     timeout: Timeout = None,
     as_json: Json = False,
 ) -> None:
-    """Send tracks to a service; prints the job."""
+    """Submit tracks to a service and print the job."""
     from pliant.client.progress import progress_bar
 
     session: Session = ctx.obj
+    session.json = as_json
     options = parse_options(option)
+    if output is not None:
+        output_folder(output, force=force)
     with session.client(url, as_json=as_json) as client:
-        with progress_bar() as bar:
+        with progress_bar(line_every=LINE_EVERY) as bar:
             job = client.submit(
                 tracks,
                 mesh=mesh,
@@ -72,28 +86,32 @@ def submit(
                 timeout=timeout,
             )
             if wait or output is not None:
+                session.following = job.id
+                if not as_json:
+                    err().print(f"Job {job.id}", highlight=False)
                 done = job.wait(on_progress=bar.on_progress, load=False, timeout=timeout)
                 job.record = done.job
                 if output is not None:
                     done.download(output, on_download=bar.on_download)
         show_job(job.record, as_json=as_json)
         if not job.status.final and not as_json:
-            err().print(f"Follow it with: pliant watch {job.id}")
+            err().print(f"Follow it with: pliant watch {job.id}", highlight=False)
 
 
 def status(ctx: typer.Context, job: JobId, url: Url = HOME, as_json: Json = False) -> None:
-    """Show a job as it stands now."""
+    """Print a job's current record."""
     with ctx.obj.client(url, as_json=as_json) as client:
-        show_job(client.get(job).record, as_json=as_json)
+        show_job(find_job(client, job).record, as_json=as_json)
 
 
 def watch(ctx: typer.Context, job: JobId, url: Url = HOME, timeout: Timeout = None, as_json: Json = False) -> None:
-    """Follow a job until it is over; exit code 1 if it failed or was cancelled."""
+    """Follow a job until it is finished; exit code 1 if it failed or was cancelled."""
     from pliant.client.progress import progress_bar
 
     with ctx.obj.client(url, as_json=as_json) as client:
-        with progress_bar() as bar:
-            done = client.wait(job, on_progress=bar.on_progress, load=False, timeout=timeout)
+        ctx.obj.following = found = find_job(client, job).id
+        with progress_bar(line_every=LINE_EVERY) as bar:
+            done = client.wait(found, on_progress=bar.on_progress, load=False, timeout=timeout)
         show_job(done.job, as_json=as_json)
 
 
@@ -101,17 +119,20 @@ def result(
     ctx: typer.Context,
     job: JobId,
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the files.")] = Path(),
-    only: Annotated[list[str] | None, typer.Option("--only", help="Fetch this file alone; again for more.")] = None,
+    force: Force = False,
+    only: Annotated[list[str] | None, typer.Option("--only", help="Download only this file; may be repeated.")] = None,
     url: Url = HOME,
     timeout: Timeout = None,
     as_json: Json = False,
 ) -> None:
-    """Fetch the files of a finished job; an interrupted fetch is continued."""
+    """Download the files of a finished job; an interrupted download is continued."""
     from pliant.client.progress import progress_bar
 
     with ctx.obj.client(url, as_json=as_json) as client:
-        done = client.result(job, load=False, timeout=timeout)
-        with progress_bar() as bar:
+        done = client.result(find_job(client, job).id, load=False, timeout=timeout)
+        changed = different_files(done.job, output, only)
+        output_folder(output, force=force, files=changed)
+        with progress_bar(line_every=LINE_EVERY) as bar:
             paths = done.download(output, names=only, on_download=bar.on_download, timeout=timeout)
     if as_json:
         print_json({name: str(path) for name, path in paths.items()})
@@ -120,10 +141,22 @@ def result(
         out().print(str(path), markup=False)
 
 
+def different_files(job: Job, folder: Path, only: list[str] | None) -> list[str]:
+    """Return the files of a job that a folder holds with other content: a download would replace them."""
+    from pliant.client.multipart import sha256
+
+    wanted = [artifact for artifact in job.artifacts if only is None or artifact.name in only]
+    return [
+        artifact.name
+        for artifact in wanted
+        if (folder / artifact.name).is_file() and sha256(folder / artifact.name) != artifact.sha256
+    ]
+
+
 def list_jobs(
     ctx: typer.Context,
     status: Annotated[
-        list[str] | None, typer.Option("--status", "-s", help="Only jobs of this status; again for more.")
+        list[str] | None, typer.Option("--status", "-s", help="Only jobs with this status; may be repeated.")
     ] = None,
     limit: Annotated[int, typer.Option("--limit", "-l", help="At most this many.", min=1)] = 20,
     url: Url = HOME,
@@ -144,9 +177,9 @@ def list_jobs(
 
 
 def log(ctx: typer.Context, job: JobId, url: Url = HOME, as_json: Json = False) -> None:
-    """Show what a job's attempts have logged."""
+    """Print a job's log."""
     with ctx.obj.client(url, as_json=as_json) as client:
-        lines = client.log(job).splitlines()
+        lines = find_job(client, job).log().splitlines()
     if as_json:
         print_json(lines)
         return
@@ -157,31 +190,35 @@ def log(ctx: typer.Context, job: JobId, url: Url = HOME, as_json: Json = False) 
 def cancel(ctx: typer.Context, job: JobId, url: Url = HOME, as_json: Json = False) -> None:
     """Stop a job."""
     with ctx.obj.client(url, as_json=as_json) as client:
-        show_job(client.cancel(job).record, as_json=as_json)
+        show_job(find_job(client, job).cancel().record, as_json=as_json)
 
 
 def retry(ctx: typer.Context, job: JobId, url: Url = HOME, as_json: Json = False) -> None:
-    """Queue a new job with what a failed or cancelled one had; prints the new job."""
+    """Run a failed or cancelled job again, and print the new job."""
     with ctx.obj.client(url, as_json=as_json) as client:
-        show_job(client.retry(job).record, as_json=as_json)
+        show_job(find_job(client, job).retry().record, as_json=as_json)
 
 
 def delete(
     ctx: typer.Context,
-    jobs: Annotated[list[str], typer.Argument(help="Ids of jobs that are over.", show_default=False)],
+    jobs: Annotated[list[str], typer.Argument(help="Finished jobs, each as for `pliant status`.", show_default=False)],
     url: Url = HOME,
     as_json: Json = False,
 ) -> None:
-    """Remove jobs and their files from the service."""
+    """Delete jobs and their files from the service."""
     with ctx.obj.client(url, as_json=as_json) as client:
-        for job in jobs:
-            client.delete(job)
+        found = [find_job(client, job) for job in jobs]  # all of them, before the first is deleted
+        for job in found:
+            job.delete()
+    ids = [job.id for job in found]
     if as_json:
-        print_json({"deleted": jobs})
+        print_json({"deleted": ids})
+    else:
+        err().print(f"Deleted: {', '.join(ids)}", highlight=False)
 
 
 def options(ctx: typer.Context, url: Url = "", as_json: Json = False) -> None:
-    """List every option: meaning, bounds, default. Asks the service if --url is given, else this installation."""
+    """List every option with meaning, bounds and default: of the service if --url is given, else of this installation."""
     if url == "":
         from pliant.schemas.options import Options
 

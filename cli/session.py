@@ -1,9 +1,8 @@
-"""What the commands have in common: their shared options, and the client they talk through."""
+"""Shared options of the commands, and the client that they use."""
 
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,28 +11,39 @@ import typer
 
 if TYPE_CHECKING:
     import httpx
-    from pliant.client.client import Client
+    from pliant.client import Client
 
 Url = Annotated[
     str, typer.Option("--url", envvar="PLIANT_URL", help="Address of the service.", show_default=True, metavar="URL")
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON on standard output, for scripts.")]
 Timeout = Annotated[
-    float | None, typer.Option("--timeout", help="Give up after this many seconds; the job goes on.", min=0.1)
+    float | None, typer.Option("--timeout", help="Stop waiting after this many seconds; the job continues.", min=0.1)
 ]
-JobId = Annotated[str, typer.Argument(help="Id of the job.", show_default=False)]
+JobId = Annotated[
+    str, typer.Argument(help="Id of the job, its first characters, or @last for the newest job.", show_default=False)
+]
 OptionPairs = Annotated[
     list[str] | None,
-    typer.Option("--option", "-O", help="An option, e.g. -O loss=huber; again for more.", metavar="NAME=VALUE"),
+    typer.Option("--option", "-O", help="An option, e.g. -O loss=huber; may be repeated.", metavar="NAME=VALUE"),
 ]
-Tracks = Annotated[Path, typer.Argument(help="Track file, in any format `pliant inspect` reads.", show_default=False)]
+Tracks = Annotated[
+    Path, typer.Argument(help="Track file, in any format `pliant inspect` reads.", show_default=False, readable=False)
+]
+"""Paths are checked by the commands: one exit code and one form of message for every wrong path."""
 Mesh = Annotated[
     str | None, typer.Option("--mesh", "-m", help="Mesh file, or the size of a grid such as 12x20.", metavar="FILE|RxC")
 ]
 GroundTruth = Annotated[
-    Path | None, typer.Option("--ground-truth", "-g", help="True shapes; metrics come by themselves.")
+    Path | None,
+    typer.Option("--ground-truth", "-g", help="True shapes; the result then has error metrics.", readable=False),
 ]
-Rotations = Annotated[Path | None, typer.Option("--rotations", "-r", help="Known cameras.")]
+Rotations = Annotated[Path | None, typer.Option("--rotations", "-r", help="Known cameras.", readable=False)]
+
+LINE_EVERY = 30.0
+"""Without a terminal, waiting commands print a line this often, seconds."""
+
+Force = Annotated[bool, typer.Option("--force", help="Replace existing files in the output folder.")]
 
 HOME = "http://127.0.0.1:8000"
 
@@ -44,20 +54,22 @@ class Session:
 
     json: bool = False
     transport: httpx.BaseTransport | None = None
-    """Instead of the network, in tests."""
+    """Replaces the network in tests."""
+    following: str | None = None
+    """Id of the job that the command waits for; Ctrl-C prints how to return to it."""
 
     def client(self, url: str, *, as_json: bool, first_contact: float | None = None) -> Client:
-        """Open a client; the token comes from PLIANT_TOKEN, so that it stands in no list of processes."""
-        from pliant.client.client import Client
-        from pliant.client.retry import Policy
+        """Return a client; the token comes from PLIANT_TOKEN, so that it never appears in a list of processes."""
+        from pliant.client import Client
+        from pliant.client.retry import Retry
 
         self.json = as_json
-        policy = Policy() if first_contact is None else Policy(first_contact=first_contact)
-        return Client(url, token=os.environ.get("PLIANT_TOKEN") or None, transport=self.transport, policy=policy)
+        retries = Retry() if first_contact is None else Retry(first_contact=first_contact)
+        return Client(url, transport=self.transport, retries=retries)
 
 
 def parse_options(pairs: list[str] | None) -> dict[str, Any]:
-    """Read NAME=VALUE pairs; a value is JSON where it can be, else text.
+    """Read NAME=VALUE pairs; a value that is not JSON is text.
 
     Raises
     ------

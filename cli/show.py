@@ -1,4 +1,4 @@
-"""What the command line shows: to people with rich, to scripts as JSON."""
+"""Output of the command line: for people with rich, for scripts as JSON."""
 
 from __future__ import annotations
 
@@ -20,23 +20,22 @@ COLOURS = {
 
 
 def out() -> Console:
-    """Console on standard output; made anew so that it writes where the stream points now."""
+    """Console on standard output; created per call, so that it follows redirections."""
     return Console(highlight=False, soft_wrap=True)
 
 
 def err() -> Console:
-    """Console on standard error, for everything that is not the answer."""
+    """Console on standard error, for everything but the command's output."""
     return Console(stderr=True, highlight=False, soft_wrap=True)
 
 
 def print_json(value: object) -> None:
-    """Print a value for scripts: one document, nothing else."""
+    """Print one JSON document."""
     print(json.dumps(value, indent=2, ensure_ascii=False))
 
 
-def show_fault(fault: BaseException, code: Exit, *, as_json: bool) -> None:
-    """Say what went wrong, on standard error."""
-    sentence = str(fault) or ("Interrupted." if isinstance(fault, KeyboardInterrupt) else type(fault).__name__)
+def show_fault(fault: BaseException, sentence: str, code: Exit, *, as_json: bool) -> None:
+    """Print an error on standard error."""
     details = details_of(fault)
     if as_json:
         err().print_json(
@@ -52,17 +51,17 @@ def show_fault(fault: BaseException, code: Exit, *, as_json: bool) -> None:
 
 
 def details_of(fault: BaseException) -> dict[str, Any]:
-    """Collect what a fault says beside its sentence: the service's problem, or the attributes of our own errors."""
+    """Return the details of an error: the service's problem document, or the attributes of a local error."""
     problem = getattr(fault, "problem", None) or getattr(getattr(fault, "job", None), "error", None)
     if problem is not None:
-        said: dict[str, Any] = problem.model_dump(exclude_none=True)
-        return said
+        details: dict[str, Any] = problem.model_dump(exclude_none=True)
+        return details
     names = ("code", "field", "expected", "got", "hint", "choices")
     return {name: getattr(fault, name) for name in names if getattr(fault, name, None) is not None}
 
 
 def show_job(job: Job, *, as_json: bool) -> None:
-    """Show all that is known of a job."""
+    """Print a job's record."""
     if as_json:
         print_json(job.model_dump(mode="json"))
         return
@@ -97,7 +96,7 @@ def show_job(job: Job, *, as_json: bool) -> None:
 
 
 def understood(interpretation: Interpretation) -> list[tuple[str, str]]:
-    """Say how inputs were read, as name and words."""
+    """Describe how inputs were read, as pairs of name and text."""
     given = [
         name for name, there in
         (("ground truth", interpretation.has_ground_truth), ("cameras", interpretation.has_rotations)) if there
@@ -124,7 +123,7 @@ def metrics_table(metrics: Mapping[str, float], title: str = "") -> Table:
 
 
 def show_jobs(jobs: Iterable[Job], *, as_json: bool) -> None:
-    """Show a list of jobs."""
+    """Print a table of jobs."""
     if as_json:
         print_json([job.model_dump(mode="json") for job in jobs])
         return
@@ -140,7 +139,7 @@ def show_jobs(jobs: Iterable[Job], *, as_json: bool) -> None:
 
 
 def show_options(schema: Mapping[str, Any], *, as_json: bool) -> None:
-    """Show the options a service knows, from their JSON Schema."""
+    """Print the options of a JSON Schema."""
     if as_json:
         print_json(schema)
         return
@@ -156,17 +155,17 @@ def show_options(schema: Mapping[str, Any], *, as_json: bool) -> None:
 
 
 def allowed(entry: Mapping[str, Any]) -> str:
-    """Say what values one option takes."""
-    said = []
+    """Describe the values that an option accepts."""
+    forms = []
     for variant in entry.get("anyOf", [entry]):
         if "enum" in variant:
-            said.append(" | ".join(map(str, variant["enum"])))
+            forms.append(" | ".join(map(str, variant["enum"])))
         elif "enum" in variant.get("items", {}):
-            said.append("any of " + ", ".join(map(str, variant["items"]["enum"])))
+            forms.append("any of " + ", ".join(map(str, variant["items"]["enum"])))
         elif "$ref" not in variant and variant.get("type") != "null":
             signs = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
             bounds = [f"{sign} {variant[key]:g}" for key, sign in signs.items() if key in variant]
-            said.append(" ".join([str(variant.get("type", variant.get("const", ""))), *bounds]))
+            forms.append(" ".join([str(variant.get("type", variant.get("const", ""))), *bounds]))
         elif variant.get("type") == "null":
-            said.append("null")
-    return " or ".join(said)
+            forms.append("null")
+    return " or ".join(forms)

@@ -1,4 +1,4 @@
-"""`pliant solve` and `pliant inspect`: files in, files out, in this very process."""
+"""`pliant solve` and `pliant inspect`: files in, files out, in this process."""
 
 from __future__ import annotations
 
@@ -7,7 +7,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from pliant.cli.session import GroundTruth, Json, Mesh, OptionPairs, Rotations, Tracks, parse_options
+from pliant.cli.paths import input_file, output_folder
+from pliant.cli.session import (
+    LINE_EVERY,
+    Force,
+    GroundTruth,
+    Json,
+    Mesh,
+    OptionPairs,
+    Rotations,
+    Tracks,
+    parse_options,
+)
 from pliant.cli.show import err, metrics_table, out, print_json, understood
 
 if TYPE_CHECKING:
@@ -29,13 +40,16 @@ def solve(
     rotations: Rotations = None,
     option: OptionPairs = None,
     threads: Threads = None,
+    force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Reconstruct without a service: the same code, the same files."""
+    """Reconstruct in this process, without a service: the same code, the same files."""
     ctx.obj.json = as_json
+    check_inputs(tracks, ground_truth, rotations)
+    output_folder(output, force=force)
     from pliant.worker.settings import NUMERICAL_THREADS
 
-    # Read by the numerical libraries when they are loaded, which is after this; the solver has threads of its own.
+    # Read by the numerical libraries when they are imported, below; the solver has its own threads.
     os.environ.update(dict.fromkeys(NUMERICAL_THREADS, "1"))
     from pliant.client.multipart import checked_options
     from pliant.client.progress import progress_bar
@@ -49,31 +63,32 @@ def solve(
     )
     if not as_json:
         show_understood(inputs.interpretation)
-    with progress_bar() as bar, threads_limited(threads):
+    with progress_bar(line_every=LINE_EVERY) as bar, threads_limited(threads):
         done = reconstruct(inputs, options, output, on_progress=bar.on_step, should_stop=None)
     show_finished(done, output, as_json=as_json)
 
 
 def inspect(
     ctx: typer.Context,
-    file: Annotated[Path, typer.Argument(help="Track file.", show_default=False)],
+    file: Annotated[Path, typer.Argument(help="Track file.", show_default=False, readable=False)],
     mesh: Mesh = None,
     ground_truth: GroundTruth = None,
     rotations: Rotations = None,
     option: OptionPairs = None,
     url: Annotated[
-        str, typer.Option("--url", help="Ask this service instead of this installation.", metavar="URL")
+        str, typer.Option("--url", help="Use this service instead of this installation.", metavar="URL")
     ] = "",
     as_json: Json = False,
 ) -> None:
-    """Say how a track file is understood, without solving anything."""
+    """Show how a track file is read, without solving."""
     ctx.obj.json = as_json
+    check_inputs(file, ground_truth, rotations)
     options = parse_options(option)
     if url == "":
         from pliant.client.multipart import checked_options
         from pliant.worker.formats import read_inputs
 
-        said = read_inputs(
+        interpretation = read_inputs(
             tracks=file,
             mesh=file_or_word(mesh),
             ground_truth=ground_truth,
@@ -82,15 +97,23 @@ def inspect(
         ).interpretation
     else:
         with ctx.obj.client(url, as_json=as_json) as client:
-            said = client.inspect(file, mesh=mesh, ground_truth=ground_truth, rotations=rotations, options=options)
+            interpretation = client.inspect(
+                file, mesh=mesh, ground_truth=ground_truth, rotations=rotations, options=options
+            )
     if as_json:
-        print_json(said.model_dump(mode="json"))
+        print_json(interpretation.model_dump(mode="json"))
     else:
-        show_understood(said)
+        show_understood(interpretation)
+
+
+def check_inputs(tracks: Path, ground_truth: Path | None, rotations: Path | None) -> None:
+    """Check the paths of the inputs; a mesh may be a word, so its reader checks it."""
+    for path, name in ((tracks, "tracks"), (ground_truth, "ground_truth"), (rotations, "rotations")):
+        input_file(path, name)
 
 
 def show_finished(done: Finished, output: Path, *, as_json: bool) -> None:
-    """Show how a reconstruction ended, and where its files are."""
+    """Print the outcome of a reconstruction and the paths of its files."""
     if as_json:
         print_json(
             {
@@ -109,12 +132,12 @@ def show_finished(done: Finished, output: Path, *, as_json: bool) -> None:
 
 
 def file_or_word(mesh: str | None) -> Path | str | None:
-    """Tell the name of a mesh file from a grid size or `none`."""
+    """Return the path of a mesh file, or the text unchanged if it is a grid size or `none`."""
     return Path(mesh) if mesh is not None and Path(mesh).is_file() else mesh
 
 
 def show_understood(interpretation: Interpretation) -> None:
-    """Show how inputs were read."""
+    """Print how inputs were read."""
     from rich.table import Table
     from rich.text import Text
 

@@ -1,4 +1,4 @@
-"""`pliant token`: who may use the service. Works on the store itself, so it is for those who run the service, not for its users."""
+"""`pliant token`: access to the service. The commands use the store directly, so they are for operators, not for users."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from pliant.cli.extras import require_server
 from pliant.cli.session import Json
 from pliant.cli.show import err, out, print_json
 from pliant.cli.up import Data, chosen
@@ -18,44 +19,44 @@ if TYPE_CHECKING:
 
 MB = 2**20
 
-app = typer.Typer(name="token", help="Make, list and revoke the tokens of a service.", no_args_is_help=True)
+app = typer.Typer(name="token", help="Create, list and revoke the tokens of a service.", no_args_is_help=True)
 
-TokenId = Annotated[str, typer.Argument(help="Id of the token, as `pliant token list` shows it.", show_default=False)]
+TokenId = Annotated[str, typer.Argument(help="Id of the token, from `pliant token list`.", show_default=False)]
 
 
 @app.command()
 def create(
     ctx: typer.Context,
-    name: Annotated[str, typer.Argument(help="Who will use it, or what for.", show_default=False)],
+    name: Annotated[str, typer.Argument(help="Name of its user or purpose.", show_default=False)],
     scope: Annotated[
         list[str] | None,
-        typer.Option("--scope", help="read, submit or admin; again for more.", show_default="read and submit"),
+        typer.Option("--scope", help="read, submit or admin; may be repeated.", show_default="read and submit"),
     ] = None,
     expires: Annotated[
-        str | None, typer.Option("--expires", help="How long it is valid, e.g. 12h, 90d, 52w.", show_default="for ever")
+        str | None, typer.Option("--expires", help="Lifetime, e.g. 12h, 90d, 52w.", show_default="never expires")
     ] = None,
     sharing: Annotated[
         str | None,
         typer.Option(
-            "--sharing", help="Id of a token whose jobs the new one works with, e.g. to replace it.", metavar="ID"
+            "--sharing", help="Id of a token whose jobs the new one shares, e.g. to replace it.", metavar="ID"
         ),
     ] = None,
     max_body_mb: Annotated[
         int | None, typer.Option(help="Largest body of one request.", min=1, show_default="the service's")
     ] = None,
     max_queued: Annotated[
-        int | None, typer.Option(help="Jobs that may wait at once.", min=1, show_default="the service's")
+        int | None, typer.Option(help="Most queued jobs.", min=1, show_default="the service's")
     ] = None,
     max_running: Annotated[
-        int | None, typer.Option(help="Jobs that are worked on at once.", min=1, show_default="the service's")
+        int | None, typer.Option(help="Most running jobs.", min=1, show_default="the service's")
     ] = None,
     requests_per_minute: Annotated[
-        int | None, typer.Option(help="Requests in a minute.", min=1, show_default="the service's")
+        int | None, typer.Option(help="Requests per minute.", min=1, show_default="the service's")
     ] = None,
     data: Data = None,
     as_json: Json = False,
 ) -> None:
-    """Make a token and print it, once: only its SHA-256 is kept."""
+    """Create a token and print it, once: the service stores only its SHA-256."""
     ctx.obj.json = as_json
     from pliant.worker.tokens import parse_duration
 
@@ -77,15 +78,15 @@ def create(
     print(text)
     until = "never expires" if token.expires_at is None else f"expires {token.expires_at:%Y-%m-%d %H:%M} UTC"
     err().print(
-        f"Token {token.id} for {token.name}: {', '.join(token.scopes)}; {until}. It is shown this once; "
-        "its user puts it into PLIANT_TOKEN.",
+        f"Token {token.id} for {token.name}: {', '.join(token.scopes)}; {until}. It is shown only once; "
+        "its user sets PLIANT_TOKEN to it.",
         markup=False,
     )
 
 
 @app.command(name="list")
 def list_tokens(ctx: typer.Context, data: Data = None, as_json: Json = False) -> None:
-    """List the tokens: ids and names, never the tokens themselves."""
+    """List ids and names of the tokens, never the tokens themselves."""
     ctx.obj.json = as_json
     with store(data) as tokens:
         found = tokens.all()
@@ -94,7 +95,7 @@ def list_tokens(ctx: typer.Context, data: Data = None, as_json: Json = False) ->
         return
     from rich.table import Table
 
-    table = Table("id", "name", "scopes", "made", "expires", "jobs of")
+    table = Table("id", "name", "scopes", "created", "expires", "jobs of")
     now = datetime.now(UTC)
     for token in found:
         expires = "never" if token.expires_at is None else f"{token.expires_at:%Y-%m-%d %H:%M}"
@@ -103,15 +104,15 @@ def list_tokens(ctx: typer.Context, data: Data = None, as_json: Json = False) ->
             token.name,
             ", ".join(token.scopes),
             f"{token.created_at:%Y-%m-%d %H:%M}",
-            f"{expires} (over)" if token.expired(now) else expires,
-            "everybody" if token.sees_all else token.owner,
+            f"{expires} (expired)" if token.expired(now) else expires,
+            "all" if token.sees_all else token.owner,
         )
     out().print(table)
 
 
 @app.command()
 def revoke(ctx: typer.Context, id: TokenId, data: Data = None, as_json: Json = False) -> None:  # noqa: A002
-    """Make a token worthless, from the next request on. Its jobs stay: `admin` sees them, and who shares them."""
+    """Revoke a token, effective from the next request. Its jobs remain visible to `admin` and to tokens that share them."""
     ctx.obj.json = as_json
     with store(data) as tokens:
         token = tokens.revoke(id)
@@ -122,17 +123,17 @@ def revoke(ctx: typer.Context, id: TokenId, data: Data = None, as_json: Json = F
 
 
 def shown(token: Token) -> dict[str, Any]:
-    """Return what scripts get of a token."""
+    """Return a token's record without its hash, for JSON output."""
     return token.model_dump(mode="json", exclude={"sha256"}, exclude_none=True)
 
 
 def scopes_of(words: list[str]) -> list[Any]:
-    """Read the scopes.
+    """Parse the scopes.
 
     Raises
     ------
     BadArgument
-        A word is none.
+        A word is not a scope.
     """
     from pliant.client.errors import BadArgument
     from pliant.worker.tokens import Scope
@@ -145,7 +146,8 @@ def scopes_of(words: list[str]) -> list[Any]:
 
 @contextmanager
 def store(data: Path | None) -> Iterator[Tokens]:
-    """Give the tokens of an installation, whether its service runs or not."""
+    """Open the tokens of an installation, whether its service is running or not."""
+    require_server("pliant token")
     from pliant.worker.processes.valkey import attended
     from pliant.worker.tokens import Tokens
 

@@ -1,4 +1,4 @@
-"""`pliant up` and `pliant work`: the processes of an installation, started and kept running in one terminal."""
+"""`pliant up` and `pliant work`: start the processes of an installation and keep them running."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
+from pliant.cli.extras import require_server
 from pliant.cli.session import Json
 from pliant.cli.show import err, out, print_json
 
@@ -25,14 +26,14 @@ READY_WITHIN = 120.0
 """Seconds until every part must answer; the first start compiles Python's caches."""
 
 ANYWHERE = {"0.0.0.0": "127.0.0.1", "::": "::1", "": "127.0.0.1"}  # noqa: S104 - translated, not bound
-"""What to call when the service listens on every address."""
+"""The address to connect to when the service listens on every address."""
 
 Data = Annotated[
     Path | None,
     typer.Option("--data", envvar="PLIANT_DATA", help="Directory for jobs and files.", show_default="pliant-data"),
 ]
 Workers = Annotated[
-    int | None, typer.Option("--workers", envvar="PLIANT_WORKERS", help="Jobs worked on at once.", min=1, show_default="1")
+    int | None, typer.Option("--workers", envvar="PLIANT_WORKERS", help="Jobs that run at the same time.", min=1, show_default="1")
 ]  # fmt: skip
 
 
@@ -46,15 +47,18 @@ def up(
     workers: Workers = None,
     auth: Annotated[
         Literal["auto", "required", "off"],
-        typer.Option("--auth", envvar="PLIANT_AUTH", help="Ask for tokens; auto: not on the loopback address."),
+        typer.Option(
+            "--auth", envvar="PLIANT_AUTH", help="Whether requests need a token; auto: not on the loopback address."
+        ),
     ] = "auto",
     as_json: Json = False,
 ) -> None:
-    """Run everything: service, page, queue and workers. One Ctrl-C stops it all.
+    """Run everything: service, page, queue and workers. Ctrl-C stops it.
 
-    Without PLIANT_REDIS_URL a Valkey server is run as well, its data in the data directory.
+    Without PLIANT_REDIS_URL it also runs a Valkey server, whose data is in the data directory.
     """
     ctx.obj.json = as_json
+    require_server("pliant up")
     from pliant.worker.processes.supervisor import Supervisor, valkey_child, worker_children
     from pliant.worker.processes.valkey import Valkey
 
@@ -86,8 +90,9 @@ def up(
 
 
 def work(ctx: typer.Context, data: Data = None, workers: Workers = None, as_json: Json = False) -> None:
-    """Run workers alone, for a service that runs elsewhere with the same PLIANT_REDIS_URL and PLIANT_BLOB_URL."""
+    """Run only workers, for a service elsewhere with the same PLIANT_REDIS_URL and PLIANT_BLOB_URL."""
     ctx.obj.json = as_json
+    require_server("pliant work")
     from pliant.worker.processes.supervisor import Supervisor, worker_children
 
     settings = chosen(data, workers)
@@ -103,7 +108,7 @@ def work(ctx: typer.Context, data: Data = None, workers: Workers = None, as_json
 
 
 def chosen(data: Path | None, workers: int | None) -> Settings:
-    """Return the settings: the command line first, then the environment."""
+    """Return the settings; the command line takes precedence over the environment."""
     from pliant.worker.settings import Settings as WorkerSettings
 
     settings = WorkerSettings.from_environment(os.environ)
@@ -115,12 +120,12 @@ def chosen(data: Path | None, workers: int | None) -> Settings:
 
 
 def taken(host: str, port: int) -> int:
-    """Return the port if it can be had, or a free one for 0.
+    """Return the port if it is free, or a free one for 0.
 
     Raises
     ------
     BadArgument
-        Somebody else has it, or the address is not this machine's.
+        The port is in use, or the address is not this machine's.
     """
     from pliant.client.errors import BadArgument
 
@@ -131,55 +136,55 @@ def taken(host: str, port: int) -> int:
             probe.bind((host, port))
         except (OSError, OverflowError) as fault:
             raise BadArgument(
-                f"Cannot listen on {host} port {port}: {fault}. Give another one: --port 0 takes a free port."
+                f"Cannot listen on {host} port {port}: {fault}. Choose another port; --port 0 takes a free one."
             ) from fault
         chosen_port: int = probe.getsockname()[1]
         return chosen_port
 
 
 def address(host: str, port: int) -> str:
-    """Return where the service can be reached from this machine."""
+    """Return the service's address on this machine."""
     name = ANYWHERE.get(host, host)
     return f"http://[{name}]:{port}" if ":" in name else f"http://{name}:{port}"
 
 
 def service_child(settings: Settings, host: str, port: int, url: str, *, auth: str) -> Child:
-    """Return the API process as a child that counts as started once all parts answer."""
+    """Return the API process as a child that counts as started once every part is ready."""
     from pliant.worker.processes.supervisor import Child
 
     env = {**settings.to_environment(), "PLIANT_HOST": host, "PLIANT_PORT": str(port), "PLIANT_AUTH": auth}
+    # No access log between the lines of this terminal, unless it is asked for.
+    env["PLIANT_LOG_LEVEL"] = os.environ.get("PLIANT_LOG_LEVEL") or "warning"
     command = [sys.executable, "-m", "pliant.service"]
     return Child(name="service", argv=command, env=env, ready=until_ready(url), grace=15.0)
 
 
 def until_ready(url: str) -> Callable[[subprocess.Popen[bytes]], None]:
-    """Return a function that waits until the service says that all its parts are there.
+    """Return a function that waits until every part of the service is ready.
 
     Raises
     ------
     Unreachable
-        The process ended, or is not ready in time.
+        The process ended, or was not ready in time.
     """
 
     def wait(process: subprocess.Popen[bytes]) -> None:
-        from pliant.client.client import Client
+        from pliant.client import Client
         from pliant.client.errors import PliantError, Unreachable
 
-        deadline = time.monotonic() + READY_WITHIN
-        said = "it did not answer"
-        with Client(url, token=os.environ.get("PLIANT_TOKEN") or None) as client:
+        reason = "it did not answer"
+        with Client(url) as client:
+            deadline = time.monotonic() + READY_WITHIN
             while time.monotonic() < deadline:
                 if process.poll() is not None:
-                    raise Unreachable(
-                        f"The service ended with code {process.returncode}; its last lines above say why."
-                    )
+                    raise Unreachable(f"The service ended with code {process.returncode}; see its last lines above.")
                 try:
                     client.ready(timeout=1)
                 except PliantError as fault:
-                    said = str(fault)
+                    reason = str(fault)
                     time.sleep(0.1)
                 else:
                     return
-        raise Unreachable(f"The service is not ready after {READY_WITHIN:g} s: {said}")
+        raise Unreachable(f"The service is not ready after {READY_WITHIN:g} s: {reason}")
 
     return wait

@@ -1,7 +1,6 @@
-"""The wire contract, the SDK and the command line.
+"""The SDK: clients of a Pliant service, synchronous and asynchronous.
 
-``from pliant.client import Client`` is the usual beginning. Names are looked up when first used, so that whoever needs only
-the wire contract (`pliant.schemas.job`) does not load NumPy and httpx.
+Start with ``from pliant.client import Client``. Names are imported on first use, so importing this package is cheap.
 """
 
 if __name__ != "pliant.client":
@@ -11,31 +10,31 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from pliant.client.async_client import AsyncClient
-    from pliant.client.async_remote import AsyncRemoteJob, AsyncResult
-    from pliant.client.client import Client
+    from pliant.client._async.client import AsyncClient
+    from pliant.client._async.job import AsyncRemoteJob, AsyncResult
+    from pliant.client._sync.client import Client
+    from pliant.client._sync.job import RemoteJob, Result
     from pliant.client.errors import (
+        APIStatusError,
         BadArgument,
         CorruptDownload,
         InvalidRequest,
+        InvalidSignature,
         JobCancelled,
         JobEnded,
         JobFailed,
         NotAllowedNow,
         NotAuthorized,
         NotFound,
-        NotGenuine,
         NotLoaded,
         PliantError,
-        Refused,
         ServiceFailed,
-        TimeIsUp,
         TooManyRequests,
         UnexpectedAnswer,
         Unreachable,
+        WaitTimeout,
     )
-    from pliant.client.remote import RemoteJob, Result
-    from pliant.client.retry import Policy
+    from pliant.client.retry import Retry
     from pliant.schemas.job import (
         Artifact,
         Interpretation,
@@ -49,15 +48,15 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "errors": (
-        "BadArgument", "CorruptDownload", "InvalidRequest", "JobCancelled", "JobEnded", "JobFailed", "NotAllowedNow",
-        "NotAuthorized", "NotFound", "NotGenuine", "NotLoaded", "PliantError", "Refused", "ServiceFailed", "TimeIsUp", "TooManyRequests",
-        "UnexpectedAnswer", "Unreachable",
+        "APIStatusError", "BadArgument", "CorruptDownload", "InvalidRequest", "InvalidSignature", "JobCancelled", "JobEnded",
+        "JobFailed", "NotAllowedNow", "NotAuthorized", "NotFound", "NotLoaded", "PliantError", "ServiceFailed",
+        "TooManyRequests", "UnexpectedAnswer", "Unreachable", "WaitTimeout",
     ),
-    "retry": ("Policy",),
-    "async_client": ("AsyncClient",),
-    "async_remote": ("AsyncRemoteJob", "AsyncResult"),
-    "client": ("Client",),
-    "remote": ("RemoteJob", "Result"),
+    "retry": ("Retry",),
+    "_async.client": ("AsyncClient",),
+    "_async.job": ("AsyncRemoteJob", "AsyncResult"),
+    "_sync.client": ("Client",),
+    "_sync.job": ("RemoteJob", "Result"),
 }  # fmt: skip
 _HOME_OF = {name: f"pliant.client.{module}" for module, names in _HOMES.items() for name in names} | {
     "Options": "pliant.schemas.options",
@@ -67,11 +66,11 @@ _HOME_OF = {name: f"pliant.client.{module}" for module, names in _HOMES.items() 
 }
 
 __all__ = [  # noqa: RUF022 - by use, not by alphabet
-    "Client", "RemoteJob", "Result", "AsyncClient", "AsyncRemoteJob", "AsyncResult", "Policy", "Options",
+    "Client", "RemoteJob", "Result", "AsyncClient", "AsyncRemoteJob", "AsyncResult", "Retry", "Options",
     "Artifact", "Interpretation", "Job", "Problem", "Progress", "ServiceLimits", "Status",
-    "PliantError", "Unreachable", "TimeIsUp", "UnexpectedAnswer", "CorruptDownload", "BadArgument", "NotLoaded", "NotGenuine",
-    "Refused", "InvalidRequest", "NotAuthorized", "NotFound", "NotAllowedNow", "TooManyRequests", "ServiceFailed",
-    "JobEnded", "JobFailed", "JobCancelled",
+    "PliantError", "Unreachable", "WaitTimeout", "UnexpectedAnswer", "CorruptDownload", "BadArgument", "NotLoaded",
+    "InvalidSignature", "APIStatusError", "InvalidRequest", "NotAuthorized", "NotFound", "NotAllowedNow", "TooManyRequests",
+    "ServiceFailed", "JobEnded", "JobFailed", "JobCancelled",
 ]  # fmt: skip
 
 

@@ -1,25 +1,25 @@
 """Errors of the SDK.
 
-    PliantError                  base: catch this one
-    ├── Unreachable              no answer from the service, however often it was asked
-    ├── TimeIsUp                 the caller's own `timeout` passed; the job, if there is one, goes on
-    ├── UnexpectedAnswer         something answered, but it does not speak Pliant
-    ├── CorruptDownload          a file did not have its SHA-256, twice
-    ├── BadArgument              what was handed to the SDK cannot be sent
-    ├── NotLoaded                a result's arrays were asked for before they were fetched
-    ├── NotGenuine               a webhook's message is not from the service, or too old
-    ├── Refused                  the service said no: problem+json with code and sentence
-    │   ├── InvalidRequest       400, 413, 415, 422: the input is at fault; `field`, `expected`, `got` say how
-    │   ├── NotAuthorized        401, 403: no token, or not one that may do this
-    │   ├── NotFound             404, 410: no such job or file (any more)
-    │   ├── NotAllowedNow        409: the job's status does not allow it
-    │   ├── TooManyRequests      429: slow down; `retry_after` says how long
-    │   └── ServiceFailed        5xx: the service is at fault
-    └── JobEnded                 the job is over and there is no result
-        ├── JobFailed            `job.error` says why
-        └── JobCancelled         somebody cancelled it
+    PliantError
+    ├── Unreachable              no answer from the service, despite retries
+    ├── WaitTimeout              the caller's `timeout` passed; the job continues
+    ├── UnexpectedAnswer         the answer is not from a Pliant service
+    ├── CorruptDownload          a file was downloaded twice and its SHA-256 is wrong
+    ├── BadArgument              an argument is invalid; nothing was sent
+    ├── NotLoaded                a result's arrays were read before they were downloaded
+    ├── InvalidSignature         a webhook message is forged, altered or too old
+    ├── APIStatusError           the service answered with an error: problem+json with code and detail
+    │   ├── InvalidRequest       400, 413, 415, 422: the input is invalid; see `field`, `expected`, `got`
+    │   ├── NotAuthorized        401, 403: the token is missing or lacks a scope
+    │   ├── NotFound             404, 410: no such job or file, or it was deleted
+    │   ├── NotAllowedNow        409: the job's status does not allow the operation
+    │   ├── TooManyRequests      429: rate or queue limit reached; see `retry_after`
+    │   └── ServiceFailed        5xx: an error in the service
+    └── JobEnded                 the job has ended without a result
+        ├── JobFailed            `job.error` gives the reason
+        └── JobCancelled         the job was cancelled
 
-The message of every error is a whole sentence, the server's own where it gave one.
+Every message is a complete sentence, the service's own where it sent one.
 """
 
 from __future__ import annotations
@@ -36,46 +36,46 @@ PROBLEM_TYPE = "application/problem+json"
 
 
 class PliantError(Exception):
-    """Something went wrong between the caller and the result."""
+    """Base of all errors of the SDK."""
 
 
 class Unreachable(PliantError):
-    """No answer from the service, however often it was asked."""
+    """No answer from the service, despite retries."""
 
 
-class TimeIsUp(PliantError, TimeoutError):
-    """The caller's own `timeout` passed. Nothing was cancelled: a job goes on and can be waited for again."""
+class WaitTimeout(PliantError, TimeoutError):
+    """The caller's `timeout` passed. Nothing was cancelled: the job continues and can be waited for again."""
 
 
 class UnexpectedAnswer(PliantError):
-    """Something answered that does not speak Pliant: a proxy's error page, or another service."""
+    """The answer is not from a Pliant service: a proxy's error page, for example."""
 
 
 class CorruptDownload(PliantError):
-    """A file did not have the SHA-256 its job names, although it was fetched twice."""
+    """A file was downloaded twice and does not have the SHA-256 of the job's record."""
 
 
 class BadArgument(PliantError, ValueError):
-    """What was handed to the SDK cannot be sent."""
+    """An argument is invalid; nothing was sent."""
 
 
 class NotLoaded(PliantError):
-    """A result's arrays were asked for before they were fetched."""
+    """A result's arrays were read before they were downloaded."""
 
 
-class NotGenuine(PliantError):
-    """A webhook's message is not from the service, was changed, or is too old."""
+class InvalidSignature(PliantError):
+    """A webhook message is forged, altered or too old."""
 
 
-class Refused(PliantError):
-    """The service said no.
+class APIStatusError(PliantError):
+    """The service answered with an error status.
 
     Attributes
     ----------
     problem : Problem
-        The whole answer: `code`, `detail`, and where they apply `field`, `expected`, `got`, `hint`, `choices`.
+        The whole document: `code`, `detail`, and where they apply `field`, `expected`, `got`, `hint`, `choices`.
     retry_after : float or None
-        Seconds the service asked to wait.
+        Seconds to wait, from the Retry-After header.
     """
 
     def __init__(self, problem: Problem, *, retry_after: float | None = None) -> None:
@@ -94,32 +94,32 @@ class Refused(PliantError):
         return self.problem.status
 
 
-class InvalidRequest(Refused):
-    """The input is at fault (400, 413, 415, 422)."""
+class InvalidRequest(APIStatusError):
+    """The input is invalid (400, 413, 415, 422)."""
 
 
-class NotAuthorized(Refused):
-    """No token, or not one that may do this (401, 403)."""
+class NotAuthorized(APIStatusError):
+    """The token is missing or lacks a scope (401, 403)."""
 
 
-class NotFound(Refused):
-    """No such job or file, or not any more (404, 410)."""
+class NotFound(APIStatusError):
+    """No such job or file, or it was deleted (404, 410)."""
 
 
-class NotAllowedNow(Refused):
-    """The job's status does not allow it (409)."""
+class NotAllowedNow(APIStatusError):
+    """The job's status does not allow the operation (409)."""
 
 
-class TooManyRequests(Refused):
-    """Too much at once (429); `retry_after` says how long to wait."""
+class TooManyRequests(APIStatusError):
+    """Rate or queue limit reached (429); see `retry_after`."""
 
 
-class ServiceFailed(Refused):
-    """The service is at fault (5xx)."""
+class ServiceFailed(APIStatusError):
+    """An error in the service (5xx)."""
 
 
 class JobEnded(PliantError):
-    """The job is over and there is no result.
+    """The job has ended without a result.
 
     Attributes
     ----------
@@ -133,19 +133,19 @@ class JobEnded(PliantError):
 
 
 class JobFailed(JobEnded):
-    """The job failed; `job.error` says why."""
+    """The job failed; `job.error` gives the reason."""
 
     @property
     def code(self) -> str:
-        """Stable machine-readable name of the fault, e.g. ``"worker_lost"``."""
+        """Stable machine-readable name of the error, e.g. ``"worker_lost"``."""
         return self.job.error.code if self.job.error is not None else "unknown"
 
 
 class JobCancelled(JobEnded):
-    """Somebody cancelled the job."""
+    """The job was cancelled."""
 
 
-BY_STATUS: Mapping[int, type[Refused]] = {
+BY_STATUS: Mapping[int, type[APIStatusError]] = {
     HTTPStatus.BAD_REQUEST: InvalidRequest,
     HTTPStatus.UNAUTHORIZED: NotAuthorized,
     HTTPStatus.FORBIDDEN: NotAuthorized,
@@ -159,25 +159,25 @@ BY_STATUS: Mapping[int, type[Refused]] = {
 }
 
 
-def error_from(status: int, headers: Mapping[str, str], body: bytes) -> Refused | UnexpectedAnswer:
-    """Make the exception that an answer of 400 or more stands for; it is returned, not raised."""
+def error_from(status: int, headers: Mapping[str, str], body: bytes) -> APIStatusError | UnexpectedAnswer:
+    """Return the exception for an answer with status 400 or above."""
     media_type = headers.get("content-type", "").partition(";")[0].strip().lower()
     if media_type != PROBLEM_TYPE:
         start = body[:200].decode("utf-8", "replace").strip()
         return UnexpectedAnswer(
             f"Expected {PROBLEM_TYPE} with status {status}, got {media_type or 'no content type'}: {start!r}. "
-            "Check that the address is a Pliant service and that no proxy answers in its place."
+            "Check that the address is a Pliant service and that no proxy answers instead."
         )
     try:
         problem = Problem.model_validate_json(body)
     except ValidationError as fault:
-        return UnexpectedAnswer(f"Status {status} with a problem document that cannot be read: {fault}")
-    kind = BY_STATUS.get(status, ServiceFailed if status >= 500 else Refused)
+        return UnexpectedAnswer(f"The problem document with status {status} cannot be read: {fault}")
+    kind = BY_STATUS.get(status, ServiceFailed if status >= 500 else APIStatusError)
     return kind(problem, retry_after=seconds_of(headers.get("retry-after")))
 
 
 def seconds_of(retry_after: str | None, *, now: datetime | None = None) -> float | None:
-    """Read a Retry-After header: seconds, or an HTTP date; nonsense counts as not given."""
+    """Read a Retry-After header, seconds or an HTTP date; an invalid one counts as absent."""
     if retry_after is None:
         return None
     if retry_after.strip().isdigit():

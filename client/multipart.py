@@ -1,13 +1,16 @@
-"""The files and fields of a submission, made from what users have: arrays, trackers' dictionaries, paths."""
+"""The files and fields of a submission, from arrays, dictionaries of trackers, or paths."""
 
 from __future__ import annotations
 
+import difflib
+import hashlib
+import os
 import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, cast
+from typing import IO, TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,8 +18,11 @@ from pliant.client.errors import BadArgument
 from pliant.schemas.options import Options
 from pydantic import ValidationError
 
+if TYPE_CHECKING:
+    from pydantic_core import ErrorDetails
+
 OnBytes = Callable[[int, int], None]
-"""Told the bytes moved so far and the bytes there are."""
+"""Called with the bytes transferred so far and the total."""
 
 Source = ArrayLike | Mapping[str, Any] | Path | str
 """An array, a dictionary of arrays as a tracker returns it, or the path of a file."""
@@ -24,13 +30,13 @@ Source = ArrayLike | Mapping[str, Any] | Path | str
 
 @dataclass(frozen=True, kw_only=True)
 class Form:
-    """A multipart body that can be sent again: fields, and paths of files."""
+    """A multipart body that can be sent again: text fields, and paths of files."""
 
     fields: Mapping[str, str]
     files: Mapping[str, Path]
     on_upload: OnBytes | None = None
     before: int = 0
-    """Bytes of the submission that went before, as uploads."""
+    """Bytes of the submission that were uploaded already."""
 
     @property
     def size(self) -> int:
@@ -39,7 +45,7 @@ class Form:
 
     @contextmanager
     def open(self) -> Iterator[dict[str, tuple[str, IO[bytes], str]]]:
-        """Open the files in the form that httpx takes, counting what is read."""
+        """Open the files in the form that httpx takes; reading them reports progress."""
         count = Count(self.before + self.size, self.on_upload)
         count.add(self.before)
         with ExitStack() as stack:
@@ -51,63 +57,69 @@ class Form:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Rest:
-    """The bytes of a file from some offset on, as a body that can be sent again."""
+class Remainder:
+    """The bytes of a file from an offset on: a body that can be sent again."""
 
     path: Path
     offset: int
-    tell: Callable[[int], None]
-    """Told the bytes of the file that are on their way so far."""
+    report: Callable[[int], None]
+    """Called with the offset in the file up to which bytes were handed to the connection."""
 
     def pieces(self) -> Iterator[bytes]:
-        """Read them."""
+        """Yield them, at most `PIECE` bytes at a time."""
         with self.path.open("rb") as file:
             file.seek(self.offset)
             while piece := file.read(PIECE):
                 yield piece
-                self.tell(file.tell())
+                self.report(file.tell())
 
 
 PIECE = 1 << 18
-"""Bytes of a raw body that are read at a time."""
+"""Bytes of a raw body read at a time."""
+
+LARGE = 32 * 2**20
+"""Bytes of all files of a submission above which they are uploaded before the job."""
+
+SMALL = 2**20
+"""Bytes of a file that is sent with the job in any case."""
 
 
 class Count:
-    """Bytes of all files of a form together."""
+    """Bytes read of all files of a form."""
 
-    def __init__(self, total: int, tell: OnBytes | None) -> None:
+    def __init__(self, total: int, report: OnBytes | None) -> None:
         self.total = total
         self.done = 0
-        self._tell = tell
+        self._report = report
 
     def add(self, number: int) -> None:
-        """Note bytes that were read."""
+        """Count bytes and report the sum."""
         self.done += number
-        if self._tell is not None and number > 0:
-            self._tell(self.done, self.total)
+        if self._report is not None and number > 0:
+            self._report(self.done, self.total)
 
 
 class CountedFile:
-    """A file that tells what is read of it; httpx streams it in pieces."""
+    """A file whose reads are counted; httpx streams it in pieces."""
 
     def __init__(self, file: IO[bytes], count: Count) -> None:
         self._file = file
         self._count = count
 
     def read(self, size: int = -1) -> bytes:
-        """Read, and count."""
+        """Read and count."""
         data = self._file.read(size)
         self._count.add(len(data))
         return data
 
     def fileno(self) -> int:
-        """Let httpx ask for the length."""
+        """Give httpx access to the file's length."""
         return self._file.fileno()
 
 
 @dataclass(frozen=True, kw_only=True)
 class Inputs:
-    """What a user hands over to be reconstructed, as it is."""
+    """The inputs of a job as the caller gave them."""
 
     tracks: Source
     visible: ArrayLike | None = None
@@ -116,12 +128,12 @@ class Inputs:
     rotations: Source | None = None
 
     def form(self, folder: Path, fields: Mapping[str, str], on_upload: OnBytes | None) -> Form:
-        """Return the form that carries it; what is not a file yet is written into `folder`.
+        """Return the form that carries them; arrays are written to files in `folder`.
 
         Raises
         ------
         BadArgument
-            Something cannot be sent.
+            An input cannot be sent.
         """
         texts = dict(fields)
         files = {"tracks": tracks_file(self.tracks, self.visible, folder)}
@@ -139,18 +151,18 @@ class Inputs:
 
 
 def tracks_file(tracks: Source, visible: ArrayLike | None, folder: Path) -> Path:
-    """Write the tracks into a file the service reads; a path is used as it is.
+    """Write the tracks to a file that the service reads; a path is used as it is.
 
-    Dictionaries go as they are, key by key: the service has the one table of trackers' formats.
+    Dictionaries are stored key by key: the service recognises the formats of trackers.
 
     Raises
     ------
     BadArgument
-        `visible` beside something that has its own visibility, or values that are not arrays.
+        `visible` was given with a file or dictionary, which have their own visibility; or a value is not an array.
     """
     if isinstance(tracks, str | Path):
         _alone(visible)
-        return _existing(tracks, "tracks")
+        return existing_file(tracks, "tracks")
     if isinstance(tracks, Mapping):
         _alone(visible)
         return _npz(folder / "tracks.npz", {str(key): _array(value, str(key)) for key, value in tracks.items()})
@@ -172,12 +184,12 @@ def mesh_part(mesh: Source | tuple[int, int], folder: Path) -> Path | str:
     Raises
     ------
     BadArgument
-        Neither faces, nor a file, nor such a text.
+        The mesh is neither faces, nor a file, nor such a text.
     """
     if isinstance(mesh, str) and re.fullmatch(r"none|\s*\d{1,6}\s*x\s*\d{1,6}\s*", mesh.lower()) is not None:
         return mesh.lower().replace(" ", "")
     if isinstance(mesh, str | Path):
-        return _existing(mesh, "mesh")
+        return existing_file(mesh, "mesh")
     if isinstance(mesh, tuple) and len(mesh) == 2 and all(isinstance(size, int) for size in mesh):
         return f"{mesh[0]}x{mesh[1]}"
     if isinstance(mesh, Mapping):
@@ -186,44 +198,66 @@ def mesh_part(mesh: Source | tuple[int, int], folder: Path) -> Path | str:
 
 
 def array_part(value: Source, name: str, key: str, folder: Path) -> Path:
-    """Return a file for the ground truth or the rotations."""
+    """Return the file of the ground truth or of the rotations."""
     if isinstance(value, str | Path):
-        return _existing(value, name)
+        return existing_file(value, name)
     arrays = value if isinstance(value, Mapping) else {key: value}
     return _npz(folder / f"{name}.npz", {str(k): _array(v, f"{name}.{k}") for k, v in arrays.items()})
 
 
 def checked_options(options: Options | Mapping[str, Any] | None) -> Options:
-    """Check options before anything is sent or solved.
+    """Validate options locally, before anything is sent or solved.
 
     Raises
     ------
     BadArgument
-        With the names at fault and what is allowed.
+        An option is unknown or invalid; the message lists each with what is allowed.
     """
     if isinstance(options, Options):
         return options
     try:
         return Options.model_validate(dict(options or {}))
     except ValidationError as fault:
-        said = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}, got {e['input']!r}" for e in fault.errors())
-        raise BadArgument(f"options: {said}. `pliant options` lists every option.") from fault
+        faults = "; ".join(map(_option_fault, fault.errors()))
+        raise BadArgument(f"options: {faults}. `pliant options` lists every option.") from fault
 
 
 def _alone(visible: ArrayLike | None) -> None:
     if visible is not None:
-        raise BadArgument("visible goes with an array of tracks; a file or dictionary brings its own visibility.")
+        raise BadArgument(
+            "visible: only valid with an array of tracks. A file or dictionary contains its own visibility."
+        )
 
 
-def _existing(path: Path | str, name: str) -> Path:
+def existing_file(path: Path | str, name: str) -> Path:
+    """Return the path of an input, with ``~`` expanded.
+
+    Raises
+    ------
+    BadArgument
+        There is no file, it is a folder, or it cannot be read.
+    """
     found = Path(path).expanduser()
+    if found.is_dir():
+        raise BadArgument(f"{name}: expected a file, got the folder {found}. Give the path of a file in it.")
     if not found.is_file():
         raise BadArgument(f"{name}: expected a file, an array or a dictionary of arrays, got no file at {found}.")
+    if not os.access(found, os.R_OK):
+        raise BadArgument(f"{name}: the file {found} cannot be read. Change its permissions.")
     return found
 
 
+def _option_fault(error: ErrorDetails) -> str:
+    """Describe one invalid option, with the closest name if the option does not exist."""
+    name = ".".join(map(str, error["loc"]))
+    if error["type"] != "extra_forbidden":
+        return f"{name}: {error['msg']}, got {error['input']!r}"
+    close = difflib.get_close_matches(name, Options.model_fields, n=1)
+    return f"{name}: there is no such option" + (f" (did you mean {close[0]}?)" if close else "")
+
+
 def _array(value: Any, name: str) -> NDArray[np.generic]:
-    """Take whatever NumPy understands, and tensors of PyTorch and JAX wherever they live."""
+    """Convert anything that NumPy accepts, and PyTorch and JAX tensors on any device."""
     for step in ("detach", "cpu"):
         if hasattr(value, step):
             value = getattr(value, step)()
@@ -231,13 +265,19 @@ def _array(value: Any, name: str) -> NDArray[np.generic]:
     if array.dtype.kind not in "biuf":
         raise BadArgument(
             f"{name}: expected an array of numbers or booleans, got dtype {array.dtype}. "
-            "Ragged lists must be filled up with NaN first; leave out what is not an array."
+            "Pad ragged lists with NaN and omit entries that are not arrays."
         )
     return array
 
 
 def _npz(path: Path, arrays: Mapping[str, NDArray[np.generic]]) -> Path:
-    """Write uncompressed: the bytes are the same every time, so a repeated submission is recognised."""
+    """Write without compression: equal arrays give equal bytes, so the service recognises a repeated submission."""
     with path.open("wb") as file:
         np.savez(file, **dict(arrays))  # type: ignore[arg-type]
     return path
+
+
+def sha256(path: Path) -> str:
+    """Hash a file without loading it into memory."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

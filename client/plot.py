@@ -1,4 +1,4 @@
-"""Pictures of a reconstruction, with matplotlib where it is installed."""
+"""Plots of a reconstruction; they need matplotlib."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ if TYPE_CHECKING:
 
 MOST_POINTS = 5000
 MOST_TRIANGLES = 30_000
-"""Drawn in one picture at most: further points are left out, larger meshes are drawn as points."""
+"""Most points and triangles in one plot: points are thinned out, larger meshes are drawn as points."""
 
 CLAY = np.array([0.85, 0.79, 0.71])
 LIGHT = np.array([-0.5, -0.6, 0.62])
-"""Towards the light, in the picture's axes: right, away from the viewer, up. Both sides of a surface are lit."""
+"""Direction of the light in the plot's axes: right, away from the viewer, up. Both sides of a surface are lit."""
 
 
 def draw(shapes: NDArray[np.float64], faces: NDArray[np.int32], frames: int, *, title: str) -> Figure:
-    """Draw evenly spread frames side by side, all to one scale: the lit surface, or points with depth as colour.
+    """Draw evenly spaced frames side by side at one scale: the lit surface, or points coloured by depth.
 
     Parameters
     ----------
     shapes : ndarray, shape (F, P, 3)
         World axes, y down as in images; drawn with y up.
     faces : ndarray, shape (T, 3) or (T, 4)
-        Points alone are drawn where there are none, or too many.
+        Without faces, or with too many, only points are drawn.
     frames : int
-        How many pictures; at most F.
+        Number of frames to draw, at most F.
 
     Raises
     ------
@@ -63,7 +63,7 @@ def draw(shapes: NDArray[np.float64], faces: NDArray[np.int32], frames: int, *, 
 
 
 def split(faces: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Return triangles (T, 3): those given, or each quad cut in two."""
+    """Return triangles (T, 3); each quad becomes two."""
     if faces.shape[1] == 3:
         return faces
     return np.concatenate([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]])

@@ -1,7 +1,9 @@
-"""A ready-made progress bar for scripts and the command line; needs rich."""
+"""A ready-made progress display for scripts and the command line; needs rich."""
 
 from __future__ import annotations
 
+import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
@@ -14,22 +16,24 @@ if TYPE_CHECKING:
 
 
 class Bar:
-    """Shows what happens to one job; its methods are what `submit`, `wait` and `download` take as callbacks."""
+    """The display of one job; its methods are callbacks for `submit`, `wait` and `download`."""
 
     def __init__(self, bars: RichProgress) -> None:
         self._bars = bars
         self._task = bars.add_task("", total=1.0, note="")
+        self.latest = ""
+        """The display as one line of text."""
 
     def on_upload(self, done: int, total: int) -> None:
-        """Show bytes that are sent."""
+        """Show an upload."""
         self._show("sending", done / max(total, 1), f"{done / 1e6:.1f} of {total / 1e6:.1f} MB")
 
     def on_download(self, done: int, total: int) -> None:
-        """Show bytes that arrive."""
+        """Show a download."""
         self._show("fetching", done / max(total, 1), f"{done / 1e6:.1f} of {total / 1e6:.1f} MB")
 
     def on_progress(self, job: Job) -> None:
-        """Show where a job stands."""
+        """Show the status and progress of a job."""
         if job.status is Status.QUEUED:
             ahead = job.place_in_queue
             note = "" if ahead is None else "next" if ahead == 0 else f"{ahead} ahead"
@@ -40,28 +44,36 @@ class Bar:
             self._show(job.status, 1.0 if job.status.final else 0.0, "")
 
     def on_step(self, progress: Progress) -> None:
-        """Show what the solver does."""
+        """Show the progress of the solver."""
         self._show(progress.stage, progress.fraction, describe(progress))
 
     def _show(self, stage: str, fraction: float, note: str) -> None:
+        self.latest = f"{stage} {fraction:.0%}" + (f", {note}" if note else "")
         self._bars.update(self._task, description=stage, completed=fraction, note=note)
 
 
 def describe(progress: Progress) -> str:
-    """Say in a few words how far a job is."""
-    said = []
+    """Summarise progress in a few words."""
+    words = []
     if progress.reweighting > 0:
-        said.append(f"reweighting {progress.reweighting} of at most {progress.max_reweightings}")
+        words.append(f"reweighting {progress.reweighting} of at most {progress.max_reweightings}")
     if progress.residual is not None:
-        said.append(f"residual {progress.residual:.3g}")
+        words.append(f"residual {progress.residual:.3g}")
     if progress.seconds_left is not None:
-        said.append(f"{progress.seconds_left:.0f} s left")
-    return ", ".join(said)
+        words.append(f"{progress.seconds_left:.0f} s left")
+    return ", ".join(words)
 
 
 @contextmanager
-def progress_bar(console: Console | None = None) -> Iterator[Bar]:
-    """Show a bar on a terminal, on standard error unless told; nothing where there is no terminal.
+def progress_bar(console: Console | None = None, *, line_every: float | None = None) -> Iterator[Bar]:
+    """Show a progress bar on a terminal.
+
+    Parameters
+    ----------
+    console : rich.console.Console, optional
+        Defaults to standard error.
+    line_every : float, optional
+        Where there is no terminal, print a line this often, seconds; by default print nothing there.
 
     Examples
     --------
@@ -80,4 +92,28 @@ def progress_bar(console: Console | None = None) -> Iterator[Bar]:
         TextColumn("[dim]{task.fields[note]}"),
     )
     with Bars(*columns, console=screen, disable=not screen.is_terminal) as bars:
-        yield Bar(bars)
+        bar = Bar(bars)
+        if screen.is_terminal or line_every is None:
+            yield bar
+            return
+        with _printed(bar, screen, line_every):
+            yield bar
+
+
+@contextmanager
+def _printed(bar: Bar, screen: Console, seconds: float) -> Iterator[None]:
+    """Print the display as a line every so many seconds, from a thread: callbacks may be further apart."""
+    finished, began = threading.Event(), time.monotonic()
+
+    def print_lines() -> None:
+        while not finished.wait(seconds):
+            elapsed = time.monotonic() - began
+            screen.print(f"{elapsed:.0f} s: {bar.latest or 'waiting'}", markup=False, highlight=False, soft_wrap=True)
+
+    thread = threading.Thread(target=print_lines, name="pliant-progress", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        finished.set()
+        thread.join()

@@ -1,8 +1,9 @@
-"""What a finished job gives: arrays and a report, held locally."""
+"""The result of a job: arrays and a report, read from local files."""
 
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import tempfile
 import weakref
@@ -13,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.client.errors import NotLoaded
-from pliant.schemas.job import Job
+from pliant.client.errors import BadArgument, JobCancelled, JobFailed, NotAllowedNow, NotFound, NotLoaded
+from pliant.schemas.job import Job, Problem, Status
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -23,18 +24,18 @@ ARRAYS = "shapes.npz"
 REPORT = "report.json"
 ANIMATION = "shapes.glb"
 LOADED = (ARRAYS, REPORT)
-"""What `wait` and `result` fetch by themselves; everything else on demand."""
+"""Files that `wait` and `result` download; the others are downloaded on demand."""
 
 
 class Reconstruction:
-    """A job that succeeded, and its files in a folder of this machine.
+    """A job that succeeded, and its files in a local folder.
 
     Attributes
     ----------
     job : Job
         The final record: options, interpretation, metrics, warnings, artifacts.
     folder : Path
-        Where fetched files are; a temporary one goes with this object.
+        Where downloaded files are; a temporary folder is removed together with this object.
     """
 
     def __init__(self, job: Job, folder: Path | str | None) -> None:
@@ -44,6 +45,10 @@ class Reconstruction:
             weakref.finalize(self, shutil.rmtree, self.folder, ignore_errors=True)
         else:
             self.folder = Path(folder)
+
+    def __repr__(self) -> str:
+        size = f"{self.job.interpretation.num_frames} frames × {self.job.interpretation.num_points} points"
+        return f"<{type(self).__name__} of job {self.job.id}: {size}, {self.job.outcome}>"
 
     @property
     def shapes(self) -> NDArray[np.float64]:
@@ -68,27 +73,27 @@ class Reconstruction:
 
     @cached_property
     def report(self) -> dict[str, Any]:
-        """The report: options as run, metrics, choices with their reasons, trace, timings, versions."""
+        """The report: options, metrics, choices with their reasons, trace, timings, versions."""
         value: dict[str, Any] = json.loads(self._local(REPORT).read_text(encoding="utf-8"))
         return value
 
     @property
     def metrics(self) -> dict[str, float]:
-        """Error metrics by name, as far as the inputs allow them."""
+        """Error metrics by name; which ones depends on the inputs."""
         return self.job.metrics if self.job.metrics is not None else {}
 
     def plot(self, frames: int = 4) -> Figure:
-        """Draw some frames of the shape in 3-D, as a lit surface where there is a mesh; needs matplotlib.
+        """Draw some frames of the shape in 3-D, as a lit surface if the job has a mesh. Needs matplotlib.
 
         Parameters
         ----------
         frames : int
-            How many, evenly spread over the sequence.
+            Number of frames, evenly spaced over the sequence.
 
         Returns
         -------
         matplotlib.figure.Figure
-            With one set of axes for each frame; nothing is shown or saved.
+            One set of axes per frame; the figure is neither shown nor saved.
         """
         from pliant.client.plot import draw
 
@@ -97,13 +102,75 @@ class Reconstruction:
     def _local(self, name: str) -> Path:
         path = self.folder / name
         if not path.is_file():
-            raise NotLoaded(f"{name} has not been fetched yet: call load() on this result first.")
+            raise NotLoaded(f"{name} has not been downloaded yet: call load() on this result first.")
         return path
 
 
 def copied(source: Path, path: Path | str) -> Path:
-    """Copy a fetched file to where the user wants it, making folders as needed."""
+    """Copy a downloaded file to `path`, creating folders as needed."""
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(source, target)
     return target
+
+
+def job_path(job: str) -> str:
+    """Return the address of a job, relative to the service.
+
+    Raises
+    ------
+    BadArgument
+        The id is malformed.
+    """
+    if re.fullmatch(r"[A-Za-z0-9_-]{1,128}", job) is None:
+        raise BadArgument(f"Expected the id of a job (letters, digits, - and _), got {job!r}.")
+    return f"/v1/jobs/{job}"
+
+
+def succeeded(job: Job) -> Job:
+    """Return a finished job if it has a result.
+
+    Raises
+    ------
+    JobFailed, JobCancelled
+        It has none.
+    """
+    if job.status is Status.FAILED:
+        raise JobFailed(job)
+    if job.status is Status.CANCELLED:
+        raise JobCancelled(job)
+    return job
+
+
+def finished(job: Job) -> Job:
+    """Return the job if it is finished and has a result.
+
+    Raises
+    ------
+    NotAllowedNow, JobFailed, JobCancelled
+        It is not finished, or has no result.
+    """
+    if not job.status.final:
+        raise NotAllowedNow(
+            Problem(
+                title="The job is not finished",
+                status=409,
+                code="not_finished",
+                detail=f"Job {job.id} is {job.status}; there is no result yet. Wait for it.",
+                retryable=True,
+            )
+        )
+    return succeeded(job)
+
+
+def unknown_file(job: Job, name: str) -> NotFound:
+    """Return the error for a file that a job does not have."""
+    held = ", ".join(artifact.name for artifact in job.artifacts) or "none"
+    return NotFound(
+        Problem(
+            title="No such file",
+            status=404,
+            code="unknown_artifact",
+            detail=f"Job {job.id} ({job.status}) has no file {name!r}. Its files: {held}.",
+        )
+    )

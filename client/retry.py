@@ -1,4 +1,4 @@
-"""When a call is repeated, and when it is given up."""
+"""When a call is retried, and when the client gives up."""
 
 from __future__ import annotations
 
@@ -9,122 +9,131 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import httpx
-from pliant.client.errors import PliantError, Refused, ServiceFailed, TimeIsUp, TooManyRequests, Unreachable
-from pliant.client.flow import Call
+from pliant.client.call import Call
+from pliant.client.errors import APIStatusError, PliantError, ServiceFailed, TooManyRequests, Unreachable, WaitTimeout
 
-PASSING = frozenset({502, 503, 504})
-"""Statuses of a service, or of the proxy before it, that is away for a moment."""
+TEMPORARY = frozenset({502, 503, 504})
+"""Statuses of a service, or of a proxy in front of it, that is unavailable for a moment."""
+
+OUT_OF_STEP = frozenset({"upload_offset_mismatch", "upload_busy", "upload_taken_over", "upload_complete"})
+"""Codes after which the client reads the upload's offset again and continues from there."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Policy:
-    """How patient a client is. The defaults outlast a restart of the service."""
+class Retry:
+    """How long and how often a client retries. The defaults outlast a restart of the service.
+
+    Pauses grow exponentially with full jitter. A `Retry-After` header takes precedence.
+    """
 
     patience: float = 90.0
-    """Give up when nothing has worked for this long, seconds."""
+    """Give up after this long without success, seconds."""
 
     first_contact: float = 5.0
-    """The same before the first answer ever: a wrong address is told soon, seconds."""
+    """The same until the service has answered once, so that a wrong address fails quickly, seconds."""
 
     shortest_pause: float = 0.25
-    """Upper bound of the first pause, seconds; each further one may be twice as long."""
+    """Upper bound of the first pause, seconds; it doubles with each further failure."""
 
     longest_pause: float = 10.0
     """Upper bound of every pause, seconds."""
 
     long_poll: float = 20.0
-    """How long the service is asked to hold an answer back while nothing is new, seconds."""
+    """Longest time that `wait` asks the service to hold one answer back, seconds."""
 
     poll_interval: float = 0.5
-    """Pause between two looks at a job where the service does not hold answers back, seconds."""
+    """Pause between two reads of a job where the service does not hold answers back, seconds."""
 
     clock: Callable[[], float] = time.monotonic
-    """Seconds, from any origin."""
+    """Returns seconds, from any origin."""
 
-    chance: Callable[[], float] = random.random
-    """Uniform in [0, 1): the jitter that keeps many clients from returning all at once."""
+    jitter: Callable[[], float] = random.random
+    """Returns a factor in [0, 1) for each pause, which spreads the retries of many clients."""
 
 
 @dataclass(kw_only=True)
 class Contact:
-    """What a client remembers between its calls: whether the service ever answered."""
+    """What a client remembers between calls."""
 
     made: bool = False
+    """True once the service has answered."""
 
 
 @dataclass(kw_only=True)
 class Attempts:
-    """The tries of one verb: its deadline, its failures in a row, its next pause."""
+    """The attempts of one operation: its deadline, consecutive failures and next pause."""
 
-    policy: Policy
+    retries: Retry
     contact: Contact
     timeout: float | None = None
-    doing: str = "talking to the service"
-    """What the caller wants, for the sentence of `TimeIsUp`."""
+    doing: str = "the call"
+    """What the operation is, for the message of `WaitTimeout`."""
 
     failures: int = 0
     failing_since: float = field(default=math.nan)
     deadline: float = field(init=False)
 
     def __post_init__(self) -> None:
-        self.deadline = math.inf if self.timeout is None else self.policy.clock() + self.timeout
+        self.deadline = math.inf if self.timeout is None else self.retries.clock() + self.timeout
 
     def remaining(self) -> float:
         """Seconds to the deadline; `math.inf` without one.
 
         Raises
         ------
-        TimeIsUp
-            It has passed.
+        WaitTimeout
+            The deadline has passed.
         """
-        left = self.deadline - self.policy.clock()
+        left = self.deadline - self.retries.clock()
         if left <= 0:
-            raise TimeIsUp(
-                f"{self.timeout:g} s were not enough for {self.doing}. "
-                "Nothing was cancelled; call again, or give a longer timeout."
+            raise WaitTimeout(
+                f"The timeout of {self.timeout:g} s passed during {self.doing}. "
+                "Nothing was cancelled; call again, or use a longer timeout."
             )
         return left
 
     def answered(self) -> None:
-        """Note that the service answered."""
+        """Record that the service answered."""
         self.contact.made = True
 
     def succeeded(self) -> None:
-        """Note that something worked: the count of failures starts afresh."""
+        """Reset the count of failures."""
         self.failures = 0
         self.failing_since = math.nan
 
     def pause_after(self, fault: Exception) -> float:
-        """Return the seconds to wait before the next try, or raise if there shall be none.
+        """Return the seconds to wait before the next attempt.
 
-        Full jitter: uniform between 0 and a bound that doubles, unless the service named the time itself.
+        Full jitter: uniform between 0 and a bound that doubles, unless the service sent `Retry-After`.
 
         Raises
         ------
-        TimeIsUp, Unreachable, Refused
-            Too late, or too long without success.
+        WaitTimeout
+            The deadline would pass during the pause.
+        Unreachable, APIStatusError
+            There was no success for too long.
         """
-        now = self.policy.clock()
+        now = self.retries.clock()
         if self.failures == 0:
             self.failing_since = now
-        bound = min(self.policy.longest_pause, self.policy.shortest_pause * 2.0 ** min(self.failures, 30))
+        bound = min(self.retries.longest_pause, self.retries.shortest_pause * 2.0 ** min(self.failures, 30))
         self.failures += 1
-        pause = bound * self.policy.chance()
-        asked = fault.retry_after if isinstance(fault, Refused) else None
-        if asked is not None:
-            pause = asked + self.policy.shortest_pause * self.policy.chance()
-        patience = self.policy.patience if self.contact.made else self.policy.first_contact
+        pause = bound * self.retries.jitter()
+        requested = fault.retry_after if isinstance(fault, APIStatusError) else None
+        if requested is not None:
+            pause = requested + self.retries.shortest_pause * self.retries.jitter()
+        patience = self.retries.patience if self.contact.made else self.retries.first_contact
         if now + pause - self.failing_since > patience:
-            raise self.final(fault) from fault
+            raise self._final(fault) from fault
         if now + pause >= self.deadline:
-            raise TimeIsUp(
-                f"{self.timeout:g} s were not enough for {self.doing}; the last fault was: {fault or type(fault).__name__}. "
-                "Call again, or give a longer timeout."
+            raise WaitTimeout(
+                f"The timeout of {self.timeout:g} s passed during {self.doing}; the last error was: "
+                f"{fault or type(fault).__name__}. Call again, or use a longer timeout."
             ) from fault
         return pause
 
-    def final(self, fault: Exception) -> PliantError:
-        """Turn the last of many faults into what the caller sees."""
+    def _final(self, fault: Exception) -> PliantError:
+        """Return the error that the caller sees after the last attempt."""
         if isinstance(fault, PliantError):
             return fault
         return Unreachable(
@@ -134,10 +143,10 @@ class Attempts:
 
 
 def may_repeat(call: Call, fault: Exception) -> bool:
-    """Tell whether a call may be sent again after this fault.
+    """Return True if a call may be sent again after this error.
 
-    A call that is not idempotent and has no Idempotency-Key is repeated only if it cannot have been carried out:
-    no connection came about, or the service turned it away for now.
+    A call that is neither idempotent nor has an Idempotency-Key is repeated only if it was certainly not carried out:
+    the connection was not established, or the service answered 429.
     """
     if isinstance(fault, httpx.UnsupportedProtocol | httpx.LocalProtocolError):
         return False
@@ -146,5 +155,5 @@ def may_repeat(call: Call, fault: Exception) -> bool:
     if not call.repeatable:
         return False
     if isinstance(fault, ServiceFailed):
-        return fault.status in PASSING or fault.problem.retryable
+        return fault.status in TEMPORARY or fault.problem.retryable
     return isinstance(fault, httpx.TransportError)

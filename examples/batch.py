@@ -3,7 +3,6 @@
 python examples/batch.py FOLDER OUT
 """
 
-import os
 import sys
 from pathlib import Path
 
@@ -12,7 +11,7 @@ from pliant.client import InvalidRequest, JobEnded
 
 folder, out = Path(sys.argv[1]), Path(sys.argv[2])
 
-with Client(os.environ.get("PLIANT_URL", "http://127.0.0.1:8000")) as client:
+with Client() as client:
     jobs = {}
     for path in sorted(folder.glob("*.npz")):
         try:

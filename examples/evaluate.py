@@ -5,7 +5,6 @@
 TRUTH.npz holds shapes (F, P, 3). Needs matplotlib.
 """
 
-import os
 import sys
 
 import numpy as np
@@ -14,7 +13,7 @@ from pliant import Client
 
 tracks, truth, target = sys.argv[1], sys.argv[2], sys.argv[3] if len(sys.argv) > 3 else "error.png"
 
-with Client(os.environ.get("PLIANT_URL", "http://127.0.0.1:8000")) as client:
+with Client() as client:
     result = client.submit(tracks, ground_truth=truth, name="evaluation").wait(timeout=3600)
 for name, value in result.metrics.items():
     print(f"{name:24} {value:.4g}")

@@ -6,7 +6,6 @@ TRACKS.npz holds CoTracker's own arrays, saved beside the tracker with
 ``np.savez("tracks.npz", pred_tracks=pred_tracks.cpu(), pred_visibility=pred_visibility.cpu())``.
 """
 
-import os
 import sys
 
 import numpy as np
@@ -16,7 +15,7 @@ from pliant.client.progress import progress_bar
 source, target = sys.argv[1], sys.argv[2] if len(sys.argv) > 2 else "cotracker.glb"
 tracker_output = dict(np.load(source))  # in a tracking script: {"pred_tracks": …, "pred_visibility": …}; tensors, too
 
-with Client(os.environ.get("PLIANT_URL", "http://127.0.0.1:8000")) as client, progress_bar() as bar:
+with Client() as client, progress_bar() as bar:
     job = client.submit(tracker_output, name="cotracker", on_upload=bar.on_upload)
     print("read as:", job.record.interpretation.layout)
     result = job.wait(on_progress=bar.on_progress, timeout=3600)

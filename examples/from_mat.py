@@ -11,7 +11,7 @@ from pliant import Client
 
 source, target = sys.argv[1], sys.argv[2] if len(sys.argv) > 2 else "shapes.npz"
 
-with Client(os.environ.get("PLIANT_URL", "http://127.0.0.1:8000")) as client:
+with Client() as client:
     # The file is sent unchanged. The service finds W and reports how it read the rows; an ambiguous file is an error.
     result = client.submit(source, mesh="none", name=os.path.basename(source)).wait(timeout=3600)
     print("read as:", result.job.interpretation.layout)

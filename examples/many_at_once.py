@@ -20,7 +20,7 @@ async def reconstruct(client: AsyncClient, path: str) -> str:
 
 
 async def main() -> None:
-    async with AsyncClient(os.environ.get("PLIANT_URL", "http://127.0.0.1:8000")) as client:
+    async with AsyncClient() as client:
         for line in await asyncio.gather(*(reconstruct(client, path) for path in sys.argv[1:])):
             print(line)
 

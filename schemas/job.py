@@ -7,6 +7,7 @@ from enum import StrEnum
 from typing import Any
 
 from pliant.schemas.options import Options
+from pliant.schemas.problems import type_of
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 
@@ -29,17 +30,20 @@ class Status(StrEnum):
 class Record(BaseModel):
     """Base of everything on the wire: unknown fields are ignored, so that an older client reads a newer service."""
 
-    model_config = ConfigDict(frozen=True, extra="ignore")
+    model_config = ConfigDict(frozen=True, extra="ignore", json_schema_serialization_defaults_required=True)
 
 
 class Problem(Record):
     """An error as RFC 9457 problem details, with what a person or a program needs to act on it."""
 
-    type: str = "about:blank"
     title: str
     status: int = Field(description="The HTTP status code; for a failed job, the one that fits best.")
     detail: str = Field(description="A whole sentence that ends with what to do next.")
     code: str = Field(description="Stable machine-readable name, e.g. `wrong_shape` or `worker_lost`.")
+    type: str = Field(
+        default_factory=lambda given: type_of(given.get("code", "")),
+        description="Reference to the explanation of the code.",
+    )
     field: str | None = Field(None, description="The input at fault, e.g. `tracks` or `options.loss`.")
     expected: str | None = None
     got: str | None = None

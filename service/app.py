@@ -1,4 +1,4 @@
-"""The application: the parts put together, and nothing else."""
+"""The application: routes, middleware and the table of errors, assembled."""
 
 from __future__ import annotations
 
@@ -6,21 +6,25 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from importlib.metadata import version
 
-import anyio
 from fastapi import FastAPI
 from pliant.service import openapi, problems
 from pliant.service.dependencies import Service
 from pliant.service.event_stream import Followers
-from pliant.service.metrics import Counting, Requests
+from pliant.service.metrics import CountRequests, Metrics
+from pliant.service.middleware.access_log import HEADER as REQUEST_ID_HEADER
+from pliant.service.middleware.access_log import AccessLog
 from pliant.service.middleware.auth import Authentication
 from pliant.service.middleware.lingering_close import LingeringClose
-from pliant.service.middleware.origin import EVERY_ANSWER, OriginGuard, SecurityHeaders
+from pliant.service.middleware.origin import OriginCheck
 from pliant.service.middleware.rate_limit import RateLimit
+from pliant.service.middleware.security_headers import SECURITY_HEADERS, SecurityHeaders
 from pliant.service.page import mount_page
-from pliant.service.routes import artifacts, events, examples, inspection, jobs, meta, metrics, uploads
+from pliant.service.routes import artifacts, events, examples, inspection, jobs, meta, uploads
+from pliant.service.routes import errors as error_pages
+from pliant.service.routes import metrics as metrics_route
 from pliant.service.settings import ServiceSettings
-from pliant.service.spool import Incoming
-from pliant.service.upload_locks import Turns
+from pliant.service.spool import Incoming, ParserSlots
+from pliant.service.upload_locks import UploadLocks
 from pliant.worker import errors
 from pliant.worker.formats import InvalidInput, Limits
 from pliant.worker.jobs.service import Jobs
@@ -46,9 +50,9 @@ STATUS_OF: dict[type[Exception], int] = {
     errors.QuotaExceeded: 507,
     errors.StoreUnavailable: 503,
     errors.WorkerError: 500,
-    ClientDisconnect: 400,  # nobody is left to read it
+    ClientDisconnect: 400,  # for the log: nobody is left to read it
 }
-"""What each error means in HTTP; a subclass takes its nearest base's."""
+"""HTTP status of each error; a subclass that is not listed uses its nearest base's."""
 
 
 def create_app(
@@ -56,22 +60,23 @@ def create_app(
     settings: ServiceSettings,
     *,
     tokens: Tokens,
-    limits: Limits = Limits(),  # noqa: B008
+    limits: Limits | None = None,
 ) -> FastAPI:
-    """Make the application.
+    """Return the application.
 
     Parameters
     ----------
     jobs_of_all : Jobs
-        The jobs; nothing is asked of them before the first request.
+        The jobs of all owners; their store is not used before the first request.
     settings : ServiceSettings
-        How the service runs.
+        Settings of the service.
     tokens : Tokens
-        Who may ask, where the settings say that tokens are asked for.
-    limits : Limits
-        What the readers accept.
+        The bearer tokens, where the settings require them.
+    limits : Limits, optional
+        Largest inputs that the readers accept; None: the usual limits, with `read_memory` of the jobs' settings.
     """
-    requests = Requests()
+    metrics = Metrics()
+    limits = limits or Limits(read_memory=jobs_of_all.settings.read_memory)
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
@@ -83,10 +88,10 @@ def create_app(
             limits=limits,
             incoming=incoming,
             followers=Followers(),
-            requests=requests,
+            metrics=metrics,
             uploads=Uploads.open(jobs_of_all.settings),
-            turns=Turns(),
-            parsing=anyio.CapacityLimiter(settings.parsers),
+            upload_locks=UploadLocks(),
+            parsing=ParserSlots(settings.parsers),
         )
         yield
         incoming.close()
@@ -97,25 +102,28 @@ def create_app(
         description=openapi.DESCRIPTION,
         version=version("pliant"),
         lifespan=lifespan,
-        middleware=middleware(settings, tokens, requests),
-        docs_url=None,  # FastAPI's page loads scripts from elsewhere, which our own content-security policy forbids
+        openapi_tags=openapi.TAGS,
+        servers=[{"url": "/", "description": "This service"}],
+        middleware=middleware(settings, tokens, metrics),
+        docs_url=None,  # FastAPI's page loads Swagger UI from a CDN, which the content-security policy forbids; see `page`
         redoc_url=None,
     )
-    problems.install(app, STATUS_OF, careful=EVERY_ANSWER)
-    for each in (jobs, inspection, uploads, artifacts, events, meta, metrics, examples):
+    problems.install(app, STATUS_OF, security_headers=SECURITY_HEADERS)
+    for each in (jobs, inspection, uploads, artifacts, events, meta, metrics_route, examples, error_pages):
         app.include_router(each.router)
     mount_page(app)
     app.openapi = lambda: openapi.document(app)  # type: ignore[method-assign]
     return app
 
 
-def middleware(settings: ServiceSettings, tokens: Tokens, requests: Requests) -> list[Middleware]:
-    """Return what every request passes, the outermost first."""
+def middleware(settings: ServiceSettings, tokens: Tokens, metrics: Metrics) -> list[Middleware]:
+    """Return the middleware, the outermost first."""
     stack = [
-        Middleware(Counting, requests=requests),
+        Middleware(AccessLog),
+        Middleware(CountRequests, metrics=metrics),
         Middleware(SecurityHeaders),
         Middleware(LingeringClose),
-        Middleware(OriginGuard, settings=settings),
+        Middleware(OriginCheck, settings=settings),
     ]
     if settings.cors_origins:
         stack.append(
@@ -125,6 +133,7 @@ def middleware(settings: ServiceSettings, tokens: Tokens, requests: Requests) ->
                 allow_methods=["GET", "POST", "PUT", "PATCH", "DELETE"],
                 allow_headers=[
                     *("Authorization", "Content-Type", "Idempotency-Key", "Last-Event-ID", "Prefer", "Range"),
+                    REQUEST_ID_HEADER,
                     *("Repr-Digest", "Upload-Complete", "Upload-Length", "Upload-Offset"),
                 ],
                 expose_headers=[
@@ -134,11 +143,12 @@ def middleware(settings: ServiceSettings, tokens: Tokens, requests: Requests) ->
                     "Repr-Digest",
                     "Retry-After",
                     "Preference-Applied",
+                    REQUEST_ID_HEADER,
                     *("Upload-Complete", "Upload-Length", "Upload-Limit", "Upload-Offset"),
                 ],
             )
         )
-    # Inside CORS: a browser's preflight carries no token, and a page of an allowed origin may read why it was refused.
+    # Inside CORS: a browser's preflight carries no token, and a page of an allowed origin may read a refusal.
     stack.append(Middleware(Authentication, settings=settings, tokens=tokens))
     stack.append(Middleware(RateLimit, settings=settings))
     return stack

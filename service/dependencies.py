@@ -1,17 +1,16 @@
-"""What every route works with: one record, made by `create_app` and handed down through the request."""
+"""What routes depend on: one record of the application, and the jobs, uploads and limits of the request's token."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from typing import Annotated
 
-import anyio
 from fastapi import Depends, Request
 from pliant.service.event_stream import Followers
-from pliant.service.metrics import Requests
+from pliant.service.metrics import Metrics
 from pliant.service.settings import ServiceSettings
-from pliant.service.spool import Incoming
-from pliant.service.upload_locks import Turns
+from pliant.service.spool import Incoming, ParserSlots
+from pliant.service.upload_locks import UploadLocks
 from pliant.worker.formats import Limits
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.tokens import Token
@@ -20,26 +19,25 @@ from pliant.worker.uploads.service import Uploads
 
 @dataclass(frozen=True)
 class Service:
-    """The parts that outlive a request."""
+    """The parts of an application that outlive a request."""
 
     jobs: Jobs
-    """Everybody's jobs; a route takes `Mine` instead."""
+    """The jobs of all owners; routes use `Mine` instead."""
     settings: ServiceSettings
     limits: Limits
     """What the readers accept."""
     incoming: Incoming
     followers: Followers
     uploads: Uploads
-    """Everybody's uploads; a route takes `MyUploads` instead."""
-    turns: Turns
-    requests: Requests
-    """What has been counted of them."""
-    parsing: anyio.CapacityLimiter
-    """Holds the number of inputs that are in memory at once."""
+    """The uploads of all owners; routes use `MyUploads` instead."""
+    upload_locks: UploadLocks
+    metrics: Metrics
+    parsing: ParserSlots
+    """Limits the inputs that are in memory at once."""
 
 
 def service_of(request: Request) -> Service:
-    """Return the record of the application that answers this request."""
+    """Return the record of the request's application."""
     service = request.app.state.service
     assert isinstance(service, Service)
     return service
@@ -47,7 +45,7 @@ def service_of(request: Request) -> Service:
 
 @dataclass(frozen=True)
 class Bounds:
-    """What the one who asks may use: the limits of his token, the service's where it has none. 0 means any number."""
+    """The limits of a request's token, the service's where the token has none. 0 means no limit."""
 
     max_body_bytes: int
     max_upload_bytes: int
@@ -64,8 +62,8 @@ def bounds_of(request: Request) -> Bounds:
     most = float("inf") if token is None or token.max_body_bytes is None else token.max_body_bytes
 
     def own(name: str, usual: int) -> int:
-        said = getattr(token, name, None)
-        return usual if said is None else int(said)
+        limit = getattr(token, name, None)
+        return usual if limit is None else int(limit)
 
     return Bounds(
         max_body_bytes=int(min(most, settings.max_body_bytes)),
@@ -77,7 +75,7 @@ def bounds_of(request: Request) -> Bounds:
 
 
 def mine(request: Request) -> Jobs:
-    """Return the jobs that the request's token may see: its own, or everybody's where tokens are off."""
+    """Return the jobs that the request's token may see: its own, or all where tokens are off."""
     owner = request.scope.get("pliant.owner")
     token = request.scope.get("pliant.token")
     return replace(
@@ -89,7 +87,7 @@ def mine(request: Request) -> Jobs:
 
 
 def my_uploads(request: Request) -> Uploads:
-    """Return the uploads of the request's token, or everybody's where tokens are off."""
+    """Return the uploads of the request's token, or all where tokens are off."""
     return service_of(request).uploads.of(request.scope.get("pliant.owner") or "")
 
 

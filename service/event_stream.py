@@ -1,41 +1,46 @@
-"""Following jobs: one watcher for a job however many clients follow it, so that a thousand listeners cost one look-up.
+"""Following jobs: one reader thread in a process, however many clients follow however many jobs.
 
-A blocking read for every listener would hold a thread each; the watcher asks twice or thrice a second instead, which is as
-often as progress is written.
+The reader waits for the ids of changed jobs (`Records.changes`), reads the new events of those that are followed here, and hands
+them to the followers. A thousand followers of one job cost one read for each change; a job without changes costs nothing.
 """
 
 from __future__ import annotations
 
 import asyncio
+import threading
+import time
 from collections import deque
-from collections.abc import AsyncGenerator
+from collections.abc import AsyncGenerator, Callable
+from contextlib import suppress
+from typing import Any
 
 from pliant.schemas.job import Job
+from pliant.worker.errors import UnknownJob
 from pliant.worker.jobs.service import Jobs
-from pliant.worker.records import Event
+from pliant.worker.records import Changes, Event, Records
 from starlette.concurrency import run_in_threadpool
 
 KEPT = 256
-"""Events a watcher holds for listeners that are slow."""
+"""Events that are held for followers that are slow."""
+
+WAIT = 1.0
+"""Seconds the reader waits for a change before it looks whether anybody still follows."""
+
+READ_AGAIN = 10.0
+"""Seconds after which every followed job is read again: a change's message is lost while a connection is re-established."""
 
 
 class Followers:
-    """The watchers of one process.
+    """The clients of one process that follow jobs."""
 
-    Attributes
-    ----------
-    pause : float
-        Seconds between two looks at a job; grows by a hundredth of it for every further job that is watched.
-    """
-
-    def __init__(self, *, pause: float = 0.3) -> None:
-        self.pause = pause
+    def __init__(self) -> None:
         self.closing = asyncio.Event()
         self._watchers: dict[str, _Watcher] = {}
+        self._reader: _Reader | None = None
 
     @property
     def watched(self) -> int:
-        """How many jobs are followed now."""
+        """Return how many jobs are followed now."""
         return len(self._watchers)
 
     def close(self) -> None:
@@ -43,6 +48,7 @@ class Followers:
         self.closing.set()
         for watcher in self._watchers.values():
             watcher.wake()
+        self._stop_reader()
 
     async def follow(
         self, jobs: Jobs, id: str, *, after: str | None = None, heartbeat: float = 15.0
@@ -52,7 +58,7 @@ class Followers:
         Parameters
         ----------
         jobs : Jobs
-            The jobs as the one who asks may see them.
+            The jobs that the client may see.
         id : str
             The job.
         after : str, optional
@@ -63,22 +69,18 @@ class Followers:
         Raises
         ------
         UnknownJob
-            There is no such job, or it vanished meanwhile.
+            There is no such job, or it was deleted meanwhile.
         InvalidRequest
             `after` is no event's id.
         """
-        watcher = self._watchers.get(id)
-        if watcher is None:
-            watcher = self._watchers[id] = _Watcher()
+        watcher = self._watchers.setdefault(id, _Watcher())
         watcher.listeners += 1
         try:
-            known = await run_in_threadpool(jobs.events, id, after=after, timeout=0)
+            self._start_reader(jobs.records)  # before the first read, so that no change falls between the two
+            known = await run_in_threadpool(jobs.events, id, after=after)
             last = after or "0-0"
-            if watcher.task is None:
-                # It looks with the rights of the first listener's process, not his: every listener was checked above.
-                watcher.task = asyncio.create_task(
-                    self._watch(jobs, id, watcher, since=known[-1].id if known else last)
-                )
+            if not known and (await run_in_threadpool(jobs.get, id)).status.final:
+                return  # nothing follows the last event of a finished job
             while True:
                 for event in known:
                     last = event.id
@@ -94,11 +96,10 @@ class Followers:
                 known = watcher.newer(last)
         finally:
             watcher.listeners -= 1
-            if watcher.listeners == 0:
-                if watcher.task is not None:
-                    watcher.task.cancel()
-                if self._watchers.get(id) is watcher:
-                    del self._watchers[id]
+            if watcher.listeners == 0 and self._watchers.get(id) is watcher:
+                del self._watchers[id]
+            if not self._watchers:
+                self._stop_reader()
 
     async def wait(self, jobs: Jobs, id: str, seconds: float) -> Job:
         """Return the job once its status is final, or as it is after so many seconds."""
@@ -113,37 +114,89 @@ class Followers:
             pass
         return await run_in_threadpool(jobs.get, id)
 
-    async def _watch(self, jobs: Jobs, id: str, watcher: _Watcher, *, since: str) -> None:
-        last = since
+    def _start_reader(self, records: Records) -> None:
+        if self._reader is None or not self._reader.is_alive():
+            self._reader = _Reader(records, self._watchers, asyncio.get_running_loop())
+            self._reader.start()
+
+    def _stop_reader(self) -> None:
+        if self._reader is not None:
+            self._reader.ended.set()
+            self._reader = None
+
+
+class _Reader(threading.Thread):
+    """The thread that waits for changes and reads events. Everything it finds is handed over on the event loop."""
+
+    def __init__(self, records: Records, watchers: dict[str, _Watcher], loop: asyncio.AbstractEventLoop) -> None:
+        super().__init__(name="events", daemon=True)
+        self.ended = threading.Event()
+        self._records = records
+        self._watchers = watchers
+        self._loop = loop
+
+    def run(self) -> None:
+        """Read until nobody follows a job or the store does not answer."""
         try:
-            while True:
-                await asyncio.sleep(self.pause * (1 + self.watched / 100))
-                found = await run_in_threadpool(jobs.events, id, after=last, timeout=0)
-                if found:
-                    last = found[-1].id
-                    watcher.tell(found)
-        except Exception as error:  # noqa: BLE001 - handed to every listener, who raises it in his own request
-            watcher.failure = error
-            watcher.wake()
+            changes = self._records.changes()
+            try:
+                self._follow(changes)
+            finally:
+                changes.close()
+        except Exception as error:  # noqa: BLE001 - handed to every follower, who raises it in its own request
+            for watcher in list(self._watchers.values()):
+                self._hand_over(watcher.fail, error)
+
+    def _follow(self, changes: Changes) -> None:
+        due = 0.0
+        while not self.ended.is_set():
+            everything = time.monotonic() >= due
+            changed = set() if everything else changes.next(WAIT)
+            followed = dict(self._watchers)
+            if everything:
+                due, changed = time.monotonic() + READ_AGAIN, set(followed)
+            for id in changed & followed.keys():
+                self._read(id, followed[id])
+
+    def _read(self, id: str, watcher: _Watcher) -> None:
+        events = self._records.events(id, after=watcher.read_up_to)
+        if events:
+            watcher.read_up_to = events[-1].id
+            self._hand_over(watcher.publish, events)
+            return
+        try:
+            self._records.get(id)
+        except UnknownJob as error:
+            self._hand_over(watcher.fail, error)
+
+    def _hand_over(self, call: Callable[[Any], None], what: object) -> None:
+        with suppress(RuntimeError):  # the loop has ended
+            self._loop.call_soon_threadsafe(call, what)
 
 
 class _Watcher:
-    """One job that is followed: its latest events, and who waits for the next."""
+    """One job that is followed: its latest events, and the followers that wait for the next."""
 
     def __init__(self) -> None:
         self.listeners = 0
-        self.task: asyncio.Task[None] | None = None
         self.failure: Exception | None = None
+        self.read_up_to: str | None = None
+        """The last event that the reader has read."""
         self._events: deque[Event] = deque(maxlen=KEPT)
         self._next = asyncio.Event()
 
-    def tell(self, events: list[Event]) -> None:
-        """Add events and wake whoever waits."""
+    def publish(self, events: list[Event]) -> None:
+        """Add events and wake the followers."""
         self._events.extend(events)
         self.wake()
 
+    def fail(self, error: Exception) -> None:
+        """End every follower with an error."""
+        self.failure = error
+        self.wake()
+
     def wake(self) -> None:
-        """Wake whoever waits."""
+        """Wake the followers."""
         self._next.set()
         self._next = asyncio.Event()
 
@@ -167,5 +220,5 @@ def is_final(event: Event) -> bool:
 
 
 def _order(id: str) -> tuple[int, int]:
-    time, _, count = id.partition("-")
-    return int(time), int(count)
+    milliseconds, _, count = id.partition("-")
+    return int(milliseconds), int(count)

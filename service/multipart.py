@@ -1,4 +1,4 @@
-"""Receiving a form: parts streamed to files with a limit and a SHA-256, never held in memory.
+"""Receive a multipart form: parts are streamed to files with a size limit and a SHA-256, never held in memory.
 
 FastAPI's `UploadFile` reads the whole body into a temporary file before the route is entered, and the route copies it again;
 here the body is parsed as it arrives, in batches on a thread, so a 300 MB part costs one write and a few hundred kilobytes.
@@ -16,7 +16,8 @@ from pathlib import Path
 from typing import BinaryIO
 
 from anyio import to_thread
-from pliant.service.problems import Refusal
+from pliant.schemas.problems import ProblemCode
+from pliant.service.problems import Refusal, wrong_input
 from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 from starlette.requests import ClientDisconnect, Request
@@ -28,7 +29,7 @@ _SUFFIX = re.compile(r"\.[a-z0-9]{1,8}")
 
 @dataclass(frozen=True)
 class FormRules:
-    """What a form may hold.
+    """The parts that a form may have.
 
     Attributes
     ----------
@@ -39,7 +40,7 @@ class FormRules:
     max_body_bytes, max_text_bytes : int
         Limits of the whole body and of one text.
     stall_seconds : float
-        How long the client may send nothing at all.
+        Seconds without a byte after which the request is refused.
     """
 
     files: frozenset[str]
@@ -60,7 +61,7 @@ class File:
 
 @dataclass(frozen=True)
 class Form:
-    """What arrived: files by part name, texts by part name."""
+    """A received form: files by part name, texts by part name."""
 
     files: Mapping[str, File]
     texts: Mapping[str, str]
@@ -68,20 +69,20 @@ class Form:
     @property
     def fingerprint(self) -> str:
         """SHA-256 over every part's name and content, the same for the same content in any order of the parts."""
-        said = {name: ["file", file.sha256] for name, file in self.files.items()}
-        said |= {name: ["text", text] for name, text in self.texts.items()}
-        return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
+        parts = {name: ["file", file.sha256] for name, file in self.files.items()}
+        parts |= {name: ["text", text] for name, text in self.texts.items()}
+        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
 
-async def receive_form(request: Request, room: Path, *, rules: FormRules) -> Form:
+async def receive_form(request: Request, folder: Path, *, rules: FormRules) -> Form:
     """Receive a multipart form.
 
     Parameters
     ----------
     request : Request
         Its body has not been read yet.
-    room : Path
-        An empty folder for the files; whoever made it removes it.
+    folder : Path
+        An empty folder for the files; the caller removes it.
     rules : FormRules
         Which parts there may be, and how large.
 
@@ -93,8 +94,7 @@ async def receive_form(request: Request, room: Path, *, rules: FormRules) -> For
     kind, parameters = parse_options_header(request.headers.get("content-type"))
     if kind != b"multipart/form-data":
         raise Refusal(
-            415,
-            "unsupported_media_type",
+            ProblemCode.UNSUPPORTED_MEDIA_TYPE,
             detail="The body must be a form: send multipart/form-data with a part `tracks`. An example is at /docs.",
             expected="multipart/form-data",
             got=kind.decode("latin-1") or "no Content-Type",
@@ -102,7 +102,7 @@ async def receive_form(request: Request, room: Path, *, rules: FormRules) -> For
     if not parameters.get(b"boundary"):
         raise _malformed("the Content-Type names no boundary")
     try:
-        reader = _Reader(parameters[b"boundary"], room, rules)
+        reader = _Reader(parameters[b"boundary"], folder, rules)
     except FormParserError as error:
         raise _malformed(str(error)) from error
     try:
@@ -123,7 +123,7 @@ async def batches(request: Request, *, max_bytes: int, stall_seconds: float) -> 
     max_bytes : int
         Largest body.
     stall_seconds : float
-        How long the client may send nothing at all.
+        Seconds without a byte after which the request is refused.
 
     Raises
     ------
@@ -143,8 +143,8 @@ async def batches(request: Request, *, max_bytes: int, stall_seconds: float) -> 
             async with asyncio.timeout(stall_seconds):
                 piece = await anext(stream, None)
         except TimeoutError:
-            detail = f"Nothing arrived for {stall_seconds:g} s, so the request was given up. Send it again."
-            raise Refusal(408, "body_stalled", detail=detail, retryable=True) from None
+            detail = f"No byte of the body arrived for {stall_seconds:g} s. Send the request again."
+            raise Refusal(ProblemCode.BODY_STALLED, detail=detail) from None
         except ClientDisconnect:
             if gathered:  # an upload keeps what has arrived
                 yield b"".join(gathered)
@@ -181,8 +181,8 @@ class _Part:
 class _Reader:
     """Parses a form piece by piece. Belongs to one request; `feed` is called from one thread at a time."""
 
-    def __init__(self, boundary: bytes, room: Path, rules: FormRules) -> None:
-        self._room, self._rules = room, rules
+    def __init__(self, boundary: bytes, folder: Path, rules: FormRules) -> None:
+        self._folder, self._rules = folder, rules
         self._files: dict[str, File] = {}
         self._texts: dict[str, str] = {}
         self._part = _Part()
@@ -231,27 +231,32 @@ class _Reader:
 
     def _open(self) -> None:
         part, rules = self._part, self._rules
-        kind, said = parse_options_header(part.disposition)
-        part.name = said.get(b"name", b"").decode("utf-8", "replace")
+        kind, options = parse_options_header(part.disposition)
+        part.name = options.get(b"name", b"").decode("utf-8", "replace")
         if kind != b"form-data" or not part.name:
             raise _malformed("a part has no Content-Disposition: form-data with a name")
         known = rules.files | rules.texts
         if part.name not in known:
             expected = "one of " + ", ".join(sorted(known))
-            raise _unfit(
-                "unknown_part", part.name[:80], expected=expected, got="a part of that name", hint="Leave it out."
+            raise wrong_input(
+                ProblemCode.UNKNOWN_PART,
+                field=part.name[:80],
+                expected=expected,
+                got="a part of that name",
+                hint="Leave it out.",
             )
         if part.name in self._files or part.name in self._texts:
-            raise _unfit("repeated_part", part.name, expected="the part once", got="it twice", hint="Send it once.")
+            code = ProblemCode.REPEATED_PART
+            raise wrong_input(code, field=part.name, expected="the part once", got="it twice", hint="Send it once.")
         # A part that can only be text is text even if the client gave it a file name, as several HTTP libraries do.
-        if part.name in rules.files and b"filename" in said:
-            suffix = Path(said[b"filename"].decode("utf-8", "replace")).suffix.lower()
-            part.path = self._room / f"{part.name}{suffix if _SUFFIX.fullmatch(suffix) else ''}"
+        if part.name in rules.files and b"filename" in options:
+            suffix = Path(options[b"filename"].decode("utf-8", "replace")).suffix.lower()
+            part.path = self._folder / f"{part.name}{suffix if _SUFFIX.fullmatch(suffix) else ''}"
             part.sink = part.path.open("xb")
         elif part.name not in rules.texts:
-            raise _unfit(
-                "not_a_file",
-                part.name,
+            raise wrong_input(
+                ProblemCode.NOT_A_FILE,
+                field=part.name,
                 expected="a file",
                 got="text",
                 hint=f"Give the part a file name, as in curl's -F {part.name}=@FILE.",
@@ -276,7 +281,10 @@ class _Reader:
                 self._texts[part.name] = part.text.decode()
             except UnicodeDecodeError:
                 hint = "Send it in UTF-8."
-                raise _unfit("not_utf8", part.name, expected="text in UTF-8", got="other bytes", hint=hint) from None
+                code = ProblemCode.NOT_UTF8
+                raise wrong_input(
+                    code, field=part.name, expected="text in UTF-8", got="other bytes", hint=hint
+                ) from None
             return
         part.sink.close()
         assert part.path is not None
@@ -287,23 +295,16 @@ class _Reader:
         self._ended = True
 
 
-def _unfit(code: str, name: str, *, expected: str, got: str, hint: str) -> Refusal:
-    detail = f"{name}: expected {expected}, got {got}. {hint}"
-    return Refusal(422, code, detail=detail, field=name, expected=expected, got=got, hint=hint)
-
-
 def _malformed(why: str) -> Refusal:
     detail = f"The form is malformed: {why.rstrip('.')}. Let an HTTP library write the body, or compare it with /docs."
-    return Refusal(400, "malformed_form", detail=detail)
+    return Refusal(ProblemCode.MALFORMED_FORM, detail=detail)
 
 
 def _too_large(limit: int, got: str, *, what: str = "body") -> Refusal:
-    return Refusal(
-        413,
-        "body_too_large" if what == "body" else "text_too_large",
-        detail=f"{what}: expected at most {limit} bytes, got {got}. Take fewer frames or points; see /v1/limits.",
+    return wrong_input(
+        ProblemCode.BODY_TOO_LARGE if what == "body" else ProblemCode.TEXT_TOO_LARGE,
         field=what,
         expected=f"at most {limit} bytes",
         got=got,
-        hint="Take fewer frames or points, or store float32.",
+        hint="Send fewer frames or points, or store float32; see /v1/limits.",
     )

@@ -1,25 +1,41 @@
-"""What the OpenAPI document says beyond what FastAPI reads from the code: errors, examples, the form."""
+"""The parts of the OpenAPI document that FastAPI cannot read from the code: errors, examples, tags, the form."""
 
 from __future__ import annotations
 
+import json
+import sys
 from http import HTTPStatus
 from typing import Any
 
 from fastapi import FastAPI
 from pliant.schemas.job import Problem
+from pliant.schemas.options import Options
+from pliant.schemas.problems import ProblemCode, type_of
 from pliant.service.middleware.auth import is_public
 from pliant.service.problems import MEDIA_TYPE
 
-SUMMARY = "Dense 2-D point tracks of a deforming thing in, a moving 3-D mesh out."
+SUMMARY = "Dense 2-D point tracks of a deforming object in, a moving 3-D mesh out."
 DESCRIPTION = """Submit a job with `POST /v1/jobs`, follow it, download its files.
 
-Every error is `application/problem+json` with a stable `code`, a `detail` that is a whole sentence and ends with what to do,
-and, where an input is at fault, `field`, `expected`, `got` and `hint`. `retryable` says whether the same request may succeed later.
+Every error is `application/problem+json` (RFC 9457) with a stable `code`, a `type` that links to its explanation, a `detail` that
+ends with what to do and, for a wrong input, `field`, `expected`, `got` and `hint`. `retryable` is true if the same request can
+succeed later. Every answer has an `X-Request-ID`, which is also in the service's log.
 """
 
+TAGS = [
+    {"name": "jobs", "description": "Submit, follow, cancel, retry and delete reconstructions."},
+    {"name": "artifacts", "description": "Download result files, whole or in ranges."},
+    {
+        "name": "uploads",
+        "description": "Send inputs above 32 MB, or over unreliable connections; interrupted uploads resume.",
+    },
+    {"name": "about", "description": "Options, limits, examples, error codes, health and metrics of this service."},
+]
+
+
 _PROBLEM_EXAMPLE = {
-    "type": "about:blank",
-    "title": "Unprocessable Content",
+    "type": type_of("too_few_frames"),
+    "title": ProblemCode.TOO_FEW_FRAMES.heading,
     "status": 422,
     "detail": "tracks: expected at least 3 frames, got 2. Track the points over more frames.",
     "code": "too_few_frames",
@@ -73,40 +89,47 @@ SUBMIT_BODY: dict[str, Any] = {
         "multipart/form-data": {
             "schema": {
                 "type": "object",
-                "anyOf": [{"required": ["tracks"]}, {"required": ["tracks_upload"]}],
+                # Tracks, or the upload that holds them. Generators of clients cannot read an anyOf here.
+                "if": {"not": {"required": ["tracks_upload"]}},
+                "then": {"required": ["tracks"]},
                 "properties": {
                     "tracks": {
                         **_FILE,
                         "description": "The 2-D tracks: npz with `tracks (F, P, 2)` and optionally `visibility (F, P)`, "
-                        "or another layout that docs/reference/formats.md lists.",
+                        "or the output of a point tracker; the documentation lists all formats.",
                     },
                     "mesh": {
                         "anyOf": [_FILE, {"type": "string", "pattern": "^([0-9]{1,6}x[0-9]{1,6}|none)$"}],
                         "description": "A mesh file whose vertex i is point i, or the text ROWSxCOLUMNS for a pixel grid. "
-                        "Left out: one is made, and the report says how.",
+                        "Omitted: a mesh is triangulated from the tracks, as the report describes.",
                     },
-                    "ground_truth": {**_FILE, "description": "npz with `shapes (F, P, 3)`; used for metrics alone."},
+                    "ground_truth": {**_FILE, "description": "npz with `shapes (F, P, 3)`; used only for metrics."},
                     "rotations": {
                         **_FILE,
                         "description": "Known cameras `(F, 3, 3)` or `(F, 2, 3)`, used as they are.",
                     },
-                    "options": {"type": "string", "description": "A JSON object; its schema is at /v1/options."},
+                    "options": {
+                        "type": "string",
+                        "contentMediaType": "application/json",
+                        "contentSchema": {"$ref": "#/components/schemas/Options"},
+                        "description": "A JSON object, also described at /v1/options.",
+                    },
                     "name": {"type": "string", "maxLength": 200, "description": "A label of your own."},
                     "webhook": {
                         "type": "string",
                         "format": "uri",
                         "maxLength": 2000,
-                        "description": "An http(s) address that gets a POST once the job has ended, signed as Standard Webhooks 1.0 says.",
+                        "description": "URL that receives a POST once the job has ended, signed as in Standard Webhooks 1.0.",
                     },
                     "webhook_secret": {
                         "type": "string",
                         "pattern": "^whsec_[A-Za-z0-9+/=]{32,}$",
-                        "description": "The key of that signature: `whsec_` and 24 to 64 random bytes in base64. Goes with `webhook`.",
+                        "description": "Key of the signature: `whsec_` and 24 to 64 random bytes in base64. Required with `webhook`.",
                     },
                     **{
                         f"{part}_upload": {
                             "type": "string",
-                            "description": f"Id of an upload (`PUT /v1/uploads/ID`) that stands for the part `{part}`.",
+                            "description": f"Id of a complete upload (`PUT /v1/uploads/ID`) to use as the part `{part}`.",
                         }
                         for part in ("tracks", "mesh", "ground_truth", "rotations")
                     },
@@ -122,6 +145,9 @@ SUBMIT_BODY: dict[str, Any] = {
 }
 
 
+_REF = "#/components/schemas/{model}"
+
+
 def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
     """Return the OpenAPI entries of these error statuses."""
     return {status: _problem(status) for status in statuses}
@@ -133,50 +159,84 @@ def _problem(status: int) -> dict[str, Any]:
         "description": HTTPStatus(status).phrase,
         "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}, **shown}},
     }
-    if status in _SAID_IN_HEADERS:
-        name, meaning = _SAID_IN_HEADERS[status]
+    if status in _ERROR_HEADERS:
+        name, meaning = _ERROR_HEADERS[status]
         entry["headers"] = {name: {"description": meaning, "schema": {"type": "string"}}}
     return entry
 
 
-_SAID_IN_HEADERS = {
+_ERROR_HEADERS = {
     401: ("WWW-Authenticate", "How to authenticate (RFC 6750)."),
     429: ("Retry-After", "Seconds to wait."),
     503: ("Retry-After", "Seconds to wait."),
 }
-_FROM_THE_GUARD = (421, 500)
-"""What any address may answer: a Host that is not this service's, a defect."""
-_FROM_THE_DOOR = (401, 403, 429, 503)
-"""What any address that is not public may answer: no token, not one that may, too often, no store to look the token up."""
+_EVERYWHERE = (421, 500)
+"""Errors of any path: an unknown Host, an internal error."""
+_WITH_TOKEN = (401, 403, 429, 503)
+"""Further errors of paths that need a token: none or an invalid one, missing scope, rate limit, no store to verify it."""
 
 
 def document(app: FastAPI) -> dict[str, Any]:
-    """Return the OpenAPI document, made once: FastAPI's, and what is answered before a route is reached."""
+    """Return the OpenAPI document: FastAPI's, with the errors of middleware and the schemas that routes only refer to."""
     if app.openapi_schema is None:
         made = FastAPI.openapi(app)
         schemas = made.setdefault("components", {}).setdefault("schemas", {})
         for path, operations in made["paths"].items():
             for operation in operations.values():
                 _complete(operation, path)
-        schemas["Problem"] = Problem.model_json_schema(ref_template="#/components/schemas/{model}")
-        for name in ("HTTPValidationError", "ValidationError"):  # FastAPI's own, which nothing here answers with
+        schemas["Problem"] = Problem.model_json_schema(ref_template=_REF)
+        schemas["Problem"]["properties"]["code"] = {
+            "$ref": _REF.format(model="ProblemCode"),
+            "description": "Stable machine-readable name of the error.",
+        }
+        schemas["ProblemCode"] = {
+            "title": "ProblemCode",
+            "type": "string",
+            "enum": [code.value for code in ProblemCode],
+        }
+        # The schema of a request: every option may be left out.
+        schemas["Options"] = Options.model_json_schema(ref_template=_REF)
+        for name in (
+            "HTTPValidationError",
+            "ValidationError",
+        ):  # FastAPI's own error format, which this service never uses
             schemas.pop(name, None)
-        said = "Where the service asks for tokens. Whoever runs it makes them with `pliant token create`."
-        made["components"]["securitySchemes"] = {"token": {"type": "http", "scheme": "bearer", "description": said}}
+        text = "Required unless tokens are off. The operator creates tokens with `pliant token create`."
+        made["components"]["securitySchemes"] = {"token": {"type": "http", "scheme": "bearer", "description": text}}
         app.openapi_schema = made
     return app.openapi_schema
 
 
 def _complete(operation: dict[str, Any], path: str) -> None:
-    """Add to an operation what is true of all, and make every error a problem."""
-    open_to_all = is_public(path)
+    """Add the security and the errors that all operations share."""
+    open_to_all = is_public(path.replace("{code}", ""))
     operation["security"] = [] if open_to_all else [{"token": []}]
     responses = operation["responses"]
     if "422" in responses:
         responses["422"] = _problem(422)
-    usual: tuple[int, ...] = _FROM_THE_GUARD if open_to_all else _FROM_THE_GUARD + _FROM_THE_DOOR
+    usual: tuple[int, ...] = _EVERYWHERE if open_to_all else _EVERYWHERE + _WITH_TOKEN
     if "{" in path:
         usual += (404,)
     for status in usual:
         responses.setdefault(str(status), _problem(status))
     operation["responses"] = dict(sorted(responses.items()))
+
+
+def main() -> None:
+    """Print the OpenAPI document of a service with default settings; with `--schemas` only its schemas."""
+    from pliant.service.app import create_app
+    from pliant.service.settings import ServiceSettings
+    from pliant.worker.jobs.service import Jobs
+    from pliant.worker.settings import Settings
+    from pliant.worker.tokens import Tokens
+
+    of_worker = Settings()
+    app = create_app(Jobs.open(of_worker), ServiceSettings(), tokens=Tokens.open(of_worker))
+    found = app.openapi()
+    if "--schemas" in sys.argv[1:]:
+        found = {**found, "paths": {}}
+    sys.stdout.write(json.dumps(found, indent=2, ensure_ascii=False) + "\n")
+
+
+if __name__ == "__main__":
+    main()

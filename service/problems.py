@@ -1,7 +1,7 @@
 """Every error as RFC 9457 problem details, made in one place.
 
-An exception becomes a `Problem` by one table, from its class to a status code; what it says (code, field, expected, got, hint)
-travels in its attributes. FastAPI's own answers (404, 405, 422) take the same road, so a client needs one parser.
+A table maps each class of exception to a status code; code, field, expected, got and hint are attributes of the exception.
+FastAPI's own errors (404, 405, 422) are converted the same way, so a client needs one parser.
 """
 
 from __future__ import annotations
@@ -16,176 +16,222 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import Response
 from pliant.schemas.job import Problem
+from pliant.schemas.problems import RETRYABLE_STATUSES, ProblemCode, find_code, type_of
 from pydantic import ValidationError
 from starlette.exceptions import HTTPException
+from starlette.types import Receive, Scope, Send
 
 MEDIA_TYPE = "application/problem+json"
-RETRYABLE = frozenset({429, 503, 507})
-"""Answers that may be different later though the request is the same."""
 
 _log = logging.getLogger("pliant.service")
 
-_SAID_BY_STATUS = {
-    400: ("bad_request", "The request could not be read. Compare it with the example at /docs."),
-    401: ("unauthorised", "Send a token as `Authorization: Bearer …`."),
-    404: ("no_such_address", "There is nothing at this address. The addresses are listed at /docs."),
-    405: ("method_not_allowed", "This address does not know this method. The methods are listed at /docs."),
-    413: ("body_too_large", "Send a smaller body; the limits are at /v1/limits."),
-    415: ("unsupported_media_type", "Send multipart/form-data or application/json; see /docs."),
-    500: ("internal_error", "The service failed; its log says more. Try again, and report it if it stays."),
+_BY_STATUS = {
+    400: (ProblemCode.BAD_REQUEST, "The request could not be read. Compare it with the example at /docs."),
+    401: (ProblemCode.UNAUTHORIZED, "Send a token as `Authorization: Bearer …`."),
+    404: (ProblemCode.NO_SUCH_ADDRESS, "No route has this path. All paths are listed at /docs."),
+    405: (ProblemCode.METHOD_NOT_ALLOWED, "This path does not support this method. The methods are listed at /docs."),
+    413: (ProblemCode.BODY_TOO_LARGE, "Send a smaller body; the limits are at /v1/limits."),
+    415: (ProblemCode.UNSUPPORTED_MEDIA_TYPE, "Send multipart/form-data or application/json; see /docs."),
+    500: (ProblemCode.INTERNAL_ERROR, "The service failed; its log has the details. Report it if it happens again."),
 }
 
 
 class Refusal(Exception):
-    """The service will not do what the request asks; said as a problem.
+    """The service refuses a request; the answer is a problem document.
 
     Attributes
     ----------
-    status : int
-        The HTTP status code.
-    code : str
-        Stable machine-readable name of the fault.
+    code : ProblemCode
+        Stable machine-readable name of the error.
     detail : str
         A whole sentence that ends with what to do next.
-    said : dict
-        Further members of `Problem`: ``field``, ``expected``, ``got``, ``hint``, ``choices``.
+    status : int
+        The HTTP status code; the code's usual one if none is given.
+    members : dict
+        Further members of `Problem`: ``field``, ``expected``, ``got``, ``hint``, ``choices``, ``type``.
     headers : dict of str to str
         Further response headers.
     """
 
     def __init__(
-        self, status: int, code: str, *, detail: str, headers: Mapping[str, str] | None = None, **said: Any
+        self,
+        code: ProblemCode,
+        *,
+        detail: str,
+        status: int | None = None,
+        headers: Mapping[str, str] | None = None,
+        **members: Any,
     ) -> None:
         super().__init__(detail)
-        self.status = status
         self.code = code
         self.detail = detail
-        self.said = said
+        self.status = status or code.status or 500
+        self.members = members
         self.headers = dict(headers or {})
 
 
-def problem(status: int, code: str, *, detail: str, **said: Any) -> Problem:
-    """Return a `Problem` whose title is the status code's name.
+class ProblemResponse(Response):
+    """The response that carries a problem document; leaves the code in the request's scope, where the access log reads it."""
+
+    media_type = MEDIA_TYPE
+
+    def __init__(self, problem: Problem, *, headers: Mapping[str, str] | None = None) -> None:
+        body = problem.model_dump_json(exclude_none=True)
+        super().__init__(body, status_code=problem.status, headers=dict(headers or {}))
+        self._code = problem.code
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send the response."""
+        if "pliant.log" in scope:
+            scope["pliant.log"]["code"] = self._code
+        await super().__call__(scope, receive, send)
+
+
+def wrong_input(code: ProblemCode, *, field: str, expected: str, got: str, hint: str, **more: Any) -> Refusal:
+    """Return (not raise) the refusal of an input, its sentence made of both sides and the hint."""
+    detail = f"{field}: expected {expected}, got {got}. {hint}"
+    return Refusal(code, detail=detail, field=field, expected=expected, got=got, hint=hint, **more)
+
+
+def answer(
+    code: ProblemCode,
+    *,
+    detail: str,
+    headers: Mapping[str, str] | None = None,
+    status: int | None = None,
+    **members: Any,
+) -> ProblemResponse:
+    """Return the response for a code.
 
     Parameters
     ----------
-    status : int
-        HTTP status code.
-    code : str
-        Stable machine-readable name.
+    code : ProblemCode
+        Stable machine-readable name; gives type, title and, unless `status` is given, the status.
     detail : str
         A whole sentence that ends with what to do.
-    **said
+    headers : mapping of str to str, optional
+        Further response headers.
+    status : int, optional
+        HTTP status code.
+    **members
         Further members of `Problem`.
     """
-    said.setdefault("retryable", status in RETRYABLE)
-    return Problem(title=HTTPStatus(status).phrase, status=status, code=code, detail=detail, **said)
+    return ProblemResponse(problem(code, status or code.status or 500, detail=detail, **members), headers=headers)
 
 
-def answer(what: Problem, *, headers: Mapping[str, str] | None = None) -> Response:
-    """Return the response that carries a problem; members that say nothing are left out."""
-    return Response(
-        what.model_dump_json(exclude_none=True),
-        status_code=what.status,
-        headers=dict(headers or {}),
-        media_type=MEDIA_TYPE,
-    )
+def problem(code: str, status: int, *, detail: str, **members: Any) -> Problem:
+    """Return a `Problem`; its type is the address that explains the code, its title the code's own."""
+    known = find_code(code)
+    title = HTTPStatus(status).phrase if known is None else known.heading
+    members.setdefault("retryable", status in RETRYABLE_STATUSES)
+    members.setdefault("type", type_of(code))
+    return Problem(title=title, status=status, code=code, detail=detail, **members)
 
 
 def from_error(error: Exception, status: int) -> Problem:
-    """Return the problem of one of our errors: its own code, field, expected, got, hint and choices where it has them.
+    """Return the problem of a worker's or reader's error, with its code, field, expected, got, hint and choices.
 
     Parameters
     ----------
     error : Exception
         An error with at least a ``code`` attribute.
     status : int
-        What the table gives for its class.
+        Status code of its class.
     """
-    said = {name: getattr(error, name, None) for name in ("field", "expected", "got", "hint", "choices")}
-    return problem(status, str(getattr(error, "code", "internal_error")), detail=str(error), **said)
+    members = {name: getattr(error, name, None) for name in ("field", "expected", "got", "hint", "choices")}
+    return problem(str(getattr(error, "code", ProblemCode.INTERNAL_ERROR)), status, detail=str(error), **members)
 
 
-def from_validation(errors: Sequence[Any], *, prefix: str) -> Problem:
-    """Return the problem of values that pydantic refused: the first fault in full, the others counted.
+def from_validation(errors: Sequence[Any], *, options: bool = False) -> Refusal:
+    """Return the refusal of values that pydantic rejected: the first fault in full, the others counted.
 
     Parameters
     ----------
     errors : sequence of dict
         `ValidationError.errors()`.
-    prefix : str
-        Where the values stood, e.g. ``"options"``; put before the field's name.
+    options : bool
+        True if the values are the options of a job, not parameters of the request.
     """
     first = errors[0]
     where = [str(part) for part in first["loc"] if part not in ("body", "query", "path", "header")]
-    field = ".".join([prefix, *where] if prefix else where) or prefix or "request"
-    unknown = first["type"] == "extra_forbidden"
-    expected = "a name listed at /v1/options" if unknown else first["msg"]
-    got = f"the unknown name {where[-1]!r}" if unknown else _short(first.get("input"))
-    others = f" {len(errors) - 1} further fault(s) follow." if len(errors) > 1 else ""
-    return problem(
-        422,
-        f"unknown_{prefix.removesuffix('s')}" if unknown else f"invalid_{prefix.removesuffix('s') or 'request'}",
-        detail=f"{field}: expected {expected}, got {got}.{others} The schema is at /v1/options.",
+    field = ".".join(["options", *where] if options else where) or ("options" if options else "request")
+    unknown = options and first["type"] == "extra_forbidden"
+    code = (
+        ProblemCode.UNKNOWN_OPTION
+        if unknown
+        else ProblemCode.INVALID_OPTION
+        if options
+        else ProblemCode.INVALID_REQUEST
+    )
+    others = f" {len(errors) - 1} further error(s) follow." if len(errors) > 1 else ""
+    source = "/v1/options" if options else "/docs"
+    return wrong_input(
+        code,
         field=field,
-        expected=expected,
-        got=got,
-        hint="Compare with the schema at /v1/options.",
+        expected="a name listed at /v1/options" if unknown else first["msg"],
+        got=(f"the unknown name {where[-1]!r}" if unknown else _short(first.get("input"))),
+        hint=f"Compare with the schema at {source}.{others}",
     )
 
 
 def _short(value: object) -> str:
-    """Return a value as a person may see it, never more than 80 characters of a stranger's text."""
+    """Return a value's text, cut to 80 characters."""
     text = repr(value)
     return text if len(text) <= 80 else text[:77] + "…"
 
 
-def install(app: FastAPI, table: Mapping[type[Exception], int], *, careful: Mapping[str, str]) -> None:
-    """Make every error of the app a problem.
+def install(app: FastAPI, table: Mapping[type[Exception], int], *, security_headers: Mapping[str, str]) -> None:
+    """Answer every error of the app with a problem document.
 
     Parameters
     ----------
     app : FastAPI
         The application.
     table : mapping of exception class to int
-        Status code by class; a subclass not named takes its nearest base's.
-    careful : mapping of str to str
-        Headers of the answer to a defect, which is made outside all middleware.
+        Status code by class; a subclass that is not listed uses its nearest base's.
+    security_headers : mapping of str to str
+        Headers of the answer to an unexpected exception, which is made outside all middleware.
     """
 
     async def refused(_: Request, error: Exception) -> Response:
         assert isinstance(error, Refusal)
-        return answer(problem(error.status, error.code, detail=error.detail, **error.said), headers=error.headers)
+        return ProblemResponse(
+            problem(error.code, error.status, detail=error.detail, **error.members), headers=error.headers
+        )
 
     async def of_ours(_: Request, error: Exception) -> Response:
         status = next(table[base] for base in type(error).__mro__ if base in table)
+        if status >= 500:
+            _log.error("%s: %s", type(error).__name__, error, exc_info=error if status == 500 else None)
         after = getattr(error, "retry_after", None)
-        return answer(from_error(error, status), headers=None if after is None else {"Retry-After": str(after)})
+        headers = None if after is None else {"Retry-After": str(after)}
+        return ProblemResponse(from_error(error, status), headers=headers)
 
     async def of_http(_: Request, error: Exception) -> Response:
         assert isinstance(error, HTTPException)
-        code, detail = _SAID_BY_STATUS.get(error.status_code, ("http_error", f"{error.detail}. See /docs."))
-        return answer(problem(error.status_code, code, detail=detail), headers=error.headers)
+        usual = (ProblemCode.HTTP_ERROR, f"{error.detail}. See /docs.")
+        code, detail = _BY_STATUS.get(error.status_code, usual)
+        return answer(code, detail=detail, status=error.status_code, headers=error.headers)
 
-    async def of_validation(_: Request, error: Exception) -> Response:
+    async def of_validation(request: Request, error: Exception) -> Response:
         assert isinstance(error, (RequestValidationError, ValidationError))
-        return answer(from_validation(error.errors(), prefix=""))
+        return await refused(request, from_validation(error.errors()))
 
     async def of_disk(request: Request, error: Exception) -> Response:
         assert isinstance(error, OSError)
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):
             return await unforeseen(request, error)
         _log.error("the data volume is full: %s", error)
-        detail = (
-            "The service has no room on its disk; nothing was kept. Try later, or ask whoever runs it to free space."
-        )
-        return answer(problem(507, "storage_full", detail=detail))
+        detail = "The service's disk is full; nothing was kept. Try later, or ask the operator to free space."
+        return answer(ProblemCode.STORAGE_FULL, detail=detail)
 
     async def unforeseen(request: Request, error: Exception) -> Response:
         # Starlette raises it again after this answer, so the server's log has the traceback; the client never sees it.
-        _log.error("unforeseen %s at %s %s", type(error).__name__, request.method, request.url.path)
-        code, detail = _SAID_BY_STATUS[500]
-        return answer(problem(500, code, detail=detail), headers={**careful, "Cache-Control": "no-store"})
+        _log.error("unexpected %s in %s %s", type(error).__name__, request.method, request.url.path)
+        code, detail = _BY_STATUS[500]
+        kept: dict[str, str] = request.scope.get("pliant.log", {})
+        own = {"X-Request-ID": kept["request_id"]} if "request_id" in kept else {}
+        return answer(code, detail=detail, headers={**security_headers, **own, "Cache-Control": "no-store"})
 
     app.add_exception_handler(Refusal, refused)
     app.add_exception_handler(HTTPException, of_http)

@@ -1,93 +1,103 @@
-"""How the service runs: one frozen record, read from the environment by hand, never on import."""
+"""Settings of the service: one frozen record, read from the environment, a `.env` file or secret files, never on import."""
 
 from __future__ import annotations
 
 import ipaddress
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import os
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 MB = 2**20
 
 USUAL_RATE = 1200
 """Requests in a minute: twenty a second, with a minute's worth at once."""
 
+SECRETS = "/run/secrets"
+"""Folder of secret files, as Docker and Kubernetes mount them, unless PLIANT_SECRETS_DIR names another one."""
+
 Auth = Literal["auto", "required", "off"]
+LogLevel = Literal["debug", "info", "warning", "error"]
+LogFormat = Literal["console", "json"]
 
 
 class InvalidServiceSetting(ValueError):
-    """An environment variable does not say what it must."""
+    """An environment variable has a value that is not allowed."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class ServiceSettings:
-    """Everything a person running the service may choose; the variable that sets it stands behind each."""
+def _split(given: object) -> object:
+    """Read a comma-separated list."""
+    return tuple(part.strip() for part in given.split(",") if part.strip()) if isinstance(given, str) else given
+
+
+Listed = Annotated[tuple[str, ...], NoDecode, BeforeValidator(_split)]
+
+
+class ServiceSettings(BaseModel):
+    """How the service runs. A field NAME is read from the variable PLIANT_NAME, except where its text says otherwise."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
 
     host: str = "127.0.0.1"
     """Address to bind (PLIANT_HOST)."""
-    port: int = 8000
+    port: int = Field(8000, ge=0, le=65535)
     """TCP port to bind; 0 takes a free one (PLIANT_PORT)."""
-    incoming: Path = field(default_factory=lambda: Path("pliant-data") / "incoming")
-    """Where bodies are written while they arrive, on the data volume (PLIANT_DATA, its folder `incoming`)."""
-    max_body_bytes: int = 2048 * MB
-    """Largest body of one request, in bytes; the variable is in MiB (PLIANT_MAX_BODY_MB)."""
-    max_text_bytes: int = 1 * MB
-    """Largest text field of a form, or whole JSON body, in bytes."""
-    max_queued: int = 1000
-    """Jobs of one token that may wait at once, unless the token has a limit of its own; 0: any number. Where tokens are off,
-    all jobs count as one token's (PLIANT_MAX_QUEUED)."""
-    requests_per_minute: int | None = None
-    """Requests per minute of one token, or of one address where tokens are off; 0: any number; not set: 1,200 where
-    the service is not on the loopback address or requires tokens, any number elsewhere (PLIANT_REQUESTS_PER_MINUTE)."""
-    parsers: int = 2
-    """How many bodies are parsed at once; each may hold a whole input in memory (PLIANT_PARSERS)."""
-    stall_seconds: float = 60.0
-    """How long a client may send nothing of a body it has begun, in seconds."""
-    max_wait_seconds: int = 60
-    """Longest `Prefer: wait=n` that is honoured, in seconds."""
-    heartbeat_seconds: float = 15.0
-    """Pause after which an event stream says that it is still there, in seconds."""
-    allowed_hosts: tuple[str, ...] = ()
-    """Values of the Host header that are answered, commas between them (PLIANT_ALLOWED_HOSTS). Empty: on the
-    loopback address its usual names, on another address any."""
+    incoming: Path = Path("pliant-data") / "incoming"
+    """Folder of request bodies that are still arriving: `incoming` inside PLIANT_DATA."""
+    max_body_bytes: int = Field(2048 * MB, ge=1)
+    """Largest body of one request, in bytes (PLIANT_MAX_BODY_MB, in MiB)."""
+    max_text_bytes: int = Field(1 * MB, ge=1)
+    """Largest text field of a form, or whole JSON body, in bytes (PLIANT_MAX_TEXT_BYTES)."""
+    max_queued: int = Field(1000, ge=0, le=10**7)
+    """Queued jobs of one token, unless the token has a limit of its own; 0: no limit. Where tokens are off, all jobs count as
+    one token's (PLIANT_MAX_QUEUED)."""
+    requests_per_minute: int | None = Field(None, ge=0, le=10**7)
+    """Requests per minute of one token, or of one address where tokens are off; 0: no limit; None: `USUAL_RATE` where the
+    service is not on the loopback address or requires tokens, no limit elsewhere (PLIANT_REQUESTS_PER_MINUTE)."""
+    parsers: int = Field(2, ge=1, le=64)
+    """Bodies that are parsed at once; each may hold a whole input in memory (PLIANT_PARSERS)."""
+    stall_seconds: float = Field(60.0, gt=0)
+    """Seconds without a byte of an unfinished body after which the request is refused (PLIANT_STALL_SECONDS)."""
+    max_wait_seconds: int = Field(60, ge=0)
+    """Longest `Prefer: wait=n` that is honoured, in seconds (PLIANT_MAX_WAIT_SECONDS)."""
+    heartbeat_seconds: float = Field(15.0, gt=0)
+    """Pause after which an event stream sends a comment line, in seconds (PLIANT_HEARTBEAT_SECONDS)."""
+    allowed_hosts: Listed = ()
+    """Values of the Host header that are answered, separated by commas (PLIANT_ALLOWED_HOSTS). Empty: on the loopback address
+    its usual names, on another address any."""
     auth: Auth = "auto"
-    """Whether a request needs a token: `required`, `off`, or `auto`, which is off on the loopback address and required on
-    any other (PLIANT_AUTH)."""
-    cors_origins: tuple[str, ...] = ()
-    """Origins whose pages may call the service, commas between them; empty: none (PLIANT_CORS_ORIGINS)."""
+    """Whether a request needs a token: `required`, `off`, or `auto`, which is off on the loopback address and required on any
+    other (PLIANT_AUTH)."""
+    cors_origins: Listed = ()
+    """Origins whose pages may call the service, separated by commas; empty: none (PLIANT_CORS_ORIGINS)."""
+    log_level: LogLevel = "info"
+    """Least level that is logged (PLIANT_LOG_LEVEL)."""
+    log_format: LogFormat = "console"
+    """`console` for people, `json` for one JSON object a line (PLIANT_LOG_FORMAT)."""
 
     @classmethod
-    def from_environment(cls, env: Mapping[str, str]) -> ServiceSettings:
-        """Read the settings.
+    def from_environment(cls) -> ServiceSettings:
+        """Read the environment first, then `.env` in the working directory, then the folder of secret files.
 
-        Parameters
-        ----------
-        env : mapping of str to str
-            Usually `os.environ`. Names that begin otherwise than with ``PLIANT_`` are not looked at.
+        An empty variable counts as unset.
 
         Raises
         ------
         InvalidServiceSetting
-            A number is not a number, or out of its range, or a word is none of those expected.
+            A value does not parse or is out of its range.
         """
-        return cls(
-            host=env.get("PLIANT_HOST", cls.host),
-            port=_whole(env, "PLIANT_PORT", default=cls.port, least=0, most=65535),
-            incoming=Path(env.get("PLIANT_DATA", "pliant-data")) / "incoming",
-            max_body_bytes=_whole(env, "PLIANT_MAX_BODY_MB", default=cls.max_body_bytes // MB, least=1, most=2**20)
-            * MB,
-            max_queued=_whole(env, "PLIANT_MAX_QUEUED", default=cls.max_queued, least=0, most=10**7),
-            requests_per_minute=(
-                _whole(env, "PLIANT_REQUESTS_PER_MINUTE", default=0, least=0, most=10**7)
-                if env.get("PLIANT_REQUESTS_PER_MINUTE")
-                else None
-            ),
-            parsers=_whole(env, "PLIANT_PARSERS", default=cls.parsers, least=1, most=64),
-            auth=_auth(env),
-            allowed_hosts=_listed(env, "PLIANT_ALLOWED_HOSTS"),
-            cors_origins=_listed(env, "PLIANT_CORS_ORIGINS"),
-        )
+        folder = os.environ.get("PLIANT_SECRETS_DIR") or SECRETS
+        try:
+            found = _Environment(_secrets_dir=folder if Path(folder).is_dir() else None)
+        except ValidationError as error:
+            first = error.errors()[0]
+            name = f"PLIANT_{str(first['loc'][0]).upper()}"
+            raise InvalidServiceSetting(f"{name}: {first['msg']}, got {first['input']!r}. Correct it.") from None
+        given: dict[str, Any] = {name: getattr(found, name) for name in ServiceSettings.model_fields}
+        given |= {"max_body_bytes": int(found.max_body_mb * MB), "incoming": found.data / "incoming"}
+        return cls(**given)
 
     @property
     def asks_for_tokens(self) -> bool:
@@ -95,12 +105,12 @@ class ServiceSettings:
         return self.auth == "required" or (self.auth == "auto" and not self.loopback)
 
     def rate_of(self, own: int | None) -> int:
-        """Return the requests in a minute that are allowed, 0 for any number.
+        """Return the allowed requests per minute, 0 for no limit.
 
         Parameters
         ----------
         own : int or None
-            What the token says.
+            The token's own limit.
         """
         if own is not None:
             return own
@@ -119,27 +129,12 @@ class ServiceSettings:
             return False
 
 
-def _whole(env: Mapping[str, str], name: str, *, default: int, least: int, most: int) -> int:
-    """Return an environment variable as a whole number in [least, most]."""
-    text = env.get(name, "")
-    if not text:
-        return default
-    if not text.isascii() or not text.isdigit() or not least <= int(text) <= most:
-        raise InvalidServiceSetting(
-            f"{name}: expected a whole number from {least} to {most}, got {text!r}. Correct it."
-        )
-    return int(text)
+class _Environment(BaseSettings, ServiceSettings):
+    """The same fields as they are spelled in the environment, where two have another unit or meaning."""
 
+    model_config = SettingsConfigDict(
+        env_prefix="PLIANT_", env_ignore_empty=True, env_file=".env", extra="ignore", frozen=True
+    )
 
-def _auth(env: Mapping[str, str]) -> Auth:
-    """Return PLIANT_AUTH."""
-    text = env.get("PLIANT_AUTH", "") or "auto"
-    for word in get_args(Auth):
-        if text == word:
-            return word  # type: ignore[no-any-return]
-    raise InvalidServiceSetting(f"PLIANT_AUTH: expected one of {', '.join(get_args(Auth))}, got {text!r}. Correct it.")
-
-
-def _listed(env: Mapping[str, str], name: str) -> tuple[str, ...]:
-    """Return a comma-separated environment variable as its parts."""
-    return tuple(part.strip() for part in env.get(name, "").split(",") if part.strip())
+    data: Path = Path("pliant-data")
+    max_body_mb: float = Field(2048.0, ge=1, le=2**20)

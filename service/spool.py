@@ -1,7 +1,7 @@
-"""The folder where bodies lie while they arrive, and nothing afterwards.
+"""The spool: a folder for request bodies while they arrive, empty afterwards; and the slots in which they are parsed.
 
-Each process owns one sub-folder beside a locked file; each request gets a room of its own in it, removed when the request
-ends however it ends. What a killed process left behind is known by its free lock and swept by the next one that starts.
+Each process owns one sub-folder and locks a file beside it; each request gets a scratch directory in it, removed when the
+request ends. The next process that starts removes sub-folders of killed processes, recognized by their free lock.
 """
 
 from __future__ import annotations
@@ -11,13 +11,21 @@ import os
 import secrets
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections import Counter, OrderedDict, deque
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
+from typing import TypeVar
+
+import anyio
+from anyio import to_thread
+
+Answer = TypeVar("Answer")
 
 
 class Incoming:
-    """One process's share of the incoming folder; `open` it, `close` it.
+    """One process's share of the spool; `open` it, `close` it.
 
     Attributes
     ----------
@@ -31,14 +39,14 @@ class Incoming:
         self._lock = -1
 
     def open(self) -> None:
-        """Take a sub-folder and sweep those of processes that are gone."""
+        """Create a sub-folder and remove those of processes that have ended."""
         self.directory.mkdir(parents=True, exist_ok=True)
         while self._own is None:
             name = secrets.token_hex(8)
             lock = self.directory / f"{name}.lock"
             descriptor = os.open(lock, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
             fcntl.flock(descriptor, fcntl.LOCK_EX)
-            # Another process may have swept the file in the moment before it was locked; then it has no name any more.
+            # Another process may have removed the file just before it was locked; then it has no name any more.
             if os.fstat(descriptor).st_nlink == 0:
                 os.close(descriptor)
                 continue
@@ -56,14 +64,14 @@ class Incoming:
         self._own, self._lock = None, -1
 
     @contextmanager
-    def room(self) -> Iterator[Path]:
-        """Give a new empty folder, and remove it with all that is in it when the block ends."""
+    def scratch(self) -> Iterator[Path]:
+        """Create an empty scratch directory, and remove it with its contents when the block ends."""
         assert self._own is not None, "open() comes first"
         with tempfile.TemporaryDirectory(dir=self._own, prefix="", ignore_cleanup_errors=True) as path:
             yield Path(path)
 
     def abandoned(self) -> list[str]:
-        """Name the sub-folders whose process is gone, which the next one that starts will sweep."""
+        """Return the sub-folders of ended processes, which the next process that starts will remove."""
         found = []
         for lock in sorted(self.directory.glob("*.lock")):
             with suppress(FileNotFoundError, BlockingIOError), lock.open("rb") as held:
@@ -72,13 +80,13 @@ class Incoming:
         return found
 
     def _sweep(self) -> None:
-        """Remove the sub-folders whose process is gone, which is to say whose lock is free."""
+        """Remove the sub-folders of ended processes, whose lock is free."""
         for lock in self.directory.glob("*.lock"):
             if self._own is not None and lock.stem == self._own.name:
                 continue
             try:
                 descriptor = os.open(lock, os.O_RDWR | os.O_CLOEXEC)
-            except FileNotFoundError:  # its process has just ended in good order
+            except FileNotFoundError:  # its process has just ended normally
                 continue
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -88,3 +96,63 @@ class Incoming:
                 pass
             finally:
                 os.close(descriptor)
+
+
+class ParserSlots:
+    """Runs calls on threads, so many at once. A slot that becomes free goes to the waiting owner that holds the fewest.
+
+    Parameters
+    ----------
+    total : int
+        Calls at once.
+    """
+
+    def __init__(self, total: int) -> None:
+        self._free = total
+        self._limiter = anyio.CapacityLimiter(total)
+        self._held: Counter[str] = Counter()
+        self._waiting: OrderedDict[str, deque[anyio.Event]] = OrderedDict()
+
+    async def run(self, owner: str, call: Callable[..., Answer], *arguments: object) -> Answer:
+        """Return what the call returns, once a slot is free for its owner."""
+        await self._take(owner)
+        try:
+            return await to_thread.run_sync(partial(call, *arguments), limiter=self._limiter)
+        finally:
+            self._give_back(owner)
+
+    async def _take(self, owner: str) -> None:
+        if self._free > 0:
+            self._free -= 1
+            self._held[owner] += 1
+            return
+        granted = anyio.Event()
+        self._waiting.setdefault(owner, deque()).append(granted)
+        try:
+            await granted.wait()
+        except BaseException:
+            if granted.is_set():
+                self._give_back(owner)
+            else:
+                self._leave(owner, granted)
+            raise
+
+    def _give_back(self, owner: str) -> None:
+        self._held[owner] -= 1
+        if not self._held[owner]:
+            del self._held[owner]
+        if not self._waiting:
+            self._free += 1
+            return
+        following = min(self._waiting, key=lambda each: self._held[each])  # of equals the first to have come
+        granted = self._waiting[following][0]
+        self._leave(following, granted)
+        if following in self._waiting:
+            self._waiting.move_to_end(following)
+        self._held[following] += 1
+        granted.set()
+
+    def _leave(self, owner: str, granted: anyio.Event) -> None:
+        self._waiting[owner].remove(granted)
+        if not self._waiting[owner]:
+            del self._waiting[owner]

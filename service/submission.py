@@ -1,4 +1,4 @@
-"""From a received form to an accepted job: read, check, store in canonical form, submit. Nothing is queued before all of it held."""
+"""From a received form to a queued job: read, validate, store in canonical form, submit. Nothing is queued before all checks pass."""
 
 from __future__ import annotations
 
@@ -8,27 +8,29 @@ from typing import Any
 
 from pliant.schemas.job import Interpretation, Job
 from pliant.schemas.options import Options
+from pliant.schemas.problems import ProblemCode
 from pliant.service.multipart import File, Form, FormRules
-from pliant.service.problems import Refusal, from_validation
+from pliant.service.problems import Refusal, from_validation, wrong_input
 from pliant.service.settings import ServiceSettings
 from pliant.worker.artifacts import kinds_for
 from pliant.worker.errors import Conflict, UnknownUpload
 from pliant.worker.formats import Limits, store_inputs
 from pliant.worker.jobs.service import Jobs
+from pliant.worker.jobs.submission import Submission
 from pliant.worker.uploads.service import Uploads
 from pliant.worker.webhooks.message import parse_webhook
 from pydantic import ValidationError
 
 FILES = frozenset({"tracks", "mesh", "ground_truth", "rotations"})
 UPLOADS = {f"{part}_upload": part for part in sorted(FILES)}
-"""Texts that name an upload, and the part that it stands for."""
+"""Text parts that name an upload, and the part that each stands for."""
 TEXTS = frozenset({"mesh", "options", "name", "webhook", "webhook_secret", *UPLOADS})
 LONGEST_NAME = 200
 """Characters of the user's label."""
 
 
 def form_rules(settings: ServiceSettings, *, max_body_bytes: int) -> FormRules:
-    """Return what the form of a job may hold; `max_body_bytes` is what whoever asks may send."""
+    """Return what the form of a job may hold; `max_body_bytes` is the limit of the request's token."""
     return FormRules(
         files=FILES,
         texts=TEXTS,
@@ -40,7 +42,7 @@ def form_rules(settings: ServiceSettings, *, max_body_bytes: int) -> FormRules:
 
 def accept(
     form: Form,
-    room: Path,
+    folder: Path,
     *,
     jobs: Jobs,
     uploads: Uploads,
@@ -53,31 +55,31 @@ def accept(
     Parameters
     ----------
     form : Form
-        What arrived.
-    room : Path
-        Where to write the canonical inputs; removed by whoever made it.
+        The received form.
+    folder : Path
+        Where to write the canonical inputs; removed by the caller.
     jobs : Jobs
-        The jobs of whoever asks.
+        The jobs of the request's token.
     uploads : Uploads
-        The uploads of whoever asks; the form may name them.
+        The uploads of the request's token; the form may name them.
     limits : Limits
-        What the readers accept.
+        Largest inputs that the readers accept.
     id, idempotency_key : str, optional
-        The client's own id, and the key of a request that may be repeated.
+        The client's own id, and the idempotency key.
 
     Returns
     -------
     job : Job
-        The job, new or the one that the same request made before.
+        The new job, or the one that the same request created before.
     new : bool
-        False if it was made before.
+        False if an earlier request created it.
 
     Raises
     ------
     Refusal, InvalidInput, WorkerError
-        Nothing is queued then.
+        Nothing is queued.
     """
-    form = with_uploads(form, room, uploads)
+    form = with_uploads(form, folder, uploads)
     options = parse_options(form.texts.get("options", ""))
     name = _name(form.texts.get("name", ""))
     webhook = parse_webhook(
@@ -85,56 +87,60 @@ def accept(
         form.texts.get("webhook_secret", "").strip(),
         networks=jobs.settings.webhook_networks,
     )
-    known = jobs.known(id=id, idempotency_key=idempotency_key, fingerprint=form.fingerprint)
-    if known is not None:
-        return known, False
-    canonical = room / "canonical.npz"
-    interpretation = read_form(form, options, limits, target=canonical)
-    job = jobs.submit(
-        canonical,
+    submission = Submission(
         options=options,
-        interpretation=interpretation,
         name=name,
         id=id,
         idempotency_key=idempotency_key,
         fingerprint=form.fingerprint,
         webhook=webhook,
     )
+    known = jobs.known(submission)
+    if known is not None:
+        return known, False
+    canonical = folder / "canonical.npz"
+    interpretation = read_form(form, options, limits, target=canonical)
+    job = jobs.submit(canonical, submission, interpretation=interpretation)
     return job, True
 
 
-def with_uploads(form: Form, room: Path, uploads: Uploads) -> Form:
-    """Return the form with the uploads that it names as files; the same content is the same form by either road.
+def with_uploads(form: Form, folder: Path, uploads: Uploads) -> Form:
+    """Return the form with the uploads that it names as files; the same content gives the same form either way.
 
     Raises
     ------
     Refusal
-        There is no such upload, it is not whole, or the form carries the part as well.
+        There is no such upload, it is not complete, or the form contains the part as well.
     """
     files, texts = dict(form.files), dict(form.texts)
     for name, part in UPLOADS.items():
         if name not in form.texts:
             continue
-        id, path = texts.pop(name).strip(), room / name
+        id, path = texts.pop(name).strip(), folder / name
         if part in files or part in texts:
-            raise _unfit(
-                "repeated_part", name, expected=f"either {part} or {name}", got="both", hint="Leave one of them out."
+            raise wrong_input(
+                ProblemCode.REPEATED_PART,
+                field=name,
+                expected=f"either {part} or {name}",
+                got="both",
+                hint="Leave one of them out.",
             )
         try:
             digest = uploads.take(id, path)
         except UnknownUpload as error:
             hint = f"PUT it to /v1/uploads/{id[:64]} first; uploads that are not used expire."
-            raise _unfit(error.code, name, expected="the id of an upload", got=repr(id[:80]), hint=hint) from error
+            code = ProblemCode[error.code.upper()]
+            raise wrong_input(
+                code, field=name, status=422, expected="the id of an upload", got=repr(id[:80]), hint=hint
+            ) from error
         except Conflict as error:
-            hint = "Send the rest of it first, from the offset that HEAD tells."
-            raise _unfit(error.code, name, expected="an upload that is whole", got="a part of it", hint=hint) from error
+            hint = "Send the rest first, from the offset that HEAD returns."
+            code = ProblemCode[error.code.upper()]
+            raise wrong_input(
+                code, field=name, status=422, expected="a complete upload", got="a part of it", hint=hint
+            ) from error
         files[part] = File(path, path.stat().st_size, digest)
     return Form(files=files, texts=texts)
-
-
-def _unfit(code: str, field: str, *, expected: str, got: str, hint: str) -> Refusal:
-    detail = f"{field}: expected {expected}, got {got}. {hint}"
-    return Refusal(422, code, detail=detail, field=field, expected=expected, got=got, hint=hint)
 
 
 def read_form(form: Form, options: Options, limits: Limits, *, target: Path | None) -> Interpretation:
@@ -147,7 +153,7 @@ def read_form(form: Form, options: Options, limits: Limits, *, target: Path | No
     """
     if "tracks" not in form.files:
         raise missing("tracks")
-    kinds_for(options)  # refuses what this installation cannot write
+    kinds_for(options)  # refuses outputs that this installation cannot write
     files: dict[str, Path | str | None] = {part: file.path for part, file in form.files.items()}
     if form.texts.get("mesh", "").strip():
         files["mesh"] = form.texts["mesh"].strip()
@@ -155,10 +161,9 @@ def read_form(form: Form, options: Options, limits: Limits, *, target: Path | No
 
 
 def missing(part: str) -> Refusal:
-    """Return the refusal of a form without a part that it must have."""
+    """Return the refusal of a form without a required part."""
     hint = f"Add the part, as in curl's -F {part}=@{part}.npz."
-    detail = f"{part}: expected a file, got none. {hint}"
-    return Refusal(422, "missing_part", detail=detail, field=part, expected="a file", got="none", hint=hint)
+    return wrong_input(ProblemCode.MISSING_PART, field=part, expected="a file", got="none", hint=hint)
 
 
 def parse_options(text: str) -> Options:
@@ -167,7 +172,7 @@ def parse_options(text: str) -> Options:
     Raises
     ------
     Refusal
-        It is no JSON object, names an option that there is not, or a value is out of its range.
+        It is no JSON object, names an unknown option, or a value is out of range.
     """
     if not text.strip():
         return Options()
@@ -180,22 +185,19 @@ def parse_options(text: str) -> Options:
     try:
         return Options.model_validate(given)
     except ValidationError as error:
-        said = from_validation(error.errors(), prefix="options").model_dump(exclude_none=True)
-        refused = {key: said[key] for key in ("field", "expected", "got", "hint")}
-        raise Refusal(422, said["code"], detail=said["detail"], **refused) from None
+        raise from_validation(error.errors(), options=True) from None
 
 
 def _not_an_object(got: str) -> Refusal:
     hint = 'For example {"method": "robust"}; the schema is at /v1/options.'
-    detail = f"options: expected a JSON object, got {got}. {hint}"
-    return Refusal(422, "invalid_option", detail=detail, field="options", expected="a JSON object", got=got, hint=hint)
+    return wrong_input(ProblemCode.INVALID_OPTION, field="options", expected="a JSON object", got=got, hint=hint)
 
 
 def _name(text: str) -> str:
-    """Return the user's label, its blanks and control characters made single spaces."""
+    """Return the user's label with runs of blanks and control characters replaced by single spaces."""
     name = " ".join("".join(sign if sign.isprintable() else " " for sign in text).split())
     if len(name) > LONGEST_NAME:
-        expected, got, hint = f"at most {LONGEST_NAME} characters", str(len(name)), "Shorten it."
-        detail = f"name: expected {expected}, got {got}. {hint}"
-        raise Refusal(422, "name_too_long", detail=detail, field="name", expected=expected, got=got, hint=hint)
+        expected = f"at most {LONGEST_NAME} characters"
+        code = ProblemCode.NAME_TOO_LONG
+        raise wrong_input(code, field="name", expected=expected, got=str(len(name)), hint="Shorten it.")
     return name

@@ -1,7 +1,7 @@
-"""One request at a time may write to a thing, and it is the latest.
+"""Upload locks: one request at a time writes to an upload, and the newest wins.
 
-A client that comes back after its connection broke must not wait until the service notices that the old one is dead, which can
-take minutes: the newcomer stops it.
+A client that reconnects must not wait until the service notices that its old connection is dead, which can take minutes, so
+the new request stops the old one.
 """
 
 from __future__ import annotations
@@ -11,34 +11,35 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 
 import anyio
+from pliant.schemas.problems import ProblemCode
 from pliant.service.problems import Refusal
 
 
 @dataclass(frozen=True)
-class _Turn:
+class _Lock:
     scope: anyio.CancelScope = field(default_factory=anyio.CancelScope)
     ended: anyio.Event = field(default_factory=anyio.Event)
 
 
-class Turns:
-    """Who writes to what in this process."""
+class UploadLocks:
+    """The uploads that requests of this process write to."""
 
     def __init__(self) -> None:
-        self._held: dict[Hashable, _Turn] = {}
+        self._held: dict[Hashable, _Lock] = {}
 
     @asynccontextmanager
     async def take(self, what: Hashable) -> AsyncIterator[None]:
-        """Hold `what` within the block; whoever held it is stopped first.
+        """Hold the lock of `what` within the block; the request that holds it now is stopped first.
 
         Raises
         ------
         Refusal
-            409: another request took it over.
+            409: a newer request took the lock.
         """
         while (before := self._held.get(what)) is not None:
             before.scope.cancel()
             await before.ended.wait()
-        mine = self._held[what] = _Turn()
+        mine = self._held[what] = _Lock()
         try:
             with mine.scope:
                 yield
@@ -46,5 +47,5 @@ class Turns:
             del self._held[what]
             mine.ended.set()
         if mine.scope.cancelled_caught:
-            detail = "Another request writes to the same upload. Ask for its offset before you go on."
-            raise Refusal(409, "upload_taken_over", detail=detail)
+            detail = "A newer request writes to the same upload. Ask for its offset before you continue."
+            raise Refusal(ProblemCode.UPLOAD_TAKEN_OVER, detail=detail)

@@ -10,10 +10,12 @@ import numpy as np
 from pliant.solver.cameras.estimation import CameraEstimate, estimate_cameras, given_cameras
 from pliant.solver.cameras.joint_refinement import LEARNED_FRAMES, learn, telling_frames
 from pliant.solver.cameras.planar_ambiguity import is_flat
+from pliant.solver.energy.hyperparameters import FINEST
 from pliant.solver.energy.objective import residuals
 from pliant.solver.energy.problem import Problem
 from pliant.solver.energy.robust_loss import largest_weight
 from pliant.solver.errors import InvalidInput
+from pliant.solver.evaluation.trust import assess
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.monitor import Monitor
 from pliant.solver.records import (
@@ -37,6 +39,7 @@ from pliant.solver.shapes.outlier_rejection import without_outliers
 from pliant.solver.shapes.setup import build_problem, with_bending
 from pliant.solver.shapes.sparsely_observed import SELDOM, OftenSeen, draw_the_rest, often_seen
 from pliant.solver.shapes.state import State
+from pliant.solver.shapes.uncertainty import bounded_by_neighbours, position_std
 from pliant.solver.tracks.completion import seen_again
 from pliant.solver.tracks.noise import SPOILED
 from pliant.solver.tracks.normalization import Normalised, normalise
@@ -130,6 +133,7 @@ def solve(
     solution = finish(
         problem, history, outcome, normalised=normalised, estimate=estimate, choices=choices, seconds=seconds
     )
+    solution = assessed(solution, problem, estimate, covariance, normalised.unit, seed=settings.seed)
     seconds["finish"] = time.perf_counter() - began
     tell(_told("finish", history[-1], settings, normalised.unit, fraction=1.0))
     return solution
@@ -319,6 +323,43 @@ def finish(
     for array in arrays:
         read_only(array)
     return Solution(shapes, camera, residual, np.clip(trust, 0.0, 1.0), trace, outcome, choices, seconds)
+
+
+INFLATION = 1.6
+"""Factor from the posterior standard deviation with known cameras and prior to one with estimated ones. Chosen on ten face scans and
+face landmarks, clean and corrupted, whose errors exceed the posterior's 90 % quantile by 1.3 to 2."""
+
+
+def assessed(
+    solution: Solution,
+    problem: Problem,
+    estimate: CameraEstimate,
+    covariance: ShapeCovariance | None,
+    unit: float,
+    *,
+    seed: int,
+) -> Solution:
+    """Return the solution with the standard deviation of its positions and how far to trust it."""
+    std, modes = None, 0
+    confidence = np.asarray(problem.confidence, dtype=np.float64)
+    if covariance is not None:
+        projections = np.asarray(estimate.scales)[:, None, None] * np.asarray(estimate.rotations)[:, :2]
+        noise = max(covariance.noise**0.5, FINEST)
+        std = INFLATION * unit * position_std(covariance, projections, confidence, noise_std=noise, seed=seed)
+        std = bounded_by_neighbours(std, solution.shapes, confidence)
+        modes = covariance.modes.shape[1]
+        read_only(std)
+    trust = assess(
+        solution.shapes,
+        solution.camera.rotations,
+        solution.residuals,
+        confidence,
+        scales=solution.camera.scales,
+        shapes_std=std,
+        planar=is_flat(estimate.gram),
+        modes=modes,
+    )
+    return replace(solution, shapes_std=std, trust=trust)
 
 
 def _start(problem: Problem, estimate: CameraEstimate, settings: Settings) -> State:

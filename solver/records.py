@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import StrEnum
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pliant.solver.errors import InvalidInput
+
+if TYPE_CHECKING:
+    from pliant.solver.evaluation.trust import Trust
 
 MIN_FRAMES = 3
 MIN_POINTS = 4
@@ -356,6 +360,12 @@ class Solution:
     choices: Choices
     seconds: dict[str, float]
     """Wall time per stage."""
+
+    shapes_std: Floats | None = None
+    """Posterior standard deviation of every position, shape `(F, P)`, the unit of the shapes; None where the prior has no posterior."""
+
+    trust: Trust | None = None
+    """Expected error, verdict and its reasons."""
 
 
 def _confidence(visible: ArrayLike | None, shape: tuple[int, int]) -> Floats:

@@ -1,4 +1,4 @@
-"""`python -m pliant.worker [work|keep|audit]`: one worker, one keeper or one audit, set up by the `PLIANT_…` environment."""
+"""`python -m pliant.worker [work|reconcile|fsck]`: one worker, one reconciler or one check, configured by `PLIANT_…` variables."""
 
 from __future__ import annotations
 
@@ -15,14 +15,15 @@ from pliant.worker.errors import WorkerError
 from pliant.worker.execution.rq_worker import PliantWorker
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.maintenance.fsck import findings
-from pliant.worker.maintenance.reconciler import Keeper
+from pliant.worker.maintenance.reconciler import Reconciler
+from pliant.worker.paths import make_data_directory
 from pliant.worker.settings import NUMERICAL_THREADS, Settings
 from pliant.worker.store.connection import BLOCK_WITHIN, connect
 from pliant.worker.store.queue import RedisQueue
 from pliant.worker.store.redis import RedisRecords
-from pliant.worker.webhooks.sender import Postman
+from pliant.worker.webhooks.sender import WebhookSender
 
-USAGE = "usage: python -m pliant.worker [work|keep|audit]"
+USAGE = "usage: python -m pliant.worker [work|reconcile|fsck]"
 
 PRELOADED = ("pliant.worker.formats.canonical", "pliant.worker.execution.pipeline")
 
@@ -34,15 +35,15 @@ def work(settings: Settings) -> int:
     """Take jobs until told to stop.
 
     What a job needs is loaded before the first fork, once for all of them. That is safe as long as this process
-    computes nothing: the numerical library shuts its threads down in the fork and starts them anew in the horse.
+    computes nothing: the numerical library shuts its threads down in the fork and starts them anew in the job process.
     """
     for variable in NUMERICAL_THREADS:
         os.environ.setdefault(variable, "1")
     for module in PRELOADED:
         importlib.import_module(module)
     gc.collect()
-    gc.freeze()  # or every horse's first collection would copy all the pages it shares with us
-    settings.work.mkdir(parents=True, exist_ok=True)
+    gc.freeze()  # or every job process's first collection would copy all the pages it shares with us
+    make_data_directory(settings.data)
     quick = connect(settings.redis, decode=True, retries=0, answer_within=WATCH_ANSWERS_WITHIN)
     connection = connect(settings.redis, decode=False, answer_within=BLOCK_WITHIN)
     PliantWorker(
@@ -55,28 +56,28 @@ def work(settings: Settings) -> int:
     return 0
 
 
-def keep(settings: Settings) -> int:
-    """Look after the jobs until told to stop."""
-    told = False
+def reconcile(settings: Settings) -> int:
+    """Run the reconciler and the webhook sender until a signal."""
+    stopping = False
 
     def stop(signum: int, frame: FrameType | None) -> None:  # noqa: ARG001
-        nonlocal told
-        told = True
+        nonlocal stopping
+        stopping = True
 
     signal.signal(signal.SIGTERM, stop)
     signal.signal(signal.SIGINT, stop)
     jobs = Jobs.open(settings)
-    postman = Postman.open(settings, jobs.records)
-    postman.start()
-    Keeper(jobs=jobs).run(lambda: told or not postman.alive)  # without its postman it ends and is started anew
-    postman.stop()
+    sender = WebhookSender.open(settings, jobs.records)
+    sender.start()
+    Reconciler(jobs=jobs).run(lambda: stopping or not sender.alive)  # without its sender it ends and is restarted
+    sender.stop()
     return 0
 
 
-def audit(settings: Settings) -> int:
-    """Say what of everything stored does not fit the records; return 1 if something does not."""
+def fsck(settings: Settings) -> int:
+    """Print what does not fit the records; return 1 if there is anything."""
     found = findings(Jobs.open(settings))
-    sys.stdout.writelines(f"{finding}\n" for finding in found or ["Everything stored is as the records say."])
+    sys.stdout.writelines(f"{finding}\n" for finding in found or ["Everything stored is as the records state."])
     return 1 if found else 0
 
 
@@ -84,7 +85,7 @@ def main(arguments: list[str]) -> int:
     """Run one process; return its exit code."""
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(processName)s %(name)s %(levelname)s %(message)s")
     logging.getLogger("rq.worker").setLevel(logging.WARNING)
-    tasks = {"work": work, "keep": keep, "audit": audit}
+    tasks = {"work": work, "reconcile": reconcile, "fsck": fsck}
     task = tasks.get(arguments[0] if arguments else "work")
     if task is None or len(arguments) > 1:
         sys.stderr.write(f"{USAGE}\n")

@@ -1,4 +1,4 @@
-"""Where the embedded Valkey of a data directory lives, for those who talk to it and for the one who starts it."""
+"""The data directory, and where its embedded Valkey lives."""
 
 from __future__ import annotations
 
@@ -7,8 +7,24 @@ import os
 import tempfile
 from pathlib import Path
 
+FOLDERS = ("blobs", "incoming", "uploads", "valkey", "work")
+"""Folders of a data directory."""
+
 LONGEST_SOCKET_PATH = 100
 """Bytes; the system's own bound is 107 on Linux and 103 on macOS."""
+
+
+def make_data_directory(data: Path) -> None:
+    """Make the data directory and its folders, readable by their owner alone: they hold everybody's inputs and results.
+
+    A directory that exists keeps its mode, for it may be anything; the folders of ours inside it are closed to others.
+    """
+    data.mkdir(parents=True, exist_ok=True, mode=0o700)
+    for name in FOLDERS:
+        folder = data / name
+        folder.mkdir(exist_ok=True, mode=0o700)
+        if folder.stat().st_uid == os.getuid():
+            folder.chmod(0o700)
 
 
 def valkey_directory(data: Path) -> Path:

@@ -1,20 +1,19 @@
-"""Job records: what is stored of a job, and the store that keeps it, as an interface.
+"""Job records: what is stored of a job, and the interface of the store that keeps it.
 
-The record is the only truth about a job; RQ merely carries its token to a worker. Every change is a compare-and-set
-on the record's version, and every change an attempt makes checks the attempt's token first (`pliant.worker.jobs.lifecycle`).
-An attempt whose job was taken away can therefore write nothing.
+The record is the authority on a job; RQ only carries its attempt id to a worker. Every change is a compare-and-set on the
+record's version, and every change that an attempt makes checks the attempt id first (`pliant.worker.jobs.lifecycle`). An attempt
+whose job was given to another attempt can therefore write nothing.
 """
 
 from __future__ import annotations
 
-import secrets
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from datetime import UTC, datetime
 from typing import NamedTuple
 
 from pliant.schemas.job import Job, Status
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
 EVENTS_KEPT = 256
 """Events of one job that can be read again; older ones are dropped."""
@@ -31,7 +30,7 @@ RUN_SECONDS = (1.0, 2.5, 5.0, 10.0, 30.0, 60.0, 120.0, 300.0, 600.0, 1800.0, 360
 
 
 class Webhook(BaseModel):
-    """Where the end of a job is told, and the secret that signs the message. Never shown to anybody."""
+    """The address that is called when a job ends, and the secret that signs the message. Never returned to a client."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -40,16 +39,19 @@ class Webhook(BaseModel):
 
 
 class Stored(BaseModel):
-    """A job with what only the machinery needs to know of it."""
+    """A job with what only the worker package needs."""
 
-    model_config = ConfigDict(frozen=True, extra="ignore")
+    model_config = ConfigDict(
+        frozen=True, extra="ignore", validate_by_name=True, validate_by_alias=True, serialize_by_alias=True
+    )
 
     job: Job
     owner: str = ""
     """Whose job it is, empty where there are no owners."""
 
-    token: str
-    """The one attempt that may write: the id under which RQ carries the job. Changed by every requeue."""
+    attempt_id: str = Field(validation_alias="token", serialization_alias="token")
+    """The one attempt that may write: the id under which RQ carries the job. Every requeue changes it.
+    Stored under the name `token`."""
 
     inputs: str
     """Blob of the canonical inputs."""
@@ -70,10 +72,10 @@ class Stored(BaseModel):
     """Digest of the request, to tell a repeated request from a different one under the same key or id."""
 
     webhook: Webhook | None = None
-    """Told once the job has ended."""
+    """Called once the job has ended."""
 
     max_running: int | None = None
-    """How many jobs of its owner may run at once, as the owner's token said when it was submitted; None: `Settings.max_running`."""
+    """How many jobs of its owner may run at once, as the owner's token stated at submission; None: `Settings.max_running`."""
 
     version: int = 0
     """Counts the changes; the compare-and-set compares it."""
@@ -85,10 +87,10 @@ class Stored(BaseModel):
 
 
 class Event(NamedTuple):
-    """One change of a job, as told to those who follow it."""
+    """One change of a job, for those who follow it."""
 
     id: str
-    """Ascending; pass it back as `after`."""
+    """Ascending; pass the last one as `after`."""
 
     name: str
     """`job` when anything but the progress changed, else `progress`."""
@@ -98,9 +100,9 @@ class Event(NamedTuple):
 
 
 class Beat(NamedTuple):
-    """A sign of life."""
+    """The heartbeat count of a job, with what the reconciler needs besides."""
 
-    token: str
+    attempt_id: str
     beats: int
     owner: str
     max_running: int | None
@@ -108,11 +110,6 @@ class Beat(NamedTuple):
 
 
 Change = Callable[[Stored], Stored]
-
-
-def new_token(id: str) -> str:
-    """Return a fresh attempt token; RQ allows letters, digits, underscores and dashes in it."""
-    return f"{id}-{secrets.token_hex(6)}"
 
 
 def event_of(before: Stored | None, after: Stored) -> tuple[str, str]:
@@ -143,8 +140,8 @@ def counted(before: Stored, after: Stored) -> dict[str, float]:
     return adding
 
 
-def told_at(before: Stored, after: Stored) -> int | None:
-    """Return when this change is due to be told by webhook, in milliseconds since 1970; None if it is not told."""
+def webhook_due(before: Stored, after: Stored) -> int | None:
+    """Return when the webhook of this change is due, in milliseconds since 1970; None if the change has none."""
     job = after.job
     if after.webhook is None or before.job.status.final or not job.status.final or job.finished_at is None:
         return None
@@ -154,6 +151,24 @@ def told_at(before: Stored, after: Stored) -> int | None:
 def events_kept(after: Stored) -> int:
     """Return how many events to keep of a job that stands like this."""
     return EVENTS_KEPT_AT_LAST if after.job.status.final else EVENTS_KEPT
+
+
+class Changes(ABC):
+    """A subscription to the ids of changed jobs. Use it from one thread, and close it."""
+
+    @abstractmethod
+    def next(self, timeout: float) -> set[str]:
+        """Wait up to `timeout` seconds for a change; return the ids of the jobs that changed, empty if none did.
+
+        Raises
+        ------
+        StoreUnavailable
+            The store does not answer.
+        """
+
+    @abstractmethod
+    def close(self) -> None:
+        """End the subscription."""
 
 
 class Records(ABC):
@@ -166,18 +181,20 @@ class Records(ABC):
     """
 
     @abstractmethod
-    def create(self, stored: Stored, *, max_queued: int = 0) -> Stored:
+    def create(self, stored: Stored, *, max_queued: int = 0, max_bytes: int = 0) -> Stored:
         """Write a new record, unless its idempotency key or its id is taken: then return the record that has it.
 
         Parameters
         ----------
         max_queued : int
             Jobs of this owner that may be queued at once, the new one among them; 0: any number.
+        max_bytes : int
+            Bytes that all jobs may hold together, the new one among them; 0: any number.
 
         Raises
         ------
-        TooManyQueued
-            There are as many.
+        TooManyQueued, QuotaExceeded
+            A limit is reached.
         """
 
     @abstractmethod
@@ -199,8 +216,19 @@ class Records(ABC):
         """Write `after` if the stored version is still `before`'s; tell whether it was."""
 
     @abstractmethod
-    def delete(self, id: str) -> None:
-        """Remove a record, its events, its log and its idempotency key; nothing happens if there is none."""
+    def delete(self, id: str, *, at: datetime) -> None:
+        """Remove a record, its events, its log and its idempotency key, and note that its files are to be removed.
+
+        Nothing happens if there is no such record.
+        """
+
+    @abstractmethod
+    def deleted(self) -> dict[str, datetime]:
+        """Return when each deleted job was deleted whose files are still to be removed."""
+
+    @abstractmethod
+    def forget_deleted(self, id: str) -> None:
+        """Note that the files of a deleted job are removed."""
 
     @abstractmethod
     def page(
@@ -229,11 +257,11 @@ class Records(ABC):
         """Return the bytes that all jobs hold together."""
 
     @abstractmethod
-    def beat(self, id: str, token: str) -> Status | None:
+    def beat(self, id: str, attempt_id: str) -> Status | None:
         """Give a sign of life for an attempt; return the job's status, None if the attempt no longer owns the job."""
 
     @abstractmethod
-    def look(self, id: str, token: str) -> Status | None:
+    def look(self, id: str, attempt_id: str) -> Status | None:
         """Return the job's status, None if the attempt no longer owns the job; no sign of life."""
 
     @abstractmethod
@@ -241,8 +269,12 @@ class Records(ABC):
         """Return the count of signs of life of every job that is there."""
 
     @abstractmethod
-    def events(self, id: str, *, after: str | None, timeout: float) -> list[Event]:
-        """Return the job's events after one id (None: all that are kept), waiting up to `timeout` seconds for the first."""
+    def events(self, id: str, *, after: str | None) -> list[Event]:
+        """Return the job's events after one id (None: all that are kept)."""
+
+    @abstractmethod
+    def changes(self) -> Changes:
+        """Subscribe to the ids of changed jobs."""
 
     @abstractmethod
     def append_log(self, id: str, lines: Sequence[str]) -> None:

@@ -87,6 +87,9 @@ class Settings:
     disk_quota: int = 0
     """Bytes all jobs together may hold before new ones are refused; 0: no quota."""
 
+    read_memory: int = 8 << 30
+    """Address space of the process that reads large inputs; what needs more is refused as too_large."""
+
     upload_expiry: float = 86400.0
     """How long an upload is kept after its last byte, or after the last job that used it; 0: for ever."""
 
@@ -176,6 +179,7 @@ VARIABLES: dict[str, tuple[str, str, Callable[[str], Any]]] = {
     "max_running": ("PLIANT_MAX_RUNNING", "a whole number, at least 0", _at_least(0, int)),
     "retention": ("PLIANT_RETENTION", *_SECONDS),
     "disk_quota": ("PLIANT_DISK_QUOTA", *_BYTES),
+    "read_memory": ("PLIANT_READ_MEMORY", "a whole number of bytes, at least 1 GiB", _at_least(1 << 30, int)),
     "upload_expiry": ("PLIANT_UPLOAD_EXPIRY", *_SECONDS),
 }
 """Field, its environment variable, what is expected, how it is read."""

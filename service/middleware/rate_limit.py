@@ -1,7 +1,7 @@
-"""How often one client may ask: a count per token, or per address where tokens are off, kept in this process.
+"""Rate limits per token, or per address where tokens are off, counted in this process.
 
-In memory and not in the store: the store writes every change to disk before it answers, which is right for a job and far too
-much for each look at one. So several API processes allow several times as much.
+The counts are in memory: the store writes every change to disk before it answers, which would cost more than most requests.
+N API processes therefore allow N times as many requests.
 """
 
 from __future__ import annotations
@@ -11,29 +11,30 @@ import math
 import time
 from collections.abc import Callable
 
-from pliant.service.problems import answer, problem
+from pliant.schemas.problems import ProblemCode
+from pliant.service.problems import answer
 from pliant.service.settings import ServiceSettings
 from pliant.worker.tokens import Token
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 WINDOW = 60.0
-"""Seconds in which the allowed number may be used up all at once."""
+"""Seconds whose requests may all come at once."""
 
 MOST_CLIENTS = 20_000
-"""Clients remembered; beyond that, those who have the most left are forgotten first."""
+"""Clients remembered; beyond that, those with the most requests left are forgotten first."""
 
 UNCOUNTED = frozenset({"/healthz", "/readyz"})
 
 
 class Rates:
-    """The generic cell rate algorithm (ITU-T I.371): of each client, only when all it asked so far is paid off."""
+    """The generic cell rate algorithm (ITU-T I.371): one time stamp per client, when its requests so far are paid off."""
 
     def __init__(self, *, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._paid_off: dict[str, float] = {}
 
     def take(self, who: str, per_minute: int) -> float:
-        """Count a request; return 0 if it may be, else after how many seconds one may (it is not counted then).
+        """Count a request; return 0 if it is allowed, else the seconds to wait (it is not counted then).
 
         Parameters
         ----------
@@ -59,7 +60,7 @@ class Rates:
 
 
 class RateLimit:
-    """ASGI middleware that answers 429 to who asks too often. Stands behind `Authentication`, which says who asks."""
+    """ASGI middleware that answers 429 above the limit. It runs after `Authentication`, which identifies the client."""
 
     def __init__(self, app: ASGIApp, settings: ServiceSettings) -> None:
         self._app = app
@@ -67,24 +68,30 @@ class RateLimit:
         self._rates = Rates()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass on a request that comes in time."""
+        """Pass on a request within the limit."""
         if scope["type"] != "http" or scope["path"] in UNCOUNTED:
             await self._app(scope, receive, send)
             return
         token: Token | None = scope.get("pliant.token")
         allowed = self._settings.rate_of(token.requests_per_minute if token is not None else None)
-        wait = self._rates.take(_who(scope, token), allowed) if allowed > 0 else 0.0
+        wait = self._rates.take(_client(scope, token), allowed) if allowed > 0 else 0.0
         if wait == 0.0:
             await self._app(scope, receive, send)
             return
         seconds = max(1, math.ceil(wait))
-        detail = f"More than {allowed} requests in a minute. Ask again in {seconds} s, or wait for jobs with `Prefer: wait` or events."
-        said = problem(429, "too_many_requests", detail=detail, expected=f"at most {allowed} a minute", got="more")
-        await answer(said, headers={"Retry-After": str(seconds)})(scope, receive, send)
+        detail = f"More than {allowed} requests in a minute. Try again in {seconds} s; to wait for jobs use `Prefer: wait` or events."
+        refused = answer(
+            ProblemCode.TOO_MANY_REQUESTS,
+            detail=detail,
+            headers={"Retry-After": str(seconds)},
+            expected=f"at most {allowed} a minute",
+            got="more",
+        )
+        await refused(scope, receive, send)
 
 
-def _who(scope: Scope, token: Token | None) -> str:
-    """Return the token's id, or the address a request comes from; of IPv6 the network, of which one client has many addresses."""
+def _client(scope: Scope, token: Token | None) -> str:
+    """Return the token's id, or the client's address; for IPv6 its /64 network, since one client has many addresses."""
     if token is not None:
         return token.id
     host = (scope.get("client") or ("", 0))[0]

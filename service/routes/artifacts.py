@@ -1,26 +1,33 @@
-"""Result files: the list, and each by name, whole or in part."""
+"""Result files: the list, and each by name, whole or a range of bytes."""
 
 from __future__ import annotations
 
 import base64
+from collections.abc import Iterator
+from itertools import chain
 from typing import Annotated
 
 from fastapi import APIRouter, Path, Request
 from fastapi.responses import Response, StreamingResponse
 from pliant.schemas.job import Artifact
+from pliant.schemas.problems import ProblemCode
 from pliant.service.dependencies import Mine
 from pliant.service.openapi import problems
 from pliant.service.problems import Refusal
 from pliant.service.ranges import decide
 from pliant.service.routes.jobs import Id
+from pliant.worker.jobs.service import Jobs
+from pliant.worker.store.blobs import Blob
 
 router = APIRouter(prefix="/v1/jobs/{id}/artifacts", tags=["artifacts"])
 
 Name = Annotated[str, Path(description="A file of the job.", examples=["shapes.npz"])]
-_BYTES = {"*/*": {"schema": {"type": "string", "format": "binary"}}}
+_BINARY = {"schema": {"type": "string", "format": "binary"}}
+# Generators of clients take the first; the file's own media type is in its description.
+_BYTES = {"application/octet-stream": _BINARY, "*/*": _BINARY}
 
 
-@router.get("", summary="List a job's files", responses=problems(401, 404, 503))
+@router.get("", operation_id="list_artifacts", summary="List a job's files", responses=problems(401, 404, 503))
 def artifacts(id: Id, jobs: Mine) -> list[Artifact]:
     """Return name, media type, size and SHA-256 of every file; empty until the job has succeeded."""
     return jobs.get(id).artifacts
@@ -29,35 +36,35 @@ def artifacts(id: Id, jobs: Mine) -> list[Artifact]:
 @router.head("/{name}", include_in_schema=False)
 @router.get(
     "/{name}",
+    operation_id="get_artifact",
     summary="Download a file",
     response_class=StreamingResponse,
     responses={
         200: {"description": "The whole file, in its own media type.", "content": _BYTES},
-        206: {"description": "The part that `Range` asked for.", "content": _BYTES},
+        206: {"description": "The bytes that `Range` names.", "content": _BYTES},
         304: {"description": "The client has this file (`If-None-Match`)."},
-        **problems(401, 404, 412, 416, 503),
+        **problems(401, 404, 410, 412, 416, 503),
     },
 )
 def artifact(id: Id, name: Name, request: Request, jobs: Mine) -> Response:
     """Return a file. `Range` with `If-Range` resumes a download; `ETag` and `Repr-Digest` are its SHA-256."""
-    about, blob = jobs.artifact(id, name)
+    about, blob = _open(jobs, id, name)
     size = blob.size
     etag = f'"{about.sha256}"'
     part = decide(request.headers, size=size, etag=etag)
     headers = {
         "ETag": etag,
         "Accept-Ranges": "bytes",
-        "Cache-Control": "private, no-cache",  # kept, but asked for again each time: the token may have been revoked
+        "Cache-Control": "private, no-cache",  # kept, but revalidated each time: the token may have been revoked
     }
     if part.status == 412:
-        detail = "The file is not the one that If-Match names. Download it anew, without that header."
-        raise Refusal(412, "precondition_failed", detail=detail, headers=headers)
+        detail = "The file is not the one that If-Match names. Download it again, without that header."
+        raise Refusal(ProblemCode.PRECONDITION_FAILED, detail=detail, headers=headers)
     if part.status == 416:
-        detail = f"The file has {size} bytes, and the range asked for lies outside. Ask for a range within, or none."
+        detail = f"The requested range lies outside the file's {size} bytes. Ask for a range inside it, or for none."
         got = request.headers["range"][:80]
         raise Refusal(
-            416,
-            "range_not_satisfiable",
+            ProblemCode.RANGE_NOT_SATISFIABLE,
             detail=detail,
             field="Range",
             expected=f"within 0–{size}",
@@ -75,5 +82,29 @@ def artifact(id: Id, name: Name, request: Request, jobs: Mine) -> Response:
         headers["Content-Range"] = f"bytes {part.start}-{part.start + part.length - 1}/{size}"
     if request.method == "HEAD":
         return Response(status_code=part.status, headers=headers, media_type=about.media_type)
-    body = blob.read(part.start, part.start + part.length)
+    body = _begin(blob.read(part.start, part.start + part.length), jobs, id, name)
     return StreamingResponse(body, status_code=part.status, headers=headers, media_type=about.media_type)
+
+
+def _open(jobs: Jobs, id: str, name: str) -> tuple[Artifact, Blob]:
+    """Return a file's description and its bytes; a file that is deleted meanwhile is gone, not a defect."""
+    try:
+        return jobs.artifact(id, name)
+    except FileNotFoundError:
+        raise _gone(jobs, id, name) from None
+
+
+def _begin(body: Iterator[bytes], jobs: Jobs, id: str, name: str) -> Iterator[bytes]:
+    """Read the first chunk now, while a status code can still report that the file is gone."""
+    try:
+        first = next(body, b"")
+    except FileNotFoundError:
+        raise _gone(jobs, id, name) from None
+    return chain([first], body)
+
+
+def _gone(jobs: Jobs, id: str, name: str) -> Refusal:
+    """Return the refusal of a file whose bytes are gone; raises `UnknownJob` if the job is, too."""
+    jobs.get(id)
+    detail = f"The file {name!r} of job {id!r} was deleted. Submit the inputs again if the result is still needed."
+    return Refusal(ProblemCode.ARTIFACT_GONE, detail=detail)

@@ -1,7 +1,8 @@
-"""A job's changes as they happen (server-sent events), and its log."""
+"""A job's events as a stream (server-sent events), and its log."""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable
 from contextlib import aclosing
 from functools import partial
@@ -10,6 +11,7 @@ from typing import Annotated
 from anyio import to_thread
 from fastapi import APIRouter, Header, Request
 from fastapi.responses import PlainTextResponse, Response, StreamingResponse
+from fastapi.sse import KEEPALIVE_COMMENT, EventSourceResponse, format_sse_event
 from pliant.service.dependencies import Core, Mine
 from pliant.service.openapi import problems
 from pliant.service.routes.jobs import Id
@@ -18,6 +20,11 @@ from pliant.worker.records import Event
 
 router = APIRouter(prefix="/v1/jobs/{id}", tags=["jobs"])
 
+RECONNECT_MS = 2000
+"""Pause before a client reconnects, in milliseconds."""
+
+_log = logging.getLogger("pliant.service")
+
 _STREAM = {
     "text/event-stream": {
         "schema": {
@@ -25,7 +32,7 @@ _STREAM = {
             "description": "One event; `data` is the JSON of a `Job` or of its `Progress`.",
             "required": ["id", "event", "data"],
             "properties": {
-                "id": {"type": "string", "description": "Ascending; send the last one as `Last-Event-ID` to go on."},
+                "id": {"type": "string", "description": "Ascending; send the last one as `Last-Event-ID` to resume."},
                 "event": {"enum": ["job", "progress"]},
                 "data": {"type": "string", "contentMediaType": "application/json"},
             },
@@ -38,6 +45,7 @@ _LOG = {"text/plain": {"schema": {"type": "string"}}}
 
 @router.get(
     "/events",
+    operation_id="stream_events",
     summary="Follow a job",
     response_class=StreamingResponse,
     responses={
@@ -50,46 +58,48 @@ async def events(
     request: Request,
     core: Core,
     jobs: Mine,
-    last: Annotated[str | None, Header(alias="Last-Event-ID", description="The last event you have.")] = None,
+    last: Annotated[str | None, Header(alias="Last-Event-ID", description="The last event received.")] = None,
 ) -> Response:
     """Stream `job` events (the whole job, when its status changed) and `progress` events, and end when the job has.
 
     Begins with the events that are kept, or after `Last-Event-ID`; a browser's EventSource sends that by itself.
-    A comment line every 15 s keeps the connection from being taken for dead. Ends, too, when the token was revoked or is over.
+    A comment line every 15 s keeps proxies from closing the connection. The stream also ends when the token expires or is revoked.
     """
     stream = core.followers.follow(jobs, id, after=last or None, heartbeat=core.settings.heartbeat_seconds)
-    # What can be refused is refused before the stream begins: afterwards there is no status code to say it with.
-    await to_thread.run_sync(partial(jobs.events, id, after=last or None, timeout=0))
-    return StreamingResponse(
-        _written(stream, still_good=request.scope.get("pliant.still_good")),
-        media_type="text/event-stream",
+    # Refuse before the stream begins: afterwards there is no status code to report an error with.
+    await to_thread.run_sync(partial(jobs.events, id, after=last or None))
+    return EventSourceResponse(
+        _encode(stream, still_valid=request.scope.get("pliant.still_valid")),
         headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"},
     )
 
 
 @router.get(
     "/log",
+    operation_id="get_log",
     summary="Read a job's log",
     response_class=PlainTextResponse,
     responses={200: {"content": _LOG}, **problems(401, 404, 503)},
 )
 def log(id: Id, jobs: Mine) -> Response:
-    """Return what the job's attempts have logged so far, one line an entry."""
+    """Return the log lines of the job's attempts so far."""
     return PlainTextResponse(jobs.log(id))
 
 
-async def _written(
-    stream: AsyncGenerator[Event | None], *, still_good: Callable[[], Awaitable[bool]] | None
-) -> AsyncIterator[str]:
-    """Yield events as the lines of a text/event-stream, as long as whoever listens still may."""
-    yield "retry: 2000\n\n"
+async def _encode(
+    stream: AsyncGenerator[Event | None], *, still_valid: Callable[[], Awaitable[bool]] | None
+) -> AsyncIterator[bytes]:
+    """Yield events in the format of text/event-stream while the request's token is valid."""
+    yield format_sse_event(retry=RECONNECT_MS)
     try:
         async with aclosing(stream):
             async for event in stream:
-                if still_good is not None and not await still_good():
+                if still_valid is not None and not await still_valid():
                     return
-                said = "" if event is None else f"id: {event.id}\nevent: {event.name}\ndata: {event.data}\n\n"
-                yield said or ": still here\n\n"
-    except WorkerError:
-        # The store went away or the job was deleted: the client comes back with Last-Event-ID and is told by a status.
-        return
+                if event is None:
+                    yield KEEPALIVE_COMMENT
+                else:
+                    yield format_sse_event(id=event.id, event=event.name, data_str=event.data)
+    except WorkerError as error:
+        # The store does not answer or the job was deleted: the client reconnects with Last-Event-ID and gets a status.
+        _log.warning("an event stream ended early: %s", error)

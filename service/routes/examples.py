@@ -1,4 +1,4 @@
-"""Made-up inputs to try the service with: what there is, and the files."""
+"""Synthetic example inputs: the list, and the files."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ class ExampleFile(Record):
     """One input file of an example."""
 
     part: str
-    """The form part that it belongs to."""
+    """The form part to send it as."""
     file: str
     url: str
 
 
 class Example(Record):
-    """A made-up sequence with known truth."""
+    """A synthetic sequence with ground truth."""
 
     name: str
     title: str
@@ -34,14 +34,14 @@ class Example(Record):
 
 
 class Examples(Record):
-    """What there is to try."""
+    """All examples."""
 
     examples: list[Example]
 
 
-@router.get("", summary="Inputs to try", responses=problems(401))
+@router.get("", operation_id="list_examples", summary="List example inputs", responses=problems(401))
 def examples(request: Request) -> Examples:
-    """List made-up sequences; send their files as the parts of a new job, or look at how such files are written."""
+    """Return synthetic sequences whose files can be sent as the parts of a job."""
     return Examples(
         examples=[
             Example(
@@ -63,12 +63,13 @@ def examples(request: Request) -> Examples:
 
 @router.get(
     "/{name}/{file}",
+    operation_id="get_example_file",
     summary="A file of an example",
     response_class=Response,
     responses={200: {"content": {"application/octet-stream": {}}}, **problems(401, 404)},
 )
 def example(name: Name, file: File) -> Response:
-    """Return an input file; the same bytes every time."""
+    """Return an input file; its bytes never change."""
     return Response(
         example_file(name, file),
         media_type="application/octet-stream",

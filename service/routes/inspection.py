@@ -1,45 +1,84 @@
-"""Inspect: how files would be understood, before a job is made of them."""
+"""Inspection: how files would be interpreted, without creating a job."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from anyio import to_thread
+import numpy as np
 from fastapi import APIRouter, Request
+from numpy.typing import NDArray
 from pliant.schemas.job import Inspection
 from pliant.service.dependencies import Bound, Core, MyUploads
 from pliant.service.multipart import Form, receive_form
 from pliant.service.openapi import SUBMIT_BODY, problems
-from pliant.service.sample import sample_of
 from pliant.service.submission import form_rules, parse_options, read_form, with_uploads
-from pliant.worker.formats import Limits, load_inputs
+from pliant.worker.formats import Inputs, Limits, load_inputs
 from pliant.worker.formats.isolated_reader import LARGE
 from pliant.worker.uploads.service import Uploads
 
 router = APIRouter(prefix="/v1/inspect", tags=["jobs"])
 
+FRAMES, POINTS = 16, 200
+"""Largest sample."""
+BOX = 1000
+"""Side of the square that holds the sample."""
+HIDDEN = -1
+
 
 @router.post(
     "",
-    summary="Say how files would be understood",
+    operation_id="inspect_inputs",
+    summary="Inspect inputs without creating a job",
     responses=problems(400, 401, 403, 408, 413, 415, 422, 429, 503, 507),
     openapi_extra={"requestBody": SUBMIT_BODY},
 )
 async def inspect(request: Request, core: Core, bounds: Bound, uploads: MyUploads) -> Inspection:
-    """Read the parts of a job as `POST /v1/jobs` would, and return the interpretation without making a job.
+    """Read the parts of a job as `POST /v1/jobs` would, and return the interpretation without creating a job.
 
-    What submitting refuses is refused here in the same words, with the readings to choose from where several fit. Nothing is kept.
+    Inputs that a submission refuses are refused with the same problem, `choices` included. Nothing is kept.
     """
     rules = form_rules(core.settings, max_body_bytes=bounds.max_body_bytes)
-    with core.incoming.room() as room:
-        form = await receive_form(request, room, rules=rules)
-        return await to_thread.run_sync(lambda: understood(form, room, uploads, core.limits), limiter=core.parsing)
+    with core.incoming.scratch() as folder:
+        form = await receive_form(request, folder, rules=rules)
+        return await core.parsing.run(uploads.owner, lambda: interpret(form, folder, uploads, core.limits))
 
 
-def understood(form: Form, room: Path, uploads: Uploads, limits: Limits) -> Inspection:
-    """Read a form as for a job, and forget all but how it was understood. Blocks; call it on a thread."""
-    whole, canonical = with_uploads(form, room, uploads), room / "canonical.npz"
-    said = read_form(whole, parse_options(whole.texts.get("options", "")), limits, target=canonical)
-    # What is too large to be read in this process is too large to be looked at in it.
+def interpret(form: Form, folder: Path, uploads: Uploads, limits: Limits) -> Inspection:
+    """Read a form as for a job, and return the interpretation with a sample. Blocks; call it on a thread."""
+    whole, canonical = with_uploads(form, folder, uploads), folder / "canonical.npz"
+    found = read_form(whole, parse_options(whole.texts.get("options", "")), limits, target=canonical)
+    # Inputs too large to be parsed in this process are too large to be sampled in it.
     sample = sample_of(load_inputs(canonical)) if canonical.stat().st_size <= LARGE else []
-    return Inspection(**said.model_dump(), sample=sample)
+    return Inspection(**found.model_dump(), sample=sample)
+
+
+def sample_of(inputs: Inputs) -> list[list[int]]:
+    """Return evenly spaced frames and points as integers in a square, small enough to be sent along for a picture.
+
+    Parameters
+    ----------
+    inputs : Inputs
+        Checked and interpreted.
+
+    Returns
+    -------
+    list of list of int
+        One list per frame: x and y of each point in turn, 0 … `BOX`, x right, y down, to one scale; `HIDDEN` twice for a hidden point.
+    """
+    points, visible = inputs.tracks.points, inputs.tracks.visible
+    frames, chosen = evenly(len(points), FRAMES), evenly(points.shape[1], POINTS)
+    some = points[np.ix_(frames, chosen)] * (1.0, -1.0 if inputs.interpretation.y_axis == "up" else 1.0)
+    seen = visible[np.ix_(frames, chosen)] > 0
+    if not seen.any():
+        return [[HIDDEN] * (2 * len(chosen))] * len(frames)
+    # The square holds the positions between the outer percentiles, so that a gross outlier does not shrink the rest to a dot.
+    low, high = np.percentile(some[seen], (1, 99), axis=0)
+    scale = 0.9 * BOX / max(float((high - low).max()), np.finfo(float).tiny)
+    placed = BOX / 2 + scale * (some - (low + high) / 2)
+    inside = seen & ((placed >= 0) & (placed <= BOX)).all(axis=2)
+    return [[int(value) for value in frame.ravel()] for frame in np.where(inside[..., None], placed.round(), HIDDEN)]
+
+
+def evenly(count: int, most: int) -> NDArray[np.intp]:
+    """Return at most that many indices, evenly spread over 0 … count − 1, both ends among them."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.intp))

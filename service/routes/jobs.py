@@ -1,4 +1,4 @@
-"""Jobs: submit, look at, list, cancel, run again, delete."""
+"""Jobs: submit, get, list, cancel, retry, delete."""
 
 from __future__ import annotations
 
@@ -6,18 +6,20 @@ import re
 from typing import Annotated
 
 from anyio import to_thread
-from fastapi import APIRouter, Header, Path, Query, Request, Response
+from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
 from pliant.schemas.job import Job, JobPage, Status
+from pliant.schemas.problems import ProblemCode
 from pliant.service.dependencies import Bound, Bounds, Core, Mine, Service, my_uploads
 from pliant.service.multipart import receive_form
 from pliant.service.openapi import JOB_EXAMPLE, SUBMIT_BODY, problems
+from pliant.service.problems import Refusal
 from pliant.service.submission import accept, form_rules
 from pliant.worker.jobs.service import LARGEST_PAGE, Jobs
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 
 Id = Annotated[str, Path(description="The job's id.", examples=["4f0c6b1d2a9e8c7b5d3f"])]
-Key = Annotated[
+_KeyHeader = Annotated[
     str | None,
     Header(
         alias="Idempotency-Key",
@@ -25,6 +27,17 @@ Key = Annotated[
         description="Any text of your own, e.g. a UUID. The same key with the same content returns the first job.",
     ),
 ]
+
+
+def idempotency_key(request: Request, key: _KeyHeader = None) -> str | None:
+    """Return the one `Idempotency-Key`; two of them could each mean another job."""
+    if len(request.headers.getlist("idempotency-key")) > 1:
+        detail = "The header Idempotency-Key was sent more than once. Send one key."
+        raise Refusal(ProblemCode.CONFLICTING_HEADERS, detail=detail, field="Idempotency-Key")
+    return key
+
+
+Key = Annotated[str | None, Depends(idempotency_key)]
 Prefer = Annotated[
     str | None,
     Header(description="`wait=20` answers when the job has ended, or after 20 s, whichever comes first."),
@@ -37,17 +50,18 @@ _LOCATION = {"Location": {"description": "The job's address.", "schema": {"type"
 @router.post(
     "",
     status_code=202,
+    operation_id="submit_job",
     summary="Submit a job",
     responses={202: {"headers": _LOCATION, "content": JOB_EXAMPLE}, **_SUBMIT_ERRORS},
     openapi_extra={"requestBody": SUBMIT_BODY},
 )
 async def submit(
-    request: Request, response: Response, core: Core, jobs: Mine, bounds: Bound, key: Key = None, prefer: Prefer = None
+    request: Request, response: Response, core: Core, jobs: Mine, bounds: Bound, key: Key, prefer: Prefer = None
 ) -> Job:
-    """Read the tracks and whatever comes with them, check them, and queue the job.
+    """Read and validate the inputs, and queue the job.
 
-    An answer of 202 is a promise: the job is stored and will end with a result or a reason, whatever is killed meanwhile.
-    Any other answer means that nothing was queued and nothing kept.
+    After 202 the job is stored durably: it ends with a result or an error even if processes are killed meanwhile.
+    After any other status nothing was queued and nothing is kept.
     """
     job, _ = await _receive(request, core, jobs, bounds, idempotency_key=key)
     response.headers["Location"] = f"/v1/jobs/{job.id}"
@@ -57,10 +71,11 @@ async def submit(
 @router.put(
     "/{id}",
     status_code=202,
+    operation_id="put_job",
     summary="Submit a job under your own id",
     responses={
         202: {"headers": _LOCATION, "content": JOB_EXAMPLE},
-        200: {"model": Job, "description": "The same request made this job before."},
+        200: {"model": Job, "description": "An earlier, equal request created this job."},
         **_SUBMIT_ERRORS,
     },
     openapi_extra={"requestBody": SUBMIT_BODY},
@@ -68,7 +83,7 @@ async def submit(
 async def put(
     id: Id, request: Request, response: Response, core: Core, jobs: Mine, bounds: Bound, prefer: Prefer = None
 ) -> Job:
-    """Do as `POST` does, under an id that you choose: 3 to 64 letters, digits, underscores or dashes.
+    """Submit a job under an id that you choose: 3 to 64 letters, digits, underscores or dashes.
 
     Repeating the request is safe: the same content returns the same job with 200, other content is refused with 409.
     """
@@ -78,44 +93,58 @@ async def put(
     return await _waited(job, core, jobs, prefer, response)
 
 
-@router.get("", summary="List jobs", responses=problems(401, 422, 503))
+@router.get("", operation_id="list_jobs", summary="List jobs", responses=problems(401, 422, 503))
 def page(
     jobs: Mine,
-    cursor: Annotated[str | None, Query(description="`next` of the page before.", max_length=200)] = None,
+    cursor: Annotated[str | None, Query(description="`next` of the previous page.", max_length=200)] = None,
     limit: Annotated[int, Query(ge=1, le=LARGEST_PAGE, description="Jobs on a page.")] = 50,
-    status: Annotated[list[Status] | None, Query(description="Only these; may be given several times.")] = None,
+    status: Annotated[list[Status] | None, Query(description="Only jobs with this status; can be repeated.")] = None,
 ) -> JobPage:
     """Return your jobs, newest first."""
     return jobs.page(cursor=cursor, limit=limit, statuses=status)
 
 
-@router.get("/{id}", summary="Look at a job", responses={200: {"content": JOB_EXAMPLE}, **problems(401, 404, 422, 503)})
+@router.get(
+    "/{id}",
+    operation_id="get_job",
+    summary="Get a job",
+    responses={200: {"content": JOB_EXAMPLE}, **problems(401, 404, 422, 503)},
+)
 async def get(id: Id, response: Response, core: Core, jobs: Mine, prefer: Prefer = None) -> Job:
-    """Return everything known of a job: status, progress, place in the queue, metrics, files, or why it failed."""
+    """Return a job: status, progress, place in the queue, metrics, files, or why it failed."""
     job = await to_thread.run_sync(jobs.get, id)
     return await _waited(job, core, jobs, prefer, response)
 
 
-@router.post("/{id}/cancel", summary="Cancel a job", responses=problems(401, 403, 404, 409, 503))
+@router.post(
+    "/{id}/cancel", operation_id="cancel_job", summary="Cancel a job", responses=problems(401, 403, 404, 409, 503)
+)
 def cancel(id: Id, jobs: Mine) -> Job:
-    """Ask a job to end. A queued one is cancelled at once; a running one stops at its next step."""
+    """Cancel a job. A queued job ends at once, a running one at its next iteration."""
     return jobs.cancel(id)
 
 
 @router.post(
     "/{id}/retry",
     status_code=202,
+    operation_id="retry_job",
     summary="Run a failed or cancelled job again",
     responses={202: {"headers": _LOCATION}, **problems(401, 403, 404, 409, 422, 429, 503, 507)},
 )
-def retry(id: Id, response: Response, jobs: Mine, key: Key = None) -> Job:
-    """Queue a new job with the same inputs, options and name; `retry_of` names the old one."""
+def retry(id: Id, response: Response, jobs: Mine, key: Key) -> Job:
+    """Queue a new job with the same inputs, options and name; its `retry_of` is the id of the old one."""
     job = jobs.retry(id, idempotency_key=key)
     response.headers["Location"] = f"/v1/jobs/{job.id}"
     return job
 
 
-@router.delete("/{id}", status_code=204, summary="Delete a finished job", responses=problems(401, 403, 404, 409, 503))
+@router.delete(
+    "/{id}",
+    status_code=204,
+    operation_id="delete_job",
+    summary="Delete a finished job",
+    responses=problems(401, 403, 404, 409, 503),
+)
 def delete(id: Id, jobs: Mine) -> None:
     """Remove a finished job with all its files."""
     jobs.delete(id)
@@ -130,27 +159,27 @@ async def _receive(
     id: str | None = None,
     idempotency_key: str | None = None,
 ) -> tuple[Job, bool]:
-    """Receive a form into a room of its own and submit what it holds; the room is gone afterwards, whatever happened."""
+    """Receive a form into a scratch directory and submit the job; the directory is removed in any case."""
     rules = form_rules(core.settings, max_body_bytes=bounds.max_body_bytes)
-    await to_thread.run_sync(lambda: jobs.check_room(id=id, idempotency_key=idempotency_key))
-    with core.incoming.room() as room:
-        form = await receive_form(request, room, rules=rules)
-        return await to_thread.run_sync(
+    await to_thread.run_sync(lambda: jobs.check_capacity(id=id, idempotency_key=idempotency_key))
+    with core.incoming.scratch() as folder:
+        form = await receive_form(request, folder, rules=rules)
+        return await core.parsing.run(
+            jobs.owner or "",
             lambda: accept(
                 form,
-                room,
+                folder,
                 jobs=jobs,
                 uploads=my_uploads(request),
                 limits=core.limits,
                 id=id,
                 idempotency_key=idempotency_key,
             ),
-            limiter=core.parsing,
         )
 
 
 async def _waited(job: Job, core: Service, jobs: Jobs, prefer: str | None, response: Response) -> Job:
-    """Return the job as it is once it has ended or the client's patience has, whichever comes first."""
+    """Return the job when it has ended, or after the seconds of `Prefer: wait`, whichever comes first."""
     wish = next(filter(None, (_WAIT.fullmatch(part) for part in (prefer or "").split(","))), None)
     if wish is None:
         return job

@@ -1,34 +1,36 @@
-"""What the service is and how it is: options, limits, health."""
+"""The service itself: options, limits, health."""
 
 from __future__ import annotations
 
 import dataclasses
 import logging
-from typing import Any
+from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter
-from fastapi.responses import JSONResponse, Response
+from fastapi import APIRouter, Query
 from pliant.schemas.job import ServiceLimits
 from pliant.schemas.options import Options
+from pliant.schemas.problems import ProblemCode
 from pliant.service.dependencies import Bound, Core
 from pliant.service.openapi import problems
-from pliant.service.problems import answer, problem
+from pliant.service.problems import Refusal
 from pliant.worker.jobs.service import LARGEST_PAGE
 
 router = APIRouter(tags=["about"])
 
+Part = Literal["redis", "blobs", "workers"]
+
 _log = logging.getLogger("pliant.service")
 
 
-@router.get("/v1/options", summary="The options of a job", responses=problems(401))
+@router.get("/v1/options", operation_id="get_options", summary="The options of a job", responses=problems(401))
 def options() -> dict[str, Any]:
-    """Return the JSON Schema of `options`: every name with its meaning, unit, bounds and default."""
+    """Return the JSON Schema of `options`: every option with its meaning, unit, bounds and default."""
     return Options.model_json_schema()
 
 
-@router.get("/v1/limits", summary="What this service accepts", responses=problems(401))
+@router.get("/v1/limits", operation_id="get_limits", summary="What this service accepts", responses=problems(401))
 def limits(core: Core, bounds: Bound) -> ServiceLimits:
-    """Return the largest body, frames, points and the like, for the token that asks."""
+    """Return the limits on bodies, frames, points, queued jobs and requests that hold for the request's token."""
     taken = {field.name for field in dataclasses.fields(core.limits)} & set(ServiceLimits.model_fields)
     return ServiceLimits(
         **{name: getattr(core.limits, name) for name in taken},
@@ -39,24 +41,30 @@ def limits(core: Core, bounds: Bound) -> ServiceLimits:
     )
 
 
-@router.get("/healthz", summary="Is the process alive?")
+@router.get("/healthz", operation_id="get_health", summary="Liveness: the process answers")
 async def healthz() -> dict[str, str]:
-    """Return 200 while the process answers at all; nothing else is looked at, and no thread is waited for."""
+    """Return 200 while the process answers; it checks nothing else and waits for no thread."""
     return {"status": "ok"}
 
 
-@router.get("/readyz", summary="Can it take jobs?", responses=problems(503))
-def readyz(core: Core) -> Response:
-    """Return 200 if the job store, the blob store and at least one worker are there, else 503 and what is missing.
+@router.get(
+    "/readyz", operation_id="get_readiness", summary="Readiness: all parts answer", responses=problems(422, 503)
+)
+def readyz(
+    core: Core,
+    exclude: Annotated[list[Part] | None, Query(description="Parts to leave out; can be repeated.")] = None,
+) -> dict[str, str]:
+    """Return 200 if the job store, the blob store and at least one worker answer, else 503 with the missing parts.
 
-    Where tokens are asked for, strangers are told which part is missing and not why; the service's log says that.
+    Probes of the API process alone use `?exclude=workers`: without a worker it still accepts jobs and serves results.
+    Where tokens are required, the answer names the missing parts only; the reasons are in the service's log.
     """
-    parts = core.jobs.ready()
-    missing = {name: said for name, said in parts.items() if said != "ok"}
+    parts = {name: state for name, state in core.jobs.ready().items() if name not in (exclude or ())}
+    missing = {name: state for name, state in parts.items() if state != "ok"}
     if not missing:
-        return JSONResponse(parts)
-    said = " ".join(f"{name}: {sentence}" for name, sentence in missing.items())
+        return parts
+    detail = " ".join(f"{name}: {sentence}" for name, sentence in missing.items())
     if core.settings.asks_for_tokens:
-        _log.warning("not ready: %s", said)
-        said = f"Not ready: {', '.join(missing)}. The service's log says why."
-    return answer(problem(503, "not_ready", detail=said), headers={"Retry-After": "2"})
+        _log.warning("not ready: %s", detail)
+        detail = f"Not ready: {', '.join(missing)}. The service's log has the reasons."
+    raise Refusal(ProblemCode.NOT_READY, detail=detail, headers={"Retry-After": "2"})

@@ -1,11 +1,11 @@
-"""Numbers for whoever runs the service."""
+"""Metrics for the operator."""
 
 from __future__ import annotations
 
 from fastapi import APIRouter
 from fastapi.responses import PlainTextResponse, Response
 from pliant.service.dependencies import Core
-from pliant.service.metrics import MEDIA_TYPE, exposition
+from pliant.service.metrics import MEDIA_TYPE
 from pliant.service.openapi import problems
 
 router = APIRouter(tags=["about"])
@@ -20,10 +20,11 @@ _TEXT = {
 
 @router.get(
     "/metrics",
-    summary="Numbers for Prometheus",
+    operation_id="get_metrics",
+    summary="Metrics for Prometheus",
     response_class=PlainTextResponse,
     responses={200: {"content": _TEXT}, **problems(401, 403)},
 )
 def metrics(core: Core) -> Response:
-    """Return counts of jobs, queue, workers, files, webhooks and requests. Where tokens are asked for, one with the scope `admin`."""
-    return Response(exposition(core.jobs, core.requests), media_type=MEDIA_TYPE)
+    """Return metrics of jobs, queue, workers, files, webhooks and requests. Where tokens are on, this needs the scope `admin`."""
+    return Response(core.metrics.exposition(core.jobs), media_type=MEDIA_TYPE)

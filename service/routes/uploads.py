@@ -1,11 +1,11 @@
-"""Large inputs in raw bytes, resumable: sent before the job, which then names them instead of carrying them.
+"""Resumable uploads of large inputs as raw bytes; a job names an upload instead of containing the file.
 
 The headers are those of the IETF's draft "Resumable Uploads for HTTP" (draft-ietf-httpbis-resumable-upload): `Upload-Offset`,
-`Upload-Complete`, `Upload-Length`, `Upload-Limit`, HEAD to ask for the offset, PATCH to append, DELETE to give up, 409 with the
-right offset where they differ. It was chosen over tus 1.0, which it is to replace, because a whole upload is one plain `PUT` that
-any HTTP client can send (`curl -T`), and over parts with numbers, as S3 has, because the offset is the only thing to remember.
-Different from the draft: the client chooses the id, as it may for jobs, so there is no interim response 104 to wait for, and a
-`PUT` with `Upload-Offset` goes on like PATCH, because it is idempotent: repeated after a lost answer it does no harm.
+`Upload-Complete`, `Upload-Length`, `Upload-Limit`, HEAD returns the offset, PATCH appends, DELETE removes, 409 carries the
+right offset where they differ. Chosen over tus 1.0, which it is meant to replace, because a whole upload is one plain `PUT` that
+any HTTP client can send (`curl -T`), and over numbered parts as in S3, because the offset is the only state.
+Differences from the draft: the client chooses the id, as for jobs, so there is no interim response 104 to wait for; and a `PUT`
+with `Upload-Offset` appends like PATCH, because it is idempotent and so can be repeated after a lost answer.
 """
 
 from __future__ import annotations
@@ -15,18 +15,19 @@ import binascii
 import re
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated
+from typing import Annotated, Any
 
 import anyio
 from anyio import to_thread
 from fastapi import APIRouter, Header, Path, Request, Response
 from pliant.schemas.job import Upload
+from pliant.schemas.problems import ProblemCode
 from pliant.service.dependencies import Bounds, Core, MyUploads, Service, bounds_of
 from pliant.service.multipart import batches
 from pliant.service.openapi import problems
-from pliant.service.problems import Refusal
+from pliant.service.problems import Refusal, wrong_input
 from pliant.worker.errors import OffsetMismatch
-from pliant.worker.uploads.service import Room, Uploads, Writer
+from pliant.worker.uploads.service import Capacity, Uploads, Writer
 
 router = APIRouter(prefix="/v1/uploads", tags=["uploads"])
 
@@ -37,26 +38,29 @@ Id = Annotated[
 ]
 Offset = Annotated[
     int | None,
-    Header(alias="Upload-Offset", ge=0, le=ANY, description="Where the body belongs; 0, the default, begins anew."),
+    Header(
+        alias="Upload-Offset",
+        ge=0,
+        le=ANY,
+        description="Offset of the body's first byte; 0, the default, starts again.",
+    ),
 ]
 Complete = Annotated[
     str,
-    Header(alias="Upload-Complete", pattern=r"^\?[01]$", description="`?0` if more will follow; `?1` is the default."),
+    Header(alias="Upload-Complete", pattern=r"^\?[01]$", description="`?0` if more follows; `?1` is the default."),
 ]
 Length = Annotated[
     int | None,
-    Header(alias="Upload-Length", ge=0, le=ANY, description="Bytes of the whole upload, where they are known."),
+    Header(alias="Upload-Length", ge=0, le=ANY, description="Bytes of the whole upload, if known."),
 ]
 Digest = Annotated[
     str | None,
-    Header(
-        alias="Repr-Digest", max_length=500, description="`sha-256=:BASE64:` of the whole; checked when it is there."
-    ),
+    Header(alias="Repr-Digest", max_length=500, description="`sha-256=:BASE64:` of the whole; checked at the end."),
 ]
 _STATE = {
-    "Upload-Offset": {"description": "Bytes that have arrived.", "schema": {"type": "integer"}},
-    "Upload-Complete": {"description": "`?1` once all of it is there.", "schema": {"type": "string"}},
-    "Upload-Limit": {"description": "The largest upload, and its seconds to live.", "schema": {"type": "string"}},
+    "Upload-Offset": {"description": "Bytes received.", "schema": {"type": "integer"}},
+    "Upload-Complete": {"description": "`?1` when complete.", "schema": {"type": "string"}},
+    "Upload-Limit": {"description": "Largest upload, and its lifetime in seconds.", "schema": {"type": "string"}},
 }
 _BODY = {
     "requestBody": {
@@ -70,10 +74,11 @@ _ERRORS = problems(400, 401, 403, 404, 408, 409, 413, 422, 429, 503, 507)
 @router.put(
     "/{id}",
     status_code=201,
-    summary="Send a large input, or go on with one",
+    operation_id="put_upload",
+    summary="Upload a large input, or resume",
     responses={
         201: {"headers": _STATE},
-        200: {"model": Upload, "description": "Went on, or was there already."},
+        200: {"model": Upload, "description": "Resumed, or already complete."},
         **_ERRORS,
     },
     openapi_extra=_BODY,
@@ -91,14 +96,14 @@ async def put(
 ) -> Upload:
     """Stream raw bytes to the service's disk. A job then names the upload: `tracks_upload=ID` in place of the part `tracks`.
 
-    After an interruption ask with HEAD how far it came, and send the rest with `Upload-Offset`. Only a whole upload can be used.
-    It is removed a day after its last byte or last use, unless whoever runs the service chose another time.
+    After an interruption get the offset with HEAD, and send the rest with `Upload-Offset`. Only a complete upload can be used.
+    It is removed a day after its last byte or last use, unless the operator chose another time.
     """
     sending = Sending.of(request, offset=offset or 0, complete=complete, length=length, digest=digest)
-    there = await _already(uploads, id, sending)
+    there = await _find_complete(uploads, id, sending)
     response.status_code = 200 if there is not None or sending.offset > 0 else 201
     if there is None:
-        async with core.turns.take((uploads.owner, id)):
+        async with core.upload_locks.take((uploads.owner, id)):
             await _receive(request, core, uploads=uploads, id=id, sending=sending)
         there = await to_thread.run_sync(uploads.get, id)
     _describe(response, there, core, uploads)
@@ -107,7 +112,11 @@ async def put(
 
 
 @router.patch(
-    "/{id}", summary="Go on with a large input", responses={200: {"headers": _STATE}, **_ERRORS}, openapi_extra=_BODY
+    "/{id}",
+    operation_id="append_upload",
+    summary="Append to an upload",
+    responses={200: {"headers": _STATE}, **_ERRORS},
+    openapi_extra=_BODY,
 )
 async def patch(
     id: Id,
@@ -120,50 +129,65 @@ async def patch(
     length: Length = None,
     digest: Digest = None,
 ) -> Upload:
-    """Append at `Upload-Offset`: the verb that the IETF's draft has for it. `PUT` with that header does the same."""
+    """Append at `Upload-Offset`, as the IETF draft specifies. `PUT` with that header does the same."""
     there = await put(id, request, response, core, uploads, offset, complete, length, digest)
     response.status_code = 200
     return there
 
 
 @router.head(
-    "/{id}", status_code=204, summary="How far is it?", responses={204: {"headers": _STATE}, **problems(401, 404)}
+    "/{id}",
+    status_code=204,
+    operation_id="get_upload_offset",
+    summary="Get the offset of an upload",
+    responses={204: {"headers": _STATE}, **problems(401, 404)},
 )
 def head(id: Id, response: Response, core: Core, uploads: MyUploads) -> None:
-    """Answer with `Upload-Offset`: where to go on; and with `Upload-Complete`."""
+    """Return `Upload-Offset`, where to resume, and `Upload-Complete`."""
     _describe(response, uploads.get(id), core, uploads)
 
 
-@router.get("/{id}", summary="Look at a large input", responses={200: {"headers": _STATE}, **problems(401, 404)})
+@router.get(
+    "/{id}",
+    operation_id="get_upload",
+    summary="Get an upload",
+    responses={200: {"headers": _STATE}, **problems(401, 404)},
+)
 def get(id: Id, response: Response, core: Core, uploads: MyUploads) -> Upload:
-    """Return how much of it has arrived, when it expires, and its SHA-256 once it is whole."""
+    """Return the bytes received, the expiry date, and the SHA-256 of a complete upload."""
     there = uploads.get(id)
     _describe(response, there, core, uploads)
     return there
 
 
-@router.delete("/{id}", status_code=204, summary="Remove a large input", responses=problems(401, 403, 404, 409))
+@router.delete(
+    "/{id}",
+    status_code=204,
+    operation_id="delete_upload",
+    summary="Delete an upload",
+    responses=problems(401, 403, 404, 409),
+)
 async def delete(id: Id, core: Core, uploads: MyUploads) -> None:
-    """Remove it, whole or not. Jobs that have been submitted with it are not touched: they have their own copy."""
-    async with core.turns.take((uploads.owner, id)):
+    """Delete an upload, complete or not. Jobs that used it keep their own copy."""
+    async with core.upload_locks.take((uploads.owner, id)):
         await to_thread.run_sync(uploads.delete, id)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sending:
-    """What one request's headers say of its body."""
+    """The position of one request's body in the upload, from its headers."""
 
     offset: int
     last: bool
-    """Nothing follows this body."""
+    """This body is the last one."""
     length: int | None
-    """Bytes of the whole, where they are known."""
+    """Bytes of the whole upload, if known."""
     sha256: str | None
-    """Of the whole, where the client says it."""
+    """Of the whole upload, if stated."""
 
     @classmethod
     def of(cls, request: Request, *, offset: int, complete: str, length: int | None, digest: str | None) -> Sending:
-        """Read them; the length of a body that is the last one tells the length of the whole."""
+        """Read the headers; the length of the last body gives the length of the whole."""
         last, body = complete == "?1", request.headers.get("content-length", "")
         if length is None and last and body.isdigit():
             length = offset + int(body)
@@ -171,15 +195,15 @@ class Sending:
 
 
 async def _receive(request: Request, core: Service, *, uploads: Uploads, id: str, sending: Sending) -> None:
-    """Write the body as it arrives. If it breaks off, what has arrived stays: that is where the client goes on."""
-    room = await to_thread.run_sync(partial(_room, core, uploads, id, bounds_of(request)))
-    held = uploads.write(id, offset=sending.offset, length=sending.length, room=room)
+    """Write the body as it arrives. If it breaks off, the bytes received are kept and the client resumes after them."""
+    capacity = await to_thread.run_sync(partial(_capacity, core, bounds_of(request)))
+    held = uploads.write(id, offset=sending.offset, length=sending.length, capacity=capacity)
     try:
         writer: Writer = await to_thread.run_sync(held.__enter__)
     except OffsetMismatch as error:
         headers = {"Upload-Offset": error.expected, "Upload-Complete": "?0"}
-        said = {"type": MISMATCH, "field": error.field, "expected": error.expected, "got": error.got}
-        raise Refusal(409, error.code, detail=str(error), headers=headers, **said) from error
+        members: dict[str, Any] = {"type": MISMATCH, "field": error.field, "expected": error.expected, "got": error.got}
+        raise Refusal(ProblemCode.UPLOAD_OFFSET_MISMATCH, detail=str(error), headers=headers, **members) from error
     try:
         # The writer holds the limit, over all requests together.
         async for batch in batches(request, max_bytes=ANY, stall_seconds=core.settings.stall_seconds):
@@ -187,18 +211,17 @@ async def _receive(request: Request, core: Service, *, uploads: Uploads, id: str
         if sending.last:
             await to_thread.run_sync(partial(writer.finish, sha256=sending.sha256))
     finally:
-        with anyio.CancelScope(shield=True):  # a request that another one stops still has to let go of the lock
+        with anyio.CancelScope(shield=True):  # a request that a newer one stops must still release the lock
             await to_thread.run_sync(held.__exit__, None, None, None)
 
 
-def _room(core: Service, uploads: Uploads, id: str, bounds: Bounds) -> Room:
+def _capacity(core: Service, bounds: Bounds) -> Capacity:
     quota = core.jobs.settings.disk_quota
-    used = core.jobs.used() + uploads.used() - uploads.size(id) if quota > 0 else 0
-    return Room(max_bytes=bounds.max_upload_bytes, quota=quota, used=used)
+    return Capacity(max_bytes=bounds.max_upload_bytes, quota=quota, used=core.jobs.used() if quota > 0 else 0)
 
 
-async def _already(uploads: Uploads, id: str, sending: Sending) -> Upload | None:
-    """Return the upload if it is whole and what the client is about to send: its first answer was lost."""
+async def _find_complete(uploads: Uploads, id: str, sending: Sending) -> Upload | None:
+    """Return the complete upload that equals what the client is about to send: the answer to its first request was lost."""
     if sending.sha256 is None or sending.offset > 0:
         return None
     there = await to_thread.run_sync(uploads.find, id)
@@ -206,7 +229,7 @@ async def _already(uploads: Uploads, id: str, sending: Sending) -> Upload | None
 
 
 def _sha256(digest: str | None) -> str | None:
-    """Return the SHA-256 of a Repr-Digest (RFC 9530) in hexadecimal; other algorithms are passed over.
+    """Return the SHA-256 of a Repr-Digest (RFC 9530) in hexadecimal; other algorithms are ignored.
 
     Raises
     ------
@@ -222,13 +245,13 @@ def _sha256(digest: str | None) -> str | None:
         value = b""
     if len(value) != 32:
         expected, got, hint = "sha-256=:BASE64 of 32 bytes:", found[0][:80], "Encode the raw digest, or leave it out."
-        detail = f"Repr-Digest: expected {expected}, got {got}. {hint}"
-        raise Refusal(422, "invalid_digest", detail=detail, field="Repr-Digest", expected=expected, got=got, hint=hint)
+        code = ProblemCode.INVALID_DIGEST
+        raise wrong_input(code, field="Repr-Digest", expected=expected, got=got, hint=hint)
     return value.hex()
 
 
 def _describe(response: Response, upload: Upload, core: Service, uploads: Uploads) -> None:
-    """Say in headers how far the upload is."""
+    """Set the headers that describe an upload."""
     headers = response.headers
     headers["Upload-Offset"] = str(upload.offset)
     headers["Upload-Complete"] = "?1" if upload.complete else "?0"

@@ -1,5 +1,5 @@
 // Bundles src/ into dist/: one script, one stylesheet, names that change with their content, and a gzip twin of each.
-// The two HTML files keep their names; they are the only files that a browser has to ask for again.
+// The two HTML files keep their names; they are the only files that a browser has to revalidate.
 
 import { build } from "esbuild";
 import { mkdir, readFile, readdir, rename, rm, writeFile } from "node:fs/promises";
@@ -14,7 +14,7 @@ const final = join(here, "dist");
 await rm(next, { recursive: true, force: true });
 await mkdir(next, { recursive: true });
 
-const entries = ["src/main.ts", "src/docs.ts", "src/page.css", "src/icon.svg"];
+const entries = ["src/main.ts", "src/reference.ts", "src/page.css", "src/icon.svg"];
 const bundled = await build({
   absWorkingDir: here,
   entryPoints: entries,
@@ -36,7 +36,10 @@ const bundled = await build({
 
 const produced = {};
 for (const [path, output] of Object.entries(bundled.metafile.outputs)) {
-  if (entries.includes(output.entryPoint)) produced[basename(output.entryPoint)] = basename(path);
+  if (!entries.includes(output.entryPoint)) continue;
+  produced[basename(output.entryPoint)] = basename(path);
+  // A script that imports a stylesheet has a second output beside it.
+  if (output.cssBundle) produced[basename(output.entryPoint).replace(/\.ts$/, ".css")] = basename(output.cssBundle);
 }
 
 for (const document of ["index.html", "docs.html"]) {

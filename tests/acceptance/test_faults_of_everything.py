@@ -16,7 +16,7 @@ import pytest
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="finds processes in /proc")
 
 WANTED = (
-    "horse_writing", "horse_storing", "valkey_down", "api_uploading", "api_receiving", "api_waiting", "api_downloading",
+    "job_process_writing", "job_process_storing", "valkey_down", "api_uploading", "api_receiving", "api_waiting", "api_downloading",
     "everything", "stopped", "frozen", "twice", "cancel_queued", "cancel_loading", "cancel_cameras", "cancel_reweight",
     "cancel_exporting",
 )  # fmt: skip

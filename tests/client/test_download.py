@@ -8,10 +8,10 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
-from pliant.client import Client, CorruptDownload, Policy, Unreachable
-from pliant.client.testing import FakeService
+from pliant.client import Client, CorruptDownload, Retry, Unreachable
+from pliant.service.testing import InMemoryService
 
-QUICK = Policy(shortest_pause=0.001, longest_pause=0.001, poll_interval=0.01, patience=0.2)
+QUICK = Retry(shortest_pause=0.001, longest_pause=0.001, poll_interval=0.01, patience=0.2)
 POINTS = np.random.default_rng(1).normal(size=(40, 900, 2))
 
 
@@ -26,18 +26,22 @@ class Torn(httpx.SyncByteStream):
         raise httpx.ReadError("connection reset by peer")
 
 
-class Tearing(FakeService):
+class Tearing(InMemoryService):
     """Sends files in pieces of a given size, then breaks off; or changes what it sends."""
 
     def __init__(self, piece: int) -> None:
-        super().__init__(looks=0)
+        super().__init__()
         self.piece = piece
         self.changed = 0
+        self.down = False
 
-    def _answer(self, request: httpx.Request) -> httpx.Response:
-        answer = super()._answer(request)
+    def handle_request(self, request: httpx.Request) -> httpx.Response:
+        if self.down and "/artifacts/" in request.url.path:
+            raise httpx.ConnectError("refused")
+        answer = super().handle_request(request)
         if "/artifacts/" not in request.url.path:
             return answer
+        answer.read()
         headers = {name: value for name, value in answer.headers.items() if name != "content-length"}
         if self.changed > 0:
             self.changed -= 1
@@ -50,11 +54,12 @@ class Tearing(FakeService):
         return [request for request in self.requests if "/artifacts/" in request.url.path]
 
 
-def finished_job(service: FakeService) -> tuple[Client, str, bytes]:
-    client = Client("http://pliant.test", transport=service, policy=QUICK)
+def finished_job(service: InMemoryService) -> tuple[Client, str, bytes]:
+    client = Client("http://pliant.test", transport=service, retries=QUICK)
     job = client.submit(POINTS)
     job.wait(load=False)
-    return client, job.id, service._ledger.find(job.id).files["shapes.npz"]
+    _, blob = service.jobs.artifact(job.id, "shapes.npz")
+    return client, job.id, b"".join(blob.read())
 
 
 def test_an_interrupted_download_goes_on_where_it_broke_off(tmp_path: Path) -> None:
@@ -74,23 +79,15 @@ def test_an_interrupted_download_goes_on_where_it_broke_off(tmp_path: Path) -> N
 def test_a_download_given_up_is_continued_by_the_next_one(tmp_path: Path) -> None:
     service = Tearing(200_000)
     client, job, data = finished_job(service)
-    honest, service._answer = service._answer, None
-    fetched = 0
 
-    def once(request: httpx.Request) -> httpx.Response:
-        nonlocal fetched
-        if "/artifacts/" in request.url.path:
-            fetched += 1
-            if fetched > 1:
-                raise httpx.ConnectError("refused")
-        return honest(request)
+    def fail_from_now_on(done: int, _: int) -> None:
+        service.down = True
 
-    service.handler = once
     with pytest.raises(Unreachable):
-        client.download(job, tmp_path, names=["shapes.npz"])
+        client.download(job, tmp_path, names=["shapes.npz"], on_download=fail_from_now_on)
     assert [path.stat().st_size for path in tmp_path.iterdir()] == [200_000]
     assert not (tmp_path / "shapes.npz").exists()
-    service.handler = honest
+    service.down = False
     client.download(job, tmp_path, names=["shapes.npz"])
     assert (tmp_path / "shapes.npz").read_bytes() == data
     assert service.fetches()[-1].headers["range"].startswith("bytes=")
@@ -103,7 +100,7 @@ def test_wrong_bytes_are_fetched_again_once_then_refused(tmp_path: Path) -> None
     client.download(job, tmp_path, names=["shapes.npz"])
     assert (tmp_path / "shapes.npz").read_bytes() == data
     service.changed = 9
-    with pytest.raises(CorruptDownload, match=r"shapes\.npz does not have the SHA-256"):
+    with pytest.raises(CorruptDownload, match=r"shapes\.npz was downloaded twice and does not have the SHA-256"):
         client.download(job, tmp_path / "other", names=["shapes.npz"])
     assert list((tmp_path / "other").iterdir()) == []
 

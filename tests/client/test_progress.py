@@ -8,11 +8,10 @@ from datetime import UTC, datetime
 
 import numpy as np
 import pytest
-from pliant.client import Client, PliantError, Policy, Progress
-from pliant.client.drive import AsyncWire, Wire
+from pliant.client import Client, PliantError, Progress, Retry
 from pliant.client.plot import draw
 from pliant.client.progress import Bar, describe, progress_bar
-from pliant.client.testing import FakeService
+from pliant.service.testing import InMemoryService
 from rich.console import Console
 
 POINTS = np.random.default_rng(1).normal(size=(4, 9, 2))
@@ -34,11 +33,11 @@ class Bars:
 def test_the_bar_takes_every_callback_of_the_sdk() -> None:
     bars = Bars()
     bar = Bar(bars)
-    with Client("http://pliant.test", transport=FakeService(looks=3), policy=Policy(poll_interval=0.01)) as client:
+    with Client("http://pliant.test", transport=InMemoryService(steps=3), retries=Retry(poll_interval=0.01)) as client:
         result = client.submit(POINTS, on_upload=bar.on_upload).wait(on_progress=bar.on_progress)
         result.download(result.folder / "more", on_download=bar.on_download)
     stages = [stage for stage, _ in bars.shown]
-    assert list(dict.fromkeys(stages)) == ["sending", "queued", "reweight", "succeeded", "fetching"]
+    assert list(dict.fromkeys(stages)) == ["sending", "queued", "running", "loading", "succeeded", "fetching"]
     assert all(0 <= fraction <= 1 for _, fraction in bars.shown)
 
 
@@ -69,19 +68,3 @@ def test_a_plot_without_matplotlib_says_how_to_get_it(monkeypatch: pytest.Monkey
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(PliantError, match="pip install matplotlib"):
         draw(np.zeros((4, 9, 3)), np.zeros((0, 3), dtype=np.int32), 2, title="")
-
-
-def test_a_wire_knows_its_wishes_alone() -> None:
-    import asyncio
-
-    import httpx
-
-    with httpx.Client() as http, pytest.raises(TypeError, match="not a wish"):
-        Wire(http).act("a pony")
-
-    async def use() -> None:
-        async with httpx.AsyncClient() as http:
-            await AsyncWire(http).act("a pony")
-
-    with pytest.raises(TypeError, match="not a wish"):
-        asyncio.run(use())

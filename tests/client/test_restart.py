@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pliant.cli.demo import announced
-from pliant.client import Client, Job, Policy, Status
+from pliant.client import Client, Job, Retry, Status
 from pliant.solver.gallery import face
 
-PATIENT = Policy(shortest_pause=0.1, longest_pause=0.5)
+PATIENT = Retry(shortest_pause=0.1, longest_pause=0.5)
 
 
 class Installation:
@@ -113,7 +113,7 @@ def test_kill_9_in_mid_wait_and_mid_download(
     sequence = face(60, 8000)
     # Known cameras and few reweightings: a large result soon, but not before anything can be killed.
     options = {"prior": "smooth+low_rank", "max_reweightings": 8, "tolerance": 1e-12}
-    with Client(installation.url, policy=PATIENT) as client:
+    with Client(installation.url, retries=PATIENT) as client:
         job = client.submit(sequence.tracks.points, mesh="none", rotations=sequence.rotations, options=options)
         seen: list[Status] = []
 

@@ -11,11 +11,13 @@ from pathlib import Path
 import httpx
 import pytest
 from pliant.client import AsyncClient, Client
-from pliant.client.download import download
-from pliant.client.drive import arun, run
-from pliant.client.retry import Attempts, Contact, Policy
-from pliant.client.testing import FakeService
+from pliant.client._async.download import download as async_download
+from pliant.client._async.transport import Exchange as AsyncExchange
+from pliant.client._sync.download import download
+from pliant.client._sync.transport import Exchange
+from pliant.client.retry import Attempts, Contact, Retry
 from pliant.schemas.job import Artifact
+from pliant.service.testing import InMemoryService
 
 SIZE = 64 * 2**20
 ROOM = 4 * 2**20
@@ -40,7 +42,7 @@ class Sink(httpx.BaseTransport, httpx.AsyncBaseTransport):
     def __init__(self) -> None:
         self.received = 0
         self.largest = 0
-        fake = Client("http://pliant.test", transport=FakeService())
+        fake = Client("http://pliant.test", transport=InMemoryService())
         self.job = fake.submit([[[0, 0]] * 9] * 4).record.model_dump_json()
 
     def take(self, piece: bytes) -> None:
@@ -98,7 +100,7 @@ def artifact() -> Artifact:
 
 
 def attempts() -> Attempts:
-    return Attempts(policy=Policy(), contact=Contact())
+    return Attempts(retries=Retry(), contact=Contact())
 
 
 @pytest.mark.usefixtures("memory")
@@ -125,7 +127,7 @@ def test_upload_asynchronously(big: Path) -> None:
 @pytest.mark.usefixtures("memory")
 def test_download(artifact: Artifact, tmp_path: Path) -> None:
     with httpx.Client(base_url="http://pliant.test", transport=Sink()) as http:
-        path = run(http, download(attempts(), "/file", artifact, tmp_path, on_download=None))
+        path = download(Exchange(http, attempts()), "/file", artifact, tmp_path, on_download=None)
     assert path.stat().st_size == SIZE
 
 
@@ -133,6 +135,6 @@ def test_download(artifact: Artifact, tmp_path: Path) -> None:
 def test_download_asynchronously(artifact: Artifact, tmp_path: Path) -> None:
     async def fetch() -> Path:
         async with httpx.AsyncClient(base_url="http://pliant.test", transport=Sink()) as http:
-            return await arun(http, download(attempts(), "/file", artifact, tmp_path, on_download=None))
+            return await async_download(AsyncExchange(http, attempts()), "/file", artifact, tmp_path, on_download=None)
 
     assert asyncio.run(fetch()).stat().st_size == SIZE

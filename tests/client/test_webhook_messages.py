@@ -7,11 +7,11 @@ from datetime import UTC, datetime
 
 import numpy as np
 import pytest
-from pliant.client import AsyncClient, BadArgument, Client, NotGenuine
-from pliant.client.testing import FakeService
+from pliant.client import AsyncClient, BadArgument, Client, InvalidSignature
 from pliant.client.webhooks import new_secret, verified
 from pliant.schemas.job import Interpretation, Job, Status
 from pliant.schemas.options import Options
+from pliant.service.testing import InMemoryService
 from pliant.worker.webhooks.message import message, parse_webhook, signed
 
 NOW = 1_900_000_000
@@ -59,20 +59,20 @@ def test_what_was_changed_is_not(job: Job) -> None:
         *(({name: value for name, value in headers.items() if name != left}, body, SECRET) for left in headers),
     ]
     for said, sent, secret in changed:
-        with pytest.raises(NotGenuine):
+        with pytest.raises(InvalidSignature):
             verified(said, sent, secret=secret, now=NOW)
 
 
 @pytest.mark.parametrize("now", [NOW + 301, NOW - 301])
 def test_what_is_old_or_from_the_future_is_not(job: Job, now: int) -> None:
     body = message(job)
-    with pytest.raises(NotGenuine, match="replay"):
+    with pytest.raises(InvalidSignature, match="replay"):
         verified(signed(SECRET, id="m", timestamp=NOW, body=body), body, secret=SECRET, now=now)
 
 
 @pytest.mark.parametrize("body", [b"", b"[]", b"{}", b'{"data": 1}', b'{"data": {"id": "x"}}', b"\xff"])
 def test_signed_and_yet_no_job(body: bytes) -> None:
-    with pytest.raises(NotGenuine, match="tells of no job"):
+    with pytest.raises(InvalidSignature, match="contains no job"):
         verified(signed(SECRET, id="m", timestamp=NOW, body=body), body, secret=SECRET, now=NOW)
 
 
@@ -83,7 +83,7 @@ def test_a_secret_is_new_each_time_and_one_the_service_takes() -> None:
         verified({}, b"", secret="whsec_é!")
 
 
-async def _submitted(service: FakeService, **given: str) -> None:
+async def _submitted(service: InMemoryService, **given: str) -> None:
     async with AsyncClient("http://pliant.test", transport=service) as client:
         await client.submit(np.ones((4, 5, 2)), **given)
 
@@ -92,7 +92,7 @@ def test_both_clients_send_the_parts() -> None:
     import asyncio
 
     given = {"webhook": "https://receiver.example/x", "webhook_secret": SECRET}
-    one, other = FakeService(), FakeService()
+    one, other = InMemoryService(), InMemoryService()
     Client("http://pliant.test", transport=one).submit(np.ones((4, 5, 2)), **given)
     asyncio.run(_submitted(other, **given))
     for service in (one, other):

@@ -56,9 +56,7 @@ def test_a_required_page_that_cannot_be_built_stops_the_build(
         builder.provide_page()
 
 
-def test_a_registry_that_does_not_answer_is_said_in_a_sentence(
-    builder: ModuleType, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_registry_that_does_not_answer_is_reported(builder: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
     use_commands(builder, monkeypatch, "", "import sys; sys.exit('ETIMEDOUT')")
     with pytest.raises(builder.PageNotBuilt, match=r"connection to the npm registry.*exit code 1: ETIMEDOUT"):
         builder.build_page()
@@ -68,7 +66,7 @@ def test_a_registry_that_does_not_answer_is_said_in_a_sentence(
         builder.build_page()
 
 
-def test_a_failing_bundler_is_said(builder: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failing_bundler_is_reported(builder: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
     use_commands(builder, monkeypatch, "import sys; sys.exit('src/main.ts:1: unexpected token')")
     with pytest.raises(builder.PageNotBuilt, match=r"could not be bundled \(exit code 1: src/main.ts:1: unexpected"):
         builder.build_page()
@@ -102,5 +100,20 @@ def test_the_pages_types_hold(builder: ModuleType) -> None:
     assert ran.returncode == 0, ran.stdout
 
 
-def test_the_lock_file_names_no_host() -> None:
-    assert "://" not in (ROOT / "service" / "web" / "package-lock.json").read_text()
+@pytest.mark.node
+def test_the_types_of_the_api_are_generated_from_its_document(builder: ModuleType, tmp_path: Path) -> None:
+    generator = ROOT / "service" / "web" / "node_modules" / "openapi-typescript" / "bin" / "cli.js"
+    if not generator.is_file() and not os.environ.get("CI"):
+        pytest.skip("openapi-typescript is not installed; run `make page`")
+    document, made = tmp_path / "openapi.json", tmp_path / "schema.d.ts"
+    printed = subprocess.run(
+        [sys.executable, "-m", "pliant.service.openapi", "--schemas"], capture_output=True, check=True
+    )
+    document.write_bytes(printed.stdout)
+    (node, _) = builder.node_commands()
+    subprocess.run([*node, str(generator), str(document), "-o", str(made)], check=True, capture_output=True)
+    assert made.read_text() == (ROOT / "service" / "web" / "src" / "schema.d.ts").read_text(), "see src/types.ts"
+
+
+def test_the_lock_file_names_no_registry() -> None:
+    assert '"resolved"' not in (ROOT / "service" / "web" / "package-lock.json").read_text()

@@ -25,7 +25,7 @@ def built(tmp_path: Path) -> TestClient:
     return TestClient(app)
 
 
-def test_the_page_is_asked_for_again_and_its_files_are_kept_for_ever(built: TestClient) -> None:
+def test_the_page_is_revalidated_and_its_files_are_immutable(built: TestClient) -> None:
     for address in ("/", "/docs"):
         index = built.get(address)
         assert index.status_code == 200
@@ -67,7 +67,7 @@ def test_nothing_but_the_page_is_served(built: TestClient, name: str) -> None:
     assert answer.status_code == 404
 
 
-def test_head_tells_the_same_without_a_body(built: TestClient) -> None:
+def test_head_returns_the_same_headers_without_a_body(built: TestClient) -> None:
     head = built.head("/page/main-ABC.js", headers={"Accept-Encoding": "identity"})
     assert (head.status_code, head.content) == (200, b"")
     assert head.headers["content-length"] == str(len(SCRIPT))

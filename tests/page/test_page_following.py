@@ -49,7 +49,7 @@ def test_a_running_job_survives_a_reload_and_can_be_cancelled(
     assert httpx.get(f"{url}/v1/jobs/{id}").json()["status"] == "cancelled"
 
     page.get_by_role("button", name="Delete").click()
-    page.get_by_role("button", name="Delete it for good?").click()
+    page.get_by_role("button", name="Delete permanently?").click()
     expect(page.get_by_role("link", name="a long job")).to_have_count(0)
     assert httpx.get(f"{url}/v1/jobs/{id}").status_code == 404
     assert httpx.get(f"{url}/v1/jobs/{waiting}").json()["status"] == "cancelled"
@@ -69,7 +69,7 @@ def test_the_list_follows_a_running_job_that_is_not_shown(
     until(lambda: float(row.get_by_role("progressbar", include_hidden=True).evaluate("(it) => it.value")) > before)
 
 
-def test_a_service_that_is_away_is_said_and_its_return_noticed(page: Page, url: str, finished: str) -> None:
+def test_an_outage_is_reported_and_its_end_noticed(page: Page, url: str, finished: str) -> None:
     page.route("**/v1/**", lambda route: route.abort())
     page.goto(f"{url}/#job={finished}")
     page.reload()
@@ -84,7 +84,7 @@ def test_a_token_is_asked_for_and_then_sent_with_everything(page: Page, url: str
         if route.request.headers.get("authorization") == "Bearer a-token":
             route.continue_()
         else:
-            problem = {"title": "Unauthorised", "status": 401, "detail": "Send a token.", "code": "unauthorised"}
+            problem = {"title": "Token required", "status": 401, "detail": "Send a token.", "code": "unauthorized"}
             route.fulfill(status=401, content_type="application/problem+json", body=json.dumps(problem))
 
     page.route("**/v1/**", guarded)
@@ -92,7 +92,7 @@ def test_a_token_is_asked_for_and_then_sent_with_everything(page: Page, url: str
     page.reload()
     expect(page.get_by_role("alert").first).to_contain_text("Send a token.")
     page.get_by_label("Token").fill("a-token")
-    page.get_by_role("button", name="Use it").click()
+    page.get_by_role("button", name="Use", exact=True).click()
     page.locator(".view canvas").wait_for(timeout=30_000)
     expect(page.get_by_role("alert")).to_have_count(0)
     with page.expect_download() as download:

@@ -108,7 +108,7 @@ def test_the_code_shown_makes_the_same_job(
     model = asked.json()
     page.goto(f"{url}/#job={model['id']}")
     page.get_by_role("button", name=language, exact=True).click()
-    shown = page.get_by_role("region", name="Do this from code").locator("code")
+    shown = page.get_by_role("region", name="Use from code").locator("code")
     expect(shown).to_contain_text(url)
     code = shown.inner_text()
     before = {job["id"] for job in httpx.get(f"{url}/v1/jobs").json()["jobs"]}
@@ -136,7 +136,7 @@ def test_a_dense_result_plays_within_time_and_memory(page: Page, tmp_path: Path)
     ):
         np.savez(tmp_path / f"{part}.npz", **arrays)
         page.get_by_label(label, exact=True).set_input_files(tmp_path / f"{part}.npz")
-    seen = page.get_by_role("region", name="How your files are understood")
+    seen = page.get_by_role("region", name="How your files are interpreted")
     expect(seen).to_contain_text("99 frames of 29,000 points", timeout=30_000)
     page.get_by_label("Method").select_option(label="pseudo-inverse")
     page.get_by_text("More options").click()

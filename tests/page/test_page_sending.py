@@ -23,7 +23,7 @@ pytestmark = [
 def test_from_an_upload_to_a_playing_mesh(page: Page, url: str, small: dict[str, bytes]) -> None:
     choose(page, small)
     expect(page.locator("[data-part=tracks]")).to_contain_text("tracks 10 × 300 × 2 float64")
-    seen = page.get_by_role("region", name="How your files are understood")
+    seen = page.get_by_role("region", name="How your files are interpreted")
     expect(seen).to_contain_text("10 frames of 300 points")
     expect(seen).to_contain_text("tracks (F, P, 2), y down")
     expect(seen).to_contain_text("given; errors are measured against it")
@@ -88,12 +88,14 @@ def test_dropped_files_find_their_places_and_say_what_they_are(page: Page, url: 
     drop(page, small)
     for part, name in (("tracks", TRACKS), ("mesh", "mesh.npz"), ("ground_truth", "truth.npz")):
         expect(page.locator(f"[data-part={part}]")).to_contain_text(name)
-    expect(page.get_by_role("region", name="How your files are understood")).to_contain_text("10 frames of 300 points")
+    expect(page.get_by_role("region", name="How your files are interpreted")).to_contain_text("10 frames of 300 points")
     page.get_by_role("button", name="Remove mesh").click()
-    expect(page.get_by_role("region", name="How your files are understood")).to_contain_text("made by triangulating")
+    expect(page.get_by_role("region", name="How your files are interpreted")).to_contain_text("made by triangulating")
     page.get_by_label("or points on a grid").fill("15×20")
     page.get_by_label("or points on a grid").press("Tab")
-    expect(page.get_by_role("region", name="How your files are understood")).to_contain_text("266 faces, from the grid")
+    expect(page.get_by_role("region", name="How your files are interpreted")).to_contain_text(
+        "266 faces, from the grid"
+    )
     page.get_by_label("or points on a grid").fill("3x3")
     page.get_by_label("or points on a grid").press("Tab")
     expect(page.get_by_role("alert")).to_contain_text("vertex_count_mismatch")
@@ -104,7 +106,7 @@ def test_a_reading_can_be_chosen_before_anything_is_made_of_it(page: Page, url: 
     jobs = len(httpx.get(f"{url}/v1/jobs?limit=100").json()["jobs"])
     choose(page, {TRACKS: packed(W=np.random.default_rng(0).normal(size=(40, 50)))})
     page.get_by_role("button", name="W (2F, P), rows stacked").click()
-    expect(page.get_by_role("region", name="How your files are understood")).to_contain_text("W (2F, P), rows stacked")
+    expect(page.get_by_role("region", name="How your files are interpreted")).to_contain_text("W (2F, P), rows stacked")
     expect(page.get_by_role("alert")).to_have_count(0)
     assert len(httpx.get(f"{url}/v1/jobs?limit=100").json()["jobs"]) == jobs
 

@@ -17,7 +17,7 @@ from pliant.service.app import STATUS_OF
 from pliant.service.settings import MB, InvalidServiceSetting, ServiceSettings
 from pliant.service.spool import Incoming
 from pliant.worker import errors
-from serving import Running, Serve, finish, submit, until
+from serving import Running, Serve, finish, settings_from, submit, until
 
 CONTENTS = os.urandom(3_000_000)
 
@@ -58,6 +58,34 @@ def test_an_interrupted_download_is_resumed(http: httpx.Client, address: str) ->
     assert http.get(address + "x").json()["code"] == "unknown_artifact"
 
 
+def test_a_file_that_is_deleted_meanwhile_is_gone(
+    running: Running, http: httpx.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job = submit(http, name="gone")
+    finish(running, job.id, b"x" * 10)
+    address = f"/v1/jobs/{job.id}/artifacts/shapes.npz"
+    stored = running.jobs.blobs.get(f"{running.jobs.records.get(job.id).prefix}shapes.npz")
+    running.jobs.blobs.delete(f"jobs/{job.id}/")
+    answer = http.get(address)
+    assert (answer.status_code, answer.json()["code"]) == (410, "artifact_gone")
+    # Deleted after its size was read, before its first byte.
+    monkeypatch.setattr("pliant.worker.store.blobs.Blobs.get", lambda *_: stored)
+    answer = http.get(address)
+    assert (answer.status_code, answer.json()["code"]) == (410, "artifact_gone")
+    running.jobs.records.delete(job.id)
+    answer = http.get(address)
+    assert (answer.status_code, answer.json()["code"]) == (404, "unknown_job")
+
+
+def test_an_api_process_without_workers_is_ready_for_its_own_part(http: httpx.Client) -> None:
+    whole = http.get("/readyz")
+    assert (whole.status_code, whole.json()["code"]) == (503, "not_ready")
+    assert "No worker" in whole.json()["detail"]
+    own = http.get("/readyz", params={"exclude": "workers"})
+    assert (own.status_code, own.json()) == (200, {"redis": "ok", "blobs": "ok"})
+    assert http.get("/readyz", params={"exclude": "nothing"}).status_code == 422
+
+
 def test_events_end_with_the_job_and_go_on_from_the_last_one(running: Running, http: httpx.Client) -> None:
     job = submit(http, name="followed")
     timer = threading.Timer(0.5, finish, (running, job.id, b"x"))
@@ -88,7 +116,7 @@ def test_waiting_ends_when_the_job_does_or_patience_does(running: Running, http:
     timer.join()
 
 
-def test_every_answer_tells_the_browser_to_be_careful(http: httpx.Client) -> None:
+def test_every_answer_has_the_security_headers(http: httpx.Client) -> None:
     for answer in (http.get("/healthz"), http.get("/nowhere"), http.get("/v1/jobs/nobody")):
         assert answer.headers["content-security-policy"].startswith("default-src 'none'")
         assert answer.headers["x-content-type-options"] == "nosniff"
@@ -146,7 +174,7 @@ def test_every_error_of_the_worker_has_a_status() -> None:
     assert all(any(base in STATUS_OF for base in kind.__mro__) for kind in kinds)
 
 
-def test_while_the_store_hangs_everybody_is_told_soon_and_the_process_counts_as_alive(
+def test_while_the_store_hangs_requests_fail_soon_and_the_process_stays_alive(
     serve: Serve, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("pliant.worker.store.connection.ANSWER_WITHIN", 2.0)
@@ -162,7 +190,7 @@ def test_while_the_store_hangs_everybody_is_told_soon_and_the_process_counts_as_
         began = time.monotonic()
         for thread in threads:
             thread.start()
-        until(lambda: running.app.state.service.requests.under_way > 40)
+        until(lambda: (running.app.state.service.metrics.registry.get_sample_value("pliant_http_under_way") or 0) > 40)
         assert http.get("/healthz").status_code == 200
         assert len(answers) < 20, "it did not wait for a thread: 40 there are, and more than 40 were before it"
         for thread in threads:
@@ -178,7 +206,7 @@ def test_a_killed_process_folder_is_swept_and_a_living_ones_is_not(tmp_path: Pat
     (tmp_path / "dead").mkdir()
     (tmp_path / "dead" / "part").write_bytes(b"x")
     (tmp_path / "dead.lock").touch()
-    with living.room() as room:
+    with living.scratch() as room:
         (room / "part").write_bytes(b"x")
         assert Incoming(tmp_path).abandoned() == ["dead"]
         second = Incoming(tmp_path)
@@ -191,9 +219,43 @@ def test_a_killed_process_folder_is_swept_and_a_living_ones_is_not(tmp_path: Pat
 
 
 def test_settings_come_from_the_environment() -> None:
-    settings = ServiceSettings.from_environment({"PLIANT_MAX_BODY_MB": "5", "PLIANT_ALLOWED_HOSTS": "a, b"})
+    settings = settings_from(MAX_BODY_MB="5", ALLOWED_HOSTS="a, b")
     assert (settings.max_body_bytes, settings.allowed_hosts, settings.loopback) == (5 * MB, ("a", "b"), True)
-    assert not ServiceSettings.from_environment({"PLIANT_HOST": "0.0.0.0"}).loopback
-    for name, value in (("PLIANT_PORT", "70000"), ("PLIANT_PARSERS", "0"), ("PLIANT_PORT", "x")):
-        with pytest.raises(InvalidServiceSetting, match=name):
-            ServiceSettings.from_environment({name: value})
+    assert not settings_from(HOST="0.0.0.0").loopback
+    for name, value in (
+        ("PORT", "70000"),
+        ("PARSERS", "0"),
+        ("PORT", "x"),
+        ("MAX_BODY_MB", "0"),
+        ("LOG_FORMAT", "xml"),
+    ):
+        with pytest.raises(InvalidServiceSetting, match=f"PLIANT_{name}"):
+            settings_from(**{name: value})
+
+
+def test_an_empty_variable_counts_as_unset() -> None:
+    names = (
+        "HOST",
+        "PORT",
+        "DATA",
+        "MAX_BODY_MB",
+        "MAX_QUEUED",
+        "REQUESTS_PER_MINUTE",
+        "AUTH",
+        "ALLOWED_HOSTS",
+        "LOG_LEVEL",
+    )
+    assert settings_from(**dict.fromkeys(names, "")) == ServiceSettings()
+
+
+def test_a_dotenv_file_and_secret_files_are_read_the_environment_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / ".env").write_text("PLIANT_PORT=1001\nPLIANT_MAX_QUEUED=7\nSOMETHING_ELSE=x\n")
+    secrets = tmp_path / "secrets"
+    secrets.mkdir()
+    (secrets / "PLIANT_MAX_QUEUED").write_text("8")
+    (secrets / "PLIANT_PARSERS").write_text("3")
+    found = settings_from(PORT="1002", SECRETS_DIR=str(secrets))
+    assert (found.port, found.max_queued, found.parsers) == (1002, 7, 3)

@@ -22,7 +22,7 @@ from pliant.worker.jobs.service import Jobs
 from pliant.worker.settings import Settings
 from pliant.worker.store.connection import connect
 from pliant.worker.tokens import Scope, Tokens
-from serving import Running, Serve, finish, form, submit, tracks
+from serving import Running, Serve, finish, form, settings_from, submit, tracks
 
 
 @pytest.fixture(scope="module")
@@ -54,25 +54,25 @@ def addresses(running: Running) -> list[tuple[str, str]]:
     return found
 
 
-def test_every_address_but_the_public_ones_asks_for_a_token(guarded: Running) -> None:
+def test_every_path_but_the_public_ones_needs_a_token(guarded: Running) -> None:
     asked = {"nothing": {}, "basic": {"Authorization": "Basic YTpi"}, "empty": {"Authorization": "Bearer"}}
     with httpx.Client(base_url=guarded.url) as http:
         open_to_all = set()
         for method, path in [*addresses(guarded), ("GET", "/nowhere"), ("POST", "/"), ("DELETE", "/v1")]:
             if is_public(path):
-                open_to_all.add(path)
+                open_to_all.add("/errors" if path.startswith("/errors") else path)
                 continue
             for headers in asked.values():
                 answer = http.request(method, path, headers=headers)
                 assert answer.status_code == 401, (method, path)
                 assert answer.headers["www-authenticate"].startswith('Bearer realm="pliant"')
                 assert answer.headers["content-type"] == "application/problem+json"
-        assert open_to_all == {"/healthz", "/readyz", "/"}
+        assert open_to_all == {"/healthz", "/readyz", "/", "/errors"}
         for path in ("/healthz", "/openapi.json"):
             assert http.get(path).status_code == 200
 
 
-def test_a_token_in_the_address_counts_for_nothing(guarded: Running) -> None:
+def test_a_token_in_the_query_is_ignored(guarded: Running) -> None:
     _, text = guarded.tokens.create("ada")
     for name in ("token", "access_token", "authorization"):
         assert httpx.get(f"{guarded.url}/v1/jobs", params={name: text}).status_code == 401
@@ -81,13 +81,13 @@ def test_a_token_in_the_address_counts_for_nothing(guarded: Running) -> None:
 
 
 @pytest.mark.parametrize("scheme", ["Bearer", "bearer", "BEARER"])
-def test_a_good_token_is_let_in(guarded: Running, scheme: str) -> None:
+def test_a_valid_token_is_accepted(guarded: Running, scheme: str) -> None:
     _, text = guarded.tokens.create("ada")
     answer = httpx.get(f"{guarded.url}/v1/jobs", headers={"Authorization": f"{scheme} {text}"})
     assert (answer.status_code, answer.json()["jobs"]) == (200, [])
 
 
-def test_wrong_revoked_and_expired_tokens_are_told_apart_from_none(guarded: Running) -> None:
+def test_wrong_revoked_and_expired_tokens_have_codes_of_their_own(guarded: Running) -> None:
     token, text = guarded.tokens.create("gone")
     _, short = guarded.tokens.create("short", expires=timedelta(seconds=0.05))
     time.sleep(0.1)
@@ -96,7 +96,7 @@ def test_wrong_revoked_and_expired_tokens_are_told_apart_from_none(guarded: Runn
         answer = httpx.get(f"{guarded.url}/v1/jobs", headers={"Authorization": f"Bearer {value}"})
         return answer.status_code, answer.json()["code"], 'error="invalid_token"' in answer.headers["www-authenticate"]
 
-    assert httpx.get(f"{guarded.url}/v1/jobs").json()["code"] == "unauthorised"
+    assert httpx.get(f"{guarded.url}/v1/jobs").json()["code"] == "unauthorized"
     assert said("nonsense") == (401, "invalid_token", True)
     assert said(text[:-2] + "zz") == (401, "invalid_token", True)
     assert said(short) == (401, "expired_token", True)
@@ -104,7 +104,7 @@ def test_wrong_revoked_and_expired_tokens_are_told_apart_from_none(guarded: Runn
     assert said(text) == (401, "invalid_token", True)
 
 
-def test_the_body_of_a_stranger_is_never_read(guarded: Running) -> None:
+def test_the_body_of_a_request_without_a_token_is_never_read(guarded: Running) -> None:
     """The answer comes although not one byte of the body was sent, and nothing is written."""
     host, port = guarded.url.removeprefix("http://").split(":")
     head = (
@@ -121,7 +121,7 @@ def test_the_body_of_a_stranger_is_never_read(guarded: Running) -> None:
     ("scopes", "read", "write"),
     [((Scope.READ,), 200, 403), ((Scope.SUBMIT,), 403, 415), ((Scope.ADMIN,), 200, 415)],
 )
-def test_a_scope_bounds_what_a_token_may(guarded: Running, scopes: tuple[Scope, ...], read: int, write: int) -> None:
+def test_a_scope_limits_what_a_token_can_do(guarded: Running, scopes: tuple[Scope, ...], read: int, write: int) -> None:
     with guarded.client(*scopes) as http:
         answers = {"read": http.get("/v1/jobs"), "write": http.post("/v1/jobs", content=b"x")}
         assert (answers["read"].status_code, answers["write"].status_code) == (read, write)
@@ -172,7 +172,7 @@ def test_to_another_token_a_job_is_not_there_on_any_route(
     assert ada.get(f"/v1/jobs/{queued.id}").json()["status"] == "queued"
 
 
-def test_another_tokens_id_is_taken_and_nothing_is_said_of_its_job(
+def test_an_id_of_another_token_is_taken_and_its_job_stays_hidden(
     guarded: Running, ada: httpx.Client, bob: httpx.Client
 ) -> None:
     body = tracks(seed=3)
@@ -201,7 +201,7 @@ def test_idempotency_keys_are_each_tokens_own(ada: httpx.Client, bob: httpx.Clie
     assert first.json()["id"] == again.json()["id"] != other.json()["id"]
 
 
-def test_admin_sees_everybodys_jobs_and_a_sharing_token_its_fellows(guarded: Running, ada: httpx.Client) -> None:
+def test_admin_sees_all_jobs_and_a_sharing_token_those_of_its_owner(guarded: Running, ada: httpx.Client) -> None:
     job = submit(ada, name="seen")
     owner = guarded.jobs.records.get(job.id).owner
     with guarded.client(Scope.ADMIN) as admin, guarded.client(sharing=owner) as fellow:
@@ -213,7 +213,7 @@ def test_admin_sees_everybodys_jobs_and_a_sharing_token_its_fellows(guarded: Run
         assert ada.get(f"/v1/jobs/{again.id}").status_code == 200, "what an admin runs again stays its owner's"
 
 
-def test_the_sdk_and_its_twin_work_with_a_token_and_say_what_is_wrong_without(guarded: Running) -> None:
+def test_the_sdk_works_with_a_token_and_explains_a_missing_one(guarded: Running) -> None:
     _, text = guarded.tokens.create("sdk")
     points = np.random.default_rng(0).normal(size=(6, 12, 2)) * 100
     with Client(guarded.url, token=text) as client:
@@ -234,14 +234,14 @@ def test_the_sdk_and_its_twin_work_with_a_token_and_say_what_is_wrong_without(gu
         stranger.get(job.id)
 
 
-def test_a_store_that_is_away_lets_nobody_in(serve: Serve, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_without_the_store_no_token_is_accepted(serve: Serve, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     running = serve(redis_url=f"unix://{tmp_path}/nobody.sock", auth="required")
     headers = {"Authorization": f"Bearer pliant_{'0' * 12}_{'a' * 43}"}
     answer = httpx.get(f"{running.url}/v1/limits", headers=headers, timeout=30)
     assert (answer.status_code, answer.json()["code"], answer.headers["retry-after"]) == (503, "store_unavailable", "2")
     ready = httpx.get(f"{running.url}/readyz", timeout=30)
     assert (ready.status_code, ready.json()["code"]) == (503, "not_ready")
-    assert ready.json()["detail"] == "Not ready: redis, workers. The service's log says why.", (
+    assert ready.json()["detail"] == "Not ready: redis, workers. The service's log has the reasons.", (
         "reasons are not for strangers"
     )
     assert "ConnectionError" in caplog.text
@@ -261,15 +261,15 @@ def test_a_preflight_needs_no_token_and_a_refusal_can_be_read(serve: Serve) -> N
     assert "access-control-allow-origin" not in strange.headers
 
 
-def test_tokens_are_off_on_loopback_and_on_elsewhere_unless_told(valkey_url: str) -> None:
+def test_tokens_are_off_on_loopback_and_on_elsewhere_by_default(valkey_url: str) -> None:
     def asks(**env: str) -> bool:
-        return ServiceSettings.from_environment({f"PLIANT_{key}": value for key, value in env.items()}).asks_for_tokens
+        return settings_from(**env).asks_for_tokens
 
     assert [asks(), asks(HOST="::1"), asks(HOST="localhost")] == [False, False, False]
     assert [asks(HOST="0.0.0.0"), asks(HOST="::"), asks(HOST="10.0.0.1"), asks(HOST="example.org")] == [True] * 4
     assert asks(AUTH="required")
     assert not asks(HOST="0.0.0.0", AUTH="off")
-    with pytest.raises(InvalidServiceSetting, match="auto, required, off"):
+    with pytest.raises(InvalidServiceSetting, match="'auto', 'required' or 'off'"):
         asks(AUTH="no")
 
 
@@ -277,14 +277,14 @@ def test_a_service_that_nobody_could_use_does_not_start(valkey_url: str, caplog:
     tokens = Tokens(connect(valkey_url, decode=True), prefix="check-door")
     strict, open_door = ServiceSettings(host="0.0.0.0"), ServiceSettings(host="0.0.0.0", auth="off")
     with pytest.raises(InvalidServiceSetting, match=r"pliant token create.*PLIANT_AUTH=off"):
-        process.check_door(strict, tokens)
-    process.check_door(open_door, tokens)
-    assert "may read and delete every job" in caplog.text
-    process.check_door(ServiceSettings(), tokens)
+        process.check_access(strict, tokens)
+    process.check_access(open_door, tokens)
+    assert "can read and delete every job" in caplog.text
+    process.check_access(ServiceSettings(), tokens)
     made, _ = tokens.create("somebody")
-    process.check_door(strict, tokens)
+    process.check_access(strict, tokens)
     tokens.revoke(made.id)
-    process.check_door(strict, Tokens(connect("unix:///nonexistent/x.sock", decode=True, retries=0), prefix="x"))
+    process.check_access(strict, Tokens(connect("unix:///nonexistent/x.sock", decode=True, retries=0), prefix="x"))
 
 
 def test_with_tokens_off_one_that_is_sent_changes_nothing(running: Running, http: httpx.Client) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import httpx
 import pytest
-from pliant.service.middleware.origin import EVERY_ANSWER
+from pliant.service.middleware.security_headers import SECURITY_HEADERS
 from serving import Running, Serve, finish, submit, until
 from starlette.requests import Request
 from starlette.responses import Response
@@ -28,7 +28,7 @@ def user(guarded: Running) -> Iterator[httpx.Client]:
         yield client
 
 
-def test_every_kind_of_answer_tells_the_browser_to_be_careful(guarded: Running, user: httpx.Client) -> None:
+def test_every_kind_of_answer_has_the_security_headers(guarded: Running, user: httpx.Client) -> None:
     job = submit(user)
     finish(guarded, job.id, b"result")
     file = f"/v1/jobs/{job.id}/artifacts/shapes.npz"
@@ -54,7 +54,7 @@ def test_every_kind_of_answer_tells_the_browser_to_be_careful(guarded: Running, 
         "not a form": user.post("/v1/jobs", content=b"x"),
         "other site": user.post("/v1/jobs", content=b"x", headers={"Origin": "https://evil.example"}),
     }
-    assert {name.lower() for name in EVERY_ANSWER} | {"cache-control"} == CAREFUL
+    assert {name.lower() for name in SECURITY_HEADERS} | {"cache-control"} == CAREFUL
     for name, answer in answers.items():
         assert set(answer.headers) >= CAREFUL, name
         policy = answer.headers["content-security-policy"]

@@ -72,7 +72,7 @@ def test_the_sample_is_small_whatever_is_sent(http: httpx.Client, size: tuple[in
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_what_a_job_is_refused_for_is_said_in_the_same_words(running: Running, http: httpx.Client, case: str) -> None:
+def test_an_inspection_refuses_what_a_submission_refuses(running: Running, http: httpx.Client, case: str) -> None:
     parts, status, code = BAD[case]
     answer, submitted = (http.post(f"/v1/{path}", files=parts) for path in ("inspect", "jobs"))
     assert (answer.status_code, answer.json()["code"]) == (status, code)

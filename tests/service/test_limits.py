@@ -8,11 +8,11 @@ import time
 import httpx
 import pytest
 from pliant.client import Client, TooManyRequests
-from pliant.client.retry import Policy
-from pliant.service.middleware.rate_limit import MOST_CLIENTS, Rates, _who
-from pliant.service.settings import USUAL_RATE, InvalidServiceSetting, ServiceSettings
+from pliant.client.retry import Retry
+from pliant.service.middleware.rate_limit import MOST_CLIENTS, Rates, _client
+from pliant.service.settings import USUAL_RATE, InvalidServiceSetting
 from pliant.worker.tokens import Scope
-from serving import Running, Serve, claim, form, submit, tracks
+from serving import Running, Serve, claim, form, settings_from, submit, tracks
 
 
 class Clock:
@@ -62,12 +62,12 @@ def test_the_memory_of_clients_is_bounded_and_the_greedy_are_not_forgotten() -> 
 
 def test_an_address_is_one_client_and_so_is_an_ipv6_network() -> None:
     def who(host: str) -> str:
-        return _who({"client": (host, 1)}, None)
+        return _client({"client": (host, 1)}, None)
 
     assert who("10.0.0.1") != who("10.0.0.2")
     assert who("2001:db8::1") == who("2001:db8::ffff:1") != who("2001:db8:0:1::1")
     assert who("testclient") == "testclient"
-    assert _who({"client": None}, None) == ""
+    assert _client({"client": None}, None) == ""
 
 
 def test_too_many_requests_are_refused_with_the_time_to_wait_and_before_the_body(serve: Serve) -> None:
@@ -93,14 +93,14 @@ def test_each_token_has_its_own_rate(serve: Serve) -> None:
         assert fourth.get("/v1/limits").json()["requests_per_minute"] == 3
 
 
-def test_the_sdk_waits_as_it_is_told_and_gets_through(serve: Serve) -> None:
+def test_the_sdk_honours_retry_after_and_succeeds(serve: Serve) -> None:
     running = serve(requests_per_minute=60)
     with Client(running.url) as client:
         begun = time.monotonic()
         for _ in range(62):
             client.options()
         assert 0.5 < time.monotonic() - begun < 20
-    hasty = Client(running.url, policy=Policy(patience=0.0, first_contact=0.0))
+    hasty = Client(running.url, retries=Retry(patience=0.0, first_contact=0.0))
 
     def many() -> None:
         for _ in range(40):
@@ -172,9 +172,9 @@ def test_a_token_may_have_a_smaller_body_than_the_service_allows(serve: Serve) -
         submit(large)
 
 
-def test_the_usual_rate_holds_where_strangers_may_come() -> None:
+def test_the_default_rate_applies_where_the_service_is_reachable_from_outside() -> None:
     def rate(own: int | None = None, **env: str) -> int:
-        return ServiceSettings.from_environment({f"PLIANT_{name}": value for name, value in env.items()}).rate_of(own)
+        return settings_from(**env).rate_of(own)
 
     assert rate() == 0
     assert rate(HOST="0.0.0.0") == rate(AUTH="required") == rate(HOST="::", AUTH="off") == USUAL_RATE
@@ -194,7 +194,7 @@ def test_no_more_of_a_tokens_jobs_are_queued_for_the_workers_than_may_run(serve:
         assert places == [0, None, 1, 2], "null: held back"
 
 
-def test_admins_jobs_are_counted_as_nobodys(serve: Serve) -> None:
+def test_jobs_of_an_admin_count_for_no_owner(serve: Serve) -> None:
     running: Running = serve(auth="required", max_queued=1)
     with running.client() as ada, running.client(Scope.ADMIN) as admin:
         submit(ada)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import httpx
 from pliant.schemas.job import Problem, Status
-from pliant.service.metrics import Histogram, Requests, exposition
+from pliant.service.metrics import Metrics
 from pliant.worker.jobs import lifecycle
 from pliant.worker.tokens import Scope
 from prometheus_client.parser import text_string_to_metric_families
@@ -30,7 +30,7 @@ def at(numbers: Numbers, name: str, **labels: str) -> float:
     return numbers.get((name, tuple(sorted(labels.items()))), 0.0)
 
 
-def test_the_numbers_are_what_happened(serve: Serve) -> None:
+def test_the_metrics_count_what_happened(serve: Serve) -> None:
     running: Running = serve()
     with httpx.Client(base_url=running.url) as http:
         before = read(http.get("/metrics").text)
@@ -41,7 +41,7 @@ def test_the_numbers_are_what_happened(serve: Serve) -> None:
         problem = Problem(title="T", status=500, detail="It broke. Try again.", code="out_of_memory")
         later = NOW + timedelta(seconds=7)
         running.jobs.records.update(
-            failed.id, lambda held: lifecycle.fail(held, token=token, problem=problem, now=later, retention=0)
+            failed.id, lambda held: lifecycle.fail(held, attempt_id=token, problem=problem, now=later, retention=0)
         )
         http.get(f"/v1/jobs/{waiting.id}")
         http.get("/v1/jobs/nobody")
@@ -88,7 +88,7 @@ def test_only_an_admins_token_may_read_them(serve: Serve) -> None:
     assert at(numbers, "pliant_http_requests_total", method="GET", route="other", status="403") == 1
 
 
-def test_without_its_store_the_service_still_tells(serve: Serve, tmp_path: Path) -> None:
+def test_without_its_store_the_service_reports_its_requests(serve: Serve, tmp_path: Path) -> None:
     running = serve(redis_url=f"unix://{tmp_path}/nobody.sock")
     answer = httpx.get(f"{running.url}/metrics", timeout=30)
     assert answer.status_code == 200
@@ -97,18 +97,10 @@ def test_without_its_store_the_service_still_tells(serve: Serve, tmp_path: Path)
     assert ("pliant_queue_depth", ()) not in numbers
 
 
-def test_a_bucket_holds_all_that_is_below_it() -> None:
-    histogram = Histogram((1.0, 2.5))
-    for value in (0.5, 1.0, 1.1, 99.0):
-        histogram.add(value)
-    lines = {labels.get("le", suffix): value for suffix, labels, value in histogram.samples()}
-    assert lines == {"1": 2, "2.5": 3, "+Inf": 4, "_sum": 101.6, "_count": 4}
-
-
 def test_an_odd_method_or_label_breaks_nothing(running: Running) -> None:
-    requests = Requests()
-    requests.count("BREW", 'a"b\\c\nd', 418, 0.1)
-    numbers = read(exposition(running.jobs, requests))
+    metrics = Metrics()
+    metrics.count("BREW", 'a"b\\c\nd', status=418, seconds=0.1)
+    numbers = read(metrics.exposition(running.jobs).decode())
     assert at(numbers, "pliant_http_requests_total", method="other", route='a"b\\c\nd', status="418") == 1
 
 

@@ -98,7 +98,7 @@ def test_every_answer_is_one_that_is_declared(
     try:
         ask()
     except Unsatisfiable:
-        assert (path, mode) in [("/healthz", GenerationMode.NEGATIVE), ("/readyz", GenerationMode.NEGATIVE)]
+        assert (path, mode) in [("/healthz", GenerationMode.NEGATIVE), ("/errors", GenerationMode.NEGATIVE)]
     assert httpx.get(f"{guarded.url}/healthz").status_code == 200
     assert guarded.left_on_disk == []
 

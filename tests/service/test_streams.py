@@ -25,7 +25,7 @@ def restless(serve: Serve) -> Running:
     return serve(heartbeat_seconds=0.2)
 
 
-def test_a_stream_with_nothing_to_say_says_that_it_is_there(restless: Running) -> None:
+def test_an_idle_stream_sends_comment_lines(restless: Running) -> None:
     with httpx.Client(base_url=restless.url, timeout=10) as http:
         job = submit(http, name="quiet")
         begun = time.monotonic()
@@ -34,11 +34,11 @@ def test_a_stream_with_nothing_to_say_says_that_it_is_there(restless: Running) -
             assert answer.headers["cache-control"] == "no-store"
             lines = answer.iter_lines()
             signs = [next(line for line in lines if line.startswith(":")) for _ in range(4)]
-        assert signs == [": still here"] * 4
+        assert signs == [": ping"] * 4
         assert 0.6 < time.monotonic() - begun < 5
 
 
-def test_a_listener_who_leaves_is_forgotten(restless: Running) -> None:
+def test_a_client_that_disconnects_is_forgotten(restless: Running) -> None:
     service = restless.app.state.service
     with httpx.Client(base_url=restless.url, timeout=10) as http:
         job = submit(http, name="left")
@@ -66,7 +66,7 @@ def test_a_stream_ends_when_its_token_does(serve: Serve, how: str, monkeypatch: 
             begun = time.monotonic()
             rest = list(lines)
         assert time.monotonic() - begun < 5
-        assert all(line in ("", ": still here") for line in rest)
+        assert all(line in ("", ": ping") for line in rest)
         assert http.get(f"/v1/jobs/{job.id}/events").status_code == 401
 
 
@@ -97,7 +97,7 @@ def test_a_wish_that_is_none_is_passed_over(http: httpx.Client, wish: str) -> No
     assert time.monotonic() - begun < 8
 
 
-def test_nobody_waits_longer_than_the_service_lets_him(serve: Serve) -> None:
+def test_a_wait_is_capped_by_the_service(serve: Serve) -> None:
     running = serve(max_wait_seconds=1)
     with httpx.Client(base_url=running.url, timeout=10) as http:
         job = submit(http)
@@ -107,7 +107,23 @@ def test_nobody_waits_longer_than_the_service_lets_him(serve: Serve) -> None:
         assert time.monotonic() - begun < 5
 
 
-def test_a_log_is_what_the_attempts_said_line_by_line(running: Running, http: httpx.Client) -> None:
+def test_resuming_a_finished_job_at_its_last_event_ends(running: Running, http: httpx.Client) -> None:
+    job = submit(http, name="resumed at the end")
+    finish(running, job.id, b"x")
+    address = f"/v1/jobs/{job.id}/events"
+    last = [line for line in http.get(address).text.splitlines() if line.startswith("id: ")][-1].removeprefix("id: ")
+    again = http.get(address, headers={"Last-Event-ID": last}, timeout=5)
+    assert (again.status_code, "id:" in again.text) == (200, False)
+
+
+@pytest.mark.parametrize("id", ["99999999999999999999-0", "0-18446744073709551616", "x", "1-"])
+def test_an_impossible_event_id_is_refused(http: httpx.Client, id: str) -> None:
+    job = submit(http, name="impossible")
+    answer = http.get(f"/v1/jobs/{job.id}/events", headers={"Last-Event-ID": id}, timeout=5)
+    assert (answer.status_code, answer.json()["code"]) == (422, "invalid_event_id")
+
+
+def test_the_log_has_the_lines_of_all_attempts(running: Running, http: httpx.Client) -> None:
     job = submit(http, name="logged")
     empty = http.get(f"/v1/jobs/{job.id}/log")
     assert (empty.status_code, empty.text) == (200, "")
@@ -129,7 +145,13 @@ def process(
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     settings = Settings(data=tmp_path, redis_url=valkey_url, queue=f"stop-{os.getpid()}")
-    env = {**os.environ, **settings.to_environment(), "PLIANT_HOST": "127.0.0.1", "PLIANT_PORT": str(port)}
+    env = {
+        **os.environ,
+        **settings.to_environment(),
+        "PLIANT_HOST": "127.0.0.1",
+        "PLIANT_PORT": str(port),
+        "PLIANT_LOG_LEVEL": "warning",
+    }
     begin = getattr(request, "param", ("-m", "pliant.service"))
     log = tmp_path / "service.log"
     with log.open("wb") as errors:
@@ -199,7 +221,7 @@ raise SystemExit(main())
 
 
 @pytest.mark.parametrize("process", [("-c", STOPPED_BETWEEN_LOOK_AND_WAIT)], indirect=True, ids=["between"])
-def test_a_stream_that_has_just_looked_whether_to_end_is_told_all_the_same(
+def test_a_stream_between_check_and_wait_still_ends_on_shutdown(
     process: tuple[subprocess.Popen[bytes], str, Path],
 ) -> None:
     service, url, log = process

@@ -186,6 +186,15 @@ def test_a_client_that_goes_away_leaves_nothing(running: Running) -> None:
     assert running.server.started
 
 
+def test_two_idempotency_keys_are_refused(running: Running, http: httpx.Client) -> None:
+    before = running.waiting
+    twice = [("Idempotency-Key", "one"), ("Idempotency-Key", "two")]
+    for address, parts in (("/v1/jobs", {"files": form()}), ("/v1/jobs/nobody/retry", {})):
+        answer = http.post(address, headers=twice, **parts)
+        assert (answer.status_code, answer.json()["code"]) == (400, "conflicting_headers")
+    assert running.waiting == before
+
+
 def test_a_key_makes_a_repeated_request_the_same_job(running: Running, http: httpx.Client) -> None:
     key = {"Idempotency-Key": "6f1b"}
     first = http.post("/v1/jobs", files=form(name="same"), headers=key)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import socket
 import time
 from collections.abc import Callable
@@ -12,6 +13,7 @@ from datetime import UTC, datetime
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import httpx
 import numpy as np
@@ -60,6 +62,14 @@ class Running:
 Serve = Callable[..., Running]
 
 
+def settings_from(**env: str) -> ServiceSettings:
+    """Read the settings of the service with these `PLIANT_` variables set, and no others."""
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("PLIANT_")}
+    given = {f"PLIANT_{name}": value for name, value in env.items()}
+    with mock.patch.dict(os.environ, kept | given, clear=True):
+        return ServiceSettings.from_environment()
+
+
 def until(holds: Callable[[], Any], *, seconds: float = 10.0) -> None:
     deadline = time.monotonic() + seconds
     while not holds():
@@ -105,17 +115,17 @@ def submit(http: httpx.Client, **parts: Any) -> Job:
 
 
 def claim(running: Running, id: str) -> str:
-    token = running.jobs.records.get(id).token
-    running.jobs.records.update(id, lambda stored: lifecycle.claim(stored, token=token, worker="w", now=NOW))
-    return token
+    attempt_id = running.jobs.records.get(id).attempt_id
+    running.jobs.records.update(id, lambda stored: lifecycle.claim(stored, attempt_id=attempt_id, worker="w", now=NOW))
+    return attempt_id
 
 
 def finish(running: Running, id: str, contents: bytes, *, name: str = "shapes.npz") -> None:
     """Do as a worker would: claim the job, store a file, publish it."""
-    token = claim(running, id)
+    attempt_id = claim(running, id)
     file = running.settings.incoming.parent / f"{id}.tmp"
     file.write_bytes(contents)
-    prefix = f"jobs/{id}/{token}/"
+    prefix = f"jobs/{id}/{attempt_id}/"
     running.jobs.blobs.put(f"{prefix}{name}", file)
     artifact = Artifact(
         name=name, media_type="application/octet-stream", bytes=len(contents), sha256=sha256(contents).hexdigest()
@@ -123,7 +133,7 @@ def finish(running: Running, id: str, contents: bytes, *, name: str = "shapes.np
     running.jobs.records.update(
         id,
         lambda stored: lifecycle.succeed(
-            stored, token=token, prefix=prefix, artifacts=[artifact], metrics={}, outcome="converged",
+            stored, attempt_id=attempt_id, prefix=prefix, artifacts=[artifact], metrics={}, outcome="converged",
             sentence="Converged.", warnings=[], now=NOW, retention=0,
         ),
     )  # fmt: skip

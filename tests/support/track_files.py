@@ -180,7 +180,7 @@ FORMATS = (
     Written("MATLAB v7.3, nested structs", "`data.tracks2d.W (2F, P)`", mat73(data=STRUCT), "mat", "matrix", visibility=None),
     Written("MATLAB v7.3, a cell for each frame", "`W {1, F}` of `(2, P)`", mat73(W=cells(FRAMES)), "mat", "matrix", visibility=None),
     Written("CSV", "columns `frame`, `point`, `x`, `y`, `visible`, by name in any order", table(), "csv"),
-    Written("CSV without visibility", "`frame`, `point`, `x`, `y`; what has no line is hidden",
+    Written("CSV without visibility", "`frame`, `point`, `x`, `y`; observations without a line are hidden",
             table(seen=False, header="frame,point,x,y"), "csv"),
     Written("CSV with semicolons or tabs", "as above, separated by `;` or tabs", table(separator=";"), "csv"),
 )  # fmt: skip

@@ -1,4 +1,4 @@
-"""A whole house of real processes for the fault tests: workers, keeper, and Valkey if it is to be killed."""
+"""A whole house of real processes for the fault tests: workers, reconciler, and Valkey if it is to be killed."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from pliant.schemas.options import Options
 from pliant.solver import KnownCamera, Mesh, Tracks, gallery
 from pliant.worker.formats import GroundTruth, Inputs, save_inputs
 from pliant.worker.jobs.service import Jobs
+from pliant.worker.jobs.submission import Submission
 from pliant.worker.maintenance.fsck import findings
 from pliant.worker.processes.supervisor import Child, Supervisor, valkey_child, worker_children
 from pliant.worker.processes.valkey import Valkey
@@ -76,7 +77,7 @@ class House:
         return self
 
     def __exit__(self, *_: object) -> None:
-        pids = [*self.supervisor.pids().values(), *self.horses()]
+        pids = [*self.supervisor.pids().values(), *self.job_processes()]
         self.supervisor.stop()
         if self._valkey is not None:
             self._valkey.release()
@@ -90,7 +91,8 @@ class House:
             has_rotations=False, layout="",
         )  # fmt: skip
         options = Options.model_validate(LONG) if long else SHORT
-        return self.jobs.submit(file, options=options, interpretation=interpretation, **more).id  # type: ignore[arg-type]
+        submission = Submission(options=options, **more)  # type: ignore[arg-type]
+        return self.jobs.submit(file, submission, interpretation=interpretation).id
 
     def until(self, condition: Callable[[], object], what: str, *, seconds: float = 20.0) -> float:
         """Poll, keeping the children running; return how long it took."""
@@ -118,7 +120,7 @@ class House:
     def worker_pids(self) -> list[int]:
         return [pid for name, pid in self.supervisor.pids().items() if name.startswith("worker")]
 
-    def horses(self) -> list[int]:
+    def job_processes(self) -> list[int]:
         return [child for pid in self.worker_pids() for child in children(pid)]
 
     def files_at_work(self) -> list[str]:
@@ -152,6 +154,6 @@ def running(pid: int) -> bool:
 
 
 def settled(house: House) -> None:
-    """No horse runs, no working file is left, and everything stored is as the records say."""
-    house.until(lambda: not house.horses() and not house.files_at_work(), "nothing is left behind")
-    assert findings(house.jobs, settle=0.5) == []
+    """No job process runs, no working file is left, and everything stored is as the records state."""
+    house.until(lambda: not house.job_processes() and not house.files_at_work(), "nothing is left behind")
+    assert findings(house.jobs, pause=0.5) == []

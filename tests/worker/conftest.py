@@ -17,6 +17,7 @@ import pytest
 from pliant.schemas.job import Interpretation, Job
 from pliant.schemas.options import Options
 from pliant.worker.jobs.service import Jobs
+from pliant.worker.jobs.submission import Submission
 from pliant.worker.processes.valkey import Valkey
 from pliant.worker.settings import Settings
 from pliant.worker.store.blobs import Blobs
@@ -101,7 +102,8 @@ def options() -> Options:
 @pytest.fixture
 def submit(jobs: Jobs, inputs_file: Path, options: Options, interpretation: Interpretation):  # type: ignore[no-untyped-def]
     def call(door: Jobs = jobs, **more: object) -> Job:
-        return door.submit(inputs_file, options=options, interpretation=interpretation, **more)  # type: ignore[arg-type]
+        submission = Submission(options=options, **more)  # type: ignore[arg-type]
+        return door.submit(inputs_file, submission, interpretation=interpretation)
 
     return call
 

@@ -1,4 +1,4 @@
-"""What a work-horse does with one delivery: claim the job, run it, publish the result or the reason why there is none.
+"""What a job process does with one delivery: claim the job, run it, publish the result or the reason why there is none.
 
 What computes is imported inside the functions, so that who only asks after jobs does not load it; a worker loads it before
 it forks.
@@ -13,7 +13,7 @@ import os
 import resource
 import time
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -41,30 +41,30 @@ ASK_EVERY = 0.25
 """Least seconds between two looks at whether the job is still wanted."""
 
 PATIENCE = 60.0
-"""Seconds that a finished job waits for a store that does not answer."""
+"""Seconds that a job waits for a store that does not answer, before it computes and once it has its result."""
 
 
-def run(id: str, token: str, *, settings: Settings, worker: str) -> None:
+def run(id: str, attempt_id: str, *, settings: Settings, worker: str) -> None:
     """Work on one delivered attempt. Returns when the record has the last word, or belongs to somebody else."""
     jobs = Jobs.open(settings)
     try:
         stored = jobs.records.update(
-            id, lambda held: lifecycle.claim(held, token=token, worker=worker, now=datetime.now(UTC))
+            id, lambda held: lifecycle.claim(held, attempt_id=attempt_id, worker=worker, now=datetime.now(UTC))
         )
     except (StaleAttempt, UnknownJob) as error:
-        logger.info("delivery %s dropped: %s", token, error)
+        logger.info("delivery %s dropped: %s", attempt_id, error)
         return
-    attempt = Attempt(jobs=jobs, id=id, token=token, deadline=_deadline(settings))
-    directory = working_directory(settings, token)
+    attempt = Attempt(jobs=jobs, id=id, attempt_id=attempt_id, deadline=_deadline(settings))
+    directory = working_directory(settings, attempt_id)
     directory.mkdir(parents=True, exist_ok=True)
     attempt.log(f"Attempt {stored.job.attempt} began on worker {worker}.")
     with _own_output(directory / OUTPUT):
         try:
             with _limited_memory(settings.memory_limit):
-                end = _work(attempt, stored, directory)
+                end = work(attempt, stored, directory)
             attempt.conclude(end)
         except (StaleAttempt, UnknownJob) as error:
-            logger.info("attempt %s ended: %s", token, error)
+            logger.info("attempt %s ended: %s", attempt_id, error)
 
 
 @dataclass(slots=True, kw_only=True)
@@ -73,7 +73,7 @@ class Attempt:
 
     jobs: Jobs
     id: str
-    token: str
+    attempt_id: str
     deadline: float
     """Monotonic time after which the job has taken too long."""
     unwanted: bool = False
@@ -90,7 +90,9 @@ class Attempt:
             return
         self._next_tell = now + TELL_EVERY
         try:
-            self.jobs.records.update(self.id, lambda held: lifecycle.report(held, token=self.token, progress=progress))
+            self.jobs.records.update(
+                self.id, lambda held: lifecycle.report(held, attempt_id=self.attempt_id, progress=progress)
+            )
             self._flush()
         except (StaleAttempt, UnknownJob):
             self.unwanted = True
@@ -103,7 +105,7 @@ class Attempt:
         if not self.unwanted and now >= self._next_ask:
             self._next_ask = now + ASK_EVERY
             if os.getppid() != self._parent:
-                os._exit(1)  # where the kernel does not end an orphan; the keeper gives its job to another
+                os._exit(1)  # where the kernel does not end an orphan; the reconciler gives its job to another
             self.unwanted = now >= self.deadline or self._status() is not Status.RUNNING
         return self.unwanted
 
@@ -126,11 +128,13 @@ class Attempt:
 
         def change(held: Stored) -> Stored:
             if end is None:
-                return lifecycle.stop(held, token=self.token, now=now, retention=settings.retention)
+                return lifecycle.stop(held, attempt_id=self.attempt_id, now=now, retention=settings.retention)
             if isinstance(end, Problem):
-                return lifecycle.fail(held, token=self.token, problem=end, now=now, retention=settings.retention)
+                return lifecycle.fail(
+                    held, attempt_id=self.attempt_id, problem=end, now=now, retention=settings.retention
+                )
             return lifecycle.succeed(
-                held, token=self.token, prefix=self.prefix, artifacts=end.artifacts, metrics=end.metrics,
+                held, attempt_id=self.attempt_id, prefix=self.prefix, artifacts=end.artifacts, metrics=end.metrics,
                 outcome=end.outcome, sentence=end.sentence, warnings=end.warnings, now=now, retention=settings.retention,
             )  # fmt: skip
 
@@ -140,14 +144,46 @@ class Attempt:
         if kept.prefix is None:
             self.jobs.blobs.delete(self.prefix)
 
+    def store(self, finished: Finished, results: Path) -> None:
+        """Store the result files, waiting for a blob store that does not answer.
+
+        Raises
+        ------
+        Interrupted
+            The job is no longer wanted.
+        StoreUnavailable
+            The blob store has not answered for `PATIENCE` seconds.
+        """
+        for artifact in finished.artifacts:
+            key, file = f"{self.prefix}{artifact.name}", results / artifact.name
+            self.wait_for_store(lambda key=key, file=file: self.jobs.blobs.put(key, file))  # type: ignore[misc]
+
+    def wait_for_store(self, call: Callable[[], object]) -> None:
+        """Call until the store answers, at most for `PATIENCE` seconds.
+
+        Raises
+        ------
+        Interrupted
+            The job is no longer wanted.
+        StoreUnavailable
+            The store has not answered.
+        """
+
+        def wanted() -> None:
+            if self.should_stop():
+                raise Interrupted
+            call()
+
+        Patience(PATIENCE).ask(wanted)
+
     @property
     def prefix(self) -> str:
         """Where this attempt's artifacts lie; only the record makes them the job's."""
-        return f"jobs/{self.id}/{self.token}/artifacts/"
+        return f"jobs/{self.id}/{self.attempt_id}/artifacts/"
 
     def _status(self) -> Status | None:
         try:
-            return self.jobs.records.look(self.id, self.token)
+            return self.jobs.records.look(self.id, self.attempt_id)
         except StoreUnavailable:
             return Status.RUNNING
 
@@ -156,26 +192,30 @@ class Attempt:
         self.jobs.records.append_log(self.id, lines)
 
 
-def _work(attempt: Attempt, stored: Stored, directory: Path) -> Finished | Problem | None:
-    """Run the job; every exception becomes the problem it is, its traceback goes into the log."""
+def work(
+    attempt: Attempt, stored: Stored, directory: Path, *, reconstruct: Callable[..., Finished] | None = None
+) -> Finished | Problem | None:
+    """Run the job; every exception becomes the problem it is, its traceback goes into the log.
+
+    `reconstruct` replaces `pliant.worker.execution.pipeline.reconstruct`, in tests.
+    """
     try:
         from pliant.solver import threads_limited
-        from pliant.worker.execution.pipeline import reconstruct
+        from pliant.worker.execution import pipeline
         from pliant.worker.formats import load_inputs
 
         file = directory / "inputs.npz"
-        attempt.jobs.blobs.fetch(stored.inputs, file)
+        attempt.wait_for_store(lambda: attempt.jobs.blobs.fetch(stored.inputs, file))
         results = directory / "artifacts"
         with threads_limited(attempt.jobs.settings.threads_per_job):
-            finished = reconstruct(
+            finished = (reconstruct or pipeline.reconstruct)(
                 load_inputs(file),
                 stored.job.options,
                 results,
                 on_progress=attempt.tell,
                 should_stop=attempt.should_stop,
             )
-        for artifact in finished.artifacts:
-            attempt.jobs.blobs.put(f"{attempt.prefix}{artifact.name}", results / artifact.name)
+        attempt.store(finished, results)
     except Interrupted:
         late = time.monotonic() >= attempt.deadline
         attempt.log("Stopped: it took too long." if late else "Stopped on request.")

@@ -23,7 +23,7 @@ def problem_of(error: BaseException, *, memory_limit: int = 0) -> Problem:
     """
     from pliant.solver import (
         InvalidInput,
-    )  # here, because it loads NumPy, which the keeper has no use for
+    )  # here, because it loads NumPy, which the reconciler has no use for
 
     if isinstance(error, InvalidInput):
         return Problem(

@@ -13,12 +13,13 @@ from enum import StrEnum
 from typing import TypeVar
 
 from pliant.schemas.job import Problem, Status
-from pliant.worker.errors import StaleAttempt, StoreUnavailable, UnknownJob
-from pliant.worker.execution.failures import how_it_ended, out_of_memory, timed_out, worker_lost
+from pliant.worker.errors import StaleAttempt, StoreUnavailable, TimedOut, UnknownJob
+from pliant.worker.execution.failures import how_it_ended, out_of_memory, problem_of, timed_out, worker_lost
 from pliant.worker.execution.workdir import last_words
+from pliant.worker.ids import new_attempt_id
 from pliant.worker.jobs import lifecycle
 from pliant.worker.processes.containment import OomKills
-from pliant.worker.records import Records, Stored, new_token
+from pliant.worker.records import Records, Stored
 from pliant.worker.settings import Settings
 
 logger = logging.getLogger(__name__)
@@ -64,30 +65,32 @@ class Reason(StrEnum):
 
 @dataclass(slots=True)
 class Watch:
-    """What the worker knows of the attempt that its horse is at."""
+    """What the worker knows of the attempt that its job process is at."""
 
     settings: Settings
     records: Records
     id: str
-    token: str
+    attempt_id: str
     worker: str
     """Name of the worker that watches."""
     clock: Callable[[], float] = time.monotonic
     reason: Reason | None = None
     """Why it was killed, once it was."""
     stopping: bool = False
-    """The worker is being shut down; whoever does that may kill the horse as well."""
+    """The worker is being shut down; whoever does that may kill the job process as well."""
     began: float = field(init=False)
     kills: OomKills = field(init=False)
     _next_beat: float = field(init=False)
     _cancelled: float | None = None
+    _own_limit: float | None = None
+    """The option `time_limit` of the job, 0 for none; None: not read yet."""
 
     def __post_init__(self) -> None:
         self.began = self._next_beat = self.clock()
         self.kills = OomKills.now()
 
     def must_end(self, *, stop_by: float | None) -> Reason | None:
-        """Give a sign of life if one is due, and return why the horse must be killed now, or None.
+        """Give a sign of life if one is due, and return why the job process must be killed now, or None.
 
         Parameters
         ----------
@@ -99,7 +102,7 @@ class Watch:
         if now >= self._next_beat:
             self._next_beat = now + BEAT
             self._look(now)
-        grace, limit = self.settings.cancel_grace, self.settings.time_limit
+        grace, limit = self.settings.cancel_grace, self.limit
         if self.reason is Reason.STALE:
             return self.reason
         if self._cancelled is not None and now >= self._cancelled + grace:
@@ -110,9 +113,18 @@ class Watch:
             self.reason = Reason.STOPPING
         return self.reason
 
+    @property
+    def limit(self) -> float:
+        """Seconds that the attempt may take: the lower one of the setting's and the job's own; 0: no limit."""
+        return min((each for each in (self.settings.time_limit, self._own_limit or 0.0) if each > 0), default=0.0)
+
     def _look(self, now: float) -> None:
         try:
-            status = self.records.beat(self.id, self.token)
+            status = self.records.beat(self.id, self.attempt_id)
+            if self._own_limit is None and status is not None:
+                self._own_limit = self.records.get(self.id).job.options.time_limit or 0.0
+        except UnknownJob:
+            status = None
         except StoreUnavailable:
             return  # the job goes on; it needs no store until it writes its result
         if status is None:
@@ -121,10 +133,10 @@ class Watch:
             self._cancelled = now
 
 
-def settle(watch: Watch, *, status: int, peak: int, patience: Patience) -> Stored | None:
-    """Write the record's last word for a horse that ended without one; one that spoke is left alone.
+def finalize(watch: Watch, *, status: int, peak: int, patience: Patience) -> Stored | None:
+    """Write the record's last word for a job process that ended without one; one that spoke is left alone.
 
-    Returns the record if there was something to write. The job's log has the reason and the end of the horse's own output
+    Returns the record if there was something to write. The job's log has the reason and the end of the job process's own output
     before the record is final: whoever is told that a job has ended finds its log whole.
 
     Parameters
@@ -132,7 +144,7 @@ def settle(watch: Watch, *, status: int, peak: int, patience: Patience) -> Store
     status : int
         As `os.wait4` returns it.
     peak : int
-        The horse's largest resident size, bytes.
+        The job process's largest resident size, bytes.
     patience : Patience
         With a store that does not answer.
 
@@ -143,7 +155,7 @@ def settle(watch: Watch, *, status: int, peak: int, patience: Patience) -> Store
     """
     change = _verdict(watch, status=status, peak=peak)
     sentence = f"Ended from outside: {watch.reason}." if watch.reason is not None else how_it_ended(status)
-    words = [sentence, *last_words(watch.settings, watch.token)]
+    words = [sentence, *last_words(watch.settings, watch.attempt_id)]
 
     def speak() -> Stored:
         change(watch.records.get(watch.id))  # raises where there is nothing to say
@@ -160,19 +172,19 @@ def settle(watch: Watch, *, status: int, peak: int, patience: Patience) -> Store
 
 
 def _verdict(watch: Watch, *, status: int, peak: int) -> Callable[[Stored], Stored]:
-    settings, token, now = watch.settings, watch.token, datetime.now(UTC)
+    settings, attempt_id, now = watch.settings, watch.attempt_id, datetime.now(UTC)
 
     def change(stored: Stored) -> Stored:
         if stored.worker != watch.worker:  # a second delivery of one attempt must not end the first
             raise StaleAttempt(watch.id)
         if watch.reason is Reason.CANCELLED:
-            return lifecycle.stop(stored, token=token, now=now, retention=settings.retention)
+            return lifecycle.stop(stored, attempt_id=attempt_id, now=now, retention=settings.retention)
         if watch.reason is Reason.STOPPING or (watch.reason is None and watch.stopping and _was_killed(status)):
             problem = worker_lost("The worker was shut down.")
-            fresh = new_token(watch.id)
+            fresh = new_attempt_id(watch.id)
             return lifecycle.requeue(
                 stored,
-                token=token,
+                attempt_id=attempt_id,
                 fresh=fresh,
                 problem=problem,
                 now=now,
@@ -180,10 +192,11 @@ def _verdict(watch: Watch, *, status: int, peak: int) -> Callable[[Stored], Stor
                 retention=settings.retention,
             )
         if watch.reason is Reason.TIMED_OUT:
-            problem = timed_out(settings.time_limit)
+            own = watch.limit != settings.time_limit
+            problem = problem_of(TimedOut(watch.limit)) if own else timed_out(settings.time_limit)
         else:
             problem = _death(watch, status=status, peak=peak)
-        return lifecycle.fail(stored, token=token, problem=problem, now=now, retention=settings.retention)
+        return lifecycle.fail(stored, attempt_id=attempt_id, problem=problem, now=now, retention=settings.retention)
 
     return change
 

@@ -14,7 +14,7 @@ from pliant.solver import Outcome, Settings, Solution, Step, solve
 from pliant.solver.evaluation.metrics import evaluate
 from pliant.worker.artifacts import build_report, kinds_for, write_artifacts
 from pliant.worker.errors import Interrupted, TimedOut
-from pliant.worker.execution.progress import Teller
+from pliant.worker.execution.progress import Reporter
 from pliant.worker.formats import Inputs
 
 
@@ -50,6 +50,7 @@ def reconstruct(
     *,
     on_progress: Callable[[Progress], None] | None = None,
     should_stop: Callable[[], bool] | None = None,
+    solver: Callable[..., Solution] | None = None,
 ) -> Finished:
     """Solve, measure, write the files.
 
@@ -65,6 +66,8 @@ def reconstruct(
         Told often; whoever cannot listen so often drops some.
     should_stop : callable, optional
         Asked often; once it says True, the job ends with `Interrupted`, and the files it has written are not all.
+    solver : callable, optional
+        Replaces `pliant.solver.solve`, in tests.
 
     Raises
     ------
@@ -77,17 +80,17 @@ def reconstruct(
     """
     # What cannot be written is refused before anything is computed.
     kinds_for(options, size=(inputs.tracks.num_frames, inputs.tracks.num_points))
-    teller = Teller(on_progress if on_progress is not None else _silent)
+    reporter = Reporter(on_progress if on_progress is not None else _silent)
     directory.mkdir(parents=True, exist_ok=True)
-    teller.part("loading", 1.0)
+    reporter.part("loading", 1.0)
     began = time.perf_counter()
     halt = _Halt(should_stop, options.time_limit)
-    solution = solve(
+    solution = (solver or solve)(
         inputs.tracks,
         inputs.mesh,
         cameras=inputs.cameras,
         settings=solver_settings(options),
-        on_step=lambda step: _told(teller, step),
+        on_step=lambda step: _told(reporter, step),
         should_stop=halt.asked,
     )
     if solution.outcome is Outcome.STOPPED:
@@ -98,7 +101,7 @@ def reconstruct(
     report = build_report(inputs, solution, options, metrics=metrics, seconds=seconds)
 
     def exported(done: float) -> None:
-        teller.part("exporting", done)
+        reporter.part("exporting", done)
         halt.check()
 
     artifacts = write_artifacts(inputs, solution, options, report, directory, on_progress=exported)
@@ -140,8 +143,8 @@ def _metrics(inputs: Inputs, solution: Solution) -> dict[str, float]:
     return {name: value for name, value in values.items() if math.isfinite(value)}
 
 
-def _told(teller: Teller, step: Step) -> None:
-    teller.part(
+def _told(reporter: Reporter, step: Step) -> None:
+    reporter.part(
         "solving",
         step.fraction,
         stage=step.stage,

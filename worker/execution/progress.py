@@ -17,7 +17,7 @@ WORTH_ESTIMATING = 0.05
 
 
 @dataclass(slots=True)
-class Teller:
+class Reporter:
     """Turns parts of parts into one fraction that never falls.
 
     Parameters

@@ -21,7 +21,7 @@ import redis
 from pliant.schemas.job import Status
 from pliant.worker.errors import StoreUnavailable, UnknownJob
 from pliant.worker.execution import attempt as work
-from pliant.worker.execution.monitor import Patience, Watch, settle
+from pliant.worker.execution.monitor import Patience, Watch, finalize
 from pliant.worker.execution.workdir import clean_up
 from pliant.worker.jobs.lifecycle import ACTIVE
 from pliant.worker.processes.containment import die_with_parent
@@ -50,7 +50,7 @@ AWAY = (redis.ConnectionError, redis.TimeoutError)
 """What Redis raises when it does not answer."""
 
 POLL = 0.05
-"""Seconds between looks at a running horse."""
+"""Seconds between looks at a running job process."""
 
 
 class Delivery(RqJob):
@@ -77,7 +77,7 @@ class Delivery(RqJob):
 
 
 class PliantWorker(Worker):
-    """One job at a time, each in a forked horse."""
+    """One job at a time, each in a forked job process."""
 
     def __init__(
         self, *, settings: Settings, connection: redis.Redis, records: Records, queue: Queue, name: str
@@ -104,7 +104,7 @@ class PliantWorker(Worker):
         """Do nothing; see `subscribe`."""
 
     def run_maintenance_tasks(self) -> None:
-        """Do nothing: the keeper looks after lost jobs."""
+        """Do nothing: the reconciler looks after lost jobs."""
 
     @property
     def should_run_maintenance_tasks(self) -> bool:
@@ -131,7 +131,7 @@ class PliantWorker(Worker):
             logger.warning("no sign of life: %s", error)
 
     def execute_job(self, job: RqJob, queue: RqQueue) -> None:
-        """Run a delivery. If the store goes away before there is a horse, the keeper delivers the job again."""
+        """Run a delivery. If the store goes away before there is a job process, the reconciler delivers the job again."""
         try:
             super().execute_job(job, queue)
         except AWAY as error:
@@ -150,7 +150,7 @@ class PliantWorker(Worker):
     request_force_stop = request_stop
 
     def kill_horse(self, sig: signal.Signals = signal.SIGKILL) -> None:
-        """Kill the horse and what it started. Before it has its own process group, its group is ours: spare that."""
+        """Kill the job process and what it started. Before it has its own process group, its group is ours: spare that."""
         with suppress(ProcessLookupError):
             if os.getpgid(self.horse_pid) == self.horse_pid:
                 os.killpg(self.horse_pid, sig)
@@ -158,7 +158,7 @@ class PliantWorker(Worker):
                 os.kill(self.horse_pid, sig)
 
     def main_work_horse(self, job: RqJob, queue: RqQueue) -> None:
-        """Be the horse: die with the worker, and say nothing but into the attempt's own log."""
+        """Be the job process: die with the worker, and say nothing but into the attempt's own log."""
         die_with_parent(int(os.environ["PLIANT_WORKER_PROCESS"]))
         job.settings = self._settings  # type: ignore[attr-defined]
         super().main_work_horse(job, queue)
@@ -169,14 +169,14 @@ class PliantWorker(Worker):
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
 
     def fork_work_horse(self, job: RqJob, queue: RqQueue) -> None:
-        """Fork; the horse must know who its parent was even if that one is gone at once."""
+        """Fork; the job process must know who its parent was even if that one is gone at once."""
         os.environ["PLIANT_WORKER_PROCESS"] = str(os.getpid())
         super().fork_work_horse(job, queue)
 
     def monitor_work_horse(self, job: RqJob, queue: RqQueue) -> None:  # noqa: ARG002
-        """Watch the horse until it ends, then bury what it left behind."""
-        id, token = (str(each) for each in (*job.args, "", "")[:2])
-        watch = Watch(self._settings, self._records, id=id, token=token, worker=self.name)
+        """Watch the job process until it ends, then bury what it left behind."""
+        id, attempt_id = (str(each) for each in (*job.args, "", "")[:2])
+        watch = Watch(self._settings, self._records, id=id, attempt_id=attempt_id, worker=self.name)
         next_sign = time.monotonic() + IDLE_WAKE
         while True:
             pid, status, usage = os.wait4(self.horse_pid, os.WNOHANG)
@@ -186,25 +186,32 @@ class PliantWorker(Worker):
                 self.kill_horse()
             if time.monotonic() > next_sign:
                 next_sign = time.monotonic() + IDLE_WAKE
-                self.heartbeat()
+                self._keep_execution(job)
             time.sleep(POLL)
         self._horse_pid = 0
-        self._bury(watch, job, status=status, peak=usage.ru_maxrss * RSS_UNIT)
+        self._reap(watch, job, status=status, peak=usage.ru_maxrss * RSS_UNIT)
 
-    def _bury(self, watch: Watch, job: RqJob, *, status: int, peak: int) -> None:
+    def _keep_execution(self, job: RqJob) -> None:
+        """Give our sign of life, and RQ's for the delivery: without it RQ declares every job of more than 90 s abandoned."""
+        try:
+            self.maintain_heartbeats(job)
+        except AWAY as error:
+            logger.warning("no sign of life: %s", error)
+
+    def _reap(self, watch: Watch, job: RqJob, *, status: int, peak: int) -> None:
         patience = Patience(60.0 if self._stop_by is None else 2.0)
         try:
-            settled = settle(watch, status=status, peak=peak, patience=patience)
+            settled = finalize(watch, status=status, peak=peak, patience=patience)
             if settled is not None and settled.job.status is Status.QUEUED:
-                fresh = settled.token
+                fresh = settled.attempt_id
                 patience.ask(lambda: self._deliveries.push(watch.id, fresh, front=True))  # it has waited before
             patience.ask(lambda: self._deliveries.remove(job.id))
         except StoreUnavailable as error:
-            logger.warning("job %s: %s; the keeper will look after it", watch.id, error)
+            logger.warning("job %s: %s; the reconciler will look after it", watch.id, error)
         finally:
-            with suppress(StoreUnavailable):  # then the keeper clears what is left
+            with suppress(StoreUnavailable):  # then the reconciler clears what is left
                 if not patience.ask(lambda: self._elsewhere(watch)):
-                    clean_up(self._settings, watch.token)
+                    clean_up(self._settings, watch.attempt_id)
 
     def _elsewhere(self, watch: Watch) -> bool:
         """Tell whether another worker is at this very attempt: ours was a second delivery, and the working files are not ours."""
@@ -212,4 +219,4 @@ class PliantWorker(Worker):
             held = self._records.get(watch.id)
         except UnknownJob:
             return False
-        return held.token == watch.token and held.worker != watch.worker and held.job.status in ACTIVE
+        return held.attempt_id == watch.attempt_id and held.worker != watch.worker and held.job.status in ACTIVE

@@ -11,14 +11,14 @@ OUTPUT = "output.log"
 """What the attempt writes to its standard output and error, its crash's stack among it."""
 
 
-def working_directory(settings: Settings, token: str) -> Path:
+def working_directory(settings: Settings, attempt_id: str) -> Path:
     """Return the directory of an attempt's working files."""
-    return settings.work / token
+    return settings.work / attempt_id
 
 
-def last_words(settings: Settings, token: str) -> list[str]:
+def last_words(settings: Settings, attempt_id: str) -> list[str]:
     """Return the end of what a dead attempt wrote to its standard output and error."""
-    file = working_directory(settings, token) / OUTPUT
+    file = working_directory(settings, attempt_id) / OUTPUT
     if not file.exists():
         return []
     with file.open("rb") as output:
@@ -26,6 +26,6 @@ def last_words(settings: Settings, token: str) -> list[str]:
         return output.read().decode(errors="replace").splitlines()[-100:]
 
 
-def clean_up(settings: Settings, token: str) -> None:
+def clean_up(settings: Settings, attempt_id: str) -> None:
     """Remove an attempt's working files."""
-    shutil.rmtree(working_directory(settings, token), ignore_errors=True)
+    shutil.rmtree(working_directory(settings, attempt_id), ignore_errors=True)

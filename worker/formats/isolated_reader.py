@@ -1,18 +1,16 @@
-"""Read large inputs in a process of their own, so that a server that takes them in stays as small as it was.
+"""The isolated reader: read large inputs in a separate process, so that the server's memory does not grow.
 
-A gigabyte of tracks needs several while it is checked and converted; freed memory seldom goes back to the system, and what a crafted
-file announces may be a hundred times its size. So inputs that announce much are read, checked and stored by a process that lives as long
-as that takes, under limits of its own; the server gets the interpretation, or the refusal. What is small is read at once.
+Checking and converting a gigabyte of tracks takes several gigabytes, freed memory seldom returns to the system, and a crafted file may
+declare a hundred times its size. Inputs that declare more than `LARGE` bytes are therefore read, checked and stored by a process with
+limits of its own; the server gets the interpretation or the refusal. Smaller inputs are read in the server.
 """
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import resource
 import signal
-import subprocess
 import sys
 import zipfile
 from contextlib import suppress
@@ -28,11 +26,11 @@ from pliant.worker.formats.errors import AmbiguousInput, too_large
 from pliant.worker.formats.read import read_inputs
 from pliant.worker.formats.reading.arrays import NPY_MAGIC, UNREADABLE_ZIP, check_directory, read_header
 from pliant.worker.formats.reading.parsers import HDF5
-from pliant.worker.formats.reading.sandbox import die_with
 from pliant.worker.formats.records import Limits
+from pliant.worker.processes.contained import DONE, REFUSED, limit_process, refusal_in, run_contained, serve
 
 LARGE = 16 << 20
-"""Bytes of arrays, by what the files announce, above which they are read apart."""
+"""Bytes of arrays, as the files declare them, above which the isolated reader is used."""
 
 GROWTH = {b"MATLAB": 1032, b"\x89PNG": 8 * 1032}
 """What a byte may become: deflate makes at most 1032 of it, and a pixel's point number has 8."""
@@ -49,9 +47,7 @@ WITHOUT_BOUND = 1 << 62
 MEMBERS = 256
 """Members of a zip file that are looked at; more are refused."""
 
-REFUSED = 3
-OWN_ERRORS = 4096
-KEPT = ("code", "field", "expected", "got", "hint")
+MODULE = "pliant.worker.formats.isolated_reader"
 
 
 def store_inputs(
@@ -80,7 +76,7 @@ def store_inputs(
     """
     parts: dict[str, Any] = {"tracks": tracks, "mesh": mesh, "ground_truth": ground_truth, "rotations": rotations}
     files = {name: part for name, part in parts.items() if isinstance(part, Path)}
-    if sum(announced(path, field=name) for name, path in files.items()) > LARGE:
+    if sum(declared_bytes(path, field=name) for name, path in files.items()) > LARGE:
         return _in_process(parts, options, limits, target)
     return _here(parts, options, limits, target)
 
@@ -92,7 +88,7 @@ def _here(parts: dict[str, Any], options: Options, limits: Limits, target: Path 
     return inputs.interpretation
 
 
-def announced(path: Path, *, field: str) -> int:
+def declared_bytes(path: Path, *, field: str) -> int:
     """Bytes that a file may become when it is read, by what it says or by what its kind allows.
 
     Raises
@@ -137,62 +133,41 @@ def _in_process(parts: dict[str, Any], options: Options, limits: Limits, target:
         "options": options.model_dump(mode="json"), "limits": asdict(limits),
         "target": None if target is None else str(target.absolute()),
     }  # fmt: skip
-    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
     passed = {name: os.environ[name] for name in ("TMPDIR",) if name in os.environ}
-    with subprocess.Popen(  # noqa: S603 - our own interpreter and module
-        [sys.executable, "-I", "-m", "pliant.worker.formats.isolated_reader", str(os.getpid())], env={**passed, **threads},
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-    ) as process:  # fmt: skip
-        try:
-            answer, errors = process.communicate(json.dumps(request).encode(), timeout=limits.read_seconds)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            raise too_large(
-                "tracks", expected=f"inputs that are read within {limits.read_seconds:g} s", got="more"
-            ) from None
-        except BaseException:
-            process.kill()
-            raise
-    return _told(process.returncode, answer, errors, limits)
+    ended = run_contained(MODULE, request, seconds=limits.read_seconds, environment=passed)
+    if ended.code == DONE:
+        return Interpretation.model_validate_json(ended.answer)
+    if ended.overdue:
+        raise too_large("tracks", expected=f"inputs that are read within {limits.read_seconds:g} s", got="more")
+    if ended.code in (-signal.SIGKILL, -signal.SIGXCPU):
+        raise _too_much_memory(limits)
+    parts_of_refusal = refusal_in(ended) if ended.code == REFUSED else None
+    if parts_of_refusal is None:
+        raise RuntimeError(f"the isolated reader ended with {ended.code}: {ended.errors}")
+    choices = parts_of_refusal.pop("choices")
+    if choices is not None:
+        raise AmbiguousInput(**parts_of_refusal, choices=choices)
+    raise InvalidInput(parts_of_refusal.pop("code"), **parts_of_refusal)
 
 
-def _told(code: int, answer: bytes, errors: bytes, limits: Limits) -> Interpretation:
-    if code == 0:
-        return Interpretation.model_validate_json(answer)
-    if code == REFUSED:
-        said = json.loads(answer)
-        choices = said.pop("choices")
-        if choices is not None:
-            raise AmbiguousInput(**said, choices=choices)
-        raise InvalidInput(said.pop("code"), **said)
-    if code in (-signal.SIGKILL, -signal.SIGXCPU):
-        raise too_large("tracks", expected=f"inputs that are read within {limits.read_memory} bytes", got="more")
-    raise RuntimeError(f"reading inputs ended with {code}: {errors[-OWN_ERRORS:].decode(errors='replace')}")
+def _too_much_memory(limits: Limits) -> InvalidInput:
+    return too_large("tracks", expected=f"inputs that are read within {limits.read_memory} bytes", got="more")
 
 
 def main() -> int:
-    """Do what the request on standard input says, and answer on standard output; the process's whole life."""
-    die_with(int(sys.argv[1]))
-    request = json.load(sys.stdin)
+    """Read the files of the request on standard input; answer with the interpretation on standard output."""
+    return serve(_answer)
+
+
+def _answer(request: dict[str, Any]) -> str:
     limits = Limits(**request["limits"])
-    _, hard = resource.getrlimit(resource.RLIMIT_AS)
-    with suppress(ValueError, OSError):  # macOS does not know an address-space limit
-        resource.setrlimit(resource.RLIMIT_AS, (limits.read_memory, hard))
+    limit_process({resource.RLIMIT_AS: limits.read_memory})
     parts = {name: Path(part["path"]) if isinstance(part, dict) else part for name, part in request["parts"].items()}
+    target = None if request["target"] is None else Path(request["target"])
     try:
-        try:
-            target = None if request["target"] is None else Path(request["target"])
-            interpretation = _here(parts, Options.model_validate(request["options"]), limits, target)
-        except MemoryError as error:
-            raise too_large(
-                "tracks", expected=f"inputs that are read within {limits.read_memory} bytes", got="more"
-            ) from error
-    except InvalidInput as error:
-        said = {name: getattr(error, name) for name in KEPT}
-        sys.stdout.write(json.dumps({**said, "choices": getattr(error, "choices", None)}))
-        return REFUSED
-    sys.stdout.write(interpretation.model_dump_json())
-    return 0
+        return _here(parts, Options.model_validate(request["options"]), limits, target).model_dump_json()
+    except MemoryError as error:
+        raise _too_much_memory(limits) from error
 
 
 if __name__ == "__main__":

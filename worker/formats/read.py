@@ -114,6 +114,7 @@ def _choose(understood: Understood, mesh: Path | str | None, options: Options, l
         source = "none" if made is None else source
     confidence, left_out, seldom = hide_seldom_seen(points, visible, made, options)
     checked = Tracks.from_arrays(points, confidence)
+    _check_extent(checked)
     selection = Selection(frames, picked[kept], whole)
     notes += [*surface.notes, *how, *_hidden_notes(checked), *seldom, *more]
     return _Chosen(checked, made, source, whole_grid(surface), selection, left_out, notes)
@@ -139,6 +140,18 @@ def _check_range(points: NDArray[np.generic], visible: NDArray[np.float64] | Non
         raise refusal(
             "out_of_range", "tracks", expected=f"visible coordinates within ±{FARTHEST:g}", got=f"{int(far.sum())} points beyond",
             hint="Mark them as hidden, or set them to NaN.",
+        )  # fmt: skip
+
+
+def _check_extent(tracks: Tracks) -> None:
+    """Refuse at submission what the solver would refuse: in every frame, all visible points at one position."""
+    seen = (tracks.visible > 0)[..., None]
+    low = np.where(seen, tracks.points, np.inf).min(axis=1)
+    high = np.where(seen, tracks.points, -np.inf).max(axis=1)
+    if not (high > low).any():
+        raise refusal(
+            "no_extent", "tracks", expected="points that differ from each other", got="one position for all points",
+            hint="Check that the points' axis is the second one and that the tracks are not all zero.",
         )  # fmt: skip
 
 

@@ -23,15 +23,15 @@ ACTIVE = (Status.RUNNING, Status.CANCELLING)
 FINAL = (Status.SUCCEEDED, Status.FAILED, Status.CANCELLED)
 
 
-def claim(stored: Stored, *, token: str, worker: str, now: datetime) -> Stored:
+def claim(stored: Stored, *, attempt_id: str, worker: str, now: datetime) -> Stored:
     """Begin the job.
 
     Raises
     ------
     StaleAttempt
-        The job is not queued under this token: a second delivery, or one that came too late.
+        The job is not queued under this attempt_id: a second delivery, or one that came too late.
     """
-    if stored.token != token or stored.job.status is not Status.QUEUED:
+    if stored.attempt_id != attempt_id or stored.job.status is not Status.QUEUED:
         raise StaleAttempt(stored.job.id)
     job = stored.job.model_copy(
         update={"status": Status.RUNNING, "started_at": now, "attempt": stored.job.attempt + 1, "progress": None}
@@ -39,7 +39,7 @@ def claim(stored: Stored, *, token: str, worker: str, now: datetime) -> Stored:
     return stored.model_copy(update={"job": job, "worker": worker})
 
 
-def report(stored: Stored, *, token: str, progress: Progress) -> Stored:
+def report(stored: Stored, *, attempt_id: str, progress: Progress) -> Stored:
     """Say how far the job is.
 
     Raises
@@ -47,14 +47,14 @@ def report(stored: Stored, *, token: str, progress: Progress) -> Stored:
     StaleAttempt
         The job belongs to another attempt, or is finished.
     """
-    _check_owner(stored, token)
+    _check_owner(stored, attempt_id)
     return stored.model_copy(update={"job": stored.job.model_copy(update={"progress": progress})})
 
 
 def succeed(
     stored: Stored,
     *,
-    token: str,
+    attempt_id: str,
     prefix: str,
     artifacts: Sequence[Artifact],
     metrics: Mapping[str, float],
@@ -71,9 +71,9 @@ def succeed(
     StaleAttempt
         The job belongs to another attempt, or is finished.
     """
-    _check_owner(stored, token)
+    _check_owner(stored, attempt_id)
     if stored.job.status is Status.CANCELLING:
-        return stop(stored, token=token, now=now, retention=retention)
+        return stop(stored, attempt_id=attempt_id, now=now, retention=retention)
     update = {
         "metrics": dict(metrics),
         "outcome": outcome,
@@ -87,7 +87,7 @@ def succeed(
     return _finish(published, Status.SUCCEEDED, now=now, retention=retention)
 
 
-def fail(stored: Stored, *, token: str, problem: Problem, now: datetime, retention: float) -> Stored:
+def fail(stored: Stored, *, attempt_id: str, problem: Problem, now: datetime, retention: float) -> Stored:
     """Record why the attempt failed; a job that was being cancelled ends cancelled.
 
     Raises
@@ -95,14 +95,14 @@ def fail(stored: Stored, *, token: str, problem: Problem, now: datetime, retenti
     StaleAttempt
         The job belongs to another attempt, or is finished.
     """
-    _check_owner(stored, token)
+    _check_owner(stored, attempt_id)
     if stored.job.status is Status.CANCELLING:
-        return stop(stored, token=token, now=now, retention=retention)
+        return stop(stored, attempt_id=attempt_id, now=now, retention=retention)
     job = stored.job.model_copy(update={"error": problem})
     return _finish(stored.model_copy(update={"job": job}), Status.FAILED, now=now, retention=retention)
 
 
-def stop(stored: Stored, *, token: str, now: datetime, retention: float) -> Stored:
+def stop(stored: Stored, *, attempt_id: str, now: datetime, retention: float) -> Stored:
     """End the attempt because it was told to.
 
     Raises
@@ -110,7 +110,7 @@ def stop(stored: Stored, *, token: str, now: datetime, retention: float) -> Stor
     StaleAttempt
         The job belongs to another attempt, is finished, or nobody asked for its end.
     """
-    _check_owner(stored, token)
+    _check_owner(stored, attempt_id)
     if stored.job.status is not Status.CANCELLING:
         raise StaleAttempt(stored.job.id)
     return _finish(stored, Status.CANCELLED, now=now, retention=retention)
@@ -139,7 +139,7 @@ def cancel(stored: Stored, *, now: datetime, retention: float) -> Stored:
 def requeue(
     stored: Stored,
     *,
-    token: str,
+    attempt_id: str,
     fresh: str,
     problem: Problem,
     now: datetime,
@@ -150,7 +150,7 @@ def requeue(
 
     Parameters
     ----------
-    token, fresh : str
+    attempt_id, fresh : str
         The attempt that was lost, and the one that may write from now on.
 
     Raises
@@ -158,29 +158,29 @@ def requeue(
     StaleAttempt
         The job belongs to another attempt, or is finished.
     """
-    _check_owner(stored, token)
+    _check_owner(stored, attempt_id)
     spent = max_attempts is not None and stored.job.attempt >= max_attempts
     if spent or stored.job.status is Status.CANCELLING:
-        return fail(stored, token=token, problem=problem, now=now, retention=retention)
+        return fail(stored, attempt_id=attempt_id, problem=problem, now=now, retention=retention)
     job = stored.job.model_copy(update={"status": Status.QUEUED, "started_at": None, "progress": None})
-    return stored.model_copy(update={"job": job, "token": fresh, "worker": None})
+    return stored.model_copy(update={"job": job, "attempt_id": fresh, "worker": None})
 
 
-def redeliver(stored: Stored, *, token: str, fresh: str) -> Stored:
-    """Give a queued job that the queue has forgotten a new token, so that only the new delivery counts.
+def redeliver(stored: Stored, *, attempt_id: str, fresh: str) -> Stored:
+    """Give a queued job that the queue has forgotten a new attempt_id, so that only the new delivery counts.
 
     Raises
     ------
     StaleAttempt
-        The job is no longer queued under that token.
+        The job is no longer queued under that attempt_id.
     """
-    if stored.token != token or stored.job.status is not Status.QUEUED:
+    if stored.attempt_id != attempt_id or stored.job.status is not Status.QUEUED:
         raise StaleAttempt(stored.job.id)
-    return stored.model_copy(update={"token": fresh})
+    return stored.model_copy(update={"attempt_id": fresh})
 
 
-def _check_owner(stored: Stored, token: str) -> None:
-    if stored.token != token or stored.job.status not in ACTIVE:
+def _check_owner(stored: Stored, attempt_id: str) -> None:
+    if stored.attempt_id != attempt_id or stored.job.status not in ACTIVE:
         raise StaleAttempt(stored.job.id)
 
 

@@ -1,4 +1,4 @@
-"""What an id, a key, a cursor can look like: checked before anything is asked of a store."""
+"""Checks of keys, cursors and event ids, made before a store is queried."""
 
 from __future__ import annotations
 
@@ -9,27 +9,14 @@ from pliant.worker.errors import InvalidRequest
 LARGEST_PAGE = 200
 LONGEST_KEY = 255
 
-_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{2,63}")
 _CURSOR = re.compile(r"[0-9]{14}:[A-Za-z0-9_-]{3,64}")
 _EVENT = re.compile(r"[0-9]{1,20}-[0-9]{1,20}")
-
-
-def is_id(text: str) -> bool:
-    """Tell whether a job could have this id."""
-    return _ID.fullmatch(text) is not None
-
-
-def check_id(id: str) -> None:
-    """Refuse an id that cannot be one; every refusal here is an `InvalidRequest`."""
-    if not is_id(id):
-        raise InvalidRequest(
-            "invalid_id", field="id", expected="3–64 letters, digits, underscores or dashes", got=repr(id)[:80],
-            hint="Choose another id or leave it out.",
-        )  # fmt: skip
+_LARGEST_EVENT = 2**64 - 1
+"""Largest part of the id of an entry of a Redis stream."""
 
 
 def check_key(idempotency_key: str) -> None:
-    """Refuse an idempotency key that is empty or too long."""
+    """Check the length of an idempotency key."""
     if not 1 <= len(idempotency_key) <= LONGEST_KEY:
         raise InvalidRequest(
             "invalid_idempotency_key", field="Idempotency-Key", expected=f"1–{LONGEST_KEY} characters",
@@ -38,7 +25,7 @@ def check_key(idempotency_key: str) -> None:
 
 
 def check_page(cursor: str | None, limit: int) -> None:
-    """Refuse a cursor that we did not give, and a limit out of range."""
+    """Check that a cursor is one that `Jobs.page` returned, and that a limit is in range."""
     if not 1 <= limit <= LARGEST_PAGE:
         raise InvalidRequest(
             "invalid_limit", field="limit", expected=f"1–{LARGEST_PAGE}", got=str(limit), hint="Ask for less at once."
@@ -51,8 +38,8 @@ def check_page(cursor: str | None, limit: int) -> None:
 
 
 def check_event_id(after: str) -> None:
-    """Refuse what is not the id of an event."""
-    if not _EVENT.fullmatch(after):
+    """Check that a text is the id of an event: two 64-bit numbers joined by a dash."""
+    if not _EVENT.fullmatch(after) or any(int(part) > _LARGEST_EVENT for part in after.split("-")):
         raise InvalidRequest(
             "invalid_event_id", field="Last-Event-ID", expected="the id of an event", got=repr(after)[:80],
             hint="Leave it out to get all events that are kept.",

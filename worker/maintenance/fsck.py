@@ -1,7 +1,7 @@
-"""The audit: compares everything that is stored with what the records say ought to be, and says what does not fit.
+"""fsck: compares what is stored with the records, and lists what does not fit.
 
 A sound installation at rest gives no findings. While jobs come and go, a finding may be a change caught half-way:
-look twice before believing it (`findings` does, by `settle`).
+look twice before believing it (`findings` does, by `pause`).
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from pliant.worker.records import Stored
 from pliant.worker.uploads.service import Uploads
 
 
-def findings(jobs: Jobs, *, settle: float = 5.0) -> list[str]:
-    """Return a sentence for everything that does not fit, twice `settle` seconds apart.
+def findings(jobs: Jobs, *, pause: float = 5.0) -> list[str]:
+    """Return a sentence for everything that does not fit, seen in two looks `pause` seconds apart.
 
     Raises
     ------
@@ -29,7 +29,7 @@ def findings(jobs: Jobs, *, settle: float = 5.0) -> list[str]:
     first = set(_look(jobs))
     if not first:
         return []
-    time.sleep(settle)
+    time.sleep(pause)
     return sorted(first & set(_look(jobs)))
 
 
@@ -80,22 +80,22 @@ def _of_files(jobs: Jobs, records: list[Stored], sizes: dict[str, int]) -> Itera
             yield f"File {key} belongs to no job."
         elif key != held.inputs and not _counts(held, key):
             yield f"File {key} belongs to no attempt of its job that counts."
-    tokens = {stored.token for stored in records if stored.job.status in ACTIVE}
+    attempt_ids = {stored.attempt_id for stored in records if stored.job.status in ACTIVE}
     work = jobs.settings.work
     for directory in work.iterdir() if work.exists() else ():
-        if directory.name not in tokens:
+        if directory.name not in attempt_ids:
             yield f"Directory {directory} belongs to no running attempt."
 
 
 def _counts(held: Stored, key: str) -> bool:
     if held.prefix is not None:
         return key.startswith(held.prefix)
-    return held.job.status in ACTIVE and key.startswith(f"jobs/{held.job.id}/{held.token}/")
+    return held.job.status in ACTIVE and key.startswith(f"jobs/{held.job.id}/{held.attempt_id}/")
 
 
 def _held_back(jobs: Jobs, records: list[Stored], waiting: set[str]) -> set[str]:
     """Return the queued jobs whose owner has as many running or about to run as may."""
-    taken = Counter(stored.owner for stored in records if stored.job.status in ACTIVE or stored.token in waiting)
+    taken = Counter(stored.owner for stored in records if stored.job.status in ACTIVE or stored.attempt_id in waiting)
     usual = jobs.settings.max_running
     most = {each.job.id: usual if each.max_running is None else each.max_running for each in records}
     return {each.job.id for each in records if 0 < most[each.job.id] <= taken[each.owner]}
@@ -103,13 +103,13 @@ def _held_back(jobs: Jobs, records: list[Stored], waiting: set[str]) -> set[str]
 
 def _of_queue(jobs: Jobs, records: list[Stored]) -> Iterator[str]:
     waiting = Counter(jobs.queue.waiting())
-    queued = {stored.token: stored.job.id for stored in records if stored.job.status is Status.QUEUED}
-    for token, times in waiting.items():
-        if token not in queued:
-            yield f"The queue holds {token}, which no queued job owns."
+    queued = {stored.attempt_id: stored.job.id for stored in records if stored.job.status is Status.QUEUED}
+    for attempt_id, times in waiting.items():
+        if attempt_id not in queued:
+            yield f"The queue holds {attempt_id}, which no queued job owns."
         elif times > 1:
-            yield f"The queue holds {token} {times} times."
+            yield f"The queue holds {attempt_id} {times} times."
     held = _held_back(jobs, records, set(waiting))
-    for token, id in queued.items():
-        if token not in waiting and id not in held:
+    for attempt_id, id in queued.items():
+        if attempt_id not in waiting and id not in held:
             yield f"Job {id} is queued, but the queue does not hold it."

@@ -170,7 +170,7 @@ def valkey_child(valkey: Valkey) -> Child:
 
 
 def worker_children(settings: Settings) -> list[Child]:
-    """Return the workers and the keeper as children."""
+    """Return the workers and the reconciler as children."""
     threads = dict.fromkeys(NUMERICAL_THREADS, "1")
     env = {**settings.to_environment(), **threads}
     command = [sys.executable, "-m", "pliant.worker"]
@@ -179,7 +179,7 @@ def worker_children(settings: Settings) -> list[Child]:
         Child(name=f"worker-{number + 1}", argv=[*command, "work"], env=env, grace=grace)
         for number in range(settings.workers)
     ]
-    return [*workers, Child(name="keeper", argv=[*command, "keep"], env=env)]
+    return [*workers, Child(name="reconciler", argv=[*command, "reconcile"], env=env)]
 
 
 def _signal(each: _Running, number: signal.Signals) -> None:

@@ -23,7 +23,7 @@ from pathlib import Path
 
 import redis
 from pliant.worker.errors import DataDirectoryInUse, ServerFailed
-from pliant.worker.paths import socket_path, valkey_directory
+from pliant.worker.paths import make_data_directory, socket_path, valkey_directory
 from pliant.worker.settings import Settings
 from pliant.worker.store.connection import connect
 
@@ -82,6 +82,7 @@ class Valkey:
         """
         binary = find_binary()
         home, socket = valkey_directory(data), socket_path(data)
+        make_data_directory(data)
         home.mkdir(parents=True, exist_ok=True, mode=0o700)
         _make_private(socket.parent)
         guard = os.open(home / "supervisor.lock", os.O_RDWR | os.O_CREAT, 0o600)
@@ -195,8 +196,8 @@ def _command(binary: Path, home: Path, socket: Path) -> list[str]:
 
 def _make_private(directory: Path) -> None:
     directory.mkdir(parents=True, exist_ok=True, mode=0o700)
-    found = directory.stat()
-    if found.st_uid != os.getuid() or stat.S_IMODE(found.st_mode) & 0o022:
+    found = directory.lstat()  # a symbolic link that somebody else has put there is not followed
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or stat.S_IMODE(found.st_mode) & 0o022:
         raise ServerFailed(
             f"{directory} can be written by others, who could pose as the server. Remove it or give another data directory.",
             log="",

@@ -2,26 +2,54 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+import logging
+import os
+import secrets
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import datetime, timedelta
 from pathlib import Path
+from typing import Any, TypeVar
+from urllib.parse import unquote, urlsplit
 
 import obstore
 from obstore.exceptions import BaseError
 from obstore.store import MemoryStore, ObjectStore, from_url
 from pliant.worker.errors import StoreUnavailable
+from pliant.worker.store.calls import RemoteCalls
+
+logger = logging.getLogger(__name__)
 
 CHUNK = 1 << 20
 """Bytes handed out at a time."""
+
+BLOCK = 4 << 20
+"""Bytes of one request to a remote store, so that each request is short enough to have a time limit."""
+
+ANSWER_WITHIN = 8.0
+"""Seconds a remote store has to answer one call."""
+
+SLOWEST = 1 << 20
+"""Bytes in a second below which a transfer to a remote store counts as hanging."""
+
+CLIENT: Any = {"connect_timeout": "3s", "timeout": "15s"}
+RETRIES: Any = {
+    "max_retries": 2,
+    "retry_timeout": timedelta(seconds=5),
+    "backoff": {"init_backoff": timedelta(milliseconds=100), "max_backoff": timedelta(seconds=1), "base": 2},
+}
+"""Time limits of one HTTP request to a remote store, and its repetitions: together they stay below `ANSWER_WITHIN` when the store's
+packets are dropped."""
+
+Answer = TypeVar("Answer")
 
 
 @dataclass(frozen=True, slots=True)
 class Blob:
     """One stored file, readable in ranges."""
 
-    _store: ObjectStore
+    _blobs: Blobs
     key: str
     size: int
     """Bytes."""
@@ -33,27 +61,38 @@ class Blob:
         ------
         ValueError
             The range is not within the file.
+        FileNotFoundError
+            The file was removed meanwhile.
         StoreUnavailable
             The store does not answer.
         """
         stop = self.size if end is None else end
         if not 0 <= start <= stop <= self.size:
             raise ValueError(f"range {start}–{stop} of a file of {self.size} bytes")
-        if start == stop:
-            return
-        with answering():
-            got = obstore.get(self._store, self.key, options={"range": (start, stop)})
-            for batch in got.stream(min_chunk_size=CHUNK):
-                whole = memoryview(batch)
-                for offset in range(0, len(whole), CHUNK):
-                    yield bytes(whole[offset : offset + CHUNK])
+        for block in range(start, stop, BLOCK):
+            whole = memoryview(self._blobs.read_range(self.key, block, min(block + BLOCK, stop)))
+            for offset in range(0, len(whole), CHUNK):
+                yield bytes(whole[offset : offset + CHUNK])
+
+
+Entries = list[Any]
 
 
 class Blobs:
-    """A store of files under slash-separated keys."""
+    """A store of files under slash-separated keys. Every method may raise `StoreUnavailable`.
 
-    def __init__(self, store: ObjectStore) -> None:
+    Calls to a remote store have a time limit and a small pool of threads of their own: a store that hangs delays nothing else.
+
+    Attributes
+    ----------
+    directory : Path or None
+        Where the files lie, if the store is a local directory.
+    """
+
+    def __init__(self, store: ObjectStore, *, directory: Path | None = None, remote: bool = False) -> None:
         self._store = store
+        self.directory = directory
+        self._calls = RemoteCalls() if remote else None
 
     @classmethod
     def open(cls, url: str) -> Blobs:
@@ -65,14 +104,20 @@ class Blobs:
             return cls(MemoryStore())
         with answering():
             if url.startswith("file:"):
-                return cls(from_url(url, mkdir=True, automatic_cleanup=True))
-            return cls(from_url(url))
+                store = from_url(url, mkdir=True, automatic_cleanup=True)
+                return cls(store, directory=Path(unquote(urlsplit(url).path)))
+            return cls(from_url(url, client_options=CLIENT, retry_config=RETRIES), remote=True)
 
     def put(self, key: str, file: Path) -> int:
-        """Store a file whole or not at all; return its size in bytes."""
-        with answering():
-            obstore.put(self._store, key, file)
-        return file.stat().st_size
+        """Store a file whole or not at all; return its size in bytes.
+
+        A local store links the file where it can, instead of writing its bytes again: do not write to it afterwards.
+        """
+        size = file.stat().st_size
+        local = self._local(key)
+        if local is None or not _linked(file, local):
+            self._call(lambda: obstore.put(self._store, key, file), seconds=ANSWER_WITHIN + size / SLOWEST)
+        return size
 
     def get(self, key: str) -> Blob:
         """Return a stored file.
@@ -81,60 +126,107 @@ class Blobs:
         ------
         FileNotFoundError
             There is none under this key.
-        StoreUnavailable
-            The store does not answer.
         """
-        with answering():
-            return Blob(self._store, key, int(obstore.head(self._store, key)["size"]))
+        return Blob(self, key, int(self._call(lambda: obstore.head(self._store, key))["size"]))
+
+    def read_range(self, key: str, start: int, end: int) -> bytes:
+        """Return the bytes of a stored file from `start` up to, not including, `end`.
+
+        Raises
+        ------
+        FileNotFoundError
+            There is none under this key.
+        """
+        return self._call(lambda: bytes(obstore.get_range(self._store, key, start=start, end=end)))
 
     def fetch(self, key: str, file: Path) -> None:
-        """Copy a stored file to a local one."""
+        """Make a stored file available under a local name, linked where the store is local. Do not write to it."""
+        local = self._local(key)
+        if local is not None and _linked(local, file):
+            return
         with file.open("wb") as out:
             for chunk in self.get(key).read():
                 out.write(chunk)
 
     def copy(self, key: str, to: str) -> None:
-        """Copy within the store."""
-        with answering():
-            obstore.copy(self._store, key, to)
+        """Copy within the store.
+
+        Raises
+        ------
+        FileNotFoundError
+            There is none under this key.
+        """
+        self._call(lambda: obstore.copy(self._store, key, to))
 
     def delete(self, prefix: str) -> None:
         """Remove everything under a prefix that ends with a slash, or one file; nothing happens if there is nothing."""
         keys = [key for key, _ in self.list(prefix)] if prefix.endswith("/") else [prefix]
-        with answering():
-            for key in keys:
-                try:
-                    obstore.delete(self._store, key)
-                except FileNotFoundError:
-                    continue
+        for key in keys:
+            with suppress(FileNotFoundError):
+                self._call(lambda key=key: obstore.delete(self._store, key))  # type: ignore[misc]
 
     def list(self, prefix: str = "") -> list[tuple[str, datetime]]:
         """Return key and time of writing of everything under a prefix."""
-        with answering():
-            return [
-                (str(each["path"]), each["last_modified"])
-                for batch in obstore.list(self._store, prefix.rstrip("/") or None)
-                for each in batch
-            ]
+        return [(str(each["path"]), each["last_modified"]) for each in self._entries(prefix)]
 
     def sizes(self, prefix: str = "") -> dict[str, int]:
         """Return the size in bytes of everything under a prefix, by key."""
-        with answering():
-            batches = obstore.list(self._store, prefix.rstrip("/") or None)
-            return {str(each["path"]): int(each["size"]) for batch in batches for each in batch}
+        return {str(each["path"]): int(each["size"]) for each in self._entries(prefix)}
 
     def check(self) -> None:
         """Return if the store answers."""
-        with answering():
-            obstore.list_with_delimiter(self._store, "jobs-that-never-are")
+        self._call(lambda: obstore.list_with_delimiter(self._store, "jobs-that-never-are"))
+
+    def _local(self, key: str) -> Path | None:
+        """Return the file of a key; None if the store is not local, or the key is not one that it accepts."""
+        plain = all(part not in ("", ".", "..") for part in key.split("/"))
+        return self.directory / key if self.directory is not None and plain else None
+
+    def _entries(self, prefix: str) -> Entries:
+        batches = iter(obstore.list(self._store, prefix.rstrip("/") or None))
+        found: Entries = []
+        while batch := self._call(lambda: next(batches, None)):
+            found += batch
+        return found
+
+    def _call(self, call: Callable[[], Answer], *, seconds: float = ANSWER_WITHIN) -> Answer:
+        def answered() -> Answer:
+            with answering():
+                return call()
+
+        return answered() if self._calls is None else self._calls.run(answered, seconds=seconds)
+
+
+def _linked(source: Path, target: Path) -> bool:
+    """Give a file a second name; False if it has to be copied: another file system, or one without links."""
+    fresh = target.with_name(f"{target.name}#{secrets.randbits(63)}")  # such names are not listed by the store
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        os.link(source, fresh)
+        fresh.replace(target)
+    except FileNotFoundError:
+        if not source.exists():
+            raise
+        return False
+    except OSError:
+        return False
+    with suppress(FileNotFoundError):  # if both names were one file already, `replace` did nothing
+        fresh.unlink()
+    return True
 
 
 @contextmanager
 def answering() -> Iterator[None]:
-    """Turn the store's failures into `StoreUnavailable`; a missing file stays `FileNotFoundError`."""
+    """Turn the store's failures into `StoreUnavailable`; a missing file stays `FileNotFoundError`.
+
+    What the store says is logged only, since it names endpoint, bucket and key.
+    """
     try:
         yield
     except FileNotFoundError:
         raise
     except (BaseError, OSError) as error:
-        raise StoreUnavailable("The blob store", reason=str(error).splitlines()[0][:200]) from error
+        logger.warning("blob store: %s", str(error).splitlines()[0][:300])
+        full = "No space left on device"
+        reason = full if full in str(error) else type(error).__name__
+        raise StoreUnavailable("The blob store", reason=reason) from error

@@ -11,10 +11,10 @@ from redis.backoff import ExponentialWithJitterBackoff
 from redis.retry import Retry
 
 ANSWER_WITHIN = 10.0
-"""Seconds a command may take. Whoever asks the service while Redis hangs waits this long to be told to come back."""
+"""Seconds a command may take; while Redis hangs, a request is answered with 503 after this time."""
 
 BLOCK_WITHIN = 30.0
-"""The same of those that block on purpose: waiting for events and for deliveries."""
+"""The same for a command that blocks on purpose: a worker that waits for a delivery."""
 
 
 def connect(url: str, *, decode: bool, retries: int = 3, answer_within: float | None = None) -> redis.Redis:

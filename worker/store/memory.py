@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import threading
-import time
+import weakref
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from datetime import datetime
 
 from pliant.schemas.job import Status
-from pliant.worker.errors import TooManyQueued, UnknownJob
-from pliant.worker.records import LOG_KEPT, Beat, Event, Records, Stored, counted, event_of, events_kept
+from pliant.worker.errors import QuotaExceeded, TooManyQueued, UnknownJob
+from pliant.worker.records import LOG_KEPT, Beat, Changes, Event, Records, Stored, counted, event_of, events_kept
+from pliant.worker.store.changes import MemoryChanges
 from pliant.worker.store.queue import Queue
 
 
@@ -18,19 +19,21 @@ class MemoryRecords(Records):
     """Records of one process, safe among its threads."""
 
     def __init__(self) -> None:
-        self._changed = threading.Condition()
+        self._lock = threading.RLock()
+        self._followers: weakref.WeakSet[MemoryChanges] = weakref.WeakSet()
         self._records: dict[str, Stored] = {}
         self._keys: dict[str, str] = {}
+        self._deleted: dict[str, datetime] = {}
         self._beats: dict[str, int] = {}
         self._events: dict[str, list[Event]] = {}
         self._logs: dict[str, list[str]] = {}
         self._tallies: Counter[str] = Counter()
         self._clock = 0
 
-    def create(self, stored: Stored, *, max_queued: int = 0) -> Stored:
+    def create(self, stored: Stored, *, max_queued: int = 0, max_bytes: int = 0) -> Stored:
         """See `Records.create`."""
         id = stored.job.id
-        with self._changed:
+        with self._lock:
             taken = self._keys.get(stored.key) if stored.key is not None else None
             if taken is not None:
                 return self._records[taken]
@@ -38,53 +41,67 @@ class MemoryRecords(Records):
                 return self._records[id]
             if 0 < max_queued <= self.count([Status.QUEUED], owner=stored.owner):
                 raise TooManyQueued(max_queued)
+            if 0 < max_bytes < (used := self.used()) + stored.bytes:
+                raise QuotaExceeded(used=used, quota=max_bytes)
             if stored.key is not None:
                 self._keys[stored.key] = id
             self._records[id] = stored
             self._beats[id] = 0
-            self._tell(None, stored)
+            self._note(None, stored)
             return stored
 
     def get(self, id: str) -> Stored:
         """See `Records.get`."""
-        with self._changed:
+        with self._lock:
             if id not in self._records:
                 raise UnknownJob(id)
             return self._records[id]
 
     def find(self, key: str) -> Stored | None:
         """See `Records.find`."""
-        with self._changed:
+        with self._lock:
             id = self._keys.get(key)
             return None if id is None else self._records[id]
 
     def replace(self, before: Stored, after: Stored) -> bool:
         """See `Records.replace`."""
         id = before.job.id
-        with self._changed:
+        with self._lock:
             held = self._records.get(id)
             if held is None or held.version != before.version:
                 return False
             self._records[id] = after
             self._tallies.update(counted(before, after))
-            self._tell(before, after)
+            self._note(before, after)
             return True
 
-    def delete(self, id: str) -> None:
+    def delete(self, id: str, *, at: datetime) -> None:
         """See `Records.delete`."""
-        with self._changed:
+        with self._lock:
             gone = self._records.pop(id, None)
+            if gone is not None:
+                self._deleted[id] = at
             if gone is not None and gone.key is not None:
                 self._keys.pop(gone.key, None)
             for kept in (self._beats, self._events, self._logs):
                 kept.pop(id, None)
-            self._changed.notify_all()
+            self._publish(id)
+
+    def deleted(self) -> dict[str, datetime]:
+        """See `Records.deleted`."""
+        with self._lock:
+            return dict(self._deleted)
+
+    def forget_deleted(self, id: str) -> None:
+        """See `Records.forget_deleted`."""
+        with self._lock:
+            self._deleted.pop(id, None)
 
     def page(
         self, *, cursor: str | None, limit: int, statuses: Sequence[Status], owner: str | None
     ) -> tuple[list[Stored], str | None]:
         """See `Records.page`."""
-        with self._changed:
+        with self._lock:
             fitting = [
                 each
                 for each in self._records.values()
@@ -98,13 +115,13 @@ class MemoryRecords(Records):
 
     def ids(self, status: Status) -> list[str]:
         """See `Records.ids`."""
-        with self._changed:
+        with self._lock:
             fitting = sorted(each.sort_key for each in self._records.values() if each.job.status is status)
         return [key.split(":", 1)[1] for key in fitting]
 
     def count(self, statuses: Sequence[Status], *, owner: str | None = None) -> int:
         """See `Records.count`."""
-        with self._changed:
+        with self._lock:
             return sum(
                 each.job.status in statuses and (owner is None or each.owner == owner)
                 for each in self._records.values()
@@ -112,73 +129,79 @@ class MemoryRecords(Records):
 
     def oldest(self, status: Status) -> datetime | None:
         """See `Records.oldest`."""
-        with self._changed:
+        with self._lock:
             return min(
                 (each.job.created_at for each in self._records.values() if each.job.status is status), default=None
             )
 
     def tallies(self) -> dict[str, float]:
         """See `Records.tallies`."""
-        with self._changed:
+        with self._lock:
             return dict(self._tallies)
 
     def used(self) -> int:
         """See `Records.used`."""
-        with self._changed:
+        with self._lock:
             return sum(each.bytes for each in self._records.values())
 
-    def beat(self, id: str, token: str) -> Status | None:
+    def beat(self, id: str, attempt_id: str) -> Status | None:
         """See `Records.beat`."""
-        with self._changed:
-            status = self.look(id, token)
+        with self._lock:
+            status = self.look(id, attempt_id)
             if status is not None:
                 self._beats[id] += 1
             return status
 
-    def look(self, id: str, token: str) -> Status | None:
+    def look(self, id: str, attempt_id: str) -> Status | None:
         """See `Records.look`."""
-        with self._changed:
+        with self._lock:
             held = self._records.get(id)
-            return held.job.status if held is not None and held.token == token else None
+            return held.job.status if held is not None and held.attempt_id == attempt_id else None
 
     def beats(self, ids: Iterable[str]) -> dict[str, Beat]:
         """See `Records.beats`."""
-        with self._changed:
+        with self._lock:
             held = {id: self._records[id] for id in ids if id in self._records}
-            return {id: Beat(each.token, self._beats[id], each.owner, each.max_running) for id, each in held.items()}
+            return {
+                id: Beat(each.attempt_id, self._beats[id], each.owner, each.max_running) for id, each in held.items()
+            }
 
-    def events(self, id: str, *, after: str | None, timeout: float) -> list[Event]:
+    def events(self, id: str, *, after: str | None) -> list[Event]:
         """See `Records.events`."""
-        deadline = time.monotonic() + timeout
-        with self._changed:
-            while True:
-                fresh = [each for each in self._events.get(id, []) if after is None or _later(each.id, after)]
-                left = deadline - time.monotonic()
-                if fresh or left <= 0 or id not in self._records:
-                    return fresh
-                self._changed.wait(left)
+        with self._lock:
+            return [each for each in self._events.get(id, []) if after is None or _later(each.id, after)]
+
+    def changes(self) -> Changes:
+        """See `Records.changes`."""
+        subscription = MemoryChanges()
+        self._followers.add(subscription)
+        return subscription
 
     def append_log(self, id: str, lines: Sequence[str]) -> None:
         """See `Records.append_log`."""
-        with self._changed:
+        with self._lock:
             if id in self._records:
                 self._logs[id] = [*self._logs.get(id, []), *lines][-LOG_KEPT:]
 
     def log(self, id: str) -> list[str]:
         """See `Records.log`."""
-        with self._changed:
+        with self._lock:
             return list(self._logs.get(id, []))
 
     def ping(self) -> None:
         """See `Records.ping`."""
 
-    def _tell(self, before: Stored | None, after: Stored) -> None:
+    def _note(self, before: Stored | None, after: Stored) -> None:
         self._clock += 1
         name, data = event_of(before, after)
         events = self._events.setdefault(after.job.id, [])
         events.append(Event(f"{self._clock}-0", name, data))
         del events[: -events_kept(after)]
-        self._changed.notify_all()
+        self._publish(after.job.id)
+
+    def _publish(self, id: str) -> None:
+        for each in list(self._followers):
+            each.add(id)
 
 
 def _later(one: str, other: str) -> bool:
@@ -190,39 +213,39 @@ class MemoryQueue(Queue):
     """A queue of one process."""
 
     def __init__(self) -> None:
-        self._tokens: list[str] = []
+        self._attempt_ids: list[str] = []
         self._held: set[str] = set()
 
-    def push(self, id: str, token: str, *, front: bool = False) -> None:  # noqa: ARG002
+    def push(self, id: str, attempt_id: str, *, front: bool = False) -> None:  # noqa: ARG002
         """See `Queue.push`."""
-        if token not in self._tokens:
-            self._tokens.insert(0 if front else len(self._tokens), token)
+        if attempt_id not in self._attempt_ids:
+            self._attempt_ids.insert(0 if front else len(self._attempt_ids), attempt_id)
 
-    def remove(self, token: str) -> None:
+    def remove(self, attempt_id: str) -> None:
         """See `Queue.remove`."""
-        self.let_go(token)
-        if token in self._tokens:
-            self._tokens.remove(token)
+        self.let_go(attempt_id)
+        if attempt_id in self._attempt_ids:
+            self._attempt_ids.remove(attempt_id)
 
-    def hold(self, token: str) -> None:
+    def hold(self, attempt_id: str) -> None:
         """See `Queue.hold`."""
-        self._held.add(token)
+        self._held.add(attempt_id)
 
     def held(self) -> set[str]:
         """See `Queue.held`."""
         return set(self._held)
 
-    def let_go(self, token: str) -> None:
+    def let_go(self, attempt_id: str) -> None:
         """See `Queue.let_go`."""
-        self._held.discard(token)
+        self._held.discard(attempt_id)
 
     def waiting(self) -> list[str]:
         """See `Queue.waiting`."""
-        return list(self._tokens)
+        return list(self._attempt_ids)
 
-    def place(self, token: str) -> int | None:
+    def place(self, attempt_id: str) -> int | None:
         """See `Queue.place`."""
-        return self._tokens.index(token) if token in self._tokens else None
+        return self._attempt_ids.index(attempt_id) if attempt_id in self._attempt_ids else None
 
     def tidy(self) -> None:
         """See `Queue.tidy`."""
@@ -230,3 +253,26 @@ class MemoryQueue(Queue):
     def workers(self) -> list[str]:
         """See `Queue.workers`."""
         return ["memory"]
+
+
+class MemoryHash:
+    """The commands of Redis on hashes that `pliant.worker.tokens.Tokens` uses."""
+
+    def __init__(self) -> None:
+        self._hashes: dict[str, dict[str, str]] = {}
+
+    def hset(self, key: str, name: str, value: str) -> None:
+        """Set a field of a hash."""
+        self._hashes.setdefault(key, {})[name] = value
+
+    def hget(self, key: str, name: str) -> str | None:
+        """Return a field of a hash, None if there is none."""
+        return self._hashes.get(key, {}).get(name)
+
+    def hvals(self, key: str) -> list[str]:
+        """Return every value of a hash."""
+        return list(self._hashes.get(key, {}).values())
+
+    def hdel(self, key: str, name: str) -> None:
+        """Remove a field of a hash."""
+        self._hashes.get(key, {}).pop(name, None)

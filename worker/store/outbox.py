@@ -21,6 +21,14 @@ redis.call('HINCRBY', at .. 'tally', 'webhooks:tried', 1)
 return {due[1], redis.call('HINCRBY', at .. 'outbox:tries', due[1], 1)}
 """
 
+# ARGV: 1 prefix, 2 id, 3 when it is due
+_POSTPONE = """
+if redis.call('ZADD', ARGV[1] .. 'outbox', 'XX', 'CH', ARGV[3], ARGV[2]) == 0 then return 0 end
+redis.call('HINCRBY', ARGV[1] .. 'outbox:tries', ARGV[2], -1)
+redis.call('HINCRBY', ARGV[1] .. 'tally', 'webhooks:tried', -1)
+return 1
+"""
+
 # ARGV: 1 prefix, 2 id, 3 name of the tally
 _CLOSE = """
 if redis.call('ZREM', ARGV[1] .. 'outbox', ARGV[2]) == 0 then return 0 end
@@ -37,6 +45,7 @@ class Outbox:
         self._redis: Any = client
         self._at = f"{prefix}:"
         self._take = client.register_script(_TAKE)
+        self._postpone = client.register_script(_POSTPONE)
         self._close = client.register_script(_CLOSE)
 
     def take(self, *, now: int, until: int) -> tuple[str, int] | None:
@@ -65,6 +74,11 @@ class Outbox:
         """Try a message again, then; nothing happens if its job is gone."""
         with reachable():
             self._redis.zadd(f"{self._at}outbox", {id: due}, xx=True)
+
+    def postpone(self, id: str, *, due: int) -> None:
+        """Put back a message that was taken and not tried."""
+        with reachable():
+            self._postpone(args=[self._at, id, due])
 
     def owed(self) -> int:
         """Return how many messages there are."""

@@ -1,4 +1,4 @@
-"""The queue: RQ carries an attempt's token from the one who submits to the one who works; it knows nothing else."""
+"""The queue: RQ carries an attempt's attempt_id from the one who submits to the one who works; it knows nothing else."""
 
 from __future__ import annotations
 
@@ -30,31 +30,31 @@ class Queue(ABC):
     """Who is next."""
 
     @abstractmethod
-    def push(self, id: str, token: str, *, front: bool = False) -> None:
+    def push(self, id: str, attempt_id: str, *, front: bool = False) -> None:
         """Put an attempt at the end, or before all the others; nothing happens if it waits already."""
 
     @abstractmethod
-    def remove(self, token: str) -> None:
+    def remove(self, attempt_id: str) -> None:
         """Take an attempt out, whether it waits or is held back."""
 
     @abstractmethod
-    def hold(self, token: str) -> None:
+    def hold(self, attempt_id: str) -> None:
         """Note that an attempt is kept out on purpose, until fewer of its owner's jobs run."""
 
     @abstractmethod
     def held(self) -> set[str]:
-        """Return the tokens that are noted as held back."""
+        """Return the attempt_ids that are noted as held back."""
 
     @abstractmethod
-    def let_go(self, token: str) -> None:
+    def let_go(self, attempt_id: str) -> None:
         """Strike the note that an attempt is held back; nothing else happens to it."""
 
     @abstractmethod
     def waiting(self) -> list[str]:
-        """Return the tokens of all attempts that wait, next first."""
+        """Return the attempt_ids of all attempts that wait, next first."""
 
     @abstractmethod
-    def place(self, token: str) -> int | None:
+    def place(self, attempt_id: str) -> int | None:
         """Return how many attempts wait before this one, None if it does not wait."""
 
     @abstractmethod
@@ -75,15 +75,15 @@ class RedisQueue(Queue):
         self._held = f"{name}:held"
         self._queue = RqQueue(name, connection=client, serializer=JSONSerializer)
 
-    def push(self, id: str, token: str, *, front: bool = False) -> None:
+    def push(self, id: str, attempt_id: str, *, front: bool = False) -> None:
         """See `Queue.push`."""
         with reachable():
-            if self._redis.lpos(self._queue.key, token) is not None:
+            if self._redis.lpos(self._queue.key, attempt_id) is not None:
                 return
             self._queue.enqueue_call(
                 FUNCTION,
-                args=(id, token),
-                job_id=token,
+                args=(id, attempt_id),
+                job_id=attempt_id,
                 timeout=-1,  # ours is kept by the worker, who can end a C call; RQ's alarm cannot
                 result_ttl=0,
                 failure_ttl=FAILURE_KEPT,
@@ -91,43 +91,43 @@ class RedisQueue(Queue):
                 at_front=front,
             )
 
-    def remove(self, token: str) -> None:
+    def remove(self, attempt_id: str) -> None:
         """See `Queue.remove`."""
-        self.let_go(token)
+        self.let_go(attempt_id)
         with reachable():
             for key in (self._queue.key, self._queue.intermediate_queue_key):
-                self._redis.lrem(key, 0, token)
+                self._redis.lrem(key, 0, attempt_id)
             try:
-                RqJob.fetch(token, connection=self._redis, serializer=JSONSerializer).delete()
+                RqJob.fetch(attempt_id, connection=self._redis, serializer=JSONSerializer).delete()
             except (NoSuchJobError, InvalidJobOperation):  # gone already, or just now
                 return
             except ValueError:  # the worker that took it strikes its note of that just now; RQ stumbles over the gap
-                self._redis.delete(RqJob.key_for(token))
+                self._redis.delete(RqJob.key_for(attempt_id))
 
-    def hold(self, token: str) -> None:
+    def hold(self, attempt_id: str) -> None:
         """See `Queue.hold`."""
         with reachable():
-            self._redis.sadd(self._held, token)
+            self._redis.sadd(self._held, attempt_id)
 
     def held(self) -> set[str]:
         """See `Queue.held`."""
         with reachable():
-            return {token.decode() for token in self._redis.smembers(self._held)}
+            return {attempt_id.decode() for attempt_id in self._redis.smembers(self._held)}
 
-    def let_go(self, token: str) -> None:
+    def let_go(self, attempt_id: str) -> None:
         """See `Queue.let_go`."""
         with reachable():
-            self._redis.srem(self._held, token)
+            self._redis.srem(self._held, attempt_id)
 
     def waiting(self) -> list[str]:
         """See `Queue.waiting`."""
         with reachable():
-            return [token.decode() for token in self._redis.lrange(self._queue.key, 0, -1)]
+            return [attempt_id.decode() for attempt_id in self._redis.lrange(self._queue.key, 0, -1)]
 
-    def place(self, token: str) -> int | None:
+    def place(self, attempt_id: str) -> int | None:
         """See `Queue.place`."""
         with reachable():
-            place: int | None = self._redis.lpos(self._queue.key, token)
+            place: int | None = self._redis.lpos(self._queue.key, attempt_id)
         return place
 
     def tidy(self) -> None:

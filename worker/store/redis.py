@@ -2,11 +2,13 @@
 
 Keys, all under one prefix::
 
-    job:<id>              hash: version, status, token, owner, sort, bytes, key, beat, most, body (JSON of `Stored`)
+    job:<id>              hash: version, status, token (the attempt id), owner, sort, bytes, key, beat, most, body (JSON of `Stored`)
     index:*:<status>      sorted set of sort keys, all jobs of a status; index:@<owner>:<status> the owner's
     events:<id>, log:<id> stream and list, both capped
     key:<digest>          the job of an idempotency key
     used                  bytes that all jobs hold
+    deleted               sorted set of deleted jobs whose files are still to be removed, by time of deletion
+    changes               channel on which the id of every changed job is published
     tally                 hash: what has been counted since the installation began
     outbox, outbox:tries  jobs whose end is to be told by webhook and when; how often it was tried (`worker.outbox`)
 
@@ -21,26 +23,27 @@ from typing import Any
 
 import redis
 from pliant.schemas.job import Status
-from pliant.worker.errors import TooManyQueued, UnknownJob
+from pliant.worker.errors import QuotaExceeded, TooManyQueued, UnknownJob
 from pliant.worker.records import (
     LOG_KEPT,
     Beat,
+    Changes,
     Event,
     Records,
     Stored,
     counted,
     event_of,
     events_kept,
+    milliseconds,
     moment,
-    told_at,
+    webhook_due,
 )
+from pliant.worker.store.changes import RedisChanges
 from pliant.worker.store.connection import reachable
 
-LONGEST_WAIT = 20.0
-"""Seconds one blocking read waits at most: below the connection's own timeout."""
-
-# ARGV: 1 prefix, 2 id, 3 version, 4 status, 5 token, 6 owner, 7 sort key, 8 bytes, 9 key digest, 10 body, 11 event, 12 data, 13 cap,
-# 14 most queued jobs of the owner (0: any), 15 most running ones as its token said ('': nothing)
+# ARGV: 1 prefix, 2 id, 3 version, 4 status, 5 attempt id, 6 owner, 7 sort key, 8 bytes, 9 key digest, 10 body, 11 event, 12 data, 13 cap,
+# 14 most queued jobs of the owner (0: any), 15 most running ones as its owner's token states ('': nothing),
+# 16 bytes that all jobs may hold (0: any)
 _CREATE = """
 local at = ARGV[1]
 if ARGV[9] ~= '' then
@@ -50,6 +53,8 @@ end
 if redis.call('EXISTS', at .. 'job:' .. ARGV[2]) == 1 then return ARGV[2] end
 local most = tonumber(ARGV[14])
 if most > 0 and redis.call('ZCARD', at .. 'index:@' .. ARGV[6] .. ':queued') >= most then return '!full' end
+local bytes = tonumber(ARGV[16])
+if bytes > 0 and tonumber(redis.call('GET', at .. 'used') or 0) + tonumber(ARGV[8]) > bytes then return '!space' end
 if ARGV[9] ~= '' then redis.call('SET', at .. 'key:' .. ARGV[9], ARGV[2]) end
 redis.call('HSET', at .. 'job:' .. ARGV[2], 'version', ARGV[3], 'status', ARGV[4], 'token', ARGV[5], 'owner', ARGV[6],
   'sort', ARGV[7], 'bytes', ARGV[8], 'key', ARGV[9], 'body', ARGV[10], 'beat', 0,
@@ -58,13 +63,14 @@ redis.call('ZADD', at .. 'index:*:' .. ARGV[4], 0, ARGV[7])
 redis.call('ZADD', at .. 'index:@' .. ARGV[6] .. ':' .. ARGV[4], 0, ARGV[7])
 redis.call('INCRBY', at .. 'used', ARGV[8])
 redis.call('XADD', at .. 'events:' .. ARGV[2], 'MAXLEN', ARGV[13], '*', 'name', ARGV[11], 'data', ARGV[12])
+redis.call('PUBLISH', at .. 'changes', ARGV[2])
 return false
 """
 
-_FULL = "!full"
-"""What `_CREATE` answers instead of an id when the owner's queue is full; no id begins with this sign."""
+_FULL, _NO_SPACE = "!full", "!space"
+"""What `_CREATE` returns instead of an id when the owner's queue or the quota is full; no id begins with this sign."""
 
-# ARGV: 1 prefix, 2 id, 3 version before, 4 version, 5 status, 6 token, 7 bytes, 8 body, 9 event, 10 data, 11 cap,
+# ARGV: 1 prefix, 2 id, 3 version before, 4 version, 5 status, 6 attempt id, 7 bytes, 8 body, 9 event, 10 data, 11 cap,
 # 12 when to tell it by webhook ('': never), 13 … tallies and what to add to them
 _REPLACE = """
 local at, job = ARGV[1], ARGV[1] .. 'job:' .. ARGV[2]
@@ -79,12 +85,13 @@ if held[2] ~= ARGV[5] then
 end
 if held[5] ~= ARGV[7] then redis.call('INCRBY', at .. 'used', tonumber(ARGV[7]) - tonumber(held[5])) end
 redis.call('XADD', at .. 'events:' .. ARGV[2], 'MAXLEN', ARGV[11], '*', 'name', ARGV[9], 'data', ARGV[10])
+redis.call('PUBLISH', at .. 'changes', ARGV[2])
 if ARGV[12] ~= '' then redis.call('ZADD', at .. 'outbox', ARGV[12], ARGV[2]) end
 for i = 13, #ARGV, 2 do redis.call('HINCRBYFLOAT', at .. 'tally', ARGV[i], ARGV[i + 1]) end
 return 1
 """
 
-# ARGV: 1 prefix, 2 id
+# ARGV: 1 prefix, 2 id, 3 milliseconds since 1970
 _DELETE = """
 local at, job = ARGV[1], ARGV[1] .. 'job:' .. ARGV[2]
 local held = redis.call('HMGET', job, 'status', 'owner', 'sort', 'bytes', 'key')
@@ -93,13 +100,15 @@ redis.call('ZREM', at .. 'index:*:' .. held[1], held[3])
 redis.call('ZREM', at .. 'index:@' .. held[2] .. ':' .. held[1], held[3])
 redis.call('DECRBY', at .. 'used', held[4])
 if held[5] ~= '' then redis.call('DEL', at .. 'key:' .. held[5]) end
+redis.call('ZADD', at .. 'deleted', ARGV[3], ARGV[2])
 redis.call('ZREM', at .. 'outbox', ARGV[2])
 redis.call('HDEL', at .. 'outbox:tries', ARGV[2])
 redis.call('DEL', job, at .. 'events:' .. ARGV[2], at .. 'log:' .. ARGV[2])
+redis.call('PUBLISH', at .. 'changes', ARGV[2])
 return 1
 """
 
-# ARGV: 1 prefix, 2 id, 3 token
+# ARGV: 1 prefix, 2 id, 3 attempt id
 _BEAT = """
 local job = ARGV[1] .. 'job:' .. ARGV[2]
 local held = redis.call('HMGET', job, 'token', 'status')
@@ -120,10 +129,8 @@ return 1
 class RedisRecords(Records):
     """Records in Redis under one key prefix."""
 
-    def __init__(self, client: redis.Redis, *, prefix: str, waiting: redis.Redis | None = None) -> None:
+    def __init__(self, client: redis.Redis, *, prefix: str) -> None:
         self._redis: Any = client  # redis-py types every answer as a union with its awaitable twin
-        self._waiting: Any = waiting or client
-        """Blocks for up to `LONGEST_WAIT`."""
         self._at = f"{prefix}:"
         self._create = client.register_script(_CREATE)
         self._replace = client.register_script(_REPLACE)
@@ -131,20 +138,22 @@ class RedisRecords(Records):
         self._beat = client.register_script(_BEAT)
         self._log = client.register_script(_LOG)
 
-    def create(self, stored: Stored, *, max_queued: int = 0) -> Stored:
+    def create(self, stored: Stored, *, max_queued: int = 0, max_bytes: int = 0) -> Stored:
         """See `Records.create`."""
         name, data = event_of(None, stored)
         job = stored.job
         with reachable():
             taken = self._create(
                 args=[
-                    self._at, job.id, stored.version, job.status.value, stored.token, stored.owner, stored.sort_key,
+                    self._at, job.id, stored.version, job.status.value, stored.attempt_id, stored.owner, stored.sort_key,
                     stored.bytes, stored.key or "", stored.model_dump_json(), name, data, events_kept(stored),
-                    max_queued, "" if stored.max_running is None else stored.max_running,
+                    max_queued, "" if stored.max_running is None else stored.max_running, max_bytes,
                 ]
             )  # fmt: skip
         if taken == _FULL:
             raise TooManyQueued(max_queued)
+        if taken == _NO_SPACE:
+            raise QuotaExceeded(used=self.used(), quota=max_bytes)
         return stored if taken is None else self.get(str(taken))
 
     def get(self, id: str) -> Stored:
@@ -164,21 +173,32 @@ class RedisRecords(Records):
     def replace(self, before: Stored, after: Stored) -> bool:
         """See `Records.replace`."""
         name, data = event_of(before, after)
-        job, due = after.job, told_at(before, after)
+        job, due = after.job, webhook_due(before, after)
         with reachable():
             written = self._replace(
                 args=[
-                    self._at, job.id, before.version, after.version, job.status.value, after.token, after.bytes,
+                    self._at, job.id, before.version, after.version, job.status.value, after.attempt_id, after.bytes,
                     after.model_dump_json(), name, data, events_kept(after),
                     "" if due is None else due, *(part for each in counted(before, after).items() for part in each),
                 ]
             )  # fmt: skip
         return bool(written)
 
-    def delete(self, id: str) -> None:
+    def delete(self, id: str, *, at: datetime) -> None:
         """See `Records.delete`."""
         with reachable():
-            self._delete(args=[self._at, id])
+            self._delete(args=[self._at, id, milliseconds(at)])
+
+    def deleted(self) -> dict[str, datetime]:
+        """See `Records.deleted`."""
+        with reachable():
+            found = self._redis.zrange(f"{self._at}deleted", 0, -1, withscores=True)
+        return {id: moment(int(at)) for id, at in found}
+
+    def forget_deleted(self, id: str) -> None:
+        """See `Records.forget_deleted`."""
+        with reachable():
+            self._redis.zrem(f"{self._at}deleted", id)
 
     def page(
         self, *, cursor: str | None, limit: int, statuses: Sequence[Status], owner: str | None
@@ -224,17 +244,17 @@ class RedisRecords(Records):
         with reachable():
             return int(self._redis.get(f"{self._at}used") or 0)
 
-    def beat(self, id: str, token: str) -> Status | None:
+    def beat(self, id: str, attempt_id: str) -> Status | None:
         """See `Records.beat`."""
         with reachable():
-            status = self._beat(args=[self._at, id, token])
+            status = self._beat(args=[self._at, id, attempt_id])
         return None if status is None else Status(str(status))
 
-    def look(self, id: str, token: str) -> Status | None:
+    def look(self, id: str, attempt_id: str) -> Status | None:
         """See `Records.look`."""
         with reachable():
             held, status = self._redis.hmget(f"{self._at}job:{id}", "token", "status")
-        return Status(status) if held == token else None
+        return Status(status) if held == attempt_id else None
 
     def beats(self, ids: Iterable[str]) -> dict[str, Beat]:
         """See `Records.beats`."""
@@ -245,24 +265,20 @@ class RedisRecords(Records):
                 pipe.hmget(f"{self._at}job:{id}", "token", "beat", "owner", "most")
             answers = pipe.execute()
         return {
-            id: Beat(token, int(beat), owner, int(most) if most else None)
-            for id, (token, beat, owner, most) in zip(wanted, answers, strict=True)
-            if token is not None
+            id: Beat(attempt_id, int(beat), owner, int(most) if most else None)
+            for id, (attempt_id, beat, owner, most) in zip(wanted, answers, strict=True)
+            if attempt_id is not None
         }
 
-    def events(self, id: str, *, after: str | None, timeout: float) -> list[Event]:
+    def events(self, id: str, *, after: str | None) -> list[Event]:
         """See `Records.events`."""
-        key = f"{self._at}events:{id}"
-        wait = max(0.0, min(timeout, LONGEST_WAIT))
         with reachable():
-            if not self._redis.exists(key):
-                return []
-            # BLOCK 0 would wait for ever.
-            block = {"block": max(1, int(wait * 1000))} if wait > 0 else {}
-            answer = self._waiting.xread({key: after or "0-0"}, **block)
-        streams = answer.values() if isinstance(answer, dict) else [each[1] for each in answer or []]
-        entries = [entry for stream in streams for entry in _flat(stream)]
+            entries = self._redis.xrange(f"{self._at}events:{id}", min="-" if after is None else f"({after}", max="+")
         return [Event(entry, fields["name"], fields["data"]) for entry, fields in entries]
+
+    def changes(self) -> Changes:
+        """See `Records.changes`."""
+        return RedisChanges(self._redis, prefix=self._at.removesuffix(":"))
 
     def append_log(self, id: str, lines: Sequence[str]) -> None:
         """See `Records.append_log`."""
@@ -283,8 +299,3 @@ class RedisRecords(Records):
     def _index(self, owner: str | None, status: Status) -> str:
         who = "*" if owner is None else f"@{owner}"
         return f"{self._at}index:{who}:{status.value}"
-
-
-def _flat(stream: Any) -> list[Any]:
-    """RESP3 answers `[[entry, …]]` for a stream where RESP2 answers `[entry, …]`."""
-    return [entry for each in stream for entry in (each if each and not isinstance(each[0], str) else [each])]

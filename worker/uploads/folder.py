@@ -12,12 +12,13 @@ from __future__ import annotations
 import fcntl
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from pliant.worker.errors import Conflict, UnknownUpload
 
-PART, WHOLE, LENGTH = "part", "whole-", "length"
+PART, WHOLE, LENGTH, RESERVED = "part", "whole-", "length", "reserved"
+"""`reserved` exists while the upload is written to: the bytes set aside for it, locked by the writer."""
 
 
 @contextmanager
@@ -72,7 +73,40 @@ def content(folder: Path) -> Path | None:
     return None
 
 
-def said_length(folder: Path) -> int | None:
-    """Return how long the whole upload is, as was said when it began; None if nothing was."""
+def reserve(folder: Path) -> int:
+    """Open and lock the reservation of an upload that is being written; return its descriptor."""
+    descriptor = os.open(folder / RESERVED, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    fcntl.flock(descriptor, fcntl.LOCK_EX)
+    return descriptor
+
+
+def taken(folder: Path) -> int:
+    """Return the bytes of the quota that an upload takes: what it holds, or has reserved while it is written to."""
+    file = content(folder)
+    held = 0
+    with suppress(FileNotFoundError):
+        held = 0 if file is None else file.stat().st_size
+    with suppress(FileNotFoundError, ValueError), (folder / RESERVED).open("rb") as reserved:
+        try:
+            fcntl.flock(reserved, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return max(held, int(reserved.read() or b"0"))
+    return held
+
+
+@contextmanager
+def counting(directory: Path) -> Iterator[None]:
+    """Hold the lock under which space is counted and reserved, so that two uploads cannot reserve the same bytes."""
+    directory.mkdir(parents=True, exist_ok=True, mode=0o700)
+    descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def declared_length(folder: Path) -> int | None:
+    """Return the length of the whole upload as declared when it began; None if it was not."""
     file = folder / LENGTH
     return int(file.read_text()) if file.exists() else None

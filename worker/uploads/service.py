@@ -1,6 +1,6 @@
 """Large inputs before there is a job: files that arrive over several requests, kept on the data volume until they expire.
 
-An upload is a folder (`worker.upload_folder`) that grows (`worker.upload_writer`); a job can take its input only from a whole one.
+An upload is a folder (`uploads.folder`) that grows (`uploads.writer`); a job can take its input only from a complete one.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from pathlib import Path
 
 from pliant.schemas.job import Upload
 from pliant.worker.errors import Conflict, OffsetMismatch, TooManyUploads, UnknownUpload
-from pliant.worker.jobs.validation import check_id, is_id
+from pliant.worker.ids import check_id, is_id
 from pliant.worker.settings import Settings
-from pliant.worker.uploads.folder import LENGTH, PART, WHOLE, content, locked, said_length
-from pliant.worker.uploads.writer import Room as Room
+from pliant.worker.uploads.folder import LENGTH, PART, RESERVED, WHOLE, content, declared_length, locked, taken
+from pliant.worker.uploads.writer import Capacity as Capacity
 from pliant.worker.uploads.writer import Writer as Writer
 from pliant.worker.uploads.writer import inconsistent
 
@@ -27,7 +27,7 @@ MOST = 100
 """Uploads that one owner may have at a time."""
 
 LATE = timedelta(minutes=10)
-"""How long after its time an upload may still be there before the audit speaks of it."""
+"""How long after its time an upload may still be there before fsck reports it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,7 +61,7 @@ class Uploads:
         try:
             if file is None:
                 raise UnknownUpload(id)
-            held, length = file.stat(), said_length(folder)
+            held, length = file.stat(), declared_length(folder)
         except FileNotFoundError:
             raise UnknownUpload(id) from None
         whole = file.name.startswith(WHOLE)
@@ -86,7 +86,7 @@ class Uploads:
         return 0 if there is None else there.offset
 
     @contextmanager
-    def write(self, id: str, *, offset: int, length: int | None, room: Room) -> Iterator[Writer]:
+    def write(self, id: str, *, offset: int, length: int | None, capacity: Capacity) -> Iterator[Writer]:
         """Go on with an upload, or begin it at 0: what an unfinished one of that id held is thrown away then.
 
         Parameters
@@ -95,8 +95,8 @@ class Uploads:
             Where the bytes that follow belong; must be what the upload holds.
         length : int, optional
             Bytes of the whole upload, where they are known.
-        room : Room
-            How large it may become.
+        capacity : Capacity
+            How much it may take.
 
         Raises
         ------
@@ -121,15 +121,17 @@ class Uploads:
             held = file.stat().st_size if file is not None and offset > 0 else 0
             if offset != held:
                 raise OffsetMismatch(id, expected=held, got=offset)
-            known = said_length(folder) if offset > 0 else None
+            known = declared_length(folder) if offset > 0 else None
             if length is not None and known not in (None, length):
-                raise inconsistent(f"{known} bytes, as was said at first", str(length))
-            writer = Writer(id=id, folder=folder, length=length if length is not None else known, room=room)
-            writer.open(offset)
+                raise inconsistent(f"{known} bytes, as declared at first", str(length))
+            writer = Writer(id=id, folder=folder, length=length if length is not None else known, capacity=capacity)
             try:
+                writer.open(offset)
                 yield writer
             finally:
                 writer.close()
+                if folder.exists() and content(folder) is None:  # refused before its first byte
+                    shutil.rmtree(folder)
 
     def take(self, id: str, to: Path) -> str:
         """Give a whole upload a second name, where neither deletion nor expiry reaches it, and return its SHA-256.
@@ -145,7 +147,7 @@ class Uploads:
         if file is None:
             raise UnknownUpload(id)
         if not file.name.startswith(WHOLE):
-            sentence = f"Upload {id!r} is not whole yet: send the rest of it, from the offset that HEAD tells."
+            sentence = f"Upload {id!r} is not whole yet: send the rest of it, from the offset that HEAD reports."
             raise Conflict("upload_incomplete", id=id, sentence=sentence)
         try:
             os.utime(file)  # used: its time begins anew
@@ -174,8 +176,8 @@ class Uploads:
             shutil.rmtree(folder)
 
     def used(self) -> int:
-        """Return the bytes that everybody's uploads take."""
-        return sum(file.stat().st_size for file in self.directory.glob("*/*/*") if file.is_file())
+        """Return the bytes that everybody's uploads hold, or have reserved while they are written to."""
+        return sum(taken(folder) for folder in self.directory.glob("*/*"))
 
     def expire(self, now: datetime) -> list[str]:
         """Remove everybody's uploads whose time is over and which nobody writes to; return their ids."""
@@ -189,11 +191,11 @@ class Uploads:
         return gone
 
     def findings(self, now: datetime) -> Iterator[str]:
-        """Say what of everybody's uploads is not as it should be."""
+        """Yield a sentence for each upload that is inconsistent or should have expired."""
         for folder in self.directory.glob("*/*"):
             names = sorted(path.name for path in folder.iterdir())
             contents = [name for name in names if name == PART or name.startswith(WHOLE)]
-            if len(contents) != 1 or not set(names) <= {*contents, LENGTH}:
+            if len(contents) != 1 or not set(names) <= {*contents, LENGTH, RESERVED}:
                 yield f"Upload {folder.name} holds {', '.join(names) or 'nothing'}, not one file."
                 continue
             file = folder / contents[0]

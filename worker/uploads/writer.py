@@ -11,19 +11,22 @@ from pathlib import Path
 from typing import BinaryIO
 
 from pliant.worker.errors import InvalidRequest, QuotaExceeded, UploadTooLarge
-from pliant.worker.uploads.folder import LENGTH, PART, WHOLE
+from pliant.worker.uploads.folder import LENGTH, PART, RESERVED, WHOLE, counting, reserve, taken
+
+STEP = 16 << 20
+"""Bytes that are reserved at a time for an upload whose length is not known."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Room:
-    """How much one upload may still take."""
+class Capacity:
+    """How much one upload may take."""
 
     max_bytes: int
     """Size of the whole upload."""
     quota: int = 0
     """Bytes that everything stored may take together; 0: no quota."""
     used: int = 0
-    """Bytes that everything else takes now."""
+    """Bytes that the jobs take."""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -34,10 +37,13 @@ class Writer:
     folder: Path
     length: int | None
     """Bytes of the whole upload, where they are known."""
-    room: Room
+    capacity: Capacity
     offset: int = 0
     """Bytes that it holds."""
     _began: int = 0
+    _reservation: int | None = None
+    """Descriptor of the locked reservation."""
+    _reserved: int = 0
     _file: BinaryIO | None = None
     _digest: hashlib._Hash = field(default_factory=hashlib.sha256)
 
@@ -49,8 +55,10 @@ class Writer:
         OSError
             ENOSPC: the disk has no room for the rest of it.
         """
+        if self.capacity.quota > 0:
+            self._reservation = reserve(self.folder)
+        self._check(self.length or 0)
         if self.length is not None:
-            self._check(self.length)
             if self.length - offset > shutil.disk_usage(self.folder).free:
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             fresh = self.folder / f"{LENGTH}.new"
@@ -126,24 +134,41 @@ class Writer:
             os.close(folder)
 
     def close(self) -> None:
-        """Put what has arrived on the disk."""
+        """Put what has arrived on the disk, and give back what was reserved beyond it."""
         if self._file is not None:
             os.fsync(self._file.fileno())
             self._file.close()
             self._file = None
+        if self._reservation is not None:
+            (self.folder / RESERVED).unlink(missing_ok=True)
+            os.close(self._reservation)
+            self._reservation = None
 
     def _check(self, size: int) -> None:
-        room = self.room
-        if size > room.max_bytes:
+        """Check that the upload may have so many bytes, and reserve them.
+
+        Bytes are reserved before they are written, those of a declared length at once and others in steps, so that uploads which
+        arrive at the same time cannot exceed the quota together.
+        """
+        capacity = self.capacity
+        if size > capacity.max_bytes:
             self.close()
             shutil.rmtree(self.folder)
-            raise UploadTooLarge(room.max_bytes, size)
-        if room.quota > 0 and room.used + size > room.quota:
-            raise QuotaExceeded(used=room.used + self.offset, quota=room.quota)
+            raise UploadTooLarge(capacity.max_bytes, size)
+        if self._reservation is None or size <= self._reserved:
+            return
+        uploads = self.folder.parent.parent
+        with counting(uploads):
+            others = sum(taken(each) for each in uploads.glob("*/*") if each != self.folder)
+            free = capacity.quota - capacity.used - others
+            if size > free:
+                raise QuotaExceeded(used=capacity.used + others + self.offset, quota=capacity.quota)
+            self._reserved = size if self.length is not None else min(size + STEP, free)
+            os.pwrite(self._reservation, f"{self._reserved:<20}".encode(), 0)
 
 
 def inconsistent(expected: str, got: str) -> InvalidRequest:
-    """Return the refusal of bytes that do not make the length that was said."""
+    """Return the error of an upload whose bytes do not fit its declared length."""
     return InvalidRequest(
         "inconsistent_upload_length", field="Upload-Length", expected=expected, got=got,
         hint="Send what is missing, or begin anew at Upload-Offset: 0.",

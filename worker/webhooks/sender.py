@@ -1,21 +1,21 @@
-"""The postman: sends what the outbox owes, again and again until it arrives or a day has passed. Runs in the keeper's process.
+"""The webhook sender: sends the messages of the outbox, with retries for about a day. It runs in the reconciler's process.
 
-A receiver that is down or slow holds up nobody: no job waits for it, and up to `HANDS` messages are under way at once.
+No job waits for a receiver. Up to `CONCURRENT` messages are sent at once, at most `PER_RECEIVER` of them to one host, so a receiver that
+does not answer delays nobody else's messages.
 """
 
 from __future__ import annotations
 
 import asyncio
-import ipaddress
 import logging
 import random
-import socket
 import ssl
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from functools import partial
 from urllib.parse import urlsplit
 
 from pliant.worker.errors import StoreUnavailable, UnknownJob
@@ -23,18 +23,22 @@ from pliant.worker.records import Records, Webhook
 from pliant.worker.settings import Settings
 from pliant.worker.store.connection import connect
 from pliant.worker.store.outbox import Outbox
-from pliant.worker.webhooks.message import Address, may_reach, message, signed
-
-if TYPE_CHECKING:
-    pass
+from pliant.worker.webhooks.address_policy import Address, NotPublic, checked_address, resolve
+from pliant.worker.webhooks.message import message, signed
 
 logger = logging.getLogger(__name__)
 
 PAUSES = (5.0, 30.0, 120.0, 600.0, 1800.0, 7200.0, 21600.0, 54000.0)
 """Seconds between the tries, a day in all; each is stretched by chance, up to a fifth."""
 
-HANDS = 8
-"""Messages under way at once."""
+CONCURRENT = 16
+"""Messages that are sent at once."""
+
+PER_RECEIVER, PER_OWNER = 2, 8
+"""The same to one host, and of the jobs of one owner: one that is silent leaves the others their share."""
+
+POSTPONED = 2.0
+"""Seconds after which a message is looked at again whose receiver or owner had reached its share."""
 
 WITHIN = 20.0
 """Seconds that one try may take from the name's look-up to the answer's headers."""
@@ -47,18 +51,8 @@ LOOK_EVERY = 0.5
 Resolve = Callable[[str, int], list[Address]]
 
 
-class NotPublic(Exception):
-    """The receiver's name stands for an address that webhooks may not go to."""
-
-
-def resolve(host: str, port: int) -> list[Address]:
-    """Return the addresses of a name; of an address, itself."""
-    found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
-    return list(dict.fromkeys(ipaddress.ip_address(str(each[4][0]).partition("%")[0]) for each in found))
-
-
 @dataclass(kw_only=True)
-class Postman:
+class WebhookSender:
     """Sends the messages of one installation. Any number may run: a message is taken by one of them at a time."""
 
     records: Records
@@ -71,18 +65,18 @@ class Postman:
     pauses: tuple[float, ...] = PAUSES
     trusted: ssl.SSLContext | None = None
     """Which certificates count; None: those of the usual authorities."""
-    _told: threading.Event = field(default_factory=threading.Event)
+    _ended: threading.Event = field(default_factory=threading.Event)
     _thread: threading.Thread | None = None
 
     @classmethod
-    def open(cls, settings: Settings, records: Records) -> Postman:
+    def open(cls, settings: Settings, records: Records) -> WebhookSender:
         """Connect to what the settings name."""
         outbox = Outbox(connect(settings.redis, decode=True), prefix=settings.queue)
         return cls(records=records, outbox=outbox, networks=settings.webhook_networks)
 
     def start(self) -> None:
         """Begin, on a thread of its own."""
-        self._thread = threading.Thread(target=lambda: asyncio.run(self._run()), name="postman", daemon=True)
+        self._thread = threading.Thread(target=lambda: asyncio.run(self._run()), name="webhook sender", daemon=True)
         self._thread.start()
 
     @property
@@ -92,32 +86,60 @@ class Postman:
 
     def stop(self) -> None:
         """End; what is under way is sent again by the next one."""
-        self._told.set()
+        self._ended.set()
         if self._thread is not None:
             self._thread.join(2 * LOOK_EVERY + 1)
 
     async def _run(self) -> None:
         under_way: set[asyncio.Task[None]] = set()
-        while not self._told.is_set():
+        busy: Counter[str] = Counter()
+        while not self._ended.is_set():
             taken = None
-            if len(under_way) < HANDS:
+            if len(under_way) < CONCURRENT:
                 try:
-                    taken = await asyncio.to_thread(self._take)
+                    taken = await asyncio.to_thread(self._take, busy)
                 except StoreUnavailable as error:
                     logger.warning("webhooks: %s", error)
             if taken is None:
                 await asyncio.sleep(LOOK_EVERY)
                 continue
-            task = asyncio.create_task(self._deliver(*taken))
+            id, tries, limits = taken
+            task = asyncio.create_task(self._deliver(id, tries))
             under_way.add(task)
+            busy.update(limits)
             task.add_done_callback(under_way.discard)
+            task.add_done_callback(partial(_release, busy, limits))
             task.add_done_callback(_complain)
         for task in under_way:
             task.cancel()
 
-    def _take(self) -> tuple[str, int] | None:
-        now = self.clock()
-        return self.outbox.take(now=int(now * 1000), until=int((now + LEASE) * 1000))
+    def _take(self, busy: Counter[str]) -> tuple[str, int, list[str]] | None:
+        """Take a message that is due and whose receiver and owner have few under way; postpone the others.
+
+        Returns
+        -------
+        id : str
+            The job.
+        tries : int
+            How often it was tried, this time among them.
+        limits : list of str
+            The receiver and the owner, as they are counted in `busy`.
+        """
+        while True:
+            now = self.clock()
+            taken = self.outbox.take(now=int(now * 1000), until=int((now + LEASE) * 1000))
+            if taken is None:
+                return None
+            try:
+                stored = self.records.get(taken[0])
+            except UnknownJob:
+                self.outbox.given_up(taken[0])
+                continue
+            host = "" if stored.webhook is None else urlsplit(stored.webhook.url).netloc
+            receiver, owner = f"receiver {host}", f"owner {stored.owner}"
+            if busy[receiver] < PER_RECEIVER and busy[owner] < PER_OWNER:
+                return *taken, [receiver, owner]
+            self.outbox.postpone(taken[0], due=int((now + POSTPONED) * 1000))
 
     async def _deliver(self, id: str, tries: int) -> None:
         """Try once, and write down what came of it."""
@@ -149,12 +171,10 @@ class Postman:
         host = parts.hostname or ""
         port = parts.port or (443 if parts.scheme == "https" else 80)
         addresses = await asyncio.to_thread(self.resolve, host, port)
-        if not addresses or not all(may_reach(each, self.networks) for each in addresses):
-            said = ", ".join(map(str, addresses)) or "no address"
-            raise NotPublic(f"{host} is {said}, which is not of the public internet.")
+        address = checked_address(host, addresses, self.networks)
         request = httpx.Request(
             "POST",
-            httpx.URL(webhook.url).copy_with(host=str(addresses[0]), port=port, fragment=None),
+            httpx.URL(webhook.url).copy_with(host=str(address), port=port, fragment=None),
             content=body,
             headers={
                 "Host": parts.netloc,
@@ -199,6 +219,10 @@ class Postman:
     def _say(self, id: str, sentence: str) -> None:
         logger.info("job %s: %s", id, sentence)
         self.records.append_log(id, [sentence])
+
+
+def _release(busy: Counter[str], limits: list[str], _: asyncio.Task[None]) -> None:
+    busy.subtract(limits)
 
 
 def _complain(task: asyncio.Task[None]) -> None:

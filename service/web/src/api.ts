@@ -26,7 +26,7 @@ function unreachable(): Refusal {
   return new Refusal({
     title: "No answer",
     status: 0,
-    detail: "The service does not answer. Check that it is running; this page will go on by itself when it is back.",
+    detail: "The service does not answer. Check that it is running; this page reconnects by itself.",
     code: "unreachable",
     retryable: true,
   });
@@ -45,7 +45,7 @@ export function problemOf(status: number, text: string): Problem {
   return {
     title: "Refused",
     status,
-    detail: `The service answered with status ${status} and no explanation. Look into its log.`,
+    detail: `The service answered with status ${status} and no explanation. Its log has the details.`,
     code: "unknown",
   };
 }

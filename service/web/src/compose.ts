@@ -72,7 +72,7 @@ export class Compose {
       index > 0 ? ", " : "",
       button(example.title, () => void this.takeExample(example), { class: "link" }),
     ]);
-    return ["Nothing at hand? Try a ", ...buttons, "."];
+    return ["No files at hand? Try the example ", ...buttons, "."];
   }
 
   /** Take the first example and send it: the shortest way to a moving mesh. */
@@ -90,7 +90,7 @@ export class Compose {
   }
 
   private async takeExample(example: Example): Promise<void> {
-    this.answer.replaceChildren(h("p", { class: "muted" }, "Making the example…"));
+    this.answer.replaceChildren(h("p", { class: "muted" }, "Loading the example…"));
     try {
       const known = example.files.filter(({ part }) => (PARTS as readonly string[]).includes(part));
       const files = await Promise.all(
@@ -110,7 +110,7 @@ export class Compose {
     if (this.sending) return;
     const form = this.form();
     if (form === null) {
-      this.answer.replaceChildren(h("p", { class: "sentence bad" }, "Choose a track file first, or try the example."));
+      this.answer.replaceChildren(h("p", { class: "sentence bad" }, "Choose a track file first, or try an example."));
       this.slots.focus("tracks");
       return;
     }
@@ -122,7 +122,7 @@ export class Compose {
     this.answer.replaceChildren(h("p", { class: "sending" }, meter, words));
     const onSent = (fraction: number): void => {
       meter.value = fraction;
-      words.textContent = fraction < 1 ? `Sending, ${percent(fraction)}` : "Sent; the service is reading it…";
+      words.textContent = fraction < 1 ? `Sending, ${percent(fraction)}` : "Sent; the service is reading the files…";
     };
     try {
       this.key ??= newKey();
@@ -158,7 +158,7 @@ export class Compose {
   /** Show why not; `again` is called when one of several readings has been chosen. */
   private refuse(error: unknown, again = (): void => this.send.form?.requestSubmit()): void {
     if (error instanceof DOMException && error.name === "AbortError") {
-      this.answer.replaceChildren(h("p", { class: "muted" }, "Stopped; nothing was kept."));
+      this.answer.replaceChildren(h("p", { class: "muted" }, "Stopped. Nothing was submitted."));
     } else if (error instanceof Refusal) {
       const choose = (choice: Record<string, unknown>): void => {
         for (const [name, value] of Object.entries(choice)) this.options.set(name, value);

@@ -149,7 +149,7 @@ export class Detail {
     const made = button(label, () => {
       if (!sure) {
         sure = true;
-        made.textContent = "Delete it for good?";
+        made.textContent = "Delete permanently?";
         made.classList.add("danger");
         setTimeout(() => {
           sure = false;
@@ -198,7 +198,7 @@ export class Detail {
     }
     if (!preview) return;
     this.stage.hidden = false;
-    this.stage.replaceChildren(h("p", { class: "view waiting" }, `Fetching the moving mesh, ${bytes(preview.bytes)}…`));
+    this.stage.replaceChildren(h("p", { class: "view waiting" }, `Loading the mesh, ${bytes(preview.bytes)}…`));
     try {
       const { Viewer } = await import("./viewer/viewer");
       if (this.leaving.signal.aborted) return;
@@ -206,7 +206,7 @@ export class Detail {
     } catch (error) {
       if (this.leaving.signal.aborted) return;
       const words = error instanceof Error ? error.message : String(error);
-      const sentence = `The moving mesh cannot be shown here (${words}). The files below are complete; shapes.glb opens in any 3-D viewer.`;
+      const sentence = `The mesh cannot be displayed here (${words}). The files below are complete; shapes.glb opens in any 3-D viewer.`;
       this.stage.replaceChildren(h("p", { class: "view waiting" }, sentence));
     }
   }

@@ -9,7 +9,7 @@ const TRAIL = 5;
 const PACE = 8;
 
 export class Glimpse {
-  readonly canvas = h("canvas", { class: "glimpse", role: "img", "aria-label": "Some of the tracks, as they were read", width: 640, height: 400 });
+  readonly canvas = h("canvas", { class: "glimpse", role: "img", "aria-label": "Sample of the tracks", width: 640, height: 400 });
   private sample: number[][] = [];
   private running = 0;
   private waiting = 0;

@@ -61,8 +61,8 @@ function report(error: unknown): void {
 
 function tokenForm(): HTMLElement {
   const input = h("input", { type: "password", id: "token", autocomplete: "off", required: true });
-  const form = h("form", { class: "row" }, h("label", { for: "token" }, "Token"), input, h("button", { type: "submit" }, "Use it"));
-  form.append(button("Forget it", () => setToken(""), { class: "quiet" }));
+  const form = h("form", { class: "row" }, h("label", { for: "token" }, "Token"), input, h("button", { type: "submit" }, "Use"));
+  form.append(button("Remove", () => setToken(""), { class: "quiet" }));
   form.addEventListener("submit", (event) => {
     event.preventDefault();
     setToken(input.value.trim());
@@ -77,7 +77,7 @@ function tokenForm(): HTMLElement {
 function offer(): void {
   const place = document.getElementById("try") as HTMLElement;
   place.hidden = !compose.hasExamples;
-  place.replaceChildren(button("Show me with a made-up face", () => void compose.tryOut(), { class: "primary large" }));
+  place.replaceChildren(button("Try it with a synthetic face", () => void compose.tryOut(), { class: "primary large" }));
 }
 
 let loaded = false;

@@ -20,7 +20,7 @@ export function refusalBox(problem: Problem, choose?: (choice: Record<string, un
     h("p", { class: "sentence" }, problem.detail),
     shown.length > 0 && list,
     hint,
-    choices.length > 0 && h("div", { class: "row", role: "group", "aria-label": "Readings that fit" }, ...choices),
+    choices.length > 0 && h("div", { class: "row", role: "group", "aria-label": "Possible interpretations" }, ...choices),
     h("p", { class: "code" }, problem.code),
   );
 }

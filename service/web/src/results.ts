@@ -9,11 +9,11 @@ import { bytes, number } from "./words";
 const METRICS: Record<string, [string, string]> = {
   e3d_sequence: ["3-D error", "one orthogonal alignment for the whole sequence; relative"],
   e3d_frame: ["3-D error, frame by frame", "each frame turned to fit best; relative"],
-  e3d_frame_similarity: ["Shape error, frame by frame", "each frame turned, mirrored and scaled to fit; relative"],
+  e3d_frame_similarity: ["Shape error, frame by frame", "after rotating, mirroring and scaling each frame to fit; relative"],
   e3d_mocap: ["3-D error, motion capture", "as that literature has it; relative to the shape's spread"],
-  reprojection_median: ["Reprojection, median", "from a seen track to the projected shape; the tracks' unit"],
-  reprojection_rms: ["Reprojection, root mean square", "outliers count here; the tracks' unit"],
-  rotation_degrees: ["Camera error", "angle between estimated and true cameras, mean; degrees"],
+  reprojection_median: ["Reprojection, median", "from a visible track to the projected shape; in the tracks' unit"],
+  reprojection_rms: ["Reprojection, root mean square", "sensitive to outliers; in the tracks' unit"],
+  rotation_degrees: ["Camera error", "mean angle between estimated and true cameras, in degrees"],
 };
 
 /** The panel "Metrics". */

@@ -8,7 +8,7 @@ import { bytes } from "./words";
 const PLACES: Record<Part, { label: string; hint: string }> = {
   tracks: { label: "Tracks", hint: "npz, npy, mat, csv …" },
   mesh: { label: "Mesh", hint: "optional: obj, ply, glb, npz" },
-  ground_truth: { label: "Ground truth", hint: "optional: errors are measured" },
+  ground_truth: { label: "Ground truth", hint: "optional: used to measure errors" },
   rotations: { label: "Cameras", hint: "optional: if they are known" },
 };
 
@@ -28,8 +28,8 @@ export class Slots {
 
   /** `onChange` is told when another set of files is there. */
   constructor(private readonly onChange: () => void) {
-    const title = h("p", { class: "zone-title" }, "Drop tracks here, and a mesh");
-    const promise = h("p", { class: "hint" }, "Files stay on this service; nothing is sent elsewhere.");
+    const title = h("p", { class: "zone-title" }, "Drop tracks and a mesh here");
+    const promise = h("p", { class: "hint" }, "Files are sent to this service only.");
     this.element.append(title, promise, ...PARTS.map((part) => this.slot(part)));
     this.grid.addEventListener("change", onChange);
     this.acceptDrops();

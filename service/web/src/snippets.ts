@@ -1,4 +1,4 @@
-// "Do this from code", for the very job shown: the same options, the same parts, this service's address.
+// The code that submits the job shown: the same options, the same parts, this service's address.
 
 import { getOptions } from "./api";
 import { button, fill, h } from "./dom";
@@ -23,7 +23,7 @@ export class Snippets {
     this.element = h(
       "section",
       { class: "panel", "aria-labelledby": "snippet-title" },
-      h("h3", { id: "snippet-title" }, "Do this from code"),
+      h("h3", { id: "snippet-title" }, "Use from code"),
       h("div", { class: "row", role: "group", "aria-label": "Language" }, ...this.tabs, copy, this.copied),
       h("pre", { tabindex: 0, "aria-label": "Code" }, this.code),
     );
@@ -55,7 +55,7 @@ export class Snippets {
       this.copied.textContent = "Copied.";
     } catch {
       getSelection()?.selectAllChildren(this.code);
-      this.copied.textContent = "Selected; press Ctrl+C.";
+      this.copied.textContent = "Selected. Press Ctrl+C to copy.";
     }
     setTimeout(() => (this.copied.textContent = ""), 3000);
   }

@@ -1,85 +1,23 @@
-// The wire contract, as the page reads it. schemas/job.py is where it is defined.
+// The types of the API. schema.d.ts is generated from the service's OpenAPI document:
+//   python -m pliant.service.openapi --schemas > openapi.json && npx openapi-typescript openapi.json -o src/schema.d.ts
 
-export type Status = "queued" | "running" | "cancelling" | "succeeded" | "failed" | "cancelled";
+import type { components } from "./schema";
 
-export interface Problem {
-  title: string;
-  status: number;
-  detail: string;
-  code: string;
-  field?: string | null;
-  expected?: string | null;
-  got?: string | null;
-  hint?: string | null;
-  retryable?: boolean;
-  choices?: Record<string, unknown>[] | null;
-}
+type Schemas = components["schemas"];
 
-export interface Progress {
-  stage: string;
-  fraction: number;
-  reweighting: number;
-  max_reweightings: number;
-  objective: number | null;
-  residual: number | null;
-  seconds_left: number | null;
-  updated_at: string;
-}
-
-export interface Artifact {
-  name: string;
-  media_type: string;
-  bytes: number;
-  sha256: string;
-  description: string;
-}
-
-export interface Interpretation {
-  num_frames: number;
-  num_points: number;
-  num_faces: number;
-  hidden_fraction: number;
-  mesh_source: string;
-  mesh_grid: [number, number] | null;
-  has_ground_truth: boolean;
-  has_rotations: boolean;
-  layout: string;
-  y_axis: string;
-  notes: string[];
-}
-
-export interface Inspection extends Interpretation {
-  /** A list a frame: x and y of each point in turn, 0 … 1000, y down, −1 twice where hidden. */
-  sample?: number[][];
-}
-
+export type Status = Schemas["Status"];
+/** A problem of the service, or one that the page itself found. */
+export type Problem = Pick<Schemas["Problem"], "title" | "status" | "detail"> & {
+  [Name in Exclude<keyof Schemas["Problem"], "code">]?: Schemas["Problem"][Name] | undefined;
+} & { code: Schemas["ProblemCode"] | "unreachable" | "unknown" | "no_events" };
+export type Progress = Schemas["Progress"];
+export type Artifact = Schemas["Artifact"];
+export type Interpretation = Schemas["Interpretation"];
+export type Inspection = Schemas["Inspection"];
+/** Options by name: the form is built from the schema at /v1/options. */
 export type Options = Record<string, unknown>;
-
-export interface Job {
-  id: string;
-  name: string;
-  status: Status;
-  created_at: string;
-  started_at: string | null;
-  finished_at: string | null;
-  expires_at: string | null;
-  attempt: number;
-  place_in_queue: number | null;
-  options: Options;
-  interpretation: Interpretation;
-  progress: Progress | null;
-  metrics: Record<string, number> | null;
-  outcome: string | null;
-  sentence: string | null;
-  warnings: string[];
-  artifacts: Artifact[];
-  error: Problem | null;
-}
-
-export interface JobPage {
-  jobs: Job[];
-  next: string | null;
-}
+export type Job = Omit<Schemas["Job"], "options" | "error"> & { options: Options; error: Problem | null };
+export type JobPage = Omit<Schemas["JobPage"], "jobs"> & { jobs: Job[] };
 
 /** The part of a JSON Schema that the options' schema uses. */
 export interface Schema {

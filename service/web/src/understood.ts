@@ -17,7 +17,7 @@ const MESHES: Record<string, string> = {
 function facts(seen: Interpretation): [string, string][] {
   return [
     ["Tracks", `${count(seen.num_frames, "frame")} of ${count(seen.num_points, "point")}, ${percent(seen.hidden_fraction)} hidden`],
-    ["Read as", `${seen.layout}, y ${seen.y_axis}`],
+    ["Layout", `${seen.layout}, y ${seen.y_axis}`],
     ["Mesh", seen.num_faces > 0 ? `${count(seen.num_faces, "face")}, ${MESHES[seen.mesh_source] ?? seen.mesh_source}` : "none: points alone"],
     ["Ground truth", seen.has_ground_truth ? "given; errors are measured against it" : "none"],
     ["Cameras", seen.has_rotations ? "given" : "estimated"],
@@ -36,13 +36,13 @@ class Facts {
   }
 }
 
-/** The panel "Understood as" of a job. */
+/** The panel "Interpretation" of a job. */
 export class Understood {
   private readonly facts = new Facts();
   readonly element = h(
     "section",
     { class: "panel", "aria-labelledby": "understood-title" },
-    h("h3", { id: "understood-title" }, "Understood as"),
+    h("h3", { id: "understood-title" }, "Interpretation"),
     this.facts.list,
     this.facts.notes,
   );
@@ -62,11 +62,11 @@ export class Inspection {
   private readonly facts = new Facts();
   private readonly glimpse = new Glimpse();
   private readonly words = h("p", { class: "muted", role: "status" });
-  private readonly ask = button("See how it is understood", () => void this.send());
+  private readonly ask = button("Check the files", () => void this.send());
   private readonly found = h(
     "div",
     { class: "found", hidden: true },
-    h("h3", { id: "found-title" }, "How your files are understood"),
+    h("h3", { id: "found-title" }, "How your files are interpreted"),
     this.glimpse.canvas,
     this.facts.list,
     this.facts.notes,

@@ -1,4 +1,4 @@
-// Numbers, sizes, times and names as people read them.
+// Numbers, sizes, times and names for display.
 
 import type { Job, Status } from "./types";
 
@@ -41,7 +41,7 @@ export function seconds(value: number): string {
   return `${(value / 3600).toFixed(1)} hours`;
 }
 
-/** The same in few letters, for a heading. */
+/** The same, abbreviated for a heading. */
 export function duration(value: number): string {
   if (value < 60) return `${value < 9.95 ? value.toFixed(1) : Math.round(value)} s`;
   if (value < 5400) return `${Math.floor(value / 60)}:${String(Math.floor(value % 60)).padStart(2, "0")} min`;
@@ -79,17 +79,17 @@ const STAGES: Record<string, string> = {
   exporting: "Writing the files",
 };
 
-/** One line on where a job stands. */
+/** One line on the state of a job. */
 export function standing(job: Job): string {
   switch (job.status) {
     case "queued":
-      if (job.place_in_queue === null) return "Waiting for a worker.";
+      if (job.place_in_queue === null) return "Queued; waiting for a worker.";
       return job.place_in_queue === 0
         ? "Next in the queue."
         : `In the queue: ${count(job.place_in_queue, "job")} before this one.`;
     case "running": {
       const progress = job.progress;
-      if (progress === null) return "A worker has begun.";
+      if (progress === null) return "Started.";
       const stage = STAGES[progress.stage] ?? progress.stage;
       const step =
         progress.stage === "reweight" && progress.max_reweightings > 0
@@ -99,12 +99,12 @@ export function standing(job: Job): string {
       return `${stage}${step}${left}.`;
     }
     case "cancelling":
-      return "Stopping at the next safe point.";
+      return "Stopping at the next iteration.";
     case "succeeded":
       return job.sentence ?? "Done.";
     case "failed":
-      return job.error?.detail ?? "The job failed; its log says more.";
+      return job.error?.detail ?? "The job failed; its log has the details.";
     case "cancelled":
-      return "Cancelled; nothing was kept but the record.";
+      return "Cancelled. Its results were not kept.";
   }
 }

@@ -8,11 +8,15 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from pliant.schemas.job import Interpretation, Progress, Status
+from pliant.schemas.job import Artifact, Interpretation, Progress, Status
 from pliant.schemas.options import Options
+from pliant.worker.errors import Interrupted, StoreUnavailable
 from pliant.worker.execution.attempt import Attempt
+from pliant.worker.execution.pipeline import Finished
 from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.service import Jobs
+from pliant.worker.jobs.submission import Submission
+from pliant.worker.store.blobs import Blobs
 
 
 @pytest.fixture
@@ -24,10 +28,12 @@ def now(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
 @pytest.fixture
 def attempt(jobs: Jobs, now: list[float], inputs_file: Path, interpretation: Interpretation) -> Attempt:
-    id = jobs.submit(inputs_file, options=Options(), interpretation=interpretation).id
-    token = jobs.records.get(id).token
-    jobs.records.update(id, lambda held: lifecycle.claim(held, token=token, worker="w", now=datetime.now(UTC)))
-    return Attempt(jobs=jobs, id=id, token=token, deadline=9.0)
+    id = jobs.submit(inputs_file, Submission(options=Options()), interpretation=interpretation).id
+    attempt_id = jobs.records.get(id).attempt_id
+    jobs.records.update(
+        id, lambda held: lifecycle.claim(held, attempt_id=attempt_id, worker="w", now=datetime.now(UTC))
+    )
+    return Attempt(jobs=jobs, id=id, attempt_id=attempt_id, deadline=9.0)
 
 
 def through(now: list[float], seconds: float, each: Callable[[], object]) -> None:
@@ -66,3 +72,34 @@ def test_past_its_time_it_stops_whatever_the_record_says(attempt: Attempt, now: 
     assert not attempt.should_stop()
     now[0] = 9.0
     assert attempt.should_stop()
+
+
+def test_a_finished_job_waits_for_a_blob_store_that_is_away(
+    jobs: Jobs, attempt: Attempt, now: list[float], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An outage of seconds discarded the result of hours."""
+    (tmp_path / "report.json").write_text("{}")
+    artifact = Artifact(name="report.json", media_type="application/json", bytes=2, sha256="0" * 64, description="")
+    finished = Finished(metrics={}, outcome="converged", sentence="Done.", warnings=(), artifacts=(artifact,))
+    put, away = jobs.blobs.put, [3]
+
+    def sometimes(self: Blobs, key: str, file: Path) -> int:
+        if away[0]:
+            away[0] -= 1
+            raise StoreUnavailable("The blob store", reason="away")
+        return put(key, file)
+
+    monkeypatch.setattr(Blobs, "put", sometimes)
+    monkeypatch.setattr("pliant.worker.execution.monitor.time.sleep", lambda seconds: None)
+    attempt.store(finished, tmp_path)
+    assert f"{attempt.prefix}report.json" in jobs.blobs.sizes()
+    away[0] = 1
+    jobs.cancel(attempt.id)
+    now[0] += 1
+    with pytest.raises(Interrupted):
+        attempt.store(finished, tmp_path)
+    monkeypatch.setattr(Attempt, "should_stop", lambda self: False)
+    monkeypatch.setattr("pliant.worker.execution.attempt.PATIENCE", -1.0)
+    away[0] = 1
+    with pytest.raises(StoreUnavailable):
+        attempt.store(finished, tmp_path)

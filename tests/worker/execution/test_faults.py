@@ -88,13 +88,13 @@ def test_a_running_job_is_cancelled(house: House) -> None:
     assert house.blobs_of(id) == {"inputs.npz"}
 
 
-def test_a_killed_horse_fails_its_job_and_nothing_else(house: House) -> None:
+def test_a_killed_job_process_fails_its_job_and_nothing_else(house: House) -> None:
     other = house.submit(long=True)
     house.solving(other)
-    (bystander,) = house.horses()
+    (bystander,) = house.job_processes()
     id = house.submit(long=True)
     house.solving(id)
-    (victim,) = set(house.horses()) - {bystander}
+    (victim,) = set(house.job_processes()) - {bystander}
     os.kill(victim, signal.SIGKILL)
     seconds = house.until(lambda: house.jobs.get(id).status.final, "the record says so", seconds=5)
     job = house.jobs.get(id)
@@ -117,7 +117,7 @@ def test_a_killed_horse_fails_its_job_and_nothing_else(house: House) -> None:
 def test_a_crash_leaves_its_stack_in_the_log(house: House) -> None:
     id = house.submit(long=True)
     house.solving(id)
-    (victim,) = house.horses()
+    (victim,) = house.job_processes()
     os.kill(victim, signal.SIGSEGV)
     job = house.final(id)
     assert job.error is not None
@@ -129,10 +129,10 @@ def test_a_crash_leaves_its_stack_in_the_log(house: House) -> None:
 def test_the_job_of_a_killed_worker_is_done_by_another(house: House) -> None:
     id = house.submit(long=True)
     house.solving(id)
-    (horse,) = house.horses()
-    (worker,) = [pid for pid in house.worker_pids() if horse in children(pid)]
+    (job_process,) = house.job_processes()
+    (worker,) = [pid for pid in house.worker_pids() if job_process in children(pid)]
     os.kill(worker, signal.SIGKILL)
-    house.until(lambda: not running(horse), "the horse dies with its worker")
+    house.until(lambda: not running(job_process), "the job process dies with its worker")
     house.until(lambda: house.jobs.get(id).attempt == 2, "another worker begins it", seconds=30)
     assert "Lost its worker" in house.jobs.log(id)
     house.jobs.cancel(id)
@@ -142,17 +142,17 @@ def test_the_job_of_a_killed_worker_is_done_by_another(house: House) -> None:
 def test_an_attempt_that_lost_its_job_writes_nothing(house: House) -> None:
     id = house.submit(long=True)
     house.solving(id)
-    (horse,) = house.horses()
-    (worker,) = [pid for pid in house.worker_pids() if horse in children(pid)]
-    for pid in (worker, horse):
+    (job_process,) = house.job_processes()
+    (worker,) = [pid for pid in house.worker_pids() if job_process in children(pid)]
+    for pid in (worker, job_process):
         os.kill(pid, signal.SIGSTOP)
     house.until(lambda: house.jobs.get(id).attempt == 2, "another worker begins it", seconds=30)
-    token = house.jobs.records.get(id).token
-    for pid in (horse, worker):
+    attempt_id = house.jobs.records.get(id).attempt_id
+    for pid in (job_process, worker):
         os.kill(pid, signal.SIGCONT)
-    house.until(lambda: not running(horse), "the stale horse is put down")
+    house.until(lambda: not running(job_process), "the stale job process is put down")
     held = house.jobs.records.get(id)
-    assert (held.token, held.job.status, held.job.attempt) == (token, Status.RUNNING, 2)
+    assert (held.attempt_id, held.job.status, held.job.attempt) == (attempt_id, Status.RUNNING, 2)
     house.jobs.cancel(id)
     assert house.final(id).status is Status.CANCELLED
     settled(house)
@@ -161,9 +161,9 @@ def test_an_attempt_that_lost_its_job_writes_nothing(house: House) -> None:
 def test_a_worker_that_is_told_to_stop_puts_its_job_back(house: House) -> None:
     id = house.submit(long=True)
     house.solving(id)
-    (horse,) = house.horses()
-    (worker,) = [pid for pid in house.worker_pids() if horse in children(pid)]
-    os.kill(horse, signal.SIGTERM)  # as service managers do, which tell every process
+    (job_process,) = house.job_processes()
+    (worker,) = [pid for pid in house.worker_pids() if job_process in children(pid)]
+    os.kill(job_process, signal.SIGTERM)  # as service managers do, which tell every process
     os.kill(worker, signal.SIGTERM)
     house.until(lambda: house.jobs.get(id).attempt == 2, "it begins again")
     assert "worker_lost" not in str([event.data for event in house.jobs.events(id)])
@@ -190,7 +190,7 @@ def test_a_foreign_delivery_is_refused(house: House, tmp_path: Path) -> None:
     raw = connect(house.settings.redis, decode=False)
     queue = RqQueue(house.settings.queue, connection=raw, serializer=JSONSerializer)
     queue.enqueue_call("os.mkdir", args=(str(marks[0]),), on_success=None)
-    forged = queue.create_job("pliant.worker.execution.attempt.run", args=("no-such-job", "no-such-token"))
+    forged = queue.create_job("pliant.worker.execution.attempt.run", args=("no-such-job", "no-such-attempt_id"))
     forged.save()
     raw.hset(forged.key, mapping={"success_callback_name": "os.getcwd", "failure_callback_name": "os.getcwd"})
     queue.enqueue_job(forged)
@@ -203,13 +203,13 @@ def test_a_foreign_delivery_is_refused(house: House, tmp_path: Path) -> None:
 def test_a_second_delivery_of_an_attempt_is_dropped(house: House) -> None:
     id = house.submit(long=True)
     job = house.solving(id)
-    token = house.jobs.records.get(id).token
-    house.jobs.queue.push(id, token)
+    attempt_id = house.jobs.records.get(id).attempt_id
+    house.jobs.queue.push(id, attempt_id)
     house.until(lambda: not house.jobs.queue.waiting(), "the second delivery is taken")
     time.sleep(0.5)
     held = house.jobs.records.get(id)
-    assert (held.token, held.job.status, held.job.attempt) == (token, Status.RUNNING, job.attempt)
-    assert house.files_at_work() == [token], "the second worker has not cleared the first one's files away"
+    assert (held.attempt_id, held.job.status, held.job.attempt) == (attempt_id, Status.RUNNING, job.attempt)
+    assert house.files_at_work() == [attempt_id], "the second worker has not cleared the first one's files away"
     house.jobs.cancel(id)
     house.final(id)
 
@@ -219,7 +219,7 @@ def test_a_job_that_the_queue_forgot_is_done(house: House) -> None:
     house.solving(first)
     house.solving(second)
     id = house.submit()
-    house.jobs.queue.remove(house.jobs.records.get(id).token)
+    house.jobs.queue.remove(house.jobs.records.get(id).attempt_id)
     house.jobs.cancel(first)
     assert house.final(id).status is Status.SUCCEEDED
     assert "forgotten" in house.jobs.log(id)
@@ -242,7 +242,7 @@ def test_lost_inputs_are_an_internal_error_whose_trace_is_in_the_log(house: Hous
     assert "Traceback" in house.jobs.log(id)
     house.final(first)
     house.final(second)
-    (finding,) = findings(house.jobs, settle=0.1)
+    (finding,) = findings(house.jobs, pause=0.1)
     assert finding == f"Job {id} (failed) has lost its inputs."
     house.jobs.delete(id)
     settled(house)
@@ -290,10 +290,10 @@ def test_wrong_arguments_and_settings_are_said() -> None:
 
 
 def test_the_audit_is_a_command(house: House) -> None:
-    command = [sys.executable, "-m", "pliant.worker", "audit"]
+    command = [sys.executable, "-m", "pliant.worker", "fsck"]
     env = {**os.environ, **house.settings.to_environment()}
     clean = subprocess.run(command, capture_output=True, text=True, check=False, env=env)
-    assert (clean.returncode, clean.stdout) == (0, "Everything stored is as the records say.\n")
+    assert (clean.returncode, clean.stdout) == (0, "Everything stored is as the records state.\n")
     house.jobs.blobs.put("jobs/nobody/nobody-1/inputs.npz", house.short_inputs)
     found = subprocess.run(command, capture_output=True, text=True, check=False, env=env)
     assert (found.returncode, found.stdout) == (1, "File jobs/nobody/nobody-1/inputs.npz belongs to no job.\n")

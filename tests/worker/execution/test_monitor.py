@@ -1,4 +1,4 @@
-"""Watching an attempt, on a clock of our own; what is written for a horse that ended without a last word."""
+"""Watching an attempt, on a clock of our own; what is written for a job process that ended without a last word."""
 
 from __future__ import annotations
 
@@ -15,11 +15,12 @@ from pliant.schemas.options import Options
 from pliant.solver import InvalidInput
 from pliant.worker.errors import StoreUnavailable
 from pliant.worker.execution.failures import how_it_ended, out_of_memory, problem_of, timed_out
-from pliant.worker.execution.monitor import Patience, Reason, Watch, settle
-from pliant.worker.execution.progress import SHARES, Teller
+from pliant.worker.execution.monitor import Patience, Reason, Watch, finalize
+from pliant.worker.execution.progress import SHARES, Reporter
 from pliant.worker.execution.workdir import OUTPUT, working_directory
 from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.service import Jobs
+from pliant.worker.jobs.submission import Submission
 from pliant.worker.processes.containment import OomKills
 from pliant.worker.records import Change, Records, Stored
 
@@ -32,13 +33,13 @@ KILLED = int(signal.SIGKILL)
 def running(jobs: Jobs, inputs_file: Path, interpretation: Interpretation) -> Callable[..., Watch]:
     """A claimed job under watch, with settings and a clock of the test's own."""
 
-    def make(time: list[float] | None = None, **settings: object) -> Watch:
-        id = jobs.submit(inputs_file, options=Options(), interpretation=interpretation).id
-        token = jobs.records.get(id).token
-        jobs.records.update(id, lambda held: lifecycle.claim(held, token=token, worker="me", now=NOW))
+    def make(time: list[float] | None = None, options: Options | None = None, **settings: object) -> Watch:
+        id = jobs.submit(inputs_file, Submission(options=options or Options()), interpretation=interpretation).id
+        attempt_id = jobs.records.get(id).attempt_id
+        jobs.records.update(id, lambda held: lifecycle.claim(held, attempt_id=attempt_id, worker="me", now=NOW))
         clock = time if time is not None else [0.0]
         changed = dataclasses.replace(jobs.settings, cancel_grace=3.0, **settings)  # type: ignore[arg-type]
-        return Watch(changed, jobs.records, id=id, token=token, worker="me", clock=lambda: clock[0])
+        return Watch(changed, jobs.records, id=id, attempt_id=attempt_id, worker="me", clock=lambda: clock[0])
 
     return make
 
@@ -52,7 +53,7 @@ def test_a_cancelled_attempt_is_killed_after_its_grace(jobs: Jobs, running: Call
     for time[0] in (0.5, 1.5, 4.0, 4.5):
         found.append(watch.must_end(stop_by=None))
     assert found == [None, None, None, Reason.CANCELLED], "noticed at the beat of 1.5 s, killed 3 s later"
-    after = settle(watch, status=KILLED, peak=0, patience=Patience(0))
+    after = finalize(watch, status=KILLED, peak=0, patience=Patience(0))
     assert after is not None
     assert (after.job.status, after.job.error) == (Status.CANCELLED, None)
 
@@ -64,10 +65,23 @@ def test_an_attempt_that_ignores_its_time_limit_is_killed(running: Callable[...,
     assert watch.must_end(stop_by=None) is None
     time[0] = 13.0
     assert watch.must_end(stop_by=None) is Reason.TIMED_OUT
-    after = settle(watch, status=KILLED, peak=0, patience=Patience(0))
+    after = finalize(watch, status=KILLED, peak=0, patience=Patience(0))
     assert after is not None
     assert after.job.error is not None
     assert (after.job.error.code, "10 s" in after.job.error.detail) == ("timed_out", True)
+
+
+def test_a_jobs_own_time_limit_is_enforced_too(running: Callable[..., Watch]) -> None:
+    time = [0.0]
+    watch = running(time, options=Options(time_limit=4.0), time_limit=100.0)
+    time[0] = 6.9
+    assert watch.must_end(stop_by=None) is None
+    time[0] = 7.1
+    assert watch.must_end(stop_by=None) is Reason.TIMED_OUT, "its 4 s and a grace of 3 s"
+    after = finalize(watch, status=KILLED, peak=0, patience=Patience(0))
+    assert after is not None
+    assert after.job.error is not None
+    assert (after.job.error.code, "4 s of its option time_limit" in after.job.error.detail) == ("timed_out", True)
 
 
 def test_without_a_limit_there_is_none(running: Callable[..., Watch]) -> None:
@@ -83,21 +97,21 @@ def test_a_worker_that_stops_puts_the_job_back_however_often(jobs: Jobs, running
     assert watch.must_end(stop_by=2.0) is None
     time[0] = 2.0
     assert watch.must_end(stop_by=2.0) is Reason.STOPPING
-    after = settle(watch, status=KILLED, peak=0, patience=Patience(0))
+    after = finalize(watch, status=KILLED, peak=0, patience=Patience(0))
     assert after is not None
     assert (after.job.status, after.job.attempt, after.worker) == (Status.QUEUED, 1, None)
-    assert after.token != watch.token
+    assert after.attempt_id != watch.attempt_id
     assert watch.must_end(stop_by=2.0) is Reason.STOPPING
     time[0] = 3.0
     assert watch.must_end(stop_by=2.0) is Reason.STALE
-    assert settle(watch, status=KILLED, peak=0, patience=Patience(0)) is None
+    assert finalize(watch, status=KILLED, peak=0, patience=Patience(0)) is None
 
 
-def test_a_horse_that_is_killed_while_its_worker_stops_is_put_back(running: Callable[..., Watch]) -> None:
+def test_a_job_process_that_is_killed_while_its_worker_stops_is_put_back(running: Callable[..., Watch]) -> None:
     for status, expected in ((KILLED, Status.QUEUED), (int(signal.SIGSEGV), Status.FAILED)):
         watch = running([0.0])
         assert watch.must_end(stop_by=100.0) is None
-        after = settle(watch, status=status, peak=0, patience=Patience(0))
+        after = finalize(watch, status=status, peak=0, patience=Patience(0))
         assert after is not None
         assert after.job.status is expected
 
@@ -106,10 +120,10 @@ def test_an_attempt_that_lost_its_job_is_killed_at_once(jobs: Jobs, running: Cal
     time = [0.0]
     watch = running(time)
     jobs.cancel(watch.id)
-    jobs.records.update(watch.id, lambda held: lifecycle.stop(held, token=watch.token, now=NOW, retention=0))
+    jobs.records.update(watch.id, lambda held: lifecycle.stop(held, attempt_id=watch.attempt_id, now=NOW, retention=0))
     jobs.delete(watch.id)
     assert watch.must_end(stop_by=None) is Reason.STALE
-    assert settle(watch, status=KILLED, peak=0, patience=Patience(0)) is None
+    assert finalize(watch, status=KILLED, peak=0, patience=Patience(0)) is None
 
 
 def test_a_watch_outlasts_its_store(running: Callable[..., Watch], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -124,14 +138,14 @@ def test_a_watch_outlasts_its_store(running: Callable[..., Watch], monkeypatch: 
         assert watch.must_end(stop_by=None) is None
     monkeypatch.setattr(type(watch.records), "get", away)
     with pytest.raises(StoreUnavailable, match="try again"):
-        settle(watch, status=KILLED, peak=0, patience=Patience(0))
+        finalize(watch, status=KILLED, peak=0, patience=Patience(0))
 
 
 def test_a_silent_death_is_told_from_one_for_want_of_memory(
     jobs: Jobs, running: Callable[..., Watch], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def code(watch: Watch, status: int, peak: int = 0) -> str:
-        after = settle(watch, status=status, peak=peak, patience=Patience(0))
+        after = finalize(watch, status=status, peak=peak, patience=Patience(0))
         assert after is not None
         assert after.job.error is not None
         assert after.job.error.retryable
@@ -146,7 +160,7 @@ def test_a_silent_death_is_told_from_one_for_want_of_memory(
     assert code(starved, KILLED) == "out_of_memory"
     assert code(segfault, int(signal.SIGSEGV)) == "worker_lost", "the kernel kills the hungry with SIGKILL"
     jobs.records.update(quiet.id, lambda held: held.model_copy(update={"worker": "another"}))
-    assert settle(quiet, status=KILLED, peak=0, patience=Patience(0)) is None, (
+    assert finalize(quiet, status=KILLED, peak=0, patience=Patience(0)) is None, (
         "a second delivery must not end the first"
     )
 
@@ -213,13 +227,13 @@ def test_limits_are_named_in_words() -> None:
 def test_progress_never_falls_and_estimates_what_is_left() -> None:
     told = []
     time = [100.0]
-    teller = Teller(told.append, clock=lambda: time[0])
-    teller.part("loading", 1.0)
-    teller.part("solving", 0.5, stage="cameras", max_reweightings=30)
+    reporter = Reporter(told.append, clock=lambda: time[0])
+    reporter.part("loading", 1.0)
+    reporter.part("solving", 0.5, stage="cameras", max_reweightings=30)
     time[0] = 110.0
-    teller.part("solving", 0.25, stage="reweight", reweighting=3, objective=2.0)
-    teller.part("exporting", 0.5, residual=0.125)
-    teller.part("exporting", 7.0)
+    reporter.part("solving", 0.25, stage="reweight", reweighting=3, objective=2.0)
+    reporter.part("exporting", 0.5, residual=0.125)
+    reporter.part("exporting", 7.0)
     fractions = [each.fraction for each in told]
     assert fractions == sorted(fractions)
     assert fractions[-1] == 1.0
@@ -245,7 +259,7 @@ def test_the_log_is_whole_before_the_record_is_final(
     jobs: Jobs, running: Callable[..., Watch], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     watch = running([0.0])
-    output = working_directory(watch.settings, watch.token) / OUTPUT
+    output = working_directory(watch.settings, watch.attempt_id) / OUTPUT
     output.parent.mkdir(parents=True)
     output.write_text("Segmentation fault\n")
     logged: list[str] = []
@@ -256,6 +270,6 @@ def test_the_log_is_whole_before_the_record_is_final(
         return update(self, id, change)
 
     monkeypatch.setattr(type(jobs.records), "update", seen)
-    assert settle(watch, status=KILLED, peak=0, patience=Patience(0)) is not None
+    assert finalize(watch, status=KILLED, peak=0, patience=Patience(0)) is not None
     assert "SIGKILL" in logged[0]
     assert logged[1:] == ["Segmentation fault"] == jobs.records.log(watch.id)[1:]

@@ -1,4 +1,4 @@
-"""What a worker does for an attempt whose horse has ended, with a store that comes back after a while."""
+"""What a worker does for an attempt whose job process has ended, with a store that comes back after a while."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from pliant.worker.execution.rq_worker import PliantWorker
 from pliant.worker.execution.workdir import working_directory
 from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.service import Jobs
+from pliant.worker.jobs.submission import Submission
 from pliant.worker.records import Stored, utc_now
 from pliant.worker.settings import Settings
 from pliant.worker.store.connection import connect
@@ -49,13 +50,13 @@ def test_the_working_files_go_once_the_store_says_whose_they_are(
     worker = PliantWorker(
         settings=jobs.settings, connection=connection, records=jobs.records, queue=jobs.queue, name="me"
     )
-    id = jobs.submit(inputs_file, options=Options(), interpretation=interpretation).id
-    token = jobs.records.get(id).token
-    jobs.records.update(id, lambda held: lifecycle.claim(held, token=token, worker="me", now=utc_now()))
-    folder = working_directory(jobs.settings, token)
+    id = jobs.submit(inputs_file, Submission(options=Options()), interpretation=interpretation).id
+    attempt_id = jobs.records.get(id).attempt_id
+    jobs.records.update(id, lambda held: lifecycle.claim(held, attempt_id=attempt_id, worker="me", now=utc_now()))
+    folder = working_directory(jobs.settings, attempt_id)
     folder.mkdir(parents=True)
     (folder / "half.npz").write_bytes(b"half")
-    watch = Watch(jobs.settings, jobs.records, id=id, token=token, worker="me")
+    watch = Watch(jobs.settings, jobs.records, id=id, attempt_id=attempt_id, worker="me")
     delivery = SimpleNamespace(id=id)
     looks: list[str] = []
     get = jobs.records.get
@@ -68,7 +69,7 @@ def test_the_working_files_go_once_the_store_says_whose_they_are(
 
     monkeypatch.setattr(jobs.records, "get", stammering)
     worker._stop_by = 0.0  # being stopped, it has two seconds
-    worker._bury(watch, delivery, status=9, peak=0)  # type: ignore[arg-type]
+    worker._reap(watch, delivery, status=9, peak=0)  # type: ignore[arg-type]
     connection.close()
     assert len(looks) >= 4
-    assert folder.exists() == (away == "it stays away"), "whose files nobody can say, the keeper clears"
+    assert folder.exists() == (away == "it stays away"), "whose files nobody can say, the reconciler clears"

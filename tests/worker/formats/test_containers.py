@@ -1,10 +1,11 @@
-"""Files of other programs, read in a child process; attacks on it are refused by code and cost one child."""
+"""Files of other programs, parsed in the sandbox; an attack is refused by code and costs one process."""
 
 from __future__ import annotations
 
 import io
 import json
 import os
+import time
 from pathlib import Path
 
 import h5py
@@ -20,7 +21,8 @@ from pliant.worker.artifacts.glb import write_glb
 from pliant.worker.formats import Inputs, Limits, read_inputs
 from pliant.worker.formats.reading.csv import read_csv
 from pliant.worker.formats.reading.gltf import read_gltf
-from pliant.worker.formats.reading.sandbox import parse_in_child
+from pliant.worker.formats.reading.hdf5 import read_matlab73
+from pliant.worker.formats.reading.sandbox import parse_in_sandbox
 from results import moving_sheet
 
 F, ROWS, COLUMNS = 6, 4, 5
@@ -98,11 +100,11 @@ def test_hdf5_that_points_elsewhere_or_declares_too_much_is_refused(tmp_path: Pa
     assert code_of(tmp_path / "huge.mat") == "too_large"
 
 
-def test_a_child_out_of_time_or_memory_costs_nothing_else(tmp_path: Path) -> None:
+def test_a_sandbox_out_of_time_or_memory_costs_nothing_else(tmp_path: Path) -> None:
     (tmp_path / "m.obj").write_text("v 1 2 3\n" * 8_000_000)  # several seconds on any machine, and one is all it gets
     limits = Limits(parse_seconds=1, max_points=10**8)
     with pytest.raises(InvalidInput) as caught:
-        parse_in_child("obj", tmp_path / "m.obj", field="mesh", limits=limits)
+        parse_in_sandbox("obj", tmp_path / "m.obj", field="mesh", limits=limits)
     assert caught.value.code == "too_slow"
     scipy.io.savemat(tmp_path / "t.mat", {"W": np.zeros((4000, 9000))}, do_compression=True)
     assert code_of(tmp_path / "t.mat", limits=Limits(parse_memory=700 << 20)) == "too_large"
@@ -134,3 +136,18 @@ def test_gltf_of_text_gives_its_faces_and_whole_numbers_only(tmp_path: Path) -> 
             field="mesh",
             limits=Limits(),
         )
+
+
+def test_hdf5_that_was_hardly_stored_is_refused_before_it_is_decompressed(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "fill.mat", "w", userblock_size=512) as file:
+        file.create_dataset("W", (1 << 13, 1 << 13), dtype="f8", chunks=(256, 256), compression="gzip")
+    with h5py.File(tmp_path / "chunk.mat", "w", userblock_size=512) as file:
+        file.create_dataset("W", (8, 8), maxshape=(None, None), dtype="f8", chunks=(2048, 2048), compression="gzip")[
+            ...
+        ] = 1
+    for name, got in (("fill", "of 0 bytes"), ("chunk", "in chunks of")):
+        began = time.process_time()
+        with (tmp_path / f"{name}.mat").open("rb") as stream, pytest.raises(InvalidInput, match=got) as caught:
+            read_matlab73(stream, field="tracks", limits=Limits())
+        assert caught.value.code == "too_large"
+        assert time.process_time() - began < 0.2

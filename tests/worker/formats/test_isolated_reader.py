@@ -15,7 +15,7 @@ from peaks import forget_peak, peak_of
 from pliant.schemas.options import Options
 from pliant.solver import InvalidInput
 from pliant.worker.formats import AmbiguousInput, Limits, isolated_reader, read_inputs, save_inputs, store_inputs
-from pliant.worker.formats.isolated_reader import announced
+from pliant.worker.formats.isolated_reader import declared_bytes
 from results import moving_sheet
 
 POINTS = moving_sheet(8, 6, 7)[..., :2] + 100
@@ -83,7 +83,7 @@ def test_a_fault_of_ours_is_not_the_inputs(all_apart: None, tmp_path: Path) -> N
 def test_what_is_read_apart_is_not_kept_here(tmp_path: Path) -> None:
     path = tmp_path / "t.npz"
     np.savez(path, tracks=np.linspace(0, 900, 20 * 220_000 * 2).reshape(220_000, 20, 2).swapaxes(0, 1))
-    assert announced(path, field="tracks") > isolated_reader.LARGE
+    assert declared_bytes(path, field="tracks") > isolated_reader.LARGE
     before = peak_now()
     said = store_inputs(tracks=path, mesh="none", options=Options(), target=tmp_path / "c.npz")
     assert (said.num_frames, said.num_points) == (20, 220_000)
@@ -103,17 +103,17 @@ def test_what_a_file_announces(tmp_path: Path) -> None:
     (tmp_path / "t.csv").write_text("frame,point,x,y\n0,0,1,2\n")
     size = {path.suffix: path.stat().st_size for path in tmp_path.iterdir()}
     assert size[".npz"] < 10_000
-    assert announced(tmp_path / "z.npz", field="tracks") == 160_000 + 128  # with the header
-    assert announced(tmp_path / "p.npy", field="tracks") == size[".npy"]
+    assert declared_bytes(tmp_path / "z.npz", field="tracks") == 160_000 + 128  # with the header
+    assert declared_bytes(tmp_path / "p.npy", field="tracks") == size[".npy"]
     np.save(tmp_path / "b.npy", np.zeros((100, 100, 2), dtype=bool))
-    assert announced(tmp_path / "b.npy", field="tracks") == 160_000
-    assert announced(tmp_path / "m.mat", field="tracks") == 1032 * size[".mat"]
-    assert announced(tmp_path / "t.csv", field="tracks") == 8 * size[".csv"]
+    assert declared_bytes(tmp_path / "b.npy", field="tracks") == 160_000
+    assert declared_bytes(tmp_path / "m.mat", field="tracks") == 1032 * size[".mat"]
+    assert declared_bytes(tmp_path / "t.csv", field="tracks") == 8 * size[".csv"]
     (tmp_path / "n.npz").write_bytes(b"PK\x03\x04" + bytes(400))
     with pytest.raises(InvalidInput, match="without its directory"):
-        announced(tmp_path / "n.npz", field="tracks")
+        declared_bytes(tmp_path / "n.npz", field="tracks")
     np.savez(tmp_path / "o.npz", tracks=np.array([{}], dtype=object))
-    assert 0 < announced(tmp_path / "o.npz", field="tracks") < 1000
+    assert 0 < declared_bytes(tmp_path / "o.npz", field="tracks") < 1000
     with h5py.File(tmp_path / "h.mat", "w", userblock_size=512) as file:
         file["W"] = np.zeros(4)
-    assert announced(tmp_path / "h.mat", field="tracks") > isolated_reader.LARGE
+    assert declared_bytes(tmp_path / "h.mat", field="tracks") > isolated_reader.LARGE

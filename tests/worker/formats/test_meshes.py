@@ -138,7 +138,7 @@ def test_a_mesh_of_other_points_is_refused(tmp_path: Path, tracks: Path) -> None
 def test_bad_obj_lines_are_refused(
     tmp_path: Path, tracks: Path, text: str, code: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(containers, "parse_in_child", parse_here)
+    monkeypatch.setattr(containers, "parse_in_sandbox", parse_here)
     (tmp_path / "m.obj").write_text(obj(FACES) + text)
     assert code_of(tracks, tmp_path / "m.obj") == code
 
@@ -210,6 +210,6 @@ def test_vertices_that_are_no_list_are_refused(tmp_path: Path, tracks: Path) -> 
 
 
 def test_indices_beyond_64_bits_are_refused(tmp_path: Path, tracks: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(containers, "parse_in_child", parse_here)
+    monkeypatch.setattr(containers, "parse_in_sandbox", parse_here)
     (tmp_path / "m.obj").write_text(obj(FACES) + f"f 1 2 3 {10**30}\n")
     assert code_of(tracks, tmp_path / "m.obj") == "damaged_file"

@@ -11,6 +11,7 @@ import scipy.io
 from pliant.schemas.options import Options
 from pliant.solver import InvalidInput, KnownCamera
 from pliant.worker.formats import Inputs, Limits, load_inputs, read_inputs, save_inputs
+from results import moving_sheet
 
 F, P = 12, 30
 
@@ -247,3 +248,26 @@ def test_given_cameras_are_completed_and_checked(tmp_path: Path) -> None:
         refused(code, lambda path=path: read_inputs(tracks=tracks, rotations=path, options=Options()))
     path = saved(tmp_path / "r.npz", turns=two_rows)
     refused("missing_array", lambda: read_inputs(tracks=tracks, rotations=path, options=Options()))
+
+
+@pytest.mark.parametrize("name", ["visibility", "expected_dist"])
+def test_more_visibility_than_tracks_is_refused_before_it_is_converted(
+    tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A file of .88 MB with 900 MB of zeros as visibility took 7.8 GB."""
+    monkeypatch.setattr("pliant.worker.formats.tracks.visibility._confidence", None)  # not reached
+    tracks = moving_sheet(6, 4, 5)[..., :2] + 100
+    arrays = {"visibility": np.ones((6, 20)), name: np.zeros((600, 2000), bool)}
+    np.savez_compressed(tmp_path / "t.npz", tracks=tracks, **arrays)
+    with pytest.raises(InvalidInput) as caught:
+        read_inputs(tracks=tmp_path / "t.npz", options=Options(layout="frames_points"))
+    assert (caught.value.code, caught.value.field, caught.value.got) == ("wrong_shape", f"tracks.{name}", "(600, 2000)")
+
+
+@pytest.mark.parametrize("where", [0.0, 300.0])
+def test_tracks_of_one_position_are_refused_when_they_are_read(tmp_path: Path, where: float) -> None:
+    points = np.full((6, 20, 2), where) + np.arange(6)[:, None, None]
+    np.savez(tmp_path / "t.npz", tracks=points)
+    with pytest.raises(InvalidInput, match="one position for all points") as caught:
+        read_inputs(tracks=tmp_path / "t.npz", mesh="none", options=Options())
+    assert caught.value.code == "no_extent"

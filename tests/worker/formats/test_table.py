@@ -42,7 +42,7 @@ def test_a_format_gives_what_the_canonical_file_gives(made: Written, tmp_path: P
     np.savez(tmp_path / "canonical.npz", **canonical)
     options = Options.model_validate({**QUICK, **made.options})
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(containers, "parse_in_child", parse_here)
+        patch.setattr(containers, "parse_in_sandbox", parse_here)
         got = read_inputs(tracks=path, mesh=MESH, options=options)
     right = read_inputs(tracks=tmp_path / "canonical.npz", mesh=MESH, options=Options.model_validate(QUICK))
     assert got.tracks.points.tobytes() == right.tracks.points.tobytes()

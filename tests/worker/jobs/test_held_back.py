@@ -6,12 +6,13 @@ import dataclasses
 from datetime import timedelta
 from pathlib import Path
 
-from keeper_world import World
 from pliant.schemas.job import Interpretation, Status
 from pliant.schemas.options import Options
 from pliant.worker.jobs import lifecycle
+from pliant.worker.jobs.submission import Submission
 from pliant.worker.maintenance.fsck import findings
-from pliant.worker.maintenance.reconciler import Keeper
+from pliant.worker.maintenance.reconciler import Reconciler
+from reconciler_world import World
 
 
 def test_no_more_of_an_owners_jobs_run_than_may_and_the_next_begins_when_one_ends(
@@ -22,27 +23,27 @@ def test_no_more_of_an_owners_jobs_run_than_may_and_the_next_begins_when_one_end
     def made(owner: str) -> str:
         jobs = world.jobs.of(owner)
         world.now += timedelta(milliseconds=10)
-        return jobs.submit(inputs_file, options=Options(), interpretation=interpretation).id
+        return jobs.submit(inputs_file, Submission(options=Options()), interpretation=interpretation).id
 
     def waiting() -> list[str]:
-        return [token.rpartition("-")[0] for token in world.jobs.queue.waiting()]
+        return [attempt_id.rpartition("-")[0] for attempt_id in world.jobs.queue.waiting()]
 
     adas = [made("ada") for _ in range(5)]
     bobs = [made("bob")]
     assert waiting() == [*adas[:2], *bobs]
     world.pass_seconds(30)
     assert waiting() == [*adas[:2], *bobs], "what is held back is not taken for forgotten"
-    assert findings(world.jobs, settle=0) == []
-    tokens = [world.claim(adas[0]), world.claim(adas[1])]
+    assert findings(world.jobs, pause=0) == []
+    attempt_ids = [world.claim(adas[0]), world.claim(adas[1])]
 
     def alive() -> None:
-        for id, token in zip(adas, tokens, strict=False):
-            world.jobs.records.beat(id, token)
+        for id, attempt_id in zip(adas, attempt_ids, strict=False):
+            world.jobs.records.beat(id, attempt_id)
 
     world.pass_seconds(10, meanwhile=alive)
     assert waiting() == bobs
     world.jobs.cancel(adas[0])
-    stopped = lambda held: lifecycle.stop(held, token=tokens[0], now=world.now, retention=0)  # noqa: E731
+    stopped = lambda held: lifecycle.stop(held, attempt_id=attempt_ids[0], now=world.now, retention=0)  # noqa: E731
     world.pass_seconds(10, meanwhile=alive)
     assert waiting() == bobs, "a job being cancelled still runs"
     world.jobs.records.update(adas[0], stopped)
@@ -64,15 +65,15 @@ def test_a_job_held_back_and_let_go_between_two_looks_is_not_taken_for_forgotten
 
     def made() -> str:
         world.now += timedelta(milliseconds=10)
-        return world.jobs.submit(inputs_file, options=Options(), interpretation=interpretation).id
+        return world.jobs.submit(inputs_file, Submission(options=Options()), interpretation=interpretation).id
 
     running = made()
-    token = world.claim(running)
+    attempt_id = world.claim(running)
     world.pass_seconds(1)
     held = made()
     world.jobs.cancel(running)
     world.jobs.records.update(
-        running, lambda stored: lifecycle.stop(stored, token=token, now=world.now, retention=60.0)
+        running, lambda stored: lifecycle.stop(stored, attempt_id=attempt_id, now=world.now, retention=60.0)
     )
     world.pass_seconds(1)
     assert [each.rpartition("-")[0] for each in world.jobs.queue.waiting()] == [held], "at the very next look"
@@ -85,12 +86,13 @@ def test_what_is_held_back_is_known_to_a_keeper_that_has_only_begun(
 ) -> None:
     world = World(tmp_path, max_running=1)
     first, second = (
-        world.jobs.submit(inputs_file, options=Options(), interpretation=interpretation, id=f"job-{n}").id for n in "12"
+        world.jobs.submit(inputs_file, Submission(options=Options(), id=f"job-{n}"), interpretation=interpretation).id
+        for n in "12"
     )
-    world.jobs.queue.let_go(world.jobs.records.get(second).token)  # as if nobody had had the time to note it
+    world.jobs.queue.let_go(world.jobs.records.get(second).attempt_id)  # as if nobody had had the time to note it
     world.pass_seconds(1)
-    assert world.jobs.queue.held() == {world.jobs.records.get(second).token}
-    world.keeper = Keeper(jobs=world.jobs, clock=lambda: world.monotonic)
+    assert world.jobs.queue.held() == {world.jobs.records.get(second).attempt_id}
+    world.reconciler = Reconciler(jobs=world.jobs, clock=lambda: world.monotonic)
     world.jobs.cancel(first)
     world.jobs.queue.hold("gone-0")
     world.pass_seconds(1)
@@ -104,11 +106,12 @@ def test_a_job_on_its_way_to_a_worker_counts_as_running(
 ) -> None:
     world = World(tmp_path, max_running=1)
     first, second = (
-        world.jobs.submit(inputs_file, options=Options(), interpretation=interpretation, id=f"job-{n}").id for n in "12"
+        world.jobs.submit(inputs_file, Submission(options=Options(), id=f"job-{n}"), interpretation=interpretation).id
+        for n in "12"
     )
     world.pass_seconds(1)
-    token = world.jobs.records.get(first).token
-    world.jobs.queue.remove(token)  # taken by a worker that has not claimed it yet
+    attempt_id = world.jobs.records.get(first).attempt_id
+    world.jobs.queue.remove(attempt_id)  # taken by a worker that has not claimed it yet
     world.pass_seconds(2)
     assert world.jobs.queue.waiting() == []
     world.pass_seconds(2)
@@ -124,11 +127,11 @@ def test_a_tokens_own_bound_on_running_jobs_goes_before_the_usual_one(
     def made(owner: str, most: int | None) -> str:
         jobs = dataclasses.replace(world.jobs.of(owner), max_running=most)
         world.now += timedelta(milliseconds=10)
-        return jobs.submit(inputs_file, options=Options(), interpretation=interpretation).id
+        return jobs.submit(inputs_file, Submission(options=Options()), interpretation=interpretation).id
 
     ones, threes, usual, free = ([made(f"{most}", most) for _ in range(4)] for most in (1, 3, None, 0))
     expected = [*ones[:1], *threes[:3], *usual[:2], *free]
     for _ in range(2):
-        assert [token.rpartition("-")[0] for token in world.jobs.queue.waiting()] == expected
-        assert findings(world.jobs, settle=0) == []
+        assert [attempt_id.rpartition("-")[0] for attempt_id in world.jobs.queue.waiting()] == expected
+        assert findings(world.jobs, pause=0) == []
         world.pass_seconds(10)

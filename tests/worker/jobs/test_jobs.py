@@ -20,7 +20,9 @@ from pliant.worker.errors import (
 )
 from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.service import Jobs
+from pliant.worker.jobs.submission import Submission
 from pliant.worker.records import Stored
+from pliant.worker.uploads.service import Capacity, Uploads
 
 NOW = datetime(2030, 1, 2, tzinfo=UTC)
 PROBLEM = Problem(
@@ -29,19 +31,19 @@ PROBLEM = Problem(
 
 
 def claim(jobs: Jobs, id: str) -> Stored:
-    token = jobs.records.get(id).token
-    return jobs.records.update(id, lambda stored: lifecycle.claim(stored, token=token, worker="w", now=NOW))
+    attempt_id = jobs.records.get(id).attempt_id
+    return jobs.records.update(id, lambda stored: lifecycle.claim(stored, attempt_id=attempt_id, worker="w", now=NOW))
 
 
 def finish(jobs: Jobs, id: str, file: Path) -> Stored:
-    token = claim(jobs, id).token
-    prefix = f"jobs/{id}/{token}/"
+    attempt_id = claim(jobs, id).attempt_id
+    prefix = f"jobs/{id}/{attempt_id}/"
     jobs.blobs.put(f"{prefix}report.json", file)
     artifact = Artifact(name="report.json", media_type="application/json", bytes=file.stat().st_size, sha256="0" * 64)
     return jobs.records.update(
         id,
         lambda stored: lifecycle.succeed(
-            stored, token=token, prefix=prefix, artifacts=[artifact], metrics={"reprojection_median": 0.5},
+            stored, attempt_id=attempt_id, prefix=prefix, artifacts=[artifact], metrics={"reprojection_median": 0.5},
             outcome="converged", sentence="Converged.", warnings=[], now=NOW, retention=60,
         ),
     )  # fmt: skip
@@ -57,7 +59,7 @@ def test_a_submitted_job_has_record_blob_and_place(jobs: Jobs, submit, inputs_fi
     assert jobs.get(second.id) == second
     stored = jobs.records.get(first.id)
     assert b"".join(jobs.blobs.get(stored.inputs).read()) == inputs_file.read_bytes()
-    assert jobs.queue.waiting() == [stored.token, jobs.records.get(second.id).token]
+    assert jobs.queue.waiting() == [stored.attempt_id, jobs.records.get(second.id).attempt_id]
     assert jobs.records.used() == 2 * inputs_file.stat().st_size
 
 
@@ -158,13 +160,13 @@ def test_simultaneous_requests_with_one_key_make_one_job(jobs: Jobs, submit) -> 
 
 def test_only_the_owning_attempt_writes(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
     id = submit().id
-    old = claim(jobs, id).token
+    old = claim(jobs, id).attempt_id
     with pytest.raises(StaleAttempt):
-        jobs.records.update(id, lambda stored: lifecycle.claim(stored, token=old, worker="twin", now=NOW))
+        jobs.records.update(id, lambda stored: lifecycle.claim(stored, attempt_id=old, worker="twin", now=NOW))
     jobs.records.update(
         id,
         lambda stored: lifecycle.requeue(
-            stored, token=old, fresh="new-token", problem=PROBLEM, now=NOW, max_attempts=2, retention=0
+            stored, attempt_id=old, fresh="new-attempt_id", problem=PROBLEM, now=NOW, max_attempts=2, retention=0
         ),
     )
     assert jobs.get(id).status is Status.QUEUED
@@ -173,10 +175,10 @@ def test_only_the_owning_attempt_writes(jobs: Jobs, submit) -> None:  # type: ig
     progress = Progress(stage="reweight", fraction=0.5, updated_at=NOW)
     before = jobs.records.get(id)
     for change in (
-        lambda stored: lifecycle.report(stored, token=old, progress=progress),
-        lambda stored: lifecycle.fail(stored, token=old, problem=PROBLEM, now=NOW, retention=0),
-        lambda stored: lifecycle.stop(stored, token=old, now=NOW, retention=0),
-        lambda stored: lifecycle.redeliver(stored, token=old, fresh="newer"),
+        lambda stored: lifecycle.report(stored, attempt_id=old, progress=progress),
+        lambda stored: lifecycle.fail(stored, attempt_id=old, problem=PROBLEM, now=NOW, retention=0),
+        lambda stored: lifecycle.stop(stored, attempt_id=old, now=NOW, retention=0),
+        lambda stored: lifecycle.redeliver(stored, attempt_id=old, fresh="newer"),
     ):
         with pytest.raises(StaleAttempt):
             jobs.records.update(id, change)
@@ -186,11 +188,17 @@ def test_only_the_owning_attempt_writes(jobs: Jobs, submit) -> None:  # type: ig
 def test_a_job_that_keeps_losing_workers_fails_at_last(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
     id = submit().id
     for attempt in (1, 2):
-        token = claim(jobs, id).token
+        attempt_id = claim(jobs, id).attempt_id
         after = jobs.records.update(
             id,
-            lambda stored, token=token, attempt=attempt: lifecycle.requeue(  # type: ignore[misc]
-                stored, token=token, fresh=f"t{attempt}", problem=PROBLEM, now=NOW, max_attempts=2, retention=60
+            lambda stored, attempt_id=attempt_id, attempt=attempt: lifecycle.requeue(  # type: ignore[misc]
+                stored,
+                attempt_id=attempt_id,
+                fresh=f"t{attempt}",
+                problem=PROBLEM,
+                now=NOW,
+                max_attempts=2,
+                retention=60,
             ),
         )
     assert (after.job.status, after.job.error, after.job.attempt) == (Status.FAILED, PROBLEM, 2)
@@ -200,18 +208,20 @@ def test_a_job_that_keeps_losing_workers_fails_at_last(jobs: Jobs, submit) -> No
 def test_cancelling(jobs: Jobs, submit, inputs_file: Path) -> None:  # type: ignore[no-untyped-def]
     queued, running, done = submit(), submit(), submit()
     assert jobs.cancel(queued.id).status is Status.CANCELLED
-    token = claim(jobs, running.id).token
+    attempt_id = claim(jobs, running.id).attempt_id
     assert jobs.cancel(running.id).status is Status.CANCELLING
     assert jobs.cancel(running.id).status is Status.CANCELLING, "asking twice is no error"
-    assert jobs.records.beat(running.id, token) is Status.CANCELLING
+    assert jobs.records.beat(running.id, attempt_id) is Status.CANCELLING
     late = jobs.records.update(
-        running.id, lambda stored: lifecycle.fail(stored, token=token, problem=PROBLEM, now=NOW, retention=0)
+        running.id, lambda stored: lifecycle.fail(stored, attempt_id=attempt_id, problem=PROBLEM, now=NOW, retention=0)
     )
     assert (late.job.status, late.job.error, late.job.expires_at) == (Status.CANCELLED, None, None)
     finish(jobs, done.id, inputs_file)
     with pytest.raises(NotAllowedNow, match="delete it"):
         jobs.cancel(done.id)
-    assert [token.rsplit("-", 1)[0] for token in jobs.queue.waiting()] == [running.id, done.id], "tokens not yet taken"
+    assert [attempt_id.rsplit("-", 1)[0] for attempt_id in jobs.queue.waiting()] == [running.id, done.id], (
+        "tokens not yet taken"
+    )
 
 
 def test_a_result_is_published_and_read_in_ranges(jobs: Jobs, submit, inputs_file: Path) -> None:  # type: ignore[no-untyped-def]
@@ -269,37 +279,43 @@ def test_running_again_is_a_new_job_with_the_same_inputs(jobs: Jobs, submit, inp
 
 def test_events_tell_every_change_once(jobs: Jobs, submit, inputs_file: Path) -> None:  # type: ignore[no-untyped-def]
     id = submit().id
-    first = jobs.events(id, timeout=0)
+    first = jobs.events(id)
     assert [event.name for event in first] == ["job"]
     assert Job.model_validate_json(first[0].data).status is Status.QUEUED
-    assert jobs.events(id, after=first[-1].id, timeout=0.05) == []
-    token = claim(jobs, id).token
+    assert jobs.events(id, after=first[-1].id) == []
+    attempt_id = claim(jobs, id).attempt_id
     progress = Progress(stage="reweight", fraction=0.5, updated_at=NOW)
-    waiting: list[list[str]] = []
-    seen = jobs.events(id, after=first[-1].id, timeout=1)[-1].id
-    waiter = threading.Thread(target=lambda: waiting.append([e.name for e in jobs.events(id, after=seen, timeout=10)]))
-    waiter.start()
-    jobs.records.update(id, lambda stored: lifecycle.report(stored, token=token, progress=progress))
-    waiter.join(10)
-    assert waiting == [["progress"]]
+    changes = jobs.records.changes()
+    while changes.next(0.05):
+        pass
+    seen = jobs.events(id)[-1].id
+    jobs.records.update(id, lambda stored: lifecycle.report(stored, attempt_id=attempt_id, progress=progress))
+    assert changes.next(5) == {id}
+    assert [event.name for event in jobs.events(id, after=seen)] == ["progress"]
+    assert changes.next(0.05) == set()
     jobs.cancel(id)
-    jobs.records.update(id, lambda stored: lifecycle.stop(stored, token=token, now=NOW, retention=0))
-    last = jobs.events(id, timeout=1)[-1]
+    jobs.records.update(id, lambda stored: lifecycle.stop(stored, attempt_id=attempt_id, now=NOW, retention=0))
+    assert changes.next(5) == {id}
+    last = jobs.events(id)[-1]
     assert Job.model_validate_json(last.data).status is Status.CANCELLED
-    with pytest.raises(InvalidRequest, match="Last-Event-ID"):
-        jobs.events(id, after="yesterday")
+    for wrong in ("yesterday", f"{2**64}-0", "99999999999999999999-0"):
+        with pytest.raises(InvalidRequest, match="Last-Event-ID"):
+            jobs.events(id, after=wrong)
+    jobs.delete(id)
+    assert changes.next(5) == {id}
+    changes.close()
 
 
 def test_events_are_capped(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
     id = submit().id
-    token = claim(jobs, id).token
+    attempt_id = claim(jobs, id).attempt_id
     for number in range(300):
         progress = Progress(stage="reweight", fraction=number / 300, updated_at=NOW)
-        jobs.records.update(id, lambda stored, p=progress: lifecycle.report(stored, token=token, progress=p))  # type: ignore[misc]
-    assert len(jobs.events(id, timeout=0)) == 256
+        jobs.records.update(id, lambda stored, p=progress: lifecycle.report(stored, attempt_id=attempt_id, progress=p))  # type: ignore[misc]
+    assert len(jobs.events(id)) == 256
     jobs.cancel(id)
-    jobs.records.update(id, lambda stored: lifecycle.stop(stored, token=token, now=NOW, retention=0))
-    kept = jobs.events(id, timeout=0)
+    jobs.records.update(id, lambda stored: lifecycle.stop(stored, attempt_id=attempt_id, now=NOW, retention=0))
+    kept = jobs.events(id)
     assert len(kept) == 16
     assert Job.model_validate_json(kept[-1].data).status is Status.CANCELLED
 
@@ -317,3 +333,36 @@ def test_readiness_names_each_part(jobs: Jobs) -> None:
     found = jobs.ready()
     assert (found["redis"], found["blobs"]) == ("ok", "ok")
     assert found["workers"] == "ok" or "pliant work" in found["workers"]
+
+
+def test_a_retry_that_meets_a_deletion_says_that_the_job_is_gone(
+    jobs: Jobs, submit, monkeypatch: pytest.MonkeyPatch
+) -> None:  # type: ignore[no-untyped-def]
+    id = submit().id
+    jobs.cancel(id)
+    known = Jobs.known
+
+    def deleted_meanwhile(door: Jobs, submission: Submission) -> Job | None:
+        jobs.delete(id)
+        return known(door, submission)
+
+    monkeypatch.setattr(Jobs, "known", deleted_meanwhile)
+    with pytest.raises(UnknownJob):
+        jobs.retry(id)
+    assert jobs.records.ids(Status.QUEUED) == []
+    assert jobs.records.deleted() == {}
+
+
+def test_jobs_count_the_uploads_and_the_quota_holds_at_the_moment_of_writing(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
+    tight = dataclasses.replace(jobs, settings=dataclasses.replace(jobs.settings, disk_quota=4_000_000))
+    uploads = Uploads.open(tight.settings)
+    with uploads.write("big-one", offset=0, length=None, capacity=Capacity(max_bytes=10**7)) as writer:
+        writer.write(bytes(1_500_000))
+    with pytest.raises(QuotaExceeded, match="hold 1,500,000 bytes"):
+        submit(tight)
+    uploads.delete("big-one")
+    stored = jobs.records.get(submit(tight).id)
+    job = stored.job.model_copy(update={"id": "another"})
+    with pytest.raises(QuotaExceeded, match="hold 3,000,000 bytes and may hold 4,000,000"):
+        jobs.records.create(stored.model_copy(update={"job": job}), max_bytes=4_000_000)
+    assert jobs.records.used() == 3_000_000

@@ -19,11 +19,11 @@ def test_no_more_of_an_owners_jobs_wait_than_may(jobs: Jobs, submit) -> None:  #
     ada, bob = (dataclasses.replace(jobs.of(owner), max_queued=2) for owner in ("ada", "bob"))
     first, _ = submit(ada), submit(ada, id="second", fingerprint="f")
     before = list(jobs.blobs.list("jobs/"))
-    ada.check_room(id="second")
+    ada.check_capacity(id="second")
     for refused in (
         lambda: submit(ada),
-        lambda: ada.check_room(id="third"),
-        lambda: ada.check_room(idempotency_key="k"),
+        lambda: ada.check_capacity(id="third"),
+        lambda: ada.check_capacity(idempotency_key="k"),
     ):
         with pytest.raises(TooManyQueued, match="2 of your jobs wait"):
             refused()
@@ -31,8 +31,10 @@ def test_no_more_of_an_owners_jobs_wait_than_may(jobs: Jobs, submit) -> None:  #
     assert submit(ada, id="second", fingerprint="f").id == "second"
     submit(bob)
     submit(jobs)
-    token = jobs.records.get(first.id).token
-    jobs.records.update(first.id, lambda held: lifecycle.claim(held, token=token, worker="w", now=datetime.now(UTC)))
+    attempt_id = jobs.records.get(first.id).attempt_id
+    jobs.records.update(
+        first.id, lambda held: lifecycle.claim(held, attempt_id=attempt_id, worker="w", now=datetime.now(UTC))
+    )
     submit(ada)
     with pytest.raises(TooManyQueued):
         submit(ada)
@@ -59,15 +61,15 @@ def test_submissions_at_the_same_moment_do_not_slip_past_the_limit(jobs: Jobs, s
 def test_a_repeated_key_finds_its_job_though_the_queue_is_full(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
     ada = dataclasses.replace(jobs.of("ada"), max_queued=1)
     job = submit(ada, idempotency_key="k", fingerprint="f")
-    ada.check_room(idempotency_key="k")
+    ada.check_capacity(idempotency_key="k")
     assert submit(ada, idempotency_key="k", fingerprint="f").id == job.id
 
 
 def test_a_job_over_its_owners_limit_is_noted_as_held_back_until_it_is_cancelled(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
     ada = dataclasses.replace(jobs.of("ada"), max_running=1)
     first, second = submit(ada), submit(ada)
-    assert jobs.queue.waiting() == [jobs.records.get(first.id).token]
-    assert jobs.queue.held() == {jobs.records.get(second.id).token}
+    assert jobs.queue.waiting() == [jobs.records.get(first.id).attempt_id]
+    assert jobs.queue.held() == {jobs.records.get(second.id).attempt_id}
     ada.cancel(second.id)
     assert jobs.queue.held() == set()
 

@@ -12,6 +12,7 @@ from pliant.schemas.options import Options
 from pliant.worker.execution.workdir import working_directory
 from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.service import Jobs
+from pliant.worker.jobs.submission import Submission
 from pliant.worker.maintenance.fsck import findings
 from pliant.worker.records import Stored
 
@@ -21,25 +22,27 @@ NOW = datetime(2030, 1, 1, tzinfo=UTC)
 @pytest.fixture
 def submit(jobs: Jobs, inputs_file: Path, interpretation: Interpretation) -> Callable[[], Stored]:
     def make() -> Stored:
-        id = jobs.submit(inputs_file, options=Options(), interpretation=interpretation).id
+        id = jobs.submit(inputs_file, Submission(options=Options()), interpretation=interpretation).id
         return jobs.records.get(id)
 
     return make
 
 
 def claim(jobs: Jobs, stored: Stored) -> Stored:
-    jobs.queue.remove(stored.token)
-    return jobs.records.update(stored.job.id, lambda held: lifecycle.claim(held, token=held.token, worker="w", now=NOW))
+    jobs.queue.remove(stored.attempt_id)
+    return jobs.records.update(
+        stored.job.id, lambda held: lifecycle.claim(held, attempt_id=held.attempt_id, worker="w", now=NOW)
+    )
 
 
 def succeed(jobs: Jobs, stored: Stored, file: Path, *, size: int) -> Stored:
-    prefix = f"jobs/{stored.job.id}/{stored.token}/artifacts/"
+    prefix = f"jobs/{stored.job.id}/{stored.attempt_id}/artifacts/"
     jobs.blobs.put(f"{prefix}report.json", file)
     artifact = Artifact(name="report.json", media_type="application/json", bytes=size, sha256="0" * 64)
     return jobs.records.update(
         stored.job.id,
         lambda held: lifecycle.succeed(
-            held, token=held.token, prefix=prefix, artifacts=[artifact], metrics={}, outcome="converged",
+            held, attempt_id=held.attempt_id, prefix=prefix, artifacts=[artifact], metrics={}, outcome="converged",
             sentence="Converged.", warnings=[], now=NOW, retention=0,
         ),
     )  # fmt: skip
@@ -50,8 +53,8 @@ def test_jobs_in_every_status_that_are_in_order_give_no_finding(
 ) -> None:
     submit()
     running = claim(jobs, submit())
-    working_directory(jobs.settings, running.token).mkdir(parents=True)
-    jobs.blobs.put(f"jobs/{running.job.id}/{running.token}/artifacts/half.npz", inputs_file)
+    working_directory(jobs.settings, running.attempt_id).mkdir(parents=True)
+    jobs.blobs.put(f"jobs/{running.job.id}/{running.attempt_id}/artifacts/half.npz", inputs_file)
     jobs.cancel(claim(jobs, submit()).job.id)
     jobs.cancel(submit().job.id)
     succeed(jobs, claim(jobs, submit()), inputs_file, size=inputs_file.stat().st_size)
@@ -59,14 +62,14 @@ def test_jobs_in_every_status_that_are_in_order_give_no_finding(
     problem = Problem(title="t", status=500, detail="d.", code="internal_error")
     jobs.records.update(
         failed.job.id,
-        lambda held: lifecycle.fail(held, token=held.token, problem=problem, now=NOW, retention=0),
+        lambda held: lifecycle.fail(held, attempt_id=held.attempt_id, problem=problem, now=NOW, retention=0),
     )
-    assert findings(jobs, settle=0) == []
+    assert findings(jobs, pause=0) == []
 
 
 def test_every_kind_of_misfit_is_found(jobs: Jobs, submit: Callable[[], Stored], inputs_file: Path) -> None:
     def only(sentence: str) -> None:
-        (found,) = findings(jobs, settle=0)
+        (found,) = findings(jobs, pause=0)
         assert sentence in found
 
     stored = submit()
@@ -88,15 +91,16 @@ def test_every_kind_of_misfit_is_found(jobs: Jobs, submit: Callable[[], Stored],
     only("nobody-1, which no queued job owns")
     jobs.queue.remove("nobody-1")
 
-    jobs.queue.remove(stored.token)
+    jobs.queue.remove(stored.attempt_id)
     only("the queue does not hold it")
-    jobs.queue.push(stored.job.id, stored.token)
+    jobs.queue.push(stored.job.id, stored.attempt_id)
 
     done = succeed(jobs, claim(jobs, submit()), inputs_file, size=5)
     only("report.json should have 5 bytes and has 3000000")
     jobs.records.update(done.job.id, lambda held: held.model_copy(update={"prefix": "elsewhere/"}))
-    assert len(findings(jobs, settle=0)) == 2
-    jobs.records.delete(done.job.id)
+    assert len(findings(jobs, pause=0)) == 2
+    jobs.records.delete(done.job.id, at=NOW)
+    jobs.records.forget_deleted(done.job.id)
     jobs.blobs.delete(f"jobs/{done.job.id}/")
 
     for update, sentence in (
@@ -111,7 +115,7 @@ def test_every_kind_of_misfit_is_found(jobs: Jobs, submit: Callable[[], Stored],
         only(sentence)
         jobs.records.update(stored.job.id, lambda held, job=sound: held.model_copy(update={"job": job}))  # type: ignore[misc]
     jobs.records.update(stored.job.id, lambda held: held.model_copy(update={"prefix": "p/"}))
-    assert any("its results lie under p/" in found for found in findings(jobs, settle=0))
+    assert any("its results lie under p/" in found for found in findings(jobs, pause=0))
     jobs.records.update(stored.job.id, lambda held: held.model_copy(update={"prefix": None}))
 
     upload = jobs.settings.uploads / "somebody" / "half"
@@ -127,15 +131,15 @@ def test_a_change_caught_half_way_is_no_finding(
     jobs: Jobs, submit: Callable[[], Stored], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stored = submit()
-    jobs.queue.remove(stored.token)
-    monkeypatch.setattr("time.sleep", lambda seconds: jobs.queue.push(stored.job.id, stored.token))
+    jobs.queue.remove(stored.attempt_id)
+    monkeypatch.setattr("time.sleep", lambda seconds: jobs.queue.push(stored.job.id, stored.attempt_id))
     assert findings(jobs) == []
 
 
 def test_a_token_twice_in_the_queue_is_found(
     jobs: Jobs, submit: Callable[[], Stored], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    token = submit().token
-    monkeypatch.setattr(type(jobs.queue), "waiting", lambda self: [token, token])
-    (found,) = findings(jobs, settle=0)
-    assert found == f"The queue holds {token} 2 times."
+    attempt_id = submit().attempt_id
+    monkeypatch.setattr(type(jobs.queue), "waiting", lambda self: [attempt_id, attempt_id])
+    (found,) = findings(jobs, pause=0)
+    assert found == f"The queue holds {attempt_id} 2 times."

@@ -1,4 +1,4 @@
-"""The keeper, on a clock of our own: what counts as lost, what as forgotten, what expires, and what never does."""
+"""The reconciler, on a clock of our own: what counts as lost, what as forgotten, what expires, and what never does."""
 
 from __future__ import annotations
 
@@ -7,19 +7,22 @@ import os
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from pathlib import Path
 
 import pytest
-from keeper_world import World
 from pliant.schemas.job import Interpretation, Problem, Status
 from pliant.schemas.options import Options
 from pliant.worker.errors import StoreUnavailable, UnknownJob
 from pliant.worker.execution.workdir import clean_up, last_words, working_directory
 from pliant.worker.jobs import lifecycle
+from pliant.worker.jobs.submission import Submission
 from pliant.worker.maintenance.fsck import findings
-from pliant.worker.maintenance.reconciler import Keeper, Stillness
+from pliant.worker.maintenance.reconciler import Reconciler, Stillness
 from pliant.worker.settings import Settings
-from pliant.worker.uploads.service import Room, Uploads
+from pliant.worker.store.blobs import Blobs
+from pliant.worker.uploads.service import Capacity, Uploads
+from reconciler_world import World
 
 
 @pytest.fixture
@@ -29,7 +32,7 @@ def world(tmp_path: Path) -> World:
 
 @pytest.fixture
 def submit(inputs_file: Path, interpretation: Interpretation) -> Callable[[World], str]:
-    return lambda world: world.jobs.submit(inputs_file, options=Options(), interpretation=interpretation).id
+    return lambda world: world.jobs.submit(inputs_file, Submission(options=Options()), interpretation=interpretation).id
 
 
 def test_a_job_whose_worker_falls_silent_is_queued_again_then_fails(
@@ -63,20 +66,20 @@ def test_a_cancelled_job_whose_worker_falls_silent_is_cancelled(world: World, su
 
 def test_signs_of_life_keep_a_job(world: World, submit: Callable[[World], str]) -> None:
     id = submit(world)
-    token = world.claim(id)
-    world.pass_seconds(30, meanwhile=lambda: world.jobs.records.beat(id, token))
+    attempt_id = world.claim(id)
+    world.pass_seconds(30, meanwhile=lambda: world.jobs.records.beat(id, attempt_id))
     assert world.jobs.get(id).status is Status.RUNNING
 
 
 def test_neither_an_outage_nor_a_jumping_clock_loses_a_job(world: World, submit: Callable[[World], str]) -> None:
     id = submit(world)
-    token = world.claim(id)
+    attempt_id = world.claim(id)
     world.pass_seconds(2)
     world.monotonic += 600  # nobody could look, and nobody could give a sign of life
     world.now += timedelta(days=1)
     world.pass_seconds(1)
     assert world.jobs.get(id).status is Status.RUNNING
-    world.jobs.records.beat(id, token)
+    world.jobs.records.beat(id, attempt_id)
     world.pass_seconds(4)
     assert world.jobs.get(id).status is Status.RUNNING
 
@@ -85,20 +88,20 @@ def test_a_queued_job_that_the_queue_does_not_hold_is_queued_again(
     world: World, submit: Callable[[World], str]
 ) -> None:
     id, other = submit(world), submit(world)
-    token = world.jobs.records.get(id).token
-    world.jobs.queue.remove(token)
+    attempt_id = world.jobs.records.get(id).attempt_id
+    world.jobs.queue.remove(attempt_id)
     world.pass_seconds(5)
-    assert world.jobs.records.get(id).token != token, "the old delivery, should it turn up, is void"
-    assert world.jobs.queue.waiting() == [world.jobs.records.get(each).token for each in (id, other)], (
+    assert world.jobs.records.get(id).attempt_id != attempt_id, "the old delivery, should it turn up, is void"
+    assert world.jobs.queue.waiting() == [world.jobs.records.get(each).attempt_id for each in (id, other)], (
         "before all the others"
     )
 
 
 def test_only_what_has_expired_is_removed(world: World, submit: Callable[[World], str]) -> None:
     queued, running, early, late = (submit(world) for _ in range(4))
-    token = world.claim(running)
+    attempt_id = world.claim(running)
     world.jobs.cancel(early)
-    beat = lambda: world.jobs.records.beat(running, token)  # noqa: E731
+    beat = lambda: world.jobs.records.beat(running, attempt_id)  # noqa: E731
     world.pass_seconds(40, meanwhile=beat)
     world.jobs.cancel(late)
     world.pass_seconds(52, meanwhile=beat)
@@ -111,7 +114,7 @@ def test_only_what_has_expired_is_removed(world: World, submit: Callable[[World]
 
 def test_without_retention_nothing_expires(world: World, submit: Callable[[World], str]) -> None:
     world.jobs = dataclasses.replace(world.jobs, settings=dataclasses.replace(world.jobs.settings, retention=0))
-    world.keeper.jobs = world.jobs
+    world.reconciler.jobs = world.jobs
     id = submit(world)
     assert world.jobs.cancel(id).expires_at is None
     world.now += timedelta(days=10_000)
@@ -124,12 +127,12 @@ def test_files_of_no_job_are_removed_once_they_are_old(
 ) -> None:
     file = tmp_path / "some-inputs.npz"
     id = submit(world)
-    token = world.claim(id)
-    wanted = {world.jobs.records.get(id).inputs, f"jobs/{id}/{token}/artifacts/shapes.npz"}
+    attempt_id = world.claim(id)
+    wanted = {world.jobs.records.get(id).inputs, f"jobs/{id}/{attempt_id}/artifacts/shapes.npz"}
     stray = {f"jobs/{id}/{id}-000000000000/artifacts/shapes.npz", "jobs/nobody/nobody-1/inputs.npz"}
     for key in (wanted | stray) - {world.jobs.records.get(id).inputs}:
         world.jobs.blobs.put(key, file)
-    beat = lambda: world.jobs.records.beat(id, token)  # noqa: E731
+    beat = lambda: world.jobs.records.beat(id, attempt_id)  # noqa: E731
 
     def sweep_at(moment: datetime) -> set[str]:
         world.now = moment
@@ -144,14 +147,16 @@ def test_files_of_no_job_are_removed_once_they_are_old(
 
 def test_working_files_of_attempts_that_are_over_are_removed(world: World, submit: Callable[[World], str]) -> None:
     id = submit(world)
-    token = world.claim(id)
-    running, over, just_over = (working_directory(world.jobs.settings, each) for each in (token, f"{id}-0", f"{id}-1"))
+    attempt_id = world.claim(id)
+    running, over, just_over = (
+        working_directory(world.jobs.settings, each) for each in (attempt_id, f"{id}-0", f"{id}-1")
+    )
     world.now = datetime.now(UTC)
     for directory in (running, over, just_over):
         directory.mkdir(parents=True)
     for directory in (running, over):
         os.utime(directory, (0, 0))
-    world.pass_seconds(31, meanwhile=lambda: world.jobs.records.beat(id, token))
+    world.pass_seconds(31, meanwhile=lambda: world.jobs.records.beat(id, attempt_id))
     assert [directory.exists() for directory in (running, over, just_over)] == [True, False, True]
 
 
@@ -159,18 +164,18 @@ def test_what_a_killed_attempt_had_uploaded_is_removed(
     world: World, submit: Callable[[World], str], tmp_path: Path
 ) -> None:
     id = submit(world)
-    token = world.claim(id)
-    half = f"jobs/{id}/{token}/artifacts/shapes.npz"
+    attempt_id = world.claim(id)
+    half = f"jobs/{id}/{attempt_id}/artifacts/shapes.npz"
     world.jobs.blobs.put(half, tmp_path / "some-inputs.npz")
-    world.pass_seconds(31, meanwhile=lambda: world.jobs.records.beat(id, token))
+    world.pass_seconds(31, meanwhile=lambda: world.jobs.records.beat(id, attempt_id))
     assert half in dict(world.jobs.blobs.list("jobs/"))
     problem = Problem(title="t", status=503, detail="d.", code="worker_lost")
     world.jobs.records.update(
-        id, lambda held: lifecycle.fail(held, token=token, problem=problem, now=world.now, retention=0)
+        id, lambda held: lifecycle.fail(held, attempt_id=attempt_id, problem=problem, now=world.now, retention=0)
     )
-    assert any("belongs to no attempt" in each for each in findings(world.jobs, settle=0))
+    assert any("belongs to no attempt" in each for each in findings(world.jobs, pause=0))
     world.pass_seconds(1)
-    assert findings(world.jobs, settle=0) == []
+    assert findings(world.jobs, pause=0) == []
     assert [key for key, _ in world.jobs.blobs.list("jobs/")] == [world.jobs.records.get(id).inputs]
 
 
@@ -183,19 +188,19 @@ def test_what_an_attempt_had_uploaded_is_removed_when_its_worker_is_lost(
     world.pass_seconds(31)
     assert world.jobs.get(id).status is Status.QUEUED
     assert [key for key, _ in world.jobs.blobs.list("jobs/")] == [world.jobs.records.get(id).inputs]
-    assert findings(world.jobs, settle=0) == []
+    assert findings(world.jobs, pause=0) == []
 
 
 def test_a_store_that_is_away_is_waited_for(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     calls = []
 
-    def tick(self: Keeper) -> None:
+    def tick(self: Reconciler) -> None:
         calls.append(self)
         raise StoreUnavailable("The job store", reason="ConnectionError")
 
-    monkeypatch.setattr(Keeper, "tick", tick)
+    monkeypatch.setattr(Reconciler, "tick", tick)
     monkeypatch.setattr(time, "sleep", lambda seconds: None)
-    world.keeper.run(lambda: len(calls) == 3)
+    world.reconciler.run(lambda: len(calls) == 3)
     assert len(calls) == 3
 
 
@@ -224,7 +229,7 @@ def test_last_words_are_the_end_of_what_was_written(tmp_path: Path) -> None:
 def test_it_removes_uploads_that_have_expired(world: World) -> None:
     uploads = Uploads.open(world.jobs.settings)
     for id in ("old", "young"):
-        with uploads.write(id, offset=0, length=None, room=Room(max_bytes=9)) as writer:
+        with uploads.write(id, offset=0, length=None, capacity=Capacity(max_bytes=9)) as writer:
             writer.write(b"x")
         (file,) = uploads.directory.glob(f"*/{id}/part")
         moment = world.now.timestamp() - (uploads.expiry if id == "old" else uploads.expiry - 3600)
@@ -239,23 +244,66 @@ def test_a_jump_of_the_clock_loses_nothing(
     world: World, jump: timedelta, inputs_file: Path, interpretation: Interpretation
 ) -> None:
     def submit() -> str:
-        return world.jobs.submit(inputs_file, options=Options(), interpretation=interpretation).id
+        return world.jobs.submit(inputs_file, Submission(options=Options()), interpretation=interpretation).id
 
     done, busy, waiting = submit(), submit(), submit()
     world.claim(done)
     world.jobs.cancel(done)
-    token = world.jobs.records.get(done).token
-    world.jobs.records.update(done, lambda held: lifecycle.stop(held, token=token, now=world.now, retention=60.0))
-    token = world.claim(busy)
-    world.pass_seconds(2, meanwhile=lambda: world.jobs.records.beat(busy, token))
+    attempt_id = world.jobs.records.get(done).attempt_id
+    world.jobs.records.update(
+        done, lambda held: lifecycle.stop(held, attempt_id=attempt_id, now=world.now, retention=60.0)
+    )
+    attempt_id = world.claim(busy)
+    world.pass_seconds(2, meanwhile=lambda: world.jobs.records.beat(busy, attempt_id))
     world.now += jump
-    world.pass_seconds(70, meanwhile=lambda: world.jobs.records.beat(busy, token))
+    world.pass_seconds(70, meanwhile=lambda: world.jobs.records.beat(busy, attempt_id))
     assert world.jobs.get(done).status is Status.CANCELLED, "held, although by the new clock its time may be over"
     assert (world.jobs.get(busy).status, world.jobs.get(busy).attempt) == (Status.RUNNING, 1)
     assert world.jobs.get(waiting).place_in_queue == 0
-    assert findings(world.jobs, settle=0) == []
+    assert findings(world.jobs, pause=0) == []
     world.now -= jump  # put right
-    world.pass_seconds(3700, meanwhile=lambda: world.jobs.records.beat(busy, token))
+    world.pass_seconds(3700, meanwhile=lambda: world.jobs.records.beat(busy, attempt_id))
     with pytest.raises(UnknownJob):
         world.jobs.get(done)
     assert world.jobs.get(busy).attempt == 1
+
+
+def test_what_a_stale_attempt_stores_late_is_removed_soon(
+    world: World, submit: Callable[[World], str], tmp_path: Path
+) -> None:
+    """After Redis was cut off for 200 s the files of stale attempts stayed until the hourly sweep."""
+    id = submit(world)
+    old = world.claim(id)
+    world.pass_seconds(7)
+    fresh = world.claim(id)
+    stop = partial(lifecycle.stop, attempt_id=fresh, now=world.now, retention=60.0)
+    (tmp_path / "late").write_text("late")
+    world.jobs.cancel(id)
+    world.jobs.records.update(id, stop)
+    world.pass_seconds(2)
+    world.jobs.blobs.put(f"jobs/{id}/{old}/artifacts/shapes.npz", tmp_path / "late")
+    assert findings(world.jobs, pause=0) != []
+    world.pass_seconds(31)
+    assert findings(world.jobs, pause=0) == []
+
+
+def test_files_of_a_deleted_job_go_once_the_blob_store_is_back(
+    world: World, submit: Callable[[World], str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    id = submit(world)
+    world.jobs.cancel(id)
+    world.now = datetime.now(UTC) + timedelta(seconds=1)  # the blob store has its own clock
+    with monkeypatch.context() as away:
+        away.setattr(Blobs, "delete", refuse)
+        world.jobs.delete(id)
+    with pytest.raises(UnknownJob):
+        world.jobs.get(id)
+    assert list(world.jobs.records.deleted()) == [id]
+    assert len(world.jobs.blobs.list()) == 1
+    world.pass_seconds(31)
+    assert world.jobs.blobs.list() == []
+    assert world.jobs.records.deleted() == {}
+
+
+def refuse(*_: object) -> None:
+    raise StoreUnavailable("The blob store", reason="away")

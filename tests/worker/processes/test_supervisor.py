@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 from pliant.worker.errors import DataDirectoryInUse, ServerFailed, StoreUnavailable
-from pliant.worker.paths import socket_path, valkey_directory
+from pliant.worker.paths import FOLDERS, make_data_directory, socket_path, valkey_directory
 from pliant.worker.processes import valkey as valkey_module
 from pliant.worker.processes.supervisor import FIRST_PAUSE, Child, Supervisor, worker_children
 from pliant.worker.processes.valkey import Valkey, find_binary
@@ -172,7 +172,7 @@ def test_a_parent_that_is_gone_already_is_noticed() -> None:
 def test_workers_are_told_their_settings_and_threads(tmp_path: Path) -> None:
     settings = Settings(data=tmp_path, workers=2, threads=3)
     children = worker_children(settings)
-    assert [child.name for child in children] == ["worker-1", "worker-2", "keeper"]
+    assert [child.name for child in children] == ["worker-1", "worker-2", "reconciler"]
     for child in children:
         assert Settings.from_environment(child.env) == settings
         assert child.env["OPENBLAS_NUM_THREADS"] == child.env["OMP_NUM_THREADS"] == "1"  # the solver has its own
@@ -263,6 +263,31 @@ def test_a_socket_directory_that_others_may_write_is_refused(tmp_path: Path) -> 
         valkey.release()
     finally:
         directory.rmdir()
+
+
+def test_a_socket_directory_that_is_a_link_is_refused(tmp_path: Path) -> None:
+    deep = tmp_path / "/".join(["deep"] * 30)
+    directory = socket_path(deep).parent
+    (tmp_path / "elsewhere").mkdir(mode=0o700)
+    directory.symlink_to(tmp_path / "elsewhere")
+    try:
+        with pytest.raises(ServerFailed, match="can be written by others"):
+            Valkey.claim(deep)
+    finally:
+        directory.unlink()
+
+
+def test_a_data_directory_is_its_owners_alone(tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    make_data_directory(data)
+    shared = tmp_path / "shared"
+    (shared / "blobs").mkdir(parents=True, mode=0o755)
+    make_data_directory(shared)
+    assert {path.name: path.stat().st_mode & 0o777 for path in (data, *data.iterdir())} == dict.fromkeys(
+        ("data", *FOLDERS), 0o700
+    )
+    assert shared.stat().st_mode & 0o077, "a directory that was there may be anybody's"
+    assert (shared / "blobs").stat().st_mode & 0o777 == 0o700
 
 
 def test_without_a_binary_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,14 +1,20 @@
-"""One suite on a directory, on memory and on an S3 server."""
+"""One suite on a directory, on memory and on an S3 server; and a store that hangs."""
 
 from __future__ import annotations
 
+import errno
+import os
 import secrets
 import shutil
+import socket
+import threading
+import time
 from pathlib import Path
 
 import pytest
 from pliant.worker.errors import StoreUnavailable
 from pliant.worker.store.blobs import CHUNK, Blobs
+from pliant.worker.store.calls import AT_ONCE, WAITING, RemoteCalls
 
 
 @pytest.fixture(params=["directory", "memory", pytest.param("s3", marks=pytest.mark.s3)])
@@ -89,3 +95,83 @@ def test_a_store_that_does_not_answer_is_said_so(monkeypatch: pytest.MonkeyPatch
     (tmp_path / "store").write_text("in the way")
     with pytest.raises(StoreUnavailable, match="try again"):
         readonly.put("jobs/a", tmp_path / "a-file")
+
+
+@pytest.mark.skipif(not Path("/proc/self/io").exists(), reason="reads /proc")
+def test_a_local_store_writes_no_bytes_again(tmp_path: Path) -> None:
+    """Inputs went from the spool to the store and to the scratch directory as three copies; now they are one file."""
+    canonical = tmp_path / "canonical.npz"
+    canonical.write_bytes(bytes(8_000_000))
+    blobs = Blobs.open((tmp_path / "store").as_uri())
+    before = written()
+    blobs.put("jobs/a/t/inputs.npz", canonical)
+    blobs.put("jobs/a/t/inputs.npz", canonical)  # repeated after a lost answer
+    blobs.fetch("jobs/a/t/inputs.npz", tmp_path / "inputs.npz")
+    assert written() - before < 100_000
+    assert canonical.stat().st_nlink == 3
+    canonical.unlink()
+    assert list(blobs.sizes()) == ["jobs/a/t/inputs.npz"]
+    assert (tmp_path / "inputs.npz").stat().st_size == 8_000_000
+
+
+def test_files_that_cannot_be_linked_are_copied(tmp_path: Path, file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def other_disk(*_: object) -> None:
+        raise OSError(errno.EXDEV, "Invalid cross-device link")
+
+    monkeypatch.setattr(os, "link", other_disk)
+    blobs = Blobs.open((tmp_path / "store").as_uri())
+    blobs.put("jobs/a", file)
+    blobs.fetch("jobs/a", tmp_path / "copy")
+    assert file.stat().st_nlink == (tmp_path / "copy").stat().st_nlink == 1
+    assert (tmp_path / "copy").read_bytes() == file.read_bytes()
+    with pytest.raises(FileNotFoundError):
+        blobs.fetch("jobs/nothing", tmp_path / "nothing")
+
+
+def test_a_call_that_hangs_costs_its_time_limit_and_too_many_cost_nothing() -> None:
+    calls, go_on = RemoteCalls(), threading.Event()
+    assert calls.run(lambda: 7, seconds=5) == 7
+    began = time.monotonic()
+    with pytest.raises(StoreUnavailable, match=r"no answer within 0\.1 s"):
+        calls.run(go_on.wait, seconds=0.1)
+    assert time.monotonic() - began < 1
+
+    def hang() -> None:
+        with pytest.raises(StoreUnavailable):
+            calls.run(go_on.wait, seconds=1.0)
+
+    hanging = [threading.Thread(target=hang) for _ in range(AT_ONCE + WAITING)]
+    for each in hanging:
+        each.start()
+    time.sleep(0.3)
+    began = time.monotonic()
+    with pytest.raises(StoreUnavailable, match="too many requests"):
+        calls.run(go_on.wait, seconds=10)
+    assert time.monotonic() - began < 0.1
+    for each in hanging:
+        each.join()
+    go_on.set()
+    assert calls.run(lambda: 8, seconds=5) == 8, "it recovers"
+
+
+@pytest.mark.slow
+def test_a_store_that_takes_connections_and_says_nothing(monkeypatch: pytest.MonkeyPatch, file: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        for name, value in {
+            "AWS_ENDPOINT_URL": f"http://127.0.0.1:{silent.getsockname()[1]}", "AWS_ALLOW_HTTP": "true",
+            "AWS_ACCESS_KEY_ID": "a", "AWS_SECRET_ACCESS_KEY": "b", "AWS_REGION": "us-east-1",
+        }.items():  # fmt: skip
+            monkeypatch.setenv(name, value)
+        blobs = Blobs.open("s3://bucket/prefix")
+        for call in (blobs.check, lambda: blobs.get("k"), lambda: blobs.list("jobs/")):
+            began = time.monotonic()
+            with pytest.raises(StoreUnavailable) as caught:
+                call()
+            assert time.monotonic() - began < 10
+            assert "127.0.0.1" not in str(caught.value)
+
+
+def written() -> int:
+    """Return the bytes that this process has written."""
+    counters = dict(line.split(": ") for line in Path("/proc/self/io").read_text().splitlines())
+    return int(counters["wchar"])

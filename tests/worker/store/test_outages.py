@@ -30,18 +30,18 @@ def test_a_job_lives_through_an_outage_of_the_store(tmp_path: Path, inputs_files
     with House(settings, own_valkey=True, inputs=inputs_files) as house:
         id = house.submit(long=True)
         house.solving(id)
-        (horse,) = house.horses()
+        (job_process,) = house.job_processes()
         server = house.supervisor.pids()["valkey"]
         os.kill(server, signal.SIGSTOP)  # it neither answers nor refuses, for longer than a lease
         time.sleep(3.5)
         os.kill(server, signal.SIGCONT)
         before = house.jobs.get(id).progress
         house.until(lambda: house.jobs.get(id).progress != before, "it goes on telling")
-        assert (house.jobs.get(id).attempt, house.horses()) == (1, [horse])
+        assert (house.jobs.get(id).attempt, house.job_processes()) == (1, [job_process])
         os.kill(server, signal.SIGKILL)
         house.until(lambda: house.supervisor.pids().get("valkey", server) != server, "it is started again")
         house.until(lambda: house.jobs.get(id).progress != before, "it goes on telling")
-        assert (house.jobs.get(id).attempt, house.horses()) == (1, [horse])
+        assert (house.jobs.get(id).attempt, house.job_processes()) == (1, [job_process])
         house.jobs.cancel(id)
         assert house.final(id).status is Status.CANCELLED
         settled(house)
@@ -169,7 +169,7 @@ def test_a_full_blob_store_refuses_the_job_and_keeps_nothing(
             house.submit(long=True)
         assert house.jobs.page().jobs == []
         assert house.jobs.records.used() == 0
-        assert findings(house.jobs, settle=0) == []
+        assert findings(house.jobs, pause=0) == []
 
 
 def test_a_full_disk_under_valkey_refuses_and_loses_nothing(
@@ -194,6 +194,6 @@ def test_a_full_disk_under_valkey_refuses_and_loses_nothing(
         filler.unlink()
         house.until(lambda: answered(True), "it accepts again")
         assert set(accepted) <= {job.id for job in house.jobs.page(limit=200).jobs}
-        # There is no keeper here: it would queue what is not queued, and sweep a refused submission's file hours later.
-        left = findings(house.jobs, settle=0)
+        # There is no reconciler here: it would queue what is not queued, and sweep a refused submission's file hours later.
+        left = findings(house.jobs, pause=0)
         assert all("belongs to no job" in each or "the queue does not hold it" in each for each in left)

@@ -1,8 +1,9 @@
-"""The outbox and its postman, with real receivers on 127.0.0.1 and a real store: what is owed, sent, repeated, given up."""
+"""The outbox and its webhook sender, with real receivers on 127.0.0.1 and a real store: what is owed, sent, repeated, given up."""
 
 from __future__ import annotations
 
 import base64
+import collections
 import dataclasses
 import hashlib
 import hmac
@@ -22,11 +23,12 @@ import pytest
 from pliant.schemas.job import Interpretation, Job, Status
 from pliant.schemas.options import Options
 from pliant.worker.jobs.service import Jobs
+from pliant.worker.jobs.submission import Submission
 from pliant.worker.records import Webhook
 from pliant.worker.settings import Settings
 from pliant.worker.store.connection import connect
 from pliant.worker.store.outbox import Outbox
-from pliant.worker.webhooks.sender import HANDS, PAUSES, Postman, resolve
+from pliant.worker.webhooks.sender import CONCURRENT, PAUSES, PER_OWNER, PER_RECEIVER, WebhookSender, resolve
 
 SECRET = "whsec_" + base64.b64encode(b"k" * 32).decode()
 LOOPBACK = "127.0.0.0/8"
@@ -85,16 +87,18 @@ def made(door: Jobs, inputs_file: Path, interpretation: Interpretation) -> Made:
 
     def call(url: str, *, end: bool = True) -> Job:
         hook = Webhook(url=url, secret=SECRET)
-        job = door.submit(inputs_file, options=Options(), interpretation=interpretation, name="hooked", webhook=hook)
+        job = door.submit(
+            inputs_file, Submission(options=Options(), name="hooked", webhook=hook), interpretation=interpretation
+        )
         return door.cancel(job.id) if end else job
 
     return call
 
 
 @pytest.fixture
-def postman(door: Jobs) -> Iterator[Postman]:
+def webhook_sender(door: Jobs) -> Iterator[WebhookSender]:
     """One with short pauses; started by the test."""
-    carrier = Postman.open(door.settings, door.records)
+    carrier = WebhookSender.open(door.settings, door.records)
     carrier.pauses = (0.05, 0.05)
     yield carrier
     carrier.stop()
@@ -109,14 +113,14 @@ def until(holds: Callable[[], object], *, seconds: float = 10.0) -> None:
 
 
 def test_the_end_of_a_job_is_told_once_signed_and_whole(
-    door: Jobs, made: Made, receiver: Receiver, postman: Postman
+    door: Jobs, made: Made, receiver: Receiver, webhook_sender: WebhookSender
 ) -> None:
     waiting = made(receiver.url, end=False)
-    assert postman.outbox.owed() == 0
+    assert webhook_sender.outbox.owed() == 0
     job = door.cancel(waiting.id)
-    assert postman.outbox.owed() == 1
-    postman.start()
-    until(lambda: postman.outbox.owed() == 0)
+    assert webhook_sender.outbox.owed() == 1
+    webhook_sender.start()
+    until(lambda: webhook_sender.outbox.owed() == 0)
     ((path, headers, body),) = receiver.got
     assert path == "/hook?x=1"
     assert headers["host"] == f"127.0.0.1:{receiver.port}"
@@ -135,12 +139,12 @@ def test_the_end_of_a_job_is_told_once_signed_and_whole(
 
 
 def test_a_receiver_that_fails_is_asked_again_with_the_same_id(
-    door: Jobs, made: Made, receiver: Receiver, postman: Postman
+    door: Jobs, made: Made, receiver: Receiver, webhook_sender: WebhookSender
 ) -> None:
     receiver.answers = [500, 302]
     job = made(receiver.url)
-    postman.start()
-    until(lambda: postman.outbox.owed() == 0)
+    webhook_sender.start()
+    until(lambda: webhook_sender.outbox.owed() == 0)
     assert [headers["webhook-id"] for _, headers, _ in receiver.got] == [f"msg_{job.id}"] * 3
     assert {path for path, _, _ in receiver.got} == {"/hook?x=1"}, "a redirect is not followed"
     assert len({body for _, _, body in receiver.got}) == 1
@@ -151,12 +155,12 @@ def test_a_receiver_that_fails_is_asked_again_with_the_same_id(
 
 
 def test_after_the_last_try_or_a_410_it_is_given_up(
-    door: Jobs, made: Made, receiver: Receiver, postman: Postman
+    door: Jobs, made: Made, receiver: Receiver, webhook_sender: WebhookSender
 ) -> None:
     receiver.answers = [500, 500, 500]
     job = made(receiver.url)
-    postman.start()
-    until(lambda: postman.outbox.owed() == 0)
+    webhook_sender.start()
+    until(lambda: webhook_sender.outbox.owed() == 0)
     until(lambda: "given up: the receiver answered 500, at try 3, the last." in door.log(job.id))
     receiver.answers = [410]
     other = made(receiver.url)
@@ -166,11 +170,11 @@ def test_after_the_last_try_or_a_410_it_is_given_up(
     assert (tallies["webhooks:tried"], tallies["webhooks:given_up"]) == (4, 2)
 
 
-def test_nobody_listening_is_a_failure_like_others(door: Jobs, made: Made, postman: Postman) -> None:
+def test_nobody_listening_is_a_failure_like_others(door: Jobs, made: Made, webhook_sender: WebhookSender) -> None:
     with socket.socket() as unused:
         unused.bind(("127.0.0.1", 0))
         job = made(f"http://127.0.0.1:{unused.getsockname()[1]}/")
-        postman.start()
+        webhook_sender.start()
         until(lambda: "ConnectError, at try 3, the last" in door.log(job.id))
 
 
@@ -178,32 +182,32 @@ def test_nobody_listening_is_a_failure_like_others(door: Jobs, made: Made, postm
     "name", ["x" * 64 + ".example", "no-such-name.invalid", "a..b"], ids=["too long", "unknown", "empty label"]
 )
 def test_a_name_that_is_none_is_a_failure_and_harms_nobody(
-    door: Jobs, made: Made, receiver: Receiver, postman: Postman, name: str
+    door: Jobs, made: Made, receiver: Receiver, webhook_sender: WebhookSender, name: str
 ) -> None:
     bad, good = made(f"http://{name}/"), made(receiver.url)
-    postman.start()
+    webhook_sender.start()
     until(lambda: "Webhook delivered" in door.log(good.id))
     until(lambda: "given up" in door.log(bad.id), seconds=30)
 
 
 def test_a_name_that_leads_inside_is_given_up_without_a_connection(
-    door: Jobs, made: Made, receiver: Receiver, postman: Postman
+    door: Jobs, made: Made, receiver: Receiver, webhook_sender: WebhookSender
 ) -> None:
-    postman.networks = ""
+    webhook_sender.networks = ""
     job = made(f"http://localhost:{receiver.port}/")
     mixed = made(f"http://mixed.example:{receiver.port}/")
     inside, outside = ipaddress.ip_address("127.0.0.1"), ipaddress.ip_address("1.1.1.1")
-    postman.resolve = lambda host, port: [outside, inside] if host == "mixed.example" else resolve(host, port)
-    postman.start()
-    until(lambda: "localhost is" in door.log(job.id))
-    assert "not of the public internet" in door.log(job.id)
-    until(lambda: "mixed.example is 1.1.1.1, 127.0.0.1" in door.log(mixed.id))
-    until(lambda: postman.outbox.owed() == 0)
+    webhook_sender.resolve = lambda host, port: [outside, inside] if host == "mixed.example" else resolve(host, port)
+    webhook_sender.start()
+    until(lambda: "localhost resolves to an address that is not on the public internet" in door.log(job.id))
+    until(lambda: "mixed.example resolves to" in door.log(mixed.id))
+    assert "1.1.1.1" not in door.log(mixed.id), "nor does anybody learn what a name inside stands for"
+    until(lambda: webhook_sender.outbox.owed() == 0)
     assert receiver.got == []
 
 
 def test_the_name_is_looked_up_once_and_the_connection_goes_to_what_was_found(
-    door: Jobs, made: Made, receiver: Receiver, postman: Postman
+    door: Jobs, made: Made, receiver: Receiver, webhook_sender: WebhookSender
 ) -> None:
     """DNS rebinding: an answer that is good when it is checked, and another one when it is used."""
     asked: list[str] = []
@@ -213,9 +217,9 @@ def test_the_name_is_looked_up_once_and_the_connection_goes_to_what_was_found(
         asked.append(host)
         return [ipaddress.ip_address("127.0.0.1" if len(asked) == 1 else "127.0.0.2")]
 
-    postman.resolve = rebinding
+    webhook_sender.resolve = rebinding
     job = made(f"http://rebinding.example:{receiver.port}/hook")
-    postman.start()
+    webhook_sender.start()
     until(lambda: "Webhook delivered" in door.log(job.id))
     assert asked == ["rebinding.example"]
     ((_, headers, _),) = receiver.got
@@ -224,7 +228,7 @@ def test_the_name_is_looked_up_once_and_the_connection_goes_to_what_was_found(
 
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="needs the command openssl to make a certificate")
 def test_the_certificate_must_be_the_names_although_the_connection_goes_to_a_number(
-    door: Jobs, made: Made, receiver: Receiver, postman: Postman, tmp_path: Path
+    door: Jobs, made: Made, receiver: Receiver, webhook_sender: WebhookSender, tmp_path: Path
 ) -> None:
     pem = tmp_path / "both.pem"
     names = ["-subj", "/CN=x", "-addext", "subjectAltName=DNS:right.example"]
@@ -235,64 +239,81 @@ def test_the_certificate_must_be_the_names_although_the_connection_goes_to_a_num
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(tmp_path / "cert.pem", pem)
     receiver.server.socket = context.wrap_socket(receiver.server.socket, server_side=True)
-    postman.resolve = lambda host, port: [ipaddress.ip_address("127.0.0.1")]
-    postman.trusted = ssl.create_default_context(cafile=str(tmp_path / "cert.pem"))
+    webhook_sender.resolve = lambda host, port: [ipaddress.ip_address("127.0.0.1")]
+    webhook_sender.trusted = ssl.create_default_context(cafile=str(tmp_path / "cert.pem"))
     right, wrong = (made(f"https://{name}.example:{receiver.port}/") for name in ("right", "wrong"))
-    postman.start()
+    webhook_sender.start()
     until(lambda: "Webhook delivered" in door.log(right.id))
     until(lambda: "given up: ConnectError" in door.log(wrong.id))
-    postman.trusted = None
+    webhook_sender.trusted = None
     stranger = made(f"https://right.example:{receiver.port}/")
     until(lambda: "given up: ConnectError" in door.log(stranger.id))
     assert len(receiver.got) == 1
 
 
 def test_a_proxy_of_the_environment_is_not_used(
-    door: Jobs, made: Made, receiver: Receiver, postman: Postman, monkeypatch: pytest.MonkeyPatch
+    door: Jobs, made: Made, receiver: Receiver, webhook_sender: WebhookSender, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("http_proxy", "HTTP_PROXY", "ALL_PROXY"):
         monkeypatch.setenv(name, "http://127.0.0.1:9")
     job = made(receiver.url)
-    postman.start()
+    webhook_sender.start()
     until(lambda: "Webhook delivered" in door.log(job.id))
 
 
-def test_a_slow_receiver_holds_up_nobody(door: Jobs, made: Made, receiver: Receiver, postman: Postman) -> None:
+def test_a_slow_receiver_holds_up_nobody(
+    door: Jobs, made: Made, receiver: Receiver, webhook_sender: WebhookSender
+) -> None:
     slow = Receiver()
     slow.open.clear()
     try:
-        for _ in range(HANDS - 1):
+        for _ in range(2 * CONCURRENT):
             made(slow.url)
-        postman.start()
-        until(lambda: len(slow.got) == HANDS - 1)
+        webhook_sender.start()
+        until(lambda: len(slow.got) == PER_RECEIVER)
         quick = made(receiver.url)
-        until(lambda: "Webhook delivered" in door.log(quick.id))
-        until(lambda: postman.outbox.owed() == HANDS - 1)  # the others are under way all the while
+        until(lambda: "Webhook delivered" in door.log(quick.id), seconds=5)
+        assert len(slow.got) == PER_RECEIVER, "the others wait their turn"
+        assert webhook_sender.outbox.owed() == 2 * CONCURRENT
+        assert door.records.tallies()["webhooks:tried"] == PER_RECEIVER + 1, (
+            "a message that was postponed was not tried"
+        )
     finally:
         slow.open.set()
         slow.server.shutdown()
         slow.server.server_close()
 
 
-def test_what_is_owed_survives_a_postman_that_died_with_it(
-    door: Jobs, made: Made, receiver: Receiver, postman: Postman
+def test_one_owner_does_not_take_all_the_places(door: Jobs, made: Made, webhook_sender: WebhookSender) -> None:
+    job = made("http://a.example/")
+    busy = collections.Counter({f"owner {door.records.get(job.id).owner}": PER_OWNER})
+    assert webhook_sender._take(busy) is None
+    assert webhook_sender._take(collections.Counter()) is None, "postponed"
+    webhook_sender.clock = lambda: time.time() + 3
+    taken = webhook_sender._take(collections.Counter())
+    assert taken is not None
+    assert taken[:2] == (job.id, 1)
+
+
+def test_what_is_owed_survives_a_sender_that_died_with_it(
+    door: Jobs, made: Made, receiver: Receiver, webhook_sender: WebhookSender
 ) -> None:
     job = made(receiver.url)
     now = int(time.time() * 1000)
-    assert postman.outbox.take(now=now + 10, until=now + 1500) == (job.id, 1), "and then it was killed"
-    assert postman.outbox.take(now=now + 10, until=now + 1500) is None, "nobody else sends it meanwhile"
-    postman.start()
+    assert webhook_sender.outbox.take(now=now + 10, until=now + 1500) == (job.id, 1), "and then it was killed"
+    assert webhook_sender.outbox.take(now=now + 10, until=now + 1500) is None, "nobody else sends it meanwhile"
+    webhook_sender.start()
     until(lambda: "(try 2)" in door.log(job.id))
     assert len(receiver.got) == 1
 
 
-def test_a_message_that_kills_its_postman_each_time_is_not_tried_for_ever(
-    door: Jobs, made: Made, receiver: Receiver, postman: Postman
+def test_a_message_that_kills_its_sender_each_time_is_not_tried_for_ever(
+    door: Jobs, made: Made, receiver: Receiver, webhook_sender: WebhookSender
 ) -> None:
     job = made(receiver.url)
     for _ in range(4):
-        postman.outbox.take(now=int(time.time() * 1000) + 10, until=0)
-    postman.start()
+        webhook_sender.outbox.take(now=int(time.time() * 1000) + 10, until=0)
+    webhook_sender.start()
     until(lambda: "tried often enough" in door.log(job.id))
     assert receiver.got == []
 
@@ -307,15 +328,20 @@ def test_a_deleted_job_owes_nothing(door: Jobs, made: Made, receiver: Receiver, 
 
 
 def test_a_job_run_again_tells_its_end_too_and_one_without_webhook_does_not(
-    door: Jobs, made: Made, receiver: Receiver, postman: Postman, inputs_file: Path, interpretation: Interpretation
+    door: Jobs,
+    made: Made,
+    receiver: Receiver,
+    webhook_sender: WebhookSender,
+    inputs_file: Path,
+    interpretation: Interpretation,
 ) -> None:
     again = door.retry(made(receiver.url).id)
     door.cancel(again.id)
-    plain = door.submit(inputs_file, options=Options(), interpretation=interpretation)
+    plain = door.submit(inputs_file, Submission(options=Options()), interpretation=interpretation)
     assert door.cancel(plain.id).status is Status.CANCELLED
-    assert postman.outbox.owed() == 2
-    postman.start()
-    until(lambda: len(receiver.got) == 2 and postman.outbox.owed() == 0)
+    assert webhook_sender.outbox.owed() == 2
+    webhook_sender.start()
+    until(lambda: len(receiver.got) == 2 and webhook_sender.outbox.owed() == 0)
     assert {headers["webhook-id"] for _, headers, _ in receiver.got} == {f"msg_{again.id}", f"msg_{again.retry_of}"}
 
 

@@ -13,8 +13,8 @@ from rq.executions import ExecutionRegistry
 
 def test_the_queue_notes_what_is_held_back_and_forgets_what_is_not(jobs: Jobs) -> None:
     queue = jobs.queue
-    for token in ("job-1", "job-2"):
-        queue.hold(token)
+    for attempt_id in ("job-1", "job-2"):
+        queue.hold(attempt_id)
     assert (queue.held(), queue.waiting()) == ({"job-1", "job-2"}, [])
     queue.push("job", "job-3")
     queue.let_go("job-1")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import hashlib
 import itertools
@@ -15,9 +16,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pliant.worker import errors
-from pliant.worker.uploads.service import MOST, Room, Uploads
+from pliant.worker.uploads.service import MOST, Capacity, Uploads
 
-ROOM = Room(max_bytes=1000)
+CAPACITY = Capacity(max_bytes=1000)
 
 
 @pytest.fixture
@@ -26,7 +27,9 @@ def uploads(tmp_path: Path) -> Uploads:
 
 
 def send(uploads: Uploads, id: str, data: bytes, *, offset: int = 0, finish: bool = True, **more: object) -> None:
-    with uploads.write(id, offset=offset, length=more.pop("length", None), room=more.pop("room", ROOM)) as writer:  # type: ignore[arg-type]
+    with uploads.write(
+        id, offset=offset, length=more.pop("length", None), capacity=more.pop("capacity", CAPACITY)
+    ) as writer:  # type: ignore[arg-type]
         writer.write(data)
         if finish:
             writer.finish(sha256=more.pop("sha256", None))  # type: ignore[arg-type]
@@ -99,13 +102,13 @@ def test_the_length_holds_over_requests(uploads: Uploads) -> None:
     assert uploads.get("one").complete
 
 
-def test_what_is_too_large_is_removed_and_what_has_no_room_is_kept(uploads: Uploads) -> None:
+def test_what_is_too_large_is_removed_and_what_exceeds_the_quota_is_kept(uploads: Uploads) -> None:
     for length in (None, 1001):
         with pytest.raises(errors.UploadTooLarge, match="at most 1000 bytes"):
             send(uploads, "one", b"x" * 1001, length=length)
         assert uploads.find("one") is None
-    tight = Room(max_bytes=1000, quota=100, used=40)
-    with uploads.write("one", offset=0, length=None, room=tight) as writer:
+    tight = Capacity(max_bytes=1000, quota=100, used=40)
+    with uploads.write("one", offset=0, length=None, capacity=tight) as writer:
         writer.write(b"x" * 60)
         with pytest.raises(errors.QuotaExceeded):
             writer.write(b"x")
@@ -143,8 +146,8 @@ def test_owners_do_not_see_each_other(uploads: Uploads, tmp_path: Path) -> None:
 
 def test_two_processes_do_not_write_to_one_upload(uploads: Uploads) -> None:
     code = (
-        "import sys; from pathlib import Path; from pliant.worker.uploads.service import Room, Uploads\n"
-        "with Uploads(directory=Path(sys.argv[1]), expiry=0).write('one', offset=0, length=None, room=Room(max_bytes=9)) as w:\n"
+        "import sys; from pathlib import Path; from pliant.worker.uploads.service import Capacity, Uploads\n"
+        "with Uploads(directory=Path(sys.argv[1]), expiry=0).write('one', offset=0, length=None, capacity=Capacity(max_bytes=9)) as w:\n"
         "    w.write(b'abc'); print(flush=True); sys.stdin.read()"
     )
     other = subprocess.Popen(
@@ -199,16 +202,16 @@ def test_the_audit_sees_what_does_not_belong(uploads: Uploads) -> None:
 
 
 def test_a_full_disk_gets_back_what_the_request_brought(small_disk: Path) -> None:
-    uploads, room = Uploads(directory=small_disk / "uploads", expiry=0), Room(max_bytes=2**30)
+    uploads, room = Uploads(directory=small_disk / "uploads", expiry=0), Capacity(max_bytes=2**30)
     with pytest.raises(OSError, match="No space"):
-        send(uploads, "announced", b"", length=4_000_000, room=room)
-    send(uploads, "one", b"x" * 1_000_000, finish=False, room=room)
-    with uploads.write("one", offset=1_000_000, length=None, room=room) as writer:
+        send(uploads, "announced", b"", length=4_000_000, capacity=room)
+    send(uploads, "one", b"x" * 1_000_000, finish=False, capacity=room)
+    with uploads.write("one", offset=1_000_000, length=None, capacity=room) as writer:
         writer.write(b"y" * 1_000_000)
         with pytest.raises(OSError, match="No space"):
             writer.write(b"y" * 2_000_000)
     assert uploads.get("one").offset == 1_000_000
-    send(uploads, "one", b"z" * 1_000_000, offset=1_000_000, room=room)
+    send(uploads, "one", b"z" * 1_000_000, offset=1_000_000, capacity=room)
     assert uploads.get("one").sha256 == hashlib.sha256(b"x" * 1_000_000 + b"z" * 1_000_000).hexdigest()
 
 
@@ -223,3 +226,46 @@ def test_a_file_system_without_links_gets_a_copy(
     monkeypatch.setattr(os, "link", refused)
     uploads.take("one", tmp_path / "taken")
     assert (tmp_path / "taken").read_bytes() == b"abc"
+
+
+def test_uploads_at_once_do_not_exceed_the_quota_together(uploads: Uploads) -> None:
+    """Eight chunked uploads of unknown length once put 400 MB on the disk under a quota of 120."""
+    tight = Capacity(max_bytes=10**9, quota=120 << 20, used=20 << 20)
+    piece, written, refused = b"x" * (1 << 20), 0, 0
+    with contextlib.ExitStack() as stack:
+        writers = [
+            stack.enter_context(uploads.write(f"up-{number}", offset=0, length=None, capacity=tight))
+            for number in range(8)
+        ]
+        for _ in range(20):
+            for writer in list(writers):
+                try:
+                    writer.write(piece)
+                    written += 1
+                except errors.QuotaExceeded:
+                    writers.remove(writer)
+                    refused += 1
+        assert written <= 100
+        assert refused > 0
+        assert written << 20 <= uploads.used() <= 100 << 20
+    assert uploads.used() == written << 20, "what was reserved and not used is given back"
+    assert list(uploads.directory.glob("*/*/reserved")) == []
+
+
+def test_a_declared_length_is_reserved_at_once_and_a_refusal_leaves_nothing(uploads: Uploads) -> None:
+    tight = Capacity(max_bytes=1000, quota=100, used=0)
+    with uploads.write("one", offset=0, length=80, capacity=tight) as writer:
+        assert uploads.used() == 80
+        with pytest.raises(errors.QuotaExceeded, match="hold 80 bytes and may hold 100"):
+            send(uploads, "two", b"", length=30, capacity=tight)
+        assert [folder.name for folder in uploads.directory.glob("*/*")] == ["one"]
+        writer.write(b"x" * 30)
+    assert uploads.used() == 30
+    send(uploads, "two", b"y" * 30, length=30, capacity=tight)
+
+
+def test_a_reservation_ends_with_its_process(uploads: Uploads) -> None:
+    send(uploads, "one", b"half", finish=False)
+    (next(uploads.directory.glob("*/one")) / "reserved").write_text("1000000")
+    assert uploads.used() == 4
+    assert list(uploads.findings(now())) == []

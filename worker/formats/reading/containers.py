@@ -8,7 +8,7 @@ from pathlib import Path
 from pliant.worker.formats.errors import refusal, too_large
 from pliant.worker.formats.reading.arrays import NPY_MAGIC, read_file
 from pliant.worker.formats.reading.parsers import recognise
-from pliant.worker.formats.reading.sandbox import parse_in_child
+from pliant.worker.formats.reading.sandbox import parse_in_sandbox
 from pliant.worker.formats.records import Arrays, Limits
 
 ZIP = (b"PK\x03\x04", b"PK\x05\x06")
@@ -31,4 +31,4 @@ def read_arrays(path: Path, *, field: str, limits: Limits, wanted: Collection[st
         raise refusal("empty_file", field, expected="a file with content", got="0 bytes", hint="Send the file again.")
     if head.startswith((NPY_MAGIC, *ZIP)):
         return read_file(path, field=field, limits=limits, wanted=wanted)
-    return parse_in_child(recognise(head, field), path, field=field, limits=limits)
+    return parse_in_sandbox(recognise(head, field), path, field=field, limits=limits)

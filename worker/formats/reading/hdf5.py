@@ -17,6 +17,15 @@ from pliant.worker.formats.records import Arrays, Limits
 UNREADABLE = (OSError, ValueError, KeyError, RuntimeError, TypeError, AttributeError, OverflowError, IndexError)
 """What h5py raises at damaged files."""
 
+DEFLATE = 1032
+"""Bytes that deflate makes of one byte at most."""
+
+SMALL = 16 << 20
+"""Bytes of a data set or chunk that are read without looking at how they are stored."""
+
+CHUNK_EXCESS = 4
+"""How many times the bytes of its data set a chunk may have: writers round chunks up along every axis."""
+
 MAX_OBJECTS = 512
 MAX_DEPTH = 4
 MAX_CELLS = 20_000
@@ -99,8 +108,26 @@ def _values(item: h5py.Dataset, name: str, so_far: int, field: str, limits: Limi
     declared = int(np.prod(item.shape, dtype=np.float64)) * item.dtype.itemsize
     if so_far + declared > limits.max_bytes:
         raise too_large(field, expected=f"at most {limits.max_bytes} bytes", got=f"{name} declares {declared}")
+    _check_stored(item, name, declared, field, limits)
     values = np.asarray(item[()])
     return np.ascontiguousarray(values.T.astype(values.dtype.newbyteorder("="), copy=False))
+
+
+def _check_stored(item: h5py.Dataset, name: str, declared: int, field: str, limits: Limits) -> None:
+    """Refuse, before a value is decompressed, what its stored bytes cannot become: most of it was never written.
+
+    One pass of deflate makes at most 1032 bytes of one. A chunk is decompressed whole, however little of it is used.
+    """
+    stored = item.id.get_storage_size()
+    if declared > SMALL and declared > DEFLATE * stored:
+        raise too_large(
+            field, expected=f"at most {DEFLATE} bytes of data for each stored byte", got=f"{name}: {declared} of {stored} bytes"
+        )  # fmt: skip
+    chunk = 0 if item.chunks is None else int(np.prod(item.chunks, dtype=np.float64)) * item.dtype.itemsize
+    if chunk > max(SMALL, CHUNK_EXCESS * declared) or chunk > limits.max_bytes:
+        raise too_large(
+            field, expected="chunks no larger than their data set", got=f"{name} in chunks of {chunk} bytes"
+        )
 
 
 def _elsewhere(field: str, what: str) -> Exception:

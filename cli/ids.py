@@ -1,0 +1,48 @@
+"""Ids of jobs as people type them: whole, a unique prefix, or ``@last``."""
+
+from __future__ import annotations
+
+from itertools import islice
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pliant.client import Client, RemoteJob
+
+LAST = "@last"
+SEARCHED = 1000
+"""Newest jobs that are searched for a prefix."""
+
+
+def find_job(client: Client, text: str) -> RemoteJob:
+    """Return the job that a command line names.
+
+    Parameters
+    ----------
+    client : Client
+        Of the service.
+    text : str
+        An id, the beginning of exactly one id, or ``@last``, the newest job.
+
+    Raises
+    ------
+    NotFound
+        No job fits.
+    BadArgument
+        The text is malformed, or more than one job fits.
+    """
+    from pliant.client import BadArgument, NotFound
+
+    if text == LAST:
+        for job in client.list(page_size=1):
+            return job
+        raise BadArgument("@last: the service has no jobs. Submit one with `pliant submit TRACKS`.")
+    try:
+        return client.get(text)
+    except NotFound:
+        fitting = [job for job in islice(client.list(page_size=200), SEARCHED) if job.id.startswith(text)]
+        if len(fitting) == 0:
+            raise
+    if len(fitting) > 1:
+        ids = ", ".join(job.id for job in fitting[:5]) + (", …" if len(fitting) > 5 else "")
+        raise BadArgument(f"{text}: {len(fitting)} jobs begin with it ({ids}). Give more characters.")
+    return fitting[0]

@@ -1,0 +1,89 @@
+"""`pliant track`: a film in, dense tracks out, without a service."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from pliant.cli.session import Json
+from pliant.cli.show import err, out, print_json
+
+if TYPE_CHECKING:
+    from pliant.tracking import OnStep, TrackedFilm, TrackingStep
+
+
+def track(
+    ctx: typer.Context,
+    film: Annotated[
+        Path,
+        typer.Argument(
+            help="mp4, mov, webm, mkv or avi film, animated GIF, zip or folder of pictures.", show_default=False
+        ),
+    ],
+    output: Annotated[Path, typer.Option("--output", "-o", help="tracks.npz to write.", show_default=False)],
+    region: Annotated[
+        Path | None, typer.Option("--region", help="Mask picture of the film's size: white is tracked.")
+    ] = None,
+    region_frame: Annotated[int, typer.Option("--region-frame", help="Frame that the mask was drawn on.", min=0)] = 0,
+    template_frame: Annotated[
+        int | None, typer.Option("--template-frame", help="Frame whose points are followed.", min=0)
+    ] = None,
+    frames: Annotated[
+        str | None, typer.Option("--frames", help="At most so many frames, or start:stop:step, e.g. 0:300:2.")
+    ] = None,
+    grid_step: Annotated[
+        float | None, typer.Option("--grid-step", help="Distance of neighbouring points in pixels.")
+    ] = None,
+    preview: Annotated[
+        Path | None, typer.Option("--preview", help="Picture to write: the tracks over some frames (JPEG).")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Track the surface that a film shows. Needs OpenCV: pip install 'pliant[film]'."""
+    ctx.obj.json = as_json
+    from pliant.tracking import track_film
+
+    with _bars() as on_step:
+        tracked = track_film(
+            film, region=region, region_frame=region_frame, template_frame=template_frame, frames=frames,
+            grid_step=grid_step, on_step=on_step,
+        )  # fmt: skip
+    tracked.save_npz(output)
+    if preview is not None:
+        preview.write_bytes(tracked.contact_sheet())
+    _show(tracked, output, as_json=as_json)
+
+
+@contextmanager
+def _bars() -> Iterator[OnStep]:
+    """Show one bar for each stage on a terminal; nothing where there is no terminal."""
+    from rich.progress import Progress, TaskID
+
+    screen = err()
+    with Progress(console=screen, disable=not screen.is_terminal) as progress:
+        tasks: dict[str, TaskID] = {}
+
+        def on_step(step: TrackingStep) -> None:
+            if step.stage not in tasks:
+                tasks[step.stage] = progress.add_task(step.stage, total=step.total)
+            progress.update(tasks[step.stage], completed=step.done, total=step.total)
+
+        yield on_step
+
+
+def _show(tracked: TrackedFilm, output: Path, *, as_json: bool) -> None:
+    count, points = tracked.visibility.shape
+    if as_json:
+        print_json(
+            {
+                "file": str(output), "frames": count, "points": points, "visible": float(tracked.visibility.mean()),
+                "template_frame": int(tracked.film.frame_indices[tracked.template]), "warnings": list(tracked.warnings),
+            }
+        )  # fmt: skip
+        return
+    for warning in tracked.warnings:
+        err().print(f"[yellow]Warning:[/yellow] {warning}")
+    out().print(f"{output}: {points} points in {count} frames, visible in {tracked.visibility.mean():.0%}.")

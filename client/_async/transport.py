@@ -1,0 +1,125 @@
+"""Sending requests and reading answers, with retries."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from contextlib import ExitStack, asynccontextmanager
+from dataclasses import dataclass
+from typing import TypeVar
+
+import httpx
+from pliant.client.call import Call, request_for
+from pliant.client.errors import PliantError, UnexpectedAnswer, Unreachable, error_from
+from pliant.client.pauses import async_sleep
+from pliant.client.retry import Attempts, may_repeat
+from pydantic import BaseModel, ValidationError
+
+R = TypeVar("R", bound=BaseModel)
+
+
+@dataclass(frozen=True)
+class Exchange:
+    """The requests of one operation: they share a deadline and a count of failures."""
+
+    http: httpx.AsyncClient
+    attempts: Attempts
+
+    async def send(self, call: Call) -> httpx.Response:
+        """Send a call once and return the answer, whatever its status, with its body unread.
+
+        Raises
+        ------
+        httpx.TransportError
+            The connection failed.
+        WaitTimeout
+            The deadline has passed.
+        """
+        with ExitStack() as sending:
+            request = request_for(self.http, call, self.attempts.remaining(), sending)
+            response = await self.http.send(request, stream=True)
+        self.attempts.answered()
+        return response
+
+    @asynccontextmanager
+    async def stream(self, call: Call) -> AsyncIterator[httpx.Response]:
+        """Send a call until an answer below 400 begins, and close that answer at the end.
+
+        Raises
+        ------
+        APIStatusError, UnexpectedAnswer, Unreachable, WaitTimeout
+            See `pliant.client.errors`.
+        """
+        response = await self._accepted(call)
+        try:
+            yield response
+        finally:
+            await response.aclose()
+
+    async def answer(self, call: Call) -> tuple[httpx.Response, bytes]:
+        """Send a call and read the whole answer; an interrupted answer counts as a failure. Raises as `stream`."""
+        while True:
+            try:
+                async with self.stream(call) as response:
+                    body = await response.aread()
+            except httpx.TransportError as lost:
+                await self.pause_or_raise(call, lost)
+                continue
+            self.attempts.succeeded()
+            return response, body
+
+    async def record(self, call: Call, kind: type[R]) -> R:
+        """Send a call and read its answer as a record of the wire contract. Raises as `stream`."""
+        response, body = await self.answer(call)
+        return parse(kind, body, response.status_code)
+
+    async def pause_or_raise(self, call: Call, fault: Exception) -> None:
+        """Wait before the next attempt, or raise the error that the caller sees."""
+        if may_repeat(call, fault):
+            await async_sleep(self.attempts.pause_after(fault))
+            return
+        self.attempts.remaining()
+        if isinstance(fault, PliantError):
+            raise fault
+        raise Unreachable(
+            f"{call.method} {call.path} was interrupted ({str(fault) or type(fault).__name__}) and was not sent again, "
+            "because it may have been carried out. Check the job before repeating it."
+        ) from fault
+
+    async def _accepted(self, call: Call) -> httpx.Response:
+        while True:
+            fault: Exception
+            try:
+                response = await self.send(call)
+                if response.status_code < 400:
+                    return response
+                fault = await refusal(response)
+            except httpx.TransportError as lost:
+                fault = lost
+            await self.pause_or_raise(call, fault)
+
+
+async def refusal(response: httpx.Response) -> PliantError:
+    """Read an answer of 400 or more to its end and return the error that it stands for."""
+    try:
+        body = await response.aread()
+    finally:
+        await response.aclose()
+    return error_from(response.status_code, response.headers, body)
+
+
+def parse(kind: type[R], body: bytes, status: int) -> R:
+    """Read JSON as a record.
+
+    Raises
+    ------
+    UnexpectedAnswer
+        The body is not such a record.
+    """
+    try:
+        return kind.model_validate_json(body)
+    except ValidationError as fault:
+        raise UnexpectedAnswer(
+            f"Expected a {kind.__name__} with status {status}, got {body[:200].decode('utf-8', 'replace')!r} "
+            f"({fault.error_count()} invalid fields). Check that the address is a Pliant service whose version is "
+            "close to this client's."
+        ) from fault

@@ -1,0 +1,1 @@
+# Generated from client/_async/__init__.py by `make client`. Edit that file instead.

@@ -1,0 +1,327 @@
+# Generated from client/_async/client.py by `make client`. Edit that file instead.
+"""The client: one method per operation of the service."""
+
+from __future__ import annotations
+
+import os
+import ssl
+import tempfile
+from collections.abc import Callable, Generator, Iterable, Mapping
+from contextlib import closing
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import httpx
+from numpy.typing import ArrayLike
+from pliant.client._sync import operations
+from pliant.client._sync.job import RemoteJob, Result
+from pliant.client._sync.operations import OnJob
+from pliant.client._sync.transport import Exchange
+from pliant.client.call import base_of, headers_of
+from pliant.client.multipart import Inputs, OnBytes, Source
+from pliant.client.result import LOADED, finished, succeeded
+from pliant.client.retry import Attempts, Contact, Retry
+from pliant.schemas.job import Interpretation, Job, ServiceLimits, Status
+from pliant.schemas.options import Options
+
+DEFAULT_URL = "http://127.0.0.1:8000"
+
+
+class Client:
+    """A client of a Pliant service.
+
+    Parameters
+    ----------
+    url : str, optional
+        Address of the service; defaults to the environment variable `PLIANT_URL`, else to ``http://127.0.0.1:8000``.
+    token : str, optional
+        Bearer token; defaults to `PLIANT_TOKEN`. An empty variable counts as unset.
+    headers : mapping of str to str, optional
+        Sent with every request.
+    verify : bool or ssl.SSLContext
+        How TLS certificates are checked, as in httpx.
+    retries : Retry
+        How long and how often calls are retried.
+    event_hooks : mapping of str to list of callables, optional
+        Called with every ``"request"`` and ``"response"``, as in httpx.
+    transport : httpx.BaseTransport, optional
+        Replaces the network, e.g. by `pliant.service.testing.InMemoryService`.
+
+    Examples
+    --------
+    ``result = (Client().submit(points)).wait(timeout=600)``; ``result.shapes`` is an array (F, P, 3).
+    """
+
+    def __init__(
+        self,
+        url: str | None = None,
+        *,
+        token: str | None = None,
+        headers: Mapping[str, str] | None = None,
+        verify: bool | ssl.SSLContext = True,
+        retries: Retry = Retry(),  # noqa: B008 - frozen, so all clients may share it
+        event_hooks: Mapping[str, list[Callable[..., Any]]] | None = None,
+        transport: httpx.BaseTransport | None = None,
+    ) -> None:
+        self.url = base_of(url if url is not None else os.environ.get("PLIANT_URL") or DEFAULT_URL)
+        bearer = token if token is not None else os.environ.get("PLIANT_TOKEN") or None
+        self._http = httpx.Client(
+            base_url=self.url,
+            headers=headers_of(bearer, headers),
+            verify=verify,
+            event_hooks=event_hooks,
+            transport=transport,
+        )
+        self._retries = retries
+        self._contact = Contact()
+
+    def __repr__(self) -> str:
+        return f"<Client {self.url}>"
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, fault: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the connections."""
+        self._http.close()
+
+    def submit(
+        self,
+        tracks: Source,
+        *,
+        visible: ArrayLike | None = None,
+        mesh: Source | tuple[int, int] | None = None,
+        ground_truth: Source | None = None,
+        rotations: Source | None = None,
+        options: Options | Mapping[str, Any] | None = None,
+        name: str = "",
+        job_id: str | None = None,
+        idempotency_key: str | None = None,
+        webhook: str | None = None,
+        webhook_secret: str | None = None,
+        on_upload: OnBytes | None = None,
+        timeout: float | None = None,
+    ) -> RemoteJob:
+        """Submit tracks for reconstruction and return the queued job.
+
+        Parameters
+        ----------
+        tracks : array_like, mapping or path
+            Points (F, P, 2) in pixels, NaN or masked where hidden; or the dictionary of a tracker (CoTracker, TAPIR, …);
+            or the path of a file in any format that the service reads.
+        visible : array_like, optional
+            Shape (F, P), bool or confidence in [0, 1]; only with an array of tracks.
+        mesh : array_like, (rows, columns), path, optional
+            Faces (T, 3) or (T, 4), the size of a grid, a mesh file, or ``"none"``. Vertex i is point i. By default the
+            service triangulates the tracks.
+        ground_truth : array_like or path, optional
+            True shapes (F, P, 3); the job then has error metrics.
+        rotations : array_like or path, optional
+            Known cameras (F, 2, 3) or (F, 3, 3).
+        options : Options or mapping, optional
+            Options of the reconstruction; validated before anything is sent.
+        name : str
+            Your own label.
+        job_id : str, optional
+            Your own id for the job. Submitting the same content under the same id again returns the same job.
+        idempotency_key : str, optional
+            Makes the submission idempotent across calls and restarts. By default each call uses a new key, so that its
+            retries never create a second job.
+        webhook : str, optional
+            URL that receives the finished job; check messages with `pliant.client.webhooks.verified`.
+        webhook_secret : str, optional
+            Signs the webhook; create one with `pliant.client.webhooks.new_secret`.
+        on_upload : callable, optional
+            Called with (bytes sent, total bytes).
+        timeout : float, optional
+            Seconds for the whole call, retries included.
+
+        Raises
+        ------
+        InvalidRequest
+            The input is invalid; `problem` has the field, what was expected, and what was received.
+        BadArgument, APIStatusError, Unreachable, WaitTimeout
+            See `pliant.client.errors`.
+        """
+        inputs = Inputs(tracks=tracks, visible=visible, mesh=mesh, ground_truth=ground_truth, rotations=rotations)
+        with tempfile.TemporaryDirectory(prefix="pliant-submit-") as folder:
+            job = operations.submit(
+                self._exchange(timeout, "the submission"),
+                inputs,
+                folder=Path(folder),
+                options=options,
+                name=name,
+                job_id=job_id,
+                idempotency_key=idempotency_key,
+                webhook=webhook,
+                webhook_secret=webhook_secret,
+                on_upload=on_upload,
+            )
+        return RemoteJob(self, job)
+
+    def inspect(
+        self,
+        tracks: Source,
+        *,
+        visible: ArrayLike | None = None,
+        mesh: Source | tuple[int, int] | None = None,
+        ground_truth: Source | None = None,
+        rotations: Source | None = None,
+        options: Options | Mapping[str, Any] | None = None,
+        on_upload: OnBytes | None = None,
+        timeout: float | None = None,
+    ) -> Interpretation:
+        """Have the service read and check inputs without creating a job.
+
+        Parameters
+        ----------
+        tracks, visible, mesh, ground_truth, rotations, options, on_upload, timeout
+            As for `submit`.
+
+        Returns
+        -------
+        Interpretation
+            Frames, points, layout, hidden share, source of the mesh, and the evidence for each reading.
+
+        Raises
+        ------
+        InvalidRequest
+            As for `submit`; `problem.choices` lists the possible readings of an ambiguous file.
+        """
+        inputs = Inputs(tracks=tracks, visible=visible, mesh=mesh, ground_truth=ground_truth, rotations=rotations)
+        with tempfile.TemporaryDirectory(prefix="pliant-inspect-") as folder:
+            return operations.inspect(
+                self._exchange(timeout, "the inspection"),
+                inputs,
+                folder=Path(folder),
+                options=options,
+                on_upload=on_upload,
+            )
+
+    def get(self, job: str, *, timeout: float | None = None) -> RemoteJob:
+        """Return a job with its current record."""
+        return RemoteJob(self, operations.get(self._exchange(timeout), job))
+
+    def list(
+        self, *, statuses: Iterable[Status | str] = (), page_size: int = 50, timeout: float | None = None
+    ) -> Generator[RemoteJob, None, None]:
+        """Iterate over the jobs, newest first; pages are requested as needed."""
+        for job in operations.jobs(self._exchange(timeout), statuses=statuses, page_size=page_size):
+            yield RemoteJob(self, job)
+
+    def wait(
+        self,
+        job: str,
+        *,
+        on_progress: OnJob | None = None,
+        folder: Path | str | None = None,
+        load: bool = True,
+        timeout: float | None = None,
+    ) -> Result:
+        """Wait until a job is finished and return its result. Survives restarts of the service.
+
+        Parameters
+        ----------
+        job : str
+            The id.
+        on_progress : callable, optional
+            Called with the job each time its record changes.
+        folder : path, optional
+            Where files of the result are kept; by default a temporary folder that is removed with the result.
+        load : bool
+            Download the arrays and the report.
+        timeout : float, optional
+            Seconds for the whole call. After it `WaitTimeout` is raised and the job continues.
+
+        Raises
+        ------
+        JobFailed, JobCancelled, WaitTimeout, Unreachable, APIStatusError
+            See `pliant.client.errors`.
+        """
+        exchange = self._exchange(timeout, f"the wait for job {job}")
+        record = succeeded(operations.wait(exchange, job, on_progress=on_progress))
+        result = Result(self, record, folder)
+        if load:
+            operations.fetch(exchange, record, result.folder, names=LOADED, on_download=None)
+        return result
+
+    def events(self, job: str, *, timeout: float | None = None) -> Generator[Job, None, None]:
+        """Yield a job's record each time it changes; the last one has a final status.
+
+        If the connection breaks or the service restarts, the stream resumes after the last event.
+        """
+        exchange = self._exchange(timeout, f"the events of job {job}")
+        with closing(operations.events(exchange, job)) as changes:
+            for now in changes:
+                yield now
+
+    def result(
+        self, job: str, *, folder: Path | str | None = None, load: bool = True, timeout: float | None = None
+    ) -> Result:
+        """Return the result of a job that has succeeded; unlike `wait`, raises `NotAllowedNow` if it is not finished."""
+        exchange = self._exchange(timeout, f"the download of job {job}")
+        record = finished(operations.get(exchange, job))
+        result = Result(self, record, folder)
+        if load:
+            operations.fetch(exchange, record, result.folder, names=LOADED, on_download=None)
+        return result
+
+    def log(self, job: str, *, timeout: float | None = None) -> str:
+        """Return a job's log so far, one entry per line."""
+        return operations.log(self._exchange(timeout), job)
+
+    def cancel(self, job: str, *, timeout: float | None = None) -> RemoteJob:
+        """Request that a job stops; a running one is `cancelling` until it has."""
+        return RemoteJob(self, operations.cancel(self._exchange(timeout), job))
+
+    def retry(self, job: str, *, timeout: float | None = None) -> RemoteJob:
+        """Queue and return a new job with the inputs and options of a failed or cancelled one."""
+        return RemoteJob(self, operations.retry(self._exchange(timeout), job))
+
+    def delete(self, job: str, *, timeout: float | None = None) -> None:
+        """Delete a finished job and its files."""
+        operations.delete(self._exchange(timeout), job)
+
+    def download(
+        self,
+        job: str,
+        folder: Path | str,
+        *,
+        names: Iterable[str] | None = None,
+        on_download: OnBytes | None = None,
+        timeout: float | None = None,
+    ) -> dict[str, Path]:
+        """Download files of a job into a folder: streamed, resumed after interruptions, checked by SHA-256.
+
+        Parameters
+        ----------
+        names : iterable of str, optional
+            Which files; by default all.
+        on_download : callable, optional
+            Called with (bytes of this file so far, bytes of this file).
+        """
+        exchange = self._exchange(timeout, f"the download of job {job}")
+        record = operations.get(exchange, job)
+        return operations.fetch(exchange, record, Path(folder), names=names, on_download=on_download)
+
+    def options(self, *, timeout: float | None = None) -> dict[str, Any]:
+        """Return the JSON Schema of the options: names, meanings, bounds, defaults."""
+        return operations.document(self._exchange(timeout), "/v1/options")
+
+    def limits(self, *, timeout: float | None = None) -> ServiceLimits:
+        """Return the service's limits."""
+        return operations.limits(self._exchange(timeout))
+
+    def ready(self, *, timeout: float | None = None) -> dict[str, Any]:
+        """Return the state of each part of the service: queue, storage, workers."""
+        return operations.document(self._exchange(timeout), "/readyz")
+
+    def _exchange(self, timeout: float | None, doing: str = "the call") -> Exchange:
+        attempts = Attempts(retries=self._retries, contact=self._contact, timeout=timeout, doing=doing)
+        return Exchange(self._http, attempts)

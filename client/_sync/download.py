@@ -1,0 +1,88 @@
+# Generated from client/_async/download.py by `make client`. Edit that file instead.
+"""Downloading a file: streamed, resumed after interruptions, checked by SHA-256."""
+
+from __future__ import annotations
+
+import re
+from functools import partial
+from pathlib import Path
+
+import httpx
+from pliant.client._sync.transport import Exchange
+from pliant.client.call import Call
+from pliant.client.errors import CorruptDownload
+from pliant.client.multipart import OnBytes, sha256
+from pliant.client.pauses import in_place
+from pliant.schemas.job import Artifact
+
+
+def download(exchange: Exchange, path: str, artifact: Artifact, folder: Path, *, on_download: OnBytes | None) -> Path:
+    """Download an artifact into a folder, under its own name.
+
+    The bytes go to a partial file beside it, named after the SHA-256, which is renamed once it is complete and correct: a
+    file under the artifact's name is always whole. A partial file of an earlier call is continued.
+
+    Raises
+    ------
+    CorruptDownload
+        The bytes were wrong twice.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    whole = folder / Path(artifact.name).name
+    if (
+        whole.is_file()
+        and whole.stat().st_size == artifact.bytes
+        and in_place(partial(sha256, whole)) == artifact.sha256
+    ):
+        return whole
+    part = folder / f".{whole.name}.{artifact.sha256[:16]}.part"
+    for _ in range(2):
+        if not part.is_file() or part.stat().st_size < artifact.bytes or artifact.bytes == 0:
+            _fill(exchange, path, artifact, part, on_download=on_download)
+        if in_place(partial(sha256, part)) == artifact.sha256:
+            part.replace(whole)
+            return whole
+        part.unlink()
+    raise CorruptDownload(
+        f"{artifact.name} was downloaded twice and does not have the SHA-256 {artifact.sha256} of the job's record. "
+        "Something between this machine and the service changes the bytes; try another connection."
+    )
+
+
+def _fill(exchange: Exchange, path: str, artifact: Artifact, part: Path, *, on_download: OnBytes | None) -> None:
+    """Append to the partial file until it is complete.
+
+    The service's entity tag is the SHA-256, so `If-Range` holds across restarts of both sides: a file that has changed is
+    sent from its beginning.
+    """
+    with part.open("ab") as file:
+        while True:
+            headers = {"Accept-Encoding": "identity"}
+            if file.tell() > 0:
+                headers |= {"Range": f"bytes={file.tell()}-", "If-Range": f'"{artifact.sha256}"'}
+            call = Call(method="GET", path=path, headers=headers)
+            try:
+                with exchange.stream(call) as response:
+                    if _first_byte(response) != file.tell():
+                        file.seek(0)
+                        file.truncate()
+                    for chunk in response.iter_bytes():
+                        exchange.attempts.remaining()
+                        exchange.attempts.succeeded()
+                        file.write(chunk)
+                        if on_download is not None:
+                            on_download(file.tell(), artifact.bytes)
+            except httpx.TransportError as lost:
+                exchange.pause_or_raise(call, lost)
+                if file.tell() >= artifact.bytes:
+                    return
+            else:
+                return
+
+
+def _first_byte(response: httpx.Response) -> int:
+    """Offset of the answer's first byte in the file; -1 if Content-Range is malformed."""
+    if response.status_code != 206:
+        return 0
+    match = re.match(r"bytes (\d+)-", response.headers.get("content-range", ""))
+    return int(match.group(1)) if match is not None else -1

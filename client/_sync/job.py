@@ -1,0 +1,127 @@
+# Generated from client/_async/job.py by `make client`. Edit that file instead.
+"""What the client returns: a job of the service, and its result."""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterable
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING, Self
+
+from pliant.client._sync.operations import OnJob
+from pliant.client.multipart import OnBytes
+from pliant.client.result import ANIMATION, LOADED, Reconstruction, copied
+from pliant.schemas.job import Job, Status
+
+if TYPE_CHECKING:
+    from pliant.client._sync.client import Client
+
+
+class RemoteJob:
+    """A job of a service: its latest known record, and its operations.
+
+    Attributes
+    ----------
+    record : Job
+        As of the last call; `refresh` updates it.
+    """
+
+    def __init__(self, client: Client, record: Job) -> None:
+        self._client = client
+        self.record = record
+
+    def __repr__(self) -> str:
+        return f"<RemoteJob {self.id} {self.status}>"
+
+    @property
+    def id(self) -> str:
+        """The job's id."""
+        return self.record.id
+
+    @property
+    def status(self) -> Status:
+        """The status as of the last call."""
+        return self.record.status
+
+    def refresh(self, *, timeout: float | None = None) -> Self:
+        """Read the record again."""
+        self.record = (self._client.get(self.id, timeout=timeout)).record
+        return self
+
+    def wait(
+        self,
+        *,
+        on_progress: OnJob | None = None,
+        folder: Path | str | None = None,
+        load: bool = True,
+        timeout: float | None = None,
+    ) -> Result:
+        """Wait until the job is finished and return its result: see `Client.wait`."""
+
+        def report(job: Job) -> None:
+            self.record = job
+            if on_progress is not None:
+                on_progress(job)
+
+        result = self._client.wait(
+            self.id,
+            on_progress=None if on_progress is None else report,
+            folder=folder,
+            load=load,
+            timeout=timeout,
+        )
+        self.record = result.job
+        return result
+
+    def events(self, *, timeout: float | None = None) -> Generator[Job, None, None]:
+        """Yield the record each time it changes; the last one has a final status."""
+        with closing(self._client.events(self.id, timeout=timeout)) as changes:
+            for job in changes:
+                self.record = job
+                yield job
+
+    def log(self, *, timeout: float | None = None) -> str:
+        """Return the job's log so far, one entry per line."""
+        return self._client.log(self.id, timeout=timeout)
+
+    def cancel(self, *, timeout: float | None = None) -> Self:
+        """Request that the job stops."""
+        self.record = (self._client.cancel(self.id, timeout=timeout)).record
+        return self
+
+    def retry(self, *, timeout: float | None = None) -> RemoteJob:
+        """Queue and return a new job with the same inputs and options, after this one failed or was cancelled."""
+        return self._client.retry(self.id, timeout=timeout)
+
+    def delete(self, *, timeout: float | None = None) -> None:
+        """Delete the job and its files."""
+        self._client.delete(self.id, timeout=timeout)
+
+
+class Result(Reconstruction):
+    """The result of a job; its methods download the files that are not local yet."""
+
+    def __init__(self, client: Client, job: Job, folder: Path | str | None) -> None:
+        super().__init__(job, folder)
+        self._client = client
+
+    def load(self, *, timeout: float | None = None) -> Self:
+        """Download the arrays and the report."""
+        self._client.download(self.job.id, self.folder, names=LOADED, timeout=timeout)
+        return self
+
+    def download(
+        self,
+        folder: Path | str,
+        *,
+        names: Iterable[str] | None = None,
+        on_download: OnBytes | None = None,
+        timeout: float | None = None,
+    ) -> dict[str, Path]:
+        """Download files into a folder: see `Client.download`."""
+        return self._client.download(self.job.id, folder, names=names, on_download=on_download, timeout=timeout)
+
+    def save_glb(self, path: Path | str, *, timeout: float | None = None) -> Path:
+        """Save the animated mesh as glTF, for Blender or any glTF viewer."""
+        held = self._client.download(self.job.id, self.folder, names=[ANIMATION], timeout=timeout)
+        return copied(held[ANIMATION], path)

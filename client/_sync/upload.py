@@ -1,0 +1,119 @@
+# Generated from client/_async/upload.py by `make client`. Edit that file instead.
+"""Uploading large files before their job: raw bytes, resumed from the last stored byte."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import httpx
+from pliant.client import multipart
+from pliant.client._sync.transport import Exchange, parse, refusal
+from pliant.client.call import Call
+from pliant.client.errors import APIStatusError, NotFound
+from pliant.client.multipart import Form, Remainder, sha256
+from pliant.client.pauses import in_place, sleep
+from pliant.client.retry import OUT_OF_STEP
+from pliant.schemas.job import Upload
+
+
+def upload_large(exchange: Exchange, form: Form, key: str) -> Form:
+    """Upload the large files of a form and return the form that refers to them.
+
+    Parameters
+    ----------
+    exchange : Exchange
+        Of the whole submission.
+    form : Form
+        Returned unchanged if its files are small, or if the service has no uploads.
+    key : str
+        Of the submission: the same key and the same content find the bytes of an earlier run.
+    """
+    if form.size <= multipart.LARGE:
+        return form
+    total, before, fields, files = form.size, 0, dict(form.fields), dict(form.files)
+
+    def report(done: int) -> None:
+        if form.on_upload is not None:
+            form.on_upload(before + done, total)
+
+    for part, path in form.files.items():
+        size = path.stat().st_size
+        if size <= multipart.SMALL:
+            continue
+        digest = in_place(partial(sha256, path))
+        upload_id = hashlib.sha256(f"{key}\n{part}\n{digest}".encode()).hexdigest()[:40]
+        if not upload(exchange, path, upload_id, digest=digest, report=report):
+            return form
+        del files[part]
+        fields[f"{part}_upload"] = upload_id
+        before += size
+    return replace(form, fields=fields, files=files, before=before)
+
+
+def upload(exchange: Exchange, path: Path, upload_id: str, *, digest: str, report: Callable[[int], None]) -> bool:
+    """Send a file from its last stored byte on; return False if the service has no uploads.
+
+    Each stored byte counts as success: a poor connection is not given up while it makes progress.
+    """
+    attempts, size, reached = exchange.attempts, path.stat().st_size, 0
+    encoded = base64.b64encode(bytes.fromhex(digest)).decode()
+    while True:
+        held = _state(exchange, upload_id)
+        if held is None:
+            return False
+        if held.complete:
+            report(size)
+            return True
+        if held.offset > reached:
+            reached = held.offset
+            attempts.succeeded()
+        headers = {"Upload-Offset": str(held.offset), "Upload-Length": str(size), "Repr-Digest": f"sha-256=:{encoded}:"}
+        body = Remainder(path=path, offset=held.offset, report=report)
+        call = Call(method="PUT", path=_path(upload_id), headers=headers, body=body)
+        fault: Exception
+        try:
+            response = exchange.send(call)
+            if response.status_code < 400:
+                response.read()
+                response.close()
+                attempts.succeeded()
+                return True
+            fault = refusal(response)
+        except httpx.TransportError as lost:
+            fault = lost
+        if isinstance(fault, APIStatusError) and (fault.code in OUT_OF_STEP or fault.problem.retryable):
+            sleep(attempts.pause_after(fault))
+        else:
+            exchange.pause_or_raise(call, fault)
+
+
+def delete_uploads(exchange: Exchange, form: Form) -> None:
+    """Delete the uploads of a form, once the job has a copy of its own; those that remain expire."""
+    for name, upload_id in form.fields.items():
+        if name.endswith("_upload"):
+            with suppress(httpx.TransportError):
+                response = exchange.send(Call(method="DELETE", path=_path(upload_id)))
+                response.close()
+
+
+def _state(exchange: Exchange, upload_id: str) -> Upload | None:
+    """Return the state of an upload, None if the service has no uploads. Does not count as success."""
+    call = Call(method="GET", path=_path(upload_id))
+    while True:
+        try:
+            with exchange.stream(call) as response:
+                return parse(Upload, response.read(), response.status_code)
+        except NotFound as missing:
+            return Upload(id=upload_id, offset=0, complete=False) if missing.code == "unknown_upload" else None
+        except httpx.TransportError as lost:
+            exchange.pause_or_raise(call, lost)
+
+
+def _path(upload_id: str) -> str:
+    return f"/v1/uploads/{upload_id}"

@@ -1,0 +1,116 @@
+"""One request as data, and the httpx request that it becomes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import AsyncIterator, Iterator, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from typing import Any
+
+import httpx
+from pliant.client.errors import BadArgument
+from pliant.client.multipart import Form, Remainder
+
+CONNECT_TIMEOUT = 10.0
+"""Seconds allowed for opening a connection."""
+
+SILENCE_TIMEOUT = 60.0
+"""Seconds without a byte after which a connection counts as lost; longer than the service holds any answer back."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Call:
+    """One request, which can be sent any number of times."""
+
+    method: str
+    path: str
+    """Relative to the service's address, e.g. ``/v1/jobs``."""
+    params: Mapping[str, str | list[str]] = field(default_factory=dict)
+    headers: Mapping[str, str] = field(default_factory=dict)
+    form: Form | None = None
+    """Multipart body; its files are reopened for each attempt."""
+    body: Remainder | None = None
+    """Raw body, likewise."""
+    changes_nothing: bool = False
+    """True for a POST without side effects."""
+
+    @property
+    def repeatable(self) -> bool:
+        """True if sending it twice has the same effect as sending it once."""
+        safe = self.changes_nothing or self.method in ("GET", "HEAD", "PUT", "DELETE")
+        return safe or "Idempotency-Key" in self.headers
+
+
+def base_of(url: str) -> str:
+    """Check the address of a service and return it without a trailing slash.
+
+    Raises
+    ------
+    BadArgument
+        Not an http or https address.
+    """
+    try:
+        parsed = httpx.URL(url)
+        valid = parsed.scheme in ("http", "https") and parsed.host != ""
+    except httpx.InvalidURL:
+        valid = False
+    if not valid:
+        raise BadArgument(f"Expected the address of a service such as http://127.0.0.1:8000, got {url!r}.")
+    return url.rstrip("/")
+
+
+def headers_of(token: str | None, more: Mapping[str, str] | None) -> dict[str, str]:
+    """Return the headers of every request; the caller's own take precedence."""
+    headers = {"User-Agent": f"pliant-client/{version('pliant')}"}
+    if token is not None:
+        headers["Authorization"] = f"Bearer {token}"
+    return {**headers, **(more or {})}
+
+
+def request_for(
+    http: httpx.Client | httpx.AsyncClient, call: Call, timeout: float, sending: ExitStack
+) -> httpx.Request:
+    """Build the request; the files that it reads stay open until `sending` is closed."""
+    if call.body is not None:
+        return _raw(http, call, call.body, timeout)
+    files: dict[str, Any] | None = None
+    if call.form is not None:  # a form without files is sent as multipart, too
+        texts = {name: (None, text) for name, text in call.form.fields.items()}
+        files = {**texts, **sending.enter_context(call.form.open())}
+    return http.build_request(
+        call.method,
+        call.path,
+        params=dict(call.params) or None,
+        headers=dict(call.headers),
+        files=files,
+        timeout=_limits(timeout),
+    )
+
+
+def _raw(http: httpx.Client | httpx.AsyncClient, call: Call, rest: Remainder, timeout: float) -> httpx.Request:
+    """Build a request whose body is the remainder of a file; the stream serves both kinds of client."""
+    length = rest.path.stat().st_size - rest.offset
+    headers = {**call.headers, "Content-Length": str(length), "Content-Type": "application/octet-stream"}
+    plain = http.build_request(call.method, call.path, headers=headers, timeout=_limits(timeout))
+    return httpx.Request(
+        plain.method, plain.url, headers=plain.headers, stream=_Stream(rest), extensions=plain.extensions
+    )
+
+
+class _Stream(httpx.SyncByteStream, httpx.AsyncByteStream):
+    def __init__(self, rest: Remainder) -> None:
+        self._rest = rest
+
+    def __iter__(self) -> Iterator[bytes]:
+        yield from self._rest.pieces()
+
+    async def __aiter__(self) -> AsyncIterator[bytes]:
+        for piece in self._rest.pieces():
+            yield piece
+
+
+def _limits(timeout: float) -> httpx.Timeout:
+    finite = timeout if math.isfinite(timeout) else SILENCE_TIMEOUT
+    return httpx.Timeout(min(SILENCE_TIMEOUT, finite), connect=min(CONNECT_TIMEOUT, finite))

@@ -1,0 +1,53 @@
+"""Logging of the process: a level, lines for people or JSON, and the id of the request behind every line."""
+
+from __future__ import annotations
+
+import logging
+from contextvars import ContextVar
+
+from pliant.service.settings import LogFormat, LogLevel
+from pythonjsonlogger.json import JsonFormatter
+
+REQUEST_ID: ContextVar[str] = ContextVar("pliant_request_id", default="-")
+"""The request that the current task or thread works for."""
+
+_NOISY = {"uvicorn": logging.WARNING, "uvicorn.error": logging.WARNING, "httpx": logging.WARNING}
+"""Loggers of libraries, and the least level that is of use: `pliant up` reports start and stop itself."""
+
+
+class AddRequestId(logging.Filter):
+    """Adds `request_id` to every record."""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Add it, and keep the record."""
+        record.request_id = REQUEST_ID.get()
+        return True
+
+
+def configure_logging(level: LogLevel, format: LogFormat) -> None:
+    """Send all records of this process to standard error.
+
+    Parameters
+    ----------
+    level : str
+        Least level.
+    format : str
+        ``"console"`` or ``"json"``.
+    """
+    handler = logging.StreamHandler()
+    handler.addFilter(AddRequestId())
+    handler.setFormatter(formatter(format))
+    logging.basicConfig(level=level.upper(), handlers=[handler], force=True)
+    for name, least in _NOISY.items():
+        logging.getLogger(name).setLevel(least)
+
+
+def formatter(format: LogFormat) -> logging.Formatter:
+    """Return the formatter; JSON lines carry every extra field of a record, times are RFC 3339 in UTC."""
+    if format == "console":
+        return logging.Formatter("%(asctime)s %(levelname)s %(name)s [%(request_id)s]: %(message)s")
+    return JsonFormatter(
+        ["levelname", "name", "message", "request_id"],
+        timestamp="time",
+        rename_fields={"levelname": "level", "name": "logger"},
+    )

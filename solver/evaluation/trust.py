@@ -1,0 +1,159 @@
+"""How far a result can be trusted, without ground truth: an expected error and a verdict with its reasons.
+
+The expected error is the root of the mean posterior variance of the positions (`shapes.uncertainty`) over the size of the shapes,
+times a factor for what the posterior does not know: cameras and prior are estimated from the same tracks. The verdict adds signs of
+failure that a posterior under a wrong model cannot show: tracks that the shapes do not explain, a camera that hardly turned around the
+object, a sheet whose pose signs are ambiguous, positions that no frame shows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from pliant.solver.records import Floats
+
+INTERVAL = (0.4, 2.2)
+"""Factors around the expected error that hold the true one in nine of ten sequences."""
+
+POOR, BAD = 0.15, 0.7
+"""Upper end of the expected error, share of the size, from which a result is to be used with care, and not to be used."""
+
+LOOSE, LOST = 0.08, 0.25
+"""Median distance of visible observations from the projected shapes, share of the size: the same two degrees. White noise that has no
+shape leaves .6 and more; tracker noise of 5 % leaves .06."""
+
+NARROW, STILL = 20.0, 5.0
+"""Degrees of turn between the two most different views: the same two degrees. Depth error grows as the inverse of the turn."""
+
+FLEXIBLE = 0.5
+"""Modes of deformation per frame from which the motion hardly determines depth: every second frame has a shape of its own."""
+
+HIDDEN, UNSEEN = 0.6, 0.9
+"""Share of positions without an observation: the same two degrees."""
+
+
+class Verdict(StrEnum):
+    """Whether a result can be used."""
+
+    GOOD = "good"
+    WITH_CARE = "with_care"
+    DO_NOT_USE = "do_not_use"
+
+
+@dataclass(frozen=True, slots=True)
+class Trust:
+    """What a result says about its own accuracy."""
+
+    verdict: Verdict
+    reasons: tuple[str, ...]
+    """A sentence with a figure for each sign that made the verdict worse than good; the gravest first."""
+
+    expected_error: float | None
+    """Expected `e3d_frame`, share of the object's size; None where the prior has no posterior."""
+
+    interval: tuple[float, float] | None
+    """Holds the true error in about nine of ten sequences; None where the model behind it is not believed."""
+
+    turn_degrees: float
+    """Angle between the two most different viewing directions, degrees; above 90 they may be opposite."""
+
+    residual: float
+    """Median distance of visible observations from the projected shapes, share of the size."""
+
+    hidden: float
+    """Share of positions that no observation shows."""
+
+    @property
+    def sentence(self) -> str:
+        """The expected error and what depth rests on, in words."""
+        rests = f"depth rests on {self.turn_degrees:.0f}° of turn"
+        if self.expected_error is None:
+            return f"The error is not estimated with this prior; {rests}."
+        if self.interval is None:
+            return f"Expected error at least {_percent(self.expected_error)} of the object's size; {rests}."
+        return f"Expected error about {_percent(self.expected_error)} of the object's size; {rests}."
+
+
+def assess(
+    shapes: Floats,
+    rotations: Floats,
+    residuals: Floats,
+    visible: Floats,
+    *,
+    scales: Floats,
+    shapes_std: Floats | None,
+    planar: bool = False,
+    modes: int = 0,
+) -> Trust:
+    """Return the verdict on a result.
+
+    Parameters
+    ----------
+    shapes : ndarray, shape (F, P, 3)
+        The tracks' unit.
+    rotations : ndarray, shape (F, 3, 3)
+        Camera from world.
+    residuals : ndarray, shape (F, P)
+        Distances of the observations from the projected shapes, the tracks' unit.
+    visible : ndarray, shape (F, P)
+        Confidence of the observations that were used; 0 where hidden or rejected.
+    scales : ndarray, shape (F,)
+        Image units per unit of the shapes.
+    shapes_std : ndarray, shape (F, P), or None
+        Posterior standard deviations, the unit of the shapes.
+    planar : bool
+        The tracks are those of a sheet, so that its pose signs are weakly determined.
+    modes : int
+        Modes of deformation of the prior.
+    """
+    centred = shapes - shapes.mean(axis=1, keepdims=True)
+    size = max(float(np.sqrt(np.square(centred).sum(axis=2).mean())), np.finfo(float).tiny)
+    seen = visible > 0
+    expected = None if shapes_std is None else float(np.sqrt(np.square(shapes_std).mean())) / size
+    believed = not planar and modes <= FLEXIBLE * len(shapes)
+    interval = (INTERVAL[0] * expected, INTERVAL[1] * expected) if expected is not None and believed else None
+    relative = (residuals / scales[:, None])[seen]
+    residual = float(np.median(relative)) / size if relative.size else np.inf
+    turn = turned(rotations)
+    hidden = 1.0 - float(seen.mean())
+    found = [
+        _sign(residual, LOOSE, LOST, f"The shapes miss the tracks by {_percent(residual)} of the object's size."),
+        _sign(-turn, -NARROW, -STILL, f"The camera turned by {turn:.0f}° only; depth needs {NARROW:.0f}° or more."),
+        _sign(hidden, HIDDEN, UNSEEN, f"{hidden:.0%} of the positions are not seen and drawn from their surroundings."),
+    ]
+    if interval is not None:
+        found.append(
+            _sign(interval[1], POOR, BAD, f"The error may be as large as {_percent(interval[1])} of the object's size.")
+        )
+    if modes > FLEXIBLE * len(shapes):
+        sentence = f"{modes} modes of deformation in {len(shapes)} frames: the motion hardly determines depth. Use more frames."
+        found.append((Verdict.WITH_CARE, sentence))
+    if planar:
+        found.append(
+            (Verdict.WITH_CARE, "The tracks are those of a thin sheet, whose bending this motion hardly shows.")
+        )
+    signs = sorted((sign for sign in found if sign[0] is not Verdict.GOOD), key=lambda sign: -_RANK[sign[0]])
+    verdict = signs[0][0] if signs else Verdict.GOOD
+    return Trust(verdict, tuple(sentence for _, sentence in signs), expected, interval, turn, residual, hidden)
+
+
+def turned(rotations: Floats) -> float:
+    """Return the largest angle between two viewing directions, degrees; opposite views of an orthographic camera count as one."""
+    directions = rotations[:: max(1, len(rotations) // 500), 2]
+    cosines = np.abs(directions @ directions.T)
+    return float(np.degrees(np.arccos(np.clip(cosines.min(), 0.0, 1.0))))
+
+
+_RANK = {Verdict.GOOD: 0, Verdict.WITH_CARE: 1, Verdict.DO_NOT_USE: 2}
+
+
+def _sign(value: float, care: float, never: float, sentence: str) -> tuple[Verdict, str]:
+    if value >= never:
+        return Verdict.DO_NOT_USE, sentence
+    return (Verdict.WITH_CARE if value >= care else Verdict.GOOD), sentence
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.2g} %" if share < 0.1 else f"{100 * share:.0f} %"

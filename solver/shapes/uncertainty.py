@@ -1,0 +1,160 @@
+"""Posterior standard deviations of positions under the Gaussian shape prior.
+
+With cameras Π, noise variance σ²/w for an observation of confidence w, and the prior covariance Σ of a point's path
+(`model.shape_covariance`), the posterior covariance of the path is
+
+    Σ − Σ Πᵀ (Π Σ Πᵀ + σ² W⁻¹)⁻¹ Π Σ,
+
+restricted to the observations that the point has (Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006,
+equation 2.24). It depends on a point through its pattern of visibility alone. Patterns of a sample of points are evaluated exactly;
+from them follows by how much a hidden position is less certain than a visible one, as a function of the frames to the nearest
+observation, and with that the rest is predicted. Cameras are taken as known, so the numbers are lower bounds where few frames or
+little motion leave the cameras uncertain.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from pliant.solver.model.shape_covariance import ShapeCovariance
+from pliant.solver.records import Floats
+from scipy import linalg
+from scipy.spatial import cKDTree
+
+MOST_FRAMES = 300
+"""Frames evaluated at most, evenly spread; fewer observations make the numbers larger, never smaller. The cost is cubic in frames."""
+
+WORK = 2e10
+"""Floating-point operations spent on patterns of visibility at most: a few seconds on one core."""
+
+MOST_PATTERNS = 128
+"""Patterns evaluated at most."""
+
+GAPS = (0, 1, 2, 4, 8, 16, 32, np.inf)
+"""Classes of a position, by the number of frames to the nearest frame that shows the point."""
+
+
+OFTEN = 0.25
+"""Share of the frames from which a point counts as observed often, as in `shapes.sparsely_observed`."""
+
+
+def position_std(
+    covariance: ShapeCovariance, projections: Floats, confidence: Floats, *, noise_std: float, seed: int = 0
+) -> Floats:
+    """Return the posterior standard deviation of every position: the root of the mean squared distance to the truth.
+
+    Parameters
+    ----------
+    covariance : ShapeCovariance
+        The prior, F frames.
+    projections : ndarray, shape (F, 2, 3)
+        s_f times the first two rows of R_f.
+    confidence : ndarray, shape (F, P)
+        Weights of the observations in [0, 1]; 0 means hidden or rejected.
+    noise_std : float
+        Standard deviation of an image coordinate, the unit of the covariance.
+    seed : int
+        Of the sample of patterns.
+
+    Returns
+    -------
+    ndarray, shape (F, P)
+        In the unit of the covariance.
+    """
+    frames = len(projections)
+    used = np.unique(np.linspace(0, frames - 1, min(frames, MOST_FRAMES)).round().astype(int))
+    prior, crossed, image = _moments(covariance, projections, used)
+    noise = noise_std**2
+    weights = confidence[used]
+    everything = _variance(prior, crossed, image, np.ones(len(used)), noise)
+    if (confidence == 1).all():
+        found = np.repeat(everything[:, None], confidence.shape[1], axis=1)
+    else:
+        sample = _sample(weights, seed)
+        exact = np.stack([_variance(prior, crossed, image, weights[:, point], noise) for point in sample], axis=1)
+        found = _predicted(everything, weights, sample, exact)
+    if len(used) < frames:
+        at = np.arange(frames)
+        found = np.stack([np.interp(at, used, column) for column in found.T], axis=1)
+    return np.asarray(np.sqrt(np.maximum(found, 0.0)))
+
+
+def bounded_by_neighbours(std: Floats, shapes: Floats, visible: Floats) -> Floats:
+    """Return the standard deviations with those of sparsely observed points bounded by their surroundings.
+
+    Such points are drawn along the surface (`shapes.sparsely_observed`), which the prior of a single path does not know. The
+    nearest point that is observed often lies on the same surface, so its distance bounds how far off the position can be.
+
+    Parameters
+    ----------
+    std, shapes, visible
+        Shapes `(F, P)`, `(F, P, 3)` and `(F, P)`.
+    """
+    often = np.flatnonzero((visible > 0).mean(axis=0) >= OFTEN)
+    rarely = np.setdiff1d(np.arange(shapes.shape[1]), often)
+    if len(often) == 0 or len(rarely) == 0:
+        return std
+    mean = shapes.mean(axis=0)
+    nearest = often[cKDTree(mean[often]).query(mean[rarely])[1]]
+    away = np.linalg.norm(shapes[:, rarely] - shapes[:, nearest], axis=2)
+    bounded = std.copy()
+    bounded[:, rarely] = np.minimum(std[:, rarely], np.hypot(std[:, nearest], away))
+    return bounded
+
+
+def _moments(covariance: ShapeCovariance, projections: Floats, used: NDArray[np.intp]) -> tuple[Floats, Floats, Floats]:
+    """Return tr Σ_ff (F,), Σ Πᵀ of shape (3F, 2F) and Π Σ Πᵀ (2F, 2F) for the frames used."""
+    rows = projections[used].reshape(-1, 3)
+    over_frames = covariance.over_frames()[np.ix_(used, used)]
+    mean = rows @ covariance.extent
+    path = rows @ covariance.play
+    wide = np.repeat(over_frames, 2, axis=1)
+    crossed = (mean.T[None, :, :] + path.T[None, :, :] * wide[:, None, :]).reshape(3 * len(used), -1)
+    image = mean @ rows.T + (path @ rows.T) * np.repeat(wide, 2, axis=0)
+    prior = np.trace(covariance.extent) + np.diag(over_frames) * np.trace(covariance.play)
+    return np.asarray(prior), crossed, np.asarray(image)
+
+
+def _variance(prior: Floats, crossed: Floats, image: Floats, weights: Floats, noise: float) -> Floats:
+    """Return the trace of the posterior covariance of each frame's position, shape `(F,)`, for one pattern of visibility."""
+    seen = np.flatnonzero(np.repeat(weights > 0, 2))
+    if len(seen) == 0:
+        return prior
+    inner = image[np.ix_(seen, seen)]
+    inner[np.diag_indices(len(seen))] += noise / np.repeat(weights, 2)[seen]
+    factor = linalg.cholesky(inner, lower=True, overwrite_a=True, check_finite=False)
+    explained = linalg.solve_triangular(factor, crossed[:, seen].T, lower=True, check_finite=False)
+    return np.asarray(prior - np.einsum("rc,rc->c", explained, explained).reshape(-1, 3).sum(axis=1))
+
+
+def _sample(weights: Floats, seed: int) -> NDArray[np.intp]:
+    """Return the points whose patterns are evaluated exactly."""
+    frames, points = weights.shape
+    count = int(np.clip(WORK / (16 * frames**3), 8, MOST_PATTERNS))
+    if points <= count:
+        return np.arange(points)
+    return np.sort(np.random.default_rng(seed).choice(points, count, replace=False))
+
+
+def _predicted(everything: Floats, weights: Floats, sample: NDArray[np.intp], exact: Floats) -> Floats:
+    """Return variances `(F, P)`: those evaluated, and for the others the mean ratio to `everything` in their class."""
+    kind = np.digitize(_gaps(weights), GAPS[1:])
+    ratio = exact / np.maximum(everything[:, None], np.finfo(float).tiny)
+    sampled = kind[:, sample]
+    factors = np.ones(len(GAPS))
+    for each in range(len(GAPS)):
+        chosen = ratio[sampled == each]
+        factors[each] = chosen.mean() if chosen.size else (factors[each - 1] if each else 1.0)
+    found = everything[:, None] * np.maximum.accumulate(factors)[kind]
+    found[:, sample] = exact
+    return np.asarray(found)
+
+
+def _gaps(weights: Floats) -> Floats:
+    """Return for each position the number of frames to the nearest frame that shows the point; ∞ where none does."""
+    frames = len(weights)
+    at = np.where(weights > 0, np.arange(frames)[:, None], -np.inf)
+    before = np.maximum.accumulate(at, axis=0)
+    after = -np.maximum.accumulate(np.where(weights > 0, -np.arange(frames)[:, None], -np.inf)[::-1], axis=0)[::-1]
+    here = np.arange(frames)[:, None]
+    return np.asarray(np.minimum(here - before, after - here), dtype=np.float64)

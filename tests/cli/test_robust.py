@@ -1,0 +1,259 @@
+"""The command line with wrong paths, missing parts and Ctrl-C: exact messages and exit codes, never a traceback."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pliant.cli import app
+from pliant.cli.exits import Exit, code_of, sentence_of
+from pliant.cli.paths import output_folder
+from pliant.cli.session import Session
+from pliant.client import BadArgument
+from pliant.service.testing import InMemoryService
+from typer.testing import CliRunner, Result
+
+Run = Callable[..., Result]
+FAST = ("-m", "none", "-O", "prior=smooth+low_rank", "-O", "max_reweightings=1")
+
+
+@pytest.fixture(scope="module")
+def service() -> Iterator[InMemoryService]:
+    service = InMemoryService()
+    yield service
+    service.stop()
+
+
+@pytest.fixture
+def run(service: InMemoryService, monkeypatch: pytest.MonkeyPatch) -> Run:
+    service.worker.steps = 0
+    for name in ("PLIANT_URL", "PLIANT_TOKEN"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("COLUMNS", "200")
+
+    def run(*arguments: object) -> Result:
+        return CliRunner().invoke(app, [str(each) for each in arguments], obj=Session(transport=service))
+
+    return run
+
+
+@pytest.fixture
+def tracks(tmp_path: Path) -> Path:
+    path = tmp_path / "tracks.npz"
+    np.savez(path, tracks=np.random.default_rng(0).normal(size=(5, 12, 2)) * 100)
+    return path
+
+
+def words(ran: Result) -> str:
+    return " ".join(ran.stderr.split())
+
+
+NO_FILE = "expected a file, an array or a dictionary of arrays, got no file at"
+A_FOLDER = "tracks: expected a file, got the folder FOLDER. Give the path of a file in it."
+A_FILE = "--output: expected a folder, got the file TRACKS. Choose another folder."
+LISTED = "`pliant options` lists every option."
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ("solve nofile.npz -o OUT", f"tracks: {NO_FILE} nofile.npz."),
+        ("solve FOLDER -o OUT", A_FOLDER),
+        ("submit FOLDER", A_FOLDER),
+        ("inspect FOLDER", A_FOLDER),
+        ("inspect TRACKS -g none.npz", f"ground_truth: {NO_FILE} none.npz."),
+        ("solve TRACKS -o TRACKS", A_FILE),
+        ("submit TRACKS -o TRACKS", A_FILE),
+        ("solve TRACKS -o TRACKS/below", "--output: TRACKS/below is below a file. Choose another folder."),
+        ("solve TRACKS -o OUT -O frobnicate=1", f"options: frobnicate: there is no such option. {LISTED}"),
+        ("submit TRACKS -O los=l1", f"options: los: there is no such option (did you mean loss?). {LISTED}"),
+    ],
+)
+def test_wrong_paths_and_options(run: Run, tracks: Path, tmp_path: Path, arguments: str, sentence: str) -> None:
+    (tmp_path / "folder").mkdir()
+    names = {"TRACKS": str(tracks), "FOLDER": str(tmp_path / "folder"), "OUT": str(tmp_path / "out")}
+
+    def filled(text: str) -> str:
+        for name, path in names.items():
+            text = text.replace(name, path)
+        return text
+
+    ran = run(*map(filled, arguments.split()))
+    assert (ran.exit_code, ran.stdout) == (Exit.REFUSED, "")
+    assert words(ran) == f"error {filled(sentence)}"
+
+
+def test_a_path_that_the_system_refuses(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Permissions do not bind root, so the system's answers are put in their place."""
+    folder = tmp_path / "locked"
+    folder.mkdir()
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    with pytest.raises(BadArgument, match=rf"the folder {folder} is not writable\. Choose another folder\."):
+        output_folder(folder, force=False)
+    monkeypatch.setattr(Path, "mkdir", lambda *_, **__: (_ for _ in ()).throw(PermissionError(13, "Permission denied")))
+    with pytest.raises(BadArgument, match=r"cannot create .*: Permission denied"):
+        output_folder(tmp_path / "new", force=False)
+
+
+def test_an_unreadable_file(run: Run, tracks: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("pliant.client.multipart.os.access", lambda *_: False)
+    ran = run("solve", tracks, "-o", tmp_path / "out")
+    assert ran.exit_code == Exit.REFUSED
+    assert words(ran) == f"error tracks: the file {tracks} cannot be read. Change its permissions."
+
+
+def test_errors_of_the_system_have_a_sentence_and_defects_have_none(tmp_path: Path) -> None:
+    full = OSError(28, "No space left on device")
+    assert (code_of(full), sentence_of(full)) == (Exit.REFUSED, "No space left on device.")
+    with pytest.raises(OSError, match="Is a directory") as caught:
+        tmp_path.open("wb")
+    assert code_of(caught.value) == Exit.REFUSED
+    assert sentence_of(caught.value) == f"{tmp_path}: Is a directory."
+    assert code_of(ZeroDivisionError()) is None
+    assert code_of(OSError("no file is named")) is None
+
+
+def test_existing_results_are_kept_unless_forced(run: Run, tracks: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "report.json").write_text("mine")
+    sentence = (
+        f"error --output: {out} already holds report.json. Choose another folder, or replace the files with --force."
+    )
+    for command in (("solve", tracks, "-o", out), ("submit", tracks, "-o", out)):
+        ran = run(*command)
+        assert (ran.exit_code, words(ran)) == (Exit.REFUSED, sentence)
+    assert (out / "report.json").read_text() == "mine"
+    assert run("submit", tracks, "-m", "none", "-o", out, "--force", "--id", "forced").exit_code == 0
+    assert json.loads((out / "report.json").read_text())["outcome"] == "converged"
+    assert run("result", "forced", "-o", out).exit_code == 0, "the same files are no conflict"
+    (out / "shapes.npz").write_text("changed")
+    ran = run("result", "forced", "-o", out)
+    assert ran.exit_code == Exit.REFUSED
+    assert "already holds shapes.npz" in words(ran)
+    assert run("result", "forced", "-o", out, "--force").exit_code == 0
+    assert np.load(out / "shapes.npz")["shapes"].shape == (5, 12, 3)
+
+
+def test_jobs_are_named_by_prefix_or_as_the_last_one(run: Run, tracks: Path) -> None:
+    for name in ("apple-1", "apple-2", "banana-1"):
+        assert run("submit", tracks, "-m", "none", "--id", name).exit_code == 0
+    assert json.loads(run("status", "ban", "--json").stdout)["id"] == "banana-1"
+    assert json.loads(run("watch", "@last", "--json").stdout)["id"] == "banana-1"
+    ran = run("status", "apple")
+    assert ran.exit_code == Exit.REFUSED
+    assert words(ran) == "error apple: 2 jobs begin with it (apple-2, apple-1). Give more characters."
+    assert run("log", "cherry").exit_code == Exit.NOT_FOUND
+    run("watch", "apple-1")
+    ran = run("delete", "apple-1", "cherry")
+    assert ran.exit_code == Exit.NOT_FOUND
+    assert run("status", "apple-1").exit_code == 0, "nothing is deleted unless every id is valid"
+    assert words(run("delete", "apple-1")) == "Deleted: apple-1"
+    empty = CliRunner().invoke(app, ["status", "@last"], obj=Session(transport=InMemoryService()))
+    assert empty.exit_code == Exit.REFUSED
+    assert "the service has no jobs" in words(empty)
+
+
+def test_the_id_is_printed_before_waiting(run: Run, tracks: Path, service: InMemoryService) -> None:
+    service.worker.steps = math.inf
+    ran = run("submit", tracks, "-m", "none", "--id", "early", "--wait", "--timeout", "0.5")
+    assert ran.exit_code == Exit.TIMEOUT
+    assert words(ran).startswith("Job early")
+    assert "The timeout of 0.5 s passed during the wait for job early" in words(ran)
+    run("cancel", "early")
+
+
+def test_a_line_is_printed_regularly_without_a_terminal(
+    run: Run, tracks: Path, service: InMemoryService, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import importlib
+
+    service.worker.steps = 40
+    monkeypatch.setattr(importlib.import_module("pliant.cli.jobs"), "LINE_EVERY", 0.1)
+    ran = run("submit", tracks, "-m", "none", "--wait")
+    assert ran.exit_code == 0
+    lines = [line for line in ran.stderr.splitlines() if " s: " in line]
+    assert len(lines) >= 3
+    assert any("loading" in line or "reweight" in line or "running" in line for line in lines)
+
+
+@pytest.mark.parametrize(
+    "command", [["up"], ["work"], ["token", "list"], ["demo"], ["doctor", "--audit"]], ids=" ".join
+)
+def test_commands_of_the_server_say_what_to_install(
+    command: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, "rq", None)
+    ran = CliRunner().invoke(app, command)
+    name = {"token": "pliant token"}.get(command[0], f"pliant {' '.join(command)}")
+    assert ran.exit_code == Exit.UNHEALTHY
+    assert words(ran) == f"error {name} needs the service, which is not installed: pip install 'pliant[server]'"
+
+
+def test_a_module_of_the_server_that_is_missing_elsewhere(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object, **__: object) -> None:
+        raise ModuleNotFoundError("No module named 'redis'", name="redis")
+
+    monkeypatch.setattr("pliant.client._sync.client.Client.list", broken)
+    ran = run("list")
+    assert ran.exit_code == Exit.UNHEALTHY
+    assert "pip install 'pliant[server]'" in words(ran)
+
+
+def interrupted(command: list[str], after: str, *, cwd: Path) -> tuple[int, str]:
+    """Run the command line, press Ctrl-C once it has printed some text, and return its exit code and standard error."""
+    started = subprocess.Popen(
+        [sys.executable, "-m", "pliant.cli", *command],
+        cwd=cwd,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    assert started.stdout is not None
+    printed = ""
+    while after not in printed:
+        piece = started.stdout.readline()
+        assert piece, printed
+        printed += piece
+    time.sleep(0.2)
+    started.send_signal(signal.SIGINT)
+    printed += started.stdout.read()
+    started.stdout.close()
+    return started.wait(30), " ".join(printed.split())
+
+
+def test_ctrl_c_while_solving(tmp_path: Path) -> None:
+    from pliant.solver.gallery import face
+
+    np.savez(tmp_path / "face.npz", tracks=face(60, 3000).tracks.points)
+    code, printed = interrupted(["solve", "face.npz", "-o", "out"], "frames ×", cwd=tmp_path)
+    assert (code, printed.rpartition("error ")[2]) == (Exit.INTERRUPTED, "Interrupted.")
+    assert "Traceback" not in printed
+
+
+def test_ctrl_c_while_waiting_says_how_to_return(
+    run: Run, tracks: Path, service: InMemoryService, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    service.worker.steps = math.inf
+    assert run("submit", tracks, "-m", "none", "--id", "slow").exit_code == 0
+    monkeypatch.setattr("pliant.client._sync.client.Client.wait", interrupt)
+    ran = run("watch", "slow")
+    assert ran.exit_code == Exit.INTERRUPTED
+    assert (
+        words(ran)
+        == "error Interrupted. Job slow continues: `pliant watch slow` follows it, `pliant cancel slow` stops it."
+    )
+    run("cancel", "slow")

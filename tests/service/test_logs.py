@@ -1,0 +1,116 @@
+"""The log: one line per request, the reason of every refusal, the request's id, and no secret."""
+
+from __future__ import annotations
+
+import io
+import json
+import logging
+
+import httpx
+import pytest
+from pliant.service.logs import REQUEST_ID, AddRequestId, configure_logging, formatter
+from pliant.worker.errors import WorkerError
+from serving import Running, Serve, submit, until
+
+
+def lines(caplog: pytest.LogCaptureFixture) -> list[logging.LogRecord]:
+    return [record for record in caplog.records if record.name == "pliant.access"]
+
+
+@pytest.fixture(autouse=True)
+def at_info(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+
+
+def test_a_request_keeps_its_id_and_its_line_names_the_job(
+    http: httpx.Client, caplog: pytest.LogCaptureFixture
+) -> None:
+    answer = http.get("/v1/options", headers={"X-Request-ID": "from-proxy:7"})
+    assert answer.headers["x-request-id"] == "from-proxy:7"
+    job = submit(http, name="logged")
+    found = http.get(f"/v1/jobs/{job.id}")
+    own = found.headers["x-request-id"]
+    assert len(own) == 16
+    until(lambda: len([record for record in lines(caplog) if vars(record).get("job") == job.id]) == 2)
+    posted, read = (record for record in lines(caplog) if vars(record).get("job") == job.id)
+    assert (vars(posted)["method"], vars(posted)["status"], posted.levelname) == ("POST", 202, "INFO")
+    assert read.getMessage().startswith(f"GET /v1/jobs/{job.id} 200 ")
+
+
+@pytest.mark.parametrize("id", ["a b", "x" * 129, "a\tb", "naïve"])
+def test_an_unfit_request_id_is_replaced(http: httpx.Client, id: str) -> None:
+    answer = http.get("/healthz", headers={"X-Request-ID": id.encode()})
+    assert answer.headers["x-request-id"] != id
+    assert len(answer.headers["x-request-id"]) == 16
+
+
+def test_a_refusal_is_logged_with_its_code_and_without_the_query(
+    http: httpx.Client, caplog: pytest.LogCaptureFixture
+) -> None:
+    http.get("/v1/jobs/nobody-here?token=SECRET", headers={"Authorization": "Bearer SECRET"})
+    until(lambda: any(vars(record).get("job") == "nobody-here" for record in lines(caplog)))
+    (record,) = [record for record in lines(caplog) if vars(record).get("job") == "nobody-here"]
+    assert (record.levelname, vars(record)["code"]) == ("WARNING", "unknown_job")
+    ours = [record for record in caplog.records if record.name.startswith("pliant")]
+    assert all("SECRET" not in str(vars(record)) for record in ours)
+    http.get("/v1/jobs/a%0Ab%1B")
+    until(lambda: any("%0Ab" in record.getMessage() for record in lines(caplog)))
+    assert all("\n" not in record.getMessage() and "\x1b" not in record.getMessage() for record in lines(caplog))
+
+
+def test_mapped_and_unexpected_errors_of_the_service_are_logged(
+    serve: Serve, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    running: Running = serve()
+
+    def fail(error: Exception) -> None:
+        def raised(*_: object, **__: object) -> None:
+            raise error
+
+        monkeypatch.setattr("pliant.worker.jobs.service.Jobs.page", raised)
+
+    with httpx.Client(base_url=running.url, timeout=20) as http:
+        fail(WorkerError("The machinery broke."))
+        mapped = http.get("/v1/jobs", headers={"X-Request-ID": "mapped-1"})
+        assert (mapped.status_code, mapped.json()["code"]) == (500, "worker_error")
+        fail(KeyError("a defect"))
+        defect = http.get("/v1/jobs", headers={"X-Request-ID": "defect-1"})
+        assert (defect.status_code, defect.json()["code"]) == (500, "internal_error")
+        assert defect.headers["x-request-id"] == "defect-1"
+    until(lambda: len([record for record in lines(caplog) if vars(record)["status"] == 500]) == 2)
+    assert {record.levelname for record in lines(caplog)} == {"ERROR"}
+    assert "WorkerError: The machinery broke." in caplog.text
+    assert "raise error" in caplog.text, "with the traceback"
+
+
+def test_json_lines_carry_every_field() -> None:
+    out = io.StringIO()
+    handler = logging.StreamHandler(out)
+    handler.addFilter(AddRequestId())
+    handler.setFormatter(formatter("json"))
+    logger = logging.getLogger("pliant.test-json")
+    logger.propagate = False
+    logger.addHandler(handler)
+    REQUEST_ID.set("id-1")
+    logger.warning("two %s", "words", extra={"job": "j1", "status": 404})
+    found = json.loads(out.getvalue())
+    assert found.pop("time")[:2] == "20"
+    assert found == {
+        "level": "WARNING", "logger": "pliant.test-json", "message": "two words", "request_id": "id-1", "job": "j1",
+        "status": 404,
+    }  # fmt: skip
+
+
+def test_level_and_format_are_set_once_for_the_process(capsys: pytest.CaptureFixture[str]) -> None:
+    root = logging.getLogger()
+    before, level = root.handlers[:], root.level
+    try:
+        configure_logging("warning", "console")
+        logging.getLogger("pliant.test").info("quiet")
+        logging.getLogger("pliant.test").warning("loud")
+        said = capsys.readouterr().err
+        assert "quiet" not in said
+        assert said.endswith("WARNING pliant.test [-]: loud\n") or "pliant.test [" in said
+    finally:
+        root.handlers[:] = before
+        root.setLevel(level)

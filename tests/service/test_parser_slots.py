@@ -1,0 +1,64 @@
+"""Parser slots: one owner with many slow inputs does not make another wait for all of them."""
+
+from __future__ import annotations
+
+import threading
+
+import anyio
+import pytest
+from pliant.service.spool import ParserSlots
+
+
+def test_another_owner_is_next_and_all_run() -> None:
+    began: list[str] = []
+    steps = threading.Semaphore(0)
+
+    def parse(name: str) -> str:
+        began.append(name)
+        assert steps.acquire(timeout=10)
+        return name
+
+    async def everything() -> None:
+        slots = ParserSlots(2)
+        async with anyio.create_task_group() as group:
+            for number in range(8):
+                group.start_soon(slots.run, "greedy", parse, f"greedy {number}")
+            await until(lambda: len(began) == 2)
+            group.start_soon(slots.run, "other", parse, "other")
+            await anyio.sleep(0.05)
+            steps.release()
+            await until(lambda: len(began) == 3)
+            assert began[2] == "other"
+            for _ in range(8):
+                steps.release()
+        assert sorted(began) == sorted(["other", *(f"greedy {number}" for number in range(8))])
+        steps.release()
+        assert await slots.run("other", parse, "afterwards") == "afterwards"
+
+    anyio.run(everything)
+
+
+def test_one_who_leaves_holds_no_slot_and_a_failure_gives_it_back() -> None:
+    go_on = threading.Event()
+
+    async def everything() -> None:
+        slots = ParserSlots(1)
+        async with anyio.create_task_group() as group:
+            group.start_soon(slots.run, "a", go_on.wait)
+            await anyio.sleep(0.02)
+            with anyio.move_on_after(0.05) as scope:
+                await slots.run("b", int)
+            assert scope.cancelled_caught
+            go_on.set()
+        with pytest.raises(ZeroDivisionError):
+            await slots.run("a", lambda: 1 // 0)
+        with anyio.fail_after(5):
+            assert await slots.run("c", int) == 0
+
+    anyio.run(everything)
+
+
+async def until(holds) -> None:  # type: ignore[no-untyped-def]
+    with anyio.fail_after(10):
+        while not holds():
+            await anyio.sleep(0.005)

@@ -1,0 +1,156 @@
+"""The table of error codes: complete, explained by the service, and linked from every problem."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import pytest
+from pliant.schemas.job import Problem
+from pliant.schemas.problems import ProblemCode, find_code
+from pliant.service.problems import Refusal, problem
+
+ROOT = Path(__file__).parents[2]
+FOLDERS = ("solver", "tracking", "worker", "service", "client", "cli")
+
+
+def sources() -> Iterator[tuple[Path, ast.Module]]:
+    for folder in FOLDERS:
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            if "testing" not in path.parts:
+                yield path, ast.parse(path.read_text())
+
+
+def code_parameters() -> dict[str, int]:
+    """Return, by qualified name, the position of the parameter `code` of every function and class that has one."""
+    found: dict[str, int] = {}
+    for path, tree in sources():
+        module = "pliant." + ".".join(path.relative_to(ROOT).with_suffix("").parts)
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ClassDef):
+                for method in node.body:
+                    if isinstance(method, ast.FunctionDef) and method.name == "__init__":
+                        names = [arg.arg for arg in method.args.args]
+                        if "code" in names:
+                            found[f"{module}.{node.name}"] = names.index("code") - 1
+            elif isinstance(node, ast.FunctionDef):
+                names = [arg.arg for arg in node.args.args]
+                if "code" in names and names[0] != "self":
+                    found[f"{module}.{node.name}"] = names.index("code")
+    return found
+
+
+def is_name(node: ast.expr) -> bool:
+    """Return True for a string that can be a code; a sentence cannot."""
+    return isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value.isidentifier()
+
+
+def literals(node: ast.expr) -> Iterator[str]:
+    """Yield the codes that an expression can be, as far as it names them."""
+    if isinstance(node, ast.Constant) and isinstance(node.value, str):
+        yield node.value
+    elif isinstance(node, ast.IfExp):
+        yield from literals(node.body)
+        yield from literals(node.orelse)
+    elif isinstance(node, ast.JoinedStr):
+        raise AssertionError(f"a code is put together in line {node.lineno}; name it whole, so that it can be found")
+
+
+def raised_codes() -> dict[str, str]:
+    """Return every code that the sources name, with one place where they do."""
+    parameters = code_parameters()
+    short = {name.rsplit(".", 1)[1] for name in parameters}
+    found: dict[str, str] = {}
+    for path, tree in sources():
+        module = "pliant." + ".".join(path.relative_to(ROOT).with_suffix("").parts)
+        names = {name.rsplit(".", 1)[1]: name for name in parameters if name.startswith(f"{module}.")}
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom) and node.module is not None:
+                for alias in node.names:
+                    if alias.name in short:
+                        same = [name for name in parameters if name.rsplit(".", 1)[1] == alias.name]
+                        # From the module itself, or from a package that exports it.
+                        origin = [name for name in same if name.startswith(f"{node.module}.")]
+                        if origin:
+                            names[alias.asname or alias.name] = origin[0]
+        for node in ast.walk(tree):
+            codes: list[ast.expr] = []
+            if isinstance(node, ast.Call):
+                called = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
+                codes += [keyword.value for keyword in node.keywords if keyword.arg == "code"]
+                position = parameters.get(names.get(called, ""))
+                if position is not None and len(node.args) > position:
+                    codes.append(node.args[position])
+                if ast.unparse(node.func) == "super().__init__" and node.args and is_name(node.args[0]):
+                    codes.append(node.args[0])
+            elif isinstance(node, (ast.Assign, ast.AnnAssign)) and node.value is not None:
+                targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+                if any(isinstance(each, ast.Name) and each.id == "code" for each in targets):
+                    codes.append(node.value)
+            elif isinstance(node, ast.FunctionDef):
+                defaults = dict(zip(node.args.kwonlyargs, node.args.kw_defaults, strict=True))
+                codes += [value for arg, value in defaults.items() if arg.arg == "code" and value is not None]
+            elif (
+                isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "ProblemCode"
+            ) and node.attr.isupper():
+                found.setdefault(ProblemCode[node.attr].value, f"{path}:{node.lineno}")
+            for each in codes:
+                for code in literals(each):
+                    found.setdefault(code, f"{path}:{each.lineno}")
+    return found
+
+
+def test_the_table_holds_exactly_the_codes_that_the_sources_raise() -> None:
+    raised = raised_codes()
+    assert len(raised) > 90
+    assert {code: place for code, place in raised.items() if find_code(code) is None} == {}, "not in the table"
+    assert {code.value for code in ProblemCode} - set(raised) == set(), "in the table, but never raised"
+
+
+@pytest.mark.parametrize("code", ProblemCode)
+def test_every_entry_is_whole(code: ProblemCode) -> None:
+    assert code.name == code.value.upper()
+    assert code.cause.endswith(".")
+    assert code.remedy.endswith(".")
+    assert code.cause != code.remedy
+    assert code.heading[0].isupper()
+    assert code.status is None or 400 <= code.status < 600
+
+
+def test_the_type_of_a_problem_resolves_to_its_explanation(http: httpx.Client) -> None:
+    answer = http.get("/v1/jobs/nobody").json()
+    assert (answer["type"], answer["title"]) == ("/errors/unknown_job", "Unknown job")
+    found = http.get(answer["type"])
+    assert found.json() == {
+        "code": "unknown_job",
+        "status": 404,
+        "title": "Unknown job",
+        "cause": ProblemCode.UNKNOWN_JOB.cause,
+        "remedy": ProblemCode.UNKNOWN_JOB.remedy,
+        "retryable": False,
+    }
+    page = http.get(answer["type"], headers={"Accept": "text/html,*/*"})
+    assert page.headers["content-type"] == "text/html; charset=utf-8"
+    assert f"<p>{ProblemCode.UNKNOWN_JOB.remedy}</p>" in page.text
+    assert "<script" not in page.text
+    assert "style" not in page.text
+    assert {each["code"] for each in http.get("/errors").json()} == {code.value for code in ProblemCode}
+
+
+def test_an_explanation_of_no_code_is_refused(http: httpx.Client) -> None:
+    answer = http.get("/errors/<b>")
+    assert (answer.status_code, answer.json()["code"]) == (422, "invalid_request")
+
+
+def test_a_code_of_a_newer_version_is_still_a_problem() -> None:
+    made = problem("from_the_future", 418, detail="Something new. Update.")
+    assert (made.title, made.type, made.retryable) == ("I'm a Teapot", "/errors/from_the_future", False)
+    assert Problem(title="T", status=500, detail="D.", code="out_of_memory").type == "/errors/out_of_memory"
+
+
+def test_a_refusal_has_its_codes_usual_status() -> None:
+    assert Refusal(ProblemCode.BODY_STALLED, detail="D.").status == 408
+    assert Refusal(ProblemCode.UNKNOWN_UPLOAD, detail="D.", status=422).status == 422
+    assert Refusal(ProblemCode.HTTP_ERROR, detail="D.").status == 500

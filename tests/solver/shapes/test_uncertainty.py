@@ -1,0 +1,125 @@
+"""Posterior standard deviations: the information form, draws from the prior, and what hiding and noise do."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pliant.solver.model.shape_covariance import ShapeCovariance
+from pliant.solver.shapes import uncertainty
+from pliant.solver.shapes.uncertainty import bounded_by_neighbours, position_std
+from scipy.spatial.transform import Rotation
+
+FRAMES = 9
+NOISE = 0.02
+
+
+def covariance(seed: int = 0, frames: int = FRAMES) -> ShapeCovariance:
+    rng = np.random.default_rng(seed)
+    spread = rng.normal(size=(3, 3))
+    play = spread @ spread.T + np.eye(3)
+    modes = 0.2 * np.cumsum(rng.normal(size=(frames, 2)), axis=0) / np.sqrt(frames)
+    return ShapeCovariance(np.diag([1.0, 0.8, 0.4]), play * 3 / np.trace(play), modes, 1e-3, NOISE**2, np.inf)
+
+
+def projections(frames: int = FRAMES, degrees: float = 40) -> np.ndarray:
+    angles = np.linspace(-degrees, degrees, frames)
+    return np.asarray(Rotation.from_euler("y", angles[:, None], degrees=True).as_matrix()[:, :2])
+
+
+def dense(given: ShapeCovariance) -> np.ndarray:
+    ones = np.ones((len(given.modes), len(given.modes)))
+    return np.kron(ones, given.extent) + np.kron(given.over_frames(), given.play)
+
+
+def projection_matrix(pairs: np.ndarray) -> np.ndarray:
+    frames = len(pairs)
+    matrix = np.zeros((2 * frames, 3 * frames))
+    for f, pair in enumerate(pairs):
+        matrix[2 * f : 2 * f + 2, 3 * f : 3 * f + 3] = pair
+    return matrix
+
+
+def test_it_is_the_inverse_of_the_posterior_precision() -> None:
+    given, pairs = covariance(), projections()
+    rng = np.random.default_rng(1)
+    confidence = rng.choice([0.0, 0.5, 1.0], size=(FRAMES, 6))
+    found = position_std(given, pairs, confidence, noise_std=NOISE)
+    matrix, prior = projection_matrix(pairs), dense(given)
+    for point in range(6):
+        weights = np.repeat(confidence[:, point], 2) / NOISE**2
+        posterior = np.linalg.inv(np.linalg.inv(prior) + matrix.T @ (weights[:, None] * matrix))
+        expected = np.sqrt(np.diag(posterior).reshape(FRAMES, 3).sum(axis=1))
+        np.testing.assert_allclose(found[:, point], expected, rtol=1e-5)
+
+
+def test_errors_of_the_posterior_mean_are_as_large_as_stated() -> None:
+    given, pairs, count = covariance(), projections(), 4000
+    rng = np.random.default_rng(2)
+    prior, matrix = dense(given), projection_matrix(pairs)
+    paths = np.linalg.cholesky(prior) @ rng.normal(size=(3 * FRAMES, count))
+    images = matrix @ paths + NOISE * rng.normal(size=(2 * FRAMES, count))
+    image = matrix @ prior @ matrix.T + NOISE**2 * np.eye(2 * FRAMES)
+    errors = (prior @ matrix.T @ np.linalg.solve(image, images) - paths).reshape(FRAMES, 3, count)
+    measured = np.sqrt((errors**2).sum(axis=1).mean(axis=1))
+    stated = position_std(given, pairs, np.ones((FRAMES, 1)), noise_std=NOISE)[:, 0]
+    np.testing.assert_allclose(measured, stated, rtol=0.05)
+
+
+def test_points_seen_alike_are_equally_certain_and_hiding_or_noise_makes_them_less_so() -> None:
+    given, pairs = covariance(), projections()
+    clear = position_std(given, pairs, np.ones((FRAMES, 3)), noise_std=NOISE)
+    assert np.ptp(clear, axis=1).max() == 0
+    hidden = np.ones((FRAMES, 3))
+    hidden[4:7, 1] = 0
+    partly = position_std(given, pairs, hidden, noise_std=NOISE)
+    assert (partly[:, 1] >= clear[:, 1] - 1e-12).all()
+    assert (partly[4:7, 1] > 1.2 * clear[4:7, 1]).all()
+    assert (position_std(given, pairs, np.ones((FRAMES, 3)), noise_std=3 * NOISE) > clear).all()
+
+
+def test_never_seen_is_the_prior_and_less_turn_is_less_certain() -> None:
+    given = covariance()
+    never = position_std(given, projections(), np.zeros((FRAMES, 1)), noise_std=NOISE)[:, 0]
+    np.testing.assert_allclose(never**2, np.diag(dense(given)).reshape(FRAMES, 3).sum(axis=1))
+    seen = np.ones((FRAMES, 1))
+    wide, narrow = (position_std(given, projections(degrees=turn), seen, noise_std=NOISE) for turn in (40, 4))
+    assert (narrow > wide).all()
+
+
+def test_what_is_predicted_from_a_sample_is_near_what_is_exact(monkeypatch: pytest.MonkeyPatch) -> None:
+    frames, points = 24, 150
+    given, pairs = covariance(3, frames), projections(frames)
+    rng = np.random.default_rng(4)
+    centre, width = rng.uniform(0, frames, points), rng.uniform(2, 8, points)
+    confidence = (np.abs(np.arange(frames)[:, None] - centre) > width).astype(float)
+    monkeypatch.setattr(uncertainty, "MOST_PATTERNS", points)
+    exact = position_std(given, pairs, confidence, noise_std=NOISE)
+    monkeypatch.setattr(uncertainty, "MOST_PATTERNS", 40)
+    predicted = position_std(given, pairs, confidence, noise_std=NOISE)
+    assert np.array_equal(predicted, position_std(given, pairs, confidence, noise_std=NOISE)), "it is deterministic"
+    assert not np.array_equal(predicted, exact)
+    assert np.median(np.abs(np.log(predicted / exact))) < 0.2
+
+
+def test_long_films_are_evaluated_at_some_of_their_frames_and_never_too_confidently(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    frames = 30
+    given, pairs, seen = covariance(5, frames), projections(frames), np.ones((frames, 2))
+    exact = position_std(given, pairs, seen, noise_std=NOISE)
+    monkeypatch.setattr(uncertainty, "MOST_FRAMES", 10)
+    fewer = position_std(given, pairs, seen, noise_std=NOISE)
+    assert fewer.shape == exact.shape
+    assert (fewer > 0.99 * exact).mean() > 0.95
+
+
+def test_a_sparsely_observed_point_is_no_less_certain_than_its_distance_from_the_surface() -> None:
+    shapes = np.zeros((4, 3, 3))
+    shapes[:, 1, 0], shapes[:, 2, 0] = 0.1, 5.0
+    visible = np.array([[1.0, 0.0, 1.0]] * 4)
+    std = np.array([[0.03, 2.0, 0.04]] * 4)
+    bounded = bounded_by_neighbours(std, shapes, visible)
+    np.testing.assert_allclose(bounded[:, 1], np.hypot(0.03, 0.1))
+    assert np.array_equal(bounded[:, [0, 2]], std[:, [0, 2]])
+    assert bounded_by_neighbours(std, shapes, np.ones((4, 3))) is std
+    assert bounded_by_neighbours(std, shapes, np.zeros((4, 3))) is std

@@ -1,0 +1,166 @@
+"""Films are recognised by content, decoded upright and in order, within limits."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+
+import films
+import numpy as np
+import pytest
+from PIL import Image
+from pliant.tracking import Film, FilmError, FilmLimits, open_film
+
+PICTURES = films.textured_pictures(8)
+
+
+def read(film: Film) -> np.ndarray:
+    return np.stack([frame.image for frame in film.frames()])
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".mov", ".webm", ".avi", ".mkv"])
+def test_video_frames_come_in_order_with_times(tmp_path: Path, suffix: str) -> None:
+    film = open_film(films.write_film(tmp_path / f"film{suffix}", PICTURES, fps=25))
+    assert film.size == (64, 48)
+    frames = list(film.frames())
+    assert [frame.index for frame in frames] == list(range(8))
+    np.testing.assert_allclose([frame.time for frame in frames], np.arange(8) / 25, atol=2e-3)
+    for frame, picture in zip(frames, PICTURES, strict=True):
+        errors = [np.abs(frame.image.astype(int) - other).mean() for other in PICTURES]
+        assert np.argmin(errors) == next(i for i, other in enumerate(PICTURES) if other is picture)
+
+
+def test_pictures_of_a_folder_and_a_zip_come_in_natural_order(tmp_path: Path) -> None:
+    names = [f"shot{number}.png" for number in (1, 2, 9, 10, 11, 100, 101, 200)]
+    entries = {name: films.png(picture) for name, picture in zip(names, PICTURES, strict=True)}
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    for name in reversed(names):
+        (folder / name).write_bytes(entries[name])
+    (folder / "notes.txt").write_text("not a picture")
+    packed = films.zip_of(tmp_path / "film.zip", {"__MACOSX/shot1.png": b"junk", **dict(reversed(entries.items()))})
+    for path in (folder, packed):
+        film = open_film(path)
+        assert film.stated_frames == 8
+        np.testing.assert_array_equal(read(film), np.stack(PICTURES))
+
+
+def test_a_gif_keeps_its_uneven_times(tmp_path: Path) -> None:
+    first, *others = [Image.fromarray(picture).quantize(64) for picture in PICTURES]
+    first.save(tmp_path / "film.gif", save_all=True, append_images=others, duration=[40, 40, 200, 40, 40, 40, 40, 40])
+    frames = list(open_film(tmp_path / "film.gif").frames())
+    assert [frame.index for frame in frames] == list(range(8))
+    np.testing.assert_allclose([frame.time for frame in frames], [0, 0.04, 0.08, 0.28, 0.32, 0.36, 0.4, 0.44])
+    assert frames[3].image.shape == (48, 64, 3)
+    assert len(list(open_film(tmp_path / "film.gif", frames="1:6:2").frames())) == 3
+    assert [frame.index for frame in open_film(tmp_path / "film.gif", frames=3).frames()] == [0, 3, 6]
+
+
+def test_a_rotation_flag_is_applied(tmp_path: Path) -> None:
+    path = films.write_film(tmp_path / "film.mp4", PICTURES)
+    upright = read(open_film(path))
+    turned = open_film(films.turned_by_90(path))
+    assert turned.size == (48, 64)
+    np.testing.assert_array_equal(read(turned), np.rot90(upright, -1, axes=(1, 2)))
+
+
+def test_a_photograph_is_turned_as_its_exif_says(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    for number, picture in enumerate(PICTURES[:3]):
+        Image.fromarray(picture).save(tmp_path / f"{number}.png", exif=exif)
+    np.testing.assert_array_equal(read(open_film(tmp_path))[0], np.rot90(PICTURES[0], -1))
+
+
+def test_variable_rate_gives_the_true_times(tmp_path: Path) -> None:
+    path = films.with_uneven_times(films.write_film(tmp_path / "film.mp4", PICTURES, fps=25), first=4)
+    times = [frame.time for frame in open_film(path).frames()]
+    # FFmpeg stops at the duration that the edit list still states.
+    np.testing.assert_allclose(np.diff(times), [0.04] * 4 + [0.12] * (len(times) - 5), atol=1e-3)
+    assert len(times) >= 6
+
+
+@pytest.mark.parametrize(
+    ("frames", "indices"),
+    [
+        (None, range(8)),
+        ("::3", [0, 3, 6]),
+        (slice(2, 5), [2, 3, 4]),
+        ("1:7:2", [1, 3, 5]),
+        (4, [0, 2, 4, 6]),
+        ("3", [0, 3, 6]),
+    ],
+)
+def test_frames_select(tmp_path: Path, frames: int | slice | str | None, indices: range | list[int]) -> None:
+    film = open_film(films.write_film(tmp_path / "film.avi", PICTURES), frames=frames)
+    assert [frame.index for frame in film.frames()] == list(indices)
+
+
+@pytest.mark.parametrize("frames", [0, -1, True, "a", "5:2", "::0", "-3:", "1:2:3:4", ""])
+def test_a_wrong_selection_is_refused(tmp_path: Path, frames: int | str) -> None:
+    path = films.write_film(tmp_path / "film.avi", PICTURES)
+    with pytest.raises(FilmError, match="start:stop:step") as caught:
+        open_film(path, frames=frames)
+    assert (caught.value.code, caught.value.field) == ("wrong_selection", "frames")
+
+
+@pytest.mark.parametrize(
+    ("limits", "code"),
+    [
+        (FilmLimits(bytes=100), "too_many_bytes"),
+        (FilmLimits(frames=5), "too_many_frames"),
+        (FilmLimits(pixels=1000), "too_many_pixels"),
+        (FilmLimits(seconds=0.1), "too_long"),
+    ],
+)
+@pytest.mark.parametrize("kind", ["mkv", "zip"])
+def test_limits(tmp_path: Path, limits: FilmLimits, code: str, kind: str) -> None:
+    if kind == "mkv":
+        path = films.write_film(tmp_path / "film.mkv", PICTURES)
+    else:
+        path = films.zip_of(tmp_path / "film.zip", {f"{i}.png": films.png(p) for i, p in enumerate(PICTURES)})
+    with pytest.raises(FilmError) as caught:
+        read(open_film(path, limits=limits))
+    assert caught.value.code == code
+
+
+def test_a_selection_keeps_a_long_film_within_limits(tmp_path: Path) -> None:
+    path = films.write_film(tmp_path / "film.mkv", PICTURES)
+    assert len(read(open_film(path, frames="::2", limits=FilmLimits(frames=5)))) == 4
+
+
+def test_pictures_of_several_sizes_are_refused(tmp_path: Path) -> None:
+    sizes = [(64, 48), (64, 48), (32, 48)]
+    entries = {f"{i}.png": films.png(np.zeros((h, w, 3), np.uint8)) for i, (w, h) in enumerate(sizes)}
+    with pytest.raises(FilmError, match="32×48 in frame 2"):
+        read(open_film(films.zip_of(tmp_path / "film.zip", entries)))
+
+
+def test_a_tiny_film_is_refused(tmp_path: Path) -> None:
+    path = films.zip_of(tmp_path / "film.zip", {"1.png": films.png(np.zeros((8, 8, 3), np.uint8))})
+    with pytest.raises(FilmError, match="16×16"):
+        open_film(path)
+
+
+def test_a_zip_bomb_is_refused_before_it_is_unpacked(tmp_path: Path) -> None:
+    path = films.zip_of(tmp_path / "film.zip", {f"{i}.bmp": b"BM" + bytes(20_000_000) for i in range(3)})
+    assert path.stat().st_size < 100_000
+    with pytest.raises(FilmError) as caught:
+        open_film(path, limits=FilmLimits(bytes=50_000_000))
+    assert caught.value.code == "too_many_bytes"
+
+
+def test_a_picture_bomb_is_refused_by_its_header(tmp_path: Path) -> None:
+    flat = Image.new("1", (10_000, 10_000))
+    flat.save(tmp_path / "1.png")
+    path = films.zip_of(tmp_path / "film.zip", {"1.png": (tmp_path / "1.png").read_bytes()})
+    with pytest.raises(FilmError) as caught:
+        open_film(path)
+    assert caught.value.code in ("too_many_pixels", "broken_picture")
+
+
+def test_a_zip_with_an_immense_directory_is_refused(tmp_path: Path) -> None:
+    path = films.zip_of(tmp_path / "film.zip", {f"{i:0200d}.png": b"" for i in range(20_000)}, zipfile.ZIP_STORED)
+    with pytest.raises(FilmError) as caught:
+        open_film(path)
+    assert caught.value.code == "too_many_pictures"

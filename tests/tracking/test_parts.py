@@ -1,0 +1,197 @@
+"""The tracker's parts: regions, cuts, flow tests, the grid, and the frame store."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import films
+import numpy as np
+import pytest
+from PIL import Image
+from pliant.solver.gallery import sphere
+from pliant.tracking import FilmError
+from pliant.tracking.appearance import Appearance, noise_variance
+from pliant.tracking.decoding.pictures import natural
+from pliant.tracking.flow import match, opencv_serial, sample
+from pliant.tracking.frame_store import CACHED, FrameStore
+from pliant.tracking.region import read_region
+from pliant.tracking.rendering import render_film
+from pliant.tracking.seeding import keep, neighbours, place, quads
+from pliant.tracking.survey import find_cuts, sharpest, tracking_scale
+
+
+def grey(count: int = 2, step: int = 2) -> list[np.ndarray]:
+    return [cv2.cvtColor(p, cv2.COLOR_RGB2GRAY) for p in films.textured_pictures(count, (96, 72), step=step)]
+
+
+def test_without_opencv_the_import_says_what_to_install() -> None:
+    code = "import sys; sys.modules['cv2'] = None\nimport pliant.tracking"
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert ran.returncode != 0
+    assert "pip install 'pliant[film]'" in ran.stderr
+
+
+def test_nothing_else_imports_opencv() -> None:
+    code = "import sys, pliant, pliant.solver, pliant.solver.gallery; sys.exit('cv2' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_regions(tmp_path: Path) -> None:
+    mask = np.zeros((48, 64), bool)
+    mask[10:30, 20:41] = True
+    np.testing.assert_array_equal(read_region(mask, (64, 48)), mask)
+    np.testing.assert_array_equal(read_region(mask.astype(np.uint8) * 255, (64, 48)), mask)
+    np.testing.assert_array_equal(read_region([(20, 10), (40, 10), (40, 29), (20, 29)], (64, 48)), mask)
+    Image.fromarray(mask.astype(np.uint8) * 255).save(tmp_path / "mask.png")
+    np.testing.assert_array_equal(read_region(tmp_path / "mask.png", (64, 48)), mask)
+    clear = np.dstack([np.zeros((48, 64, 3), np.uint8), mask.astype(np.uint8) * 255])
+    Image.fromarray(clear).save(tmp_path / "clear.png")
+    np.testing.assert_array_equal(read_region(str(tmp_path / "clear.png"), (64, 48)), mask)
+
+
+@pytest.mark.parametrize(
+    ("region", "code"),
+    [
+        (np.ones((10, 10), bool), "wrong_region_size"),
+        (np.zeros((48, 64), bool), "empty_region"),
+        (np.ones((48, 64, 3), np.uint8), "wrong_region"),
+        (np.ones((48, 64)), "wrong_region"),
+        ([(0, 0), (1, 1)], "wrong_polygon"),
+        ([(0, 0), (1, np.nan), (5, 5)], "wrong_polygon"),
+        ("missing.png", "unreadable_region"),
+        (Path(__file__), "unreadable_region"),
+    ],
+)
+def test_wrong_regions_are_refused(region: object, code: str) -> None:
+    with pytest.raises(FilmError) as caught:
+        read_region(region, (64, 48))  # type: ignore[arg-type]
+    assert (caught.value.code, caught.value.field) == (code, "region")
+
+
+def test_a_mask_of_another_size_is_not_decoded(tmp_path: Path) -> None:
+    Image.new("L", (100, 80), 255).save(tmp_path / "mask.png")
+    with pytest.raises(FilmError, match="got 100×80"):
+        read_region(tmp_path / "mask.png", (64, 48))
+
+
+def test_cuts_are_single_steps() -> None:
+    likeness = np.full(30, 0.95)
+    assert find_cuts(likeness) == ()
+    likeness[12] = 0.1
+    assert find_cuts(likeness) == (12,)
+    likeness[18:24] = 0.1  # fast motion
+    assert find_cuts(likeness) == (12,)
+
+
+def test_the_template_is_a_sharp_frame_of_the_middle() -> None:
+    sharpness = np.zeros(30)
+    sharpness[[3, 14, 28]] = 1
+    assert sharpest(sharpness, 0, 30) == 14
+    assert sharpest(sharpness, 20, 23) == 21
+
+
+def test_small_films_are_enlarged_and_large_ones_reduced() -> None:
+    assert tracking_scale((160, 120), 960) == 3
+    assert tracking_scale((320, 240), 960) == 1.5
+    assert tracking_scale((640, 480), 960) == 1
+    assert tracking_scale((3840, 2160), 960) == 0.25
+
+
+def test_matches_follow_the_motion_and_notice_what_leaves() -> None:
+    first, second = grey()
+    points = np.array([[30.0, 30.0], [50.5, 40.25], [94.5, 40.0]], np.float32)
+    with opencv_serial():
+        found = match(first, second, points)
+    np.testing.assert_allclose(found.points[:2] - points[:2], [[2, 0], [2, 0]], atol=0.15)
+    np.testing.assert_array_equal(found.lost, [False, False, True])
+
+
+def test_sampling_is_bilinear() -> None:
+    rows, columns = np.mgrid[:5, :6].astype(np.float32)
+    field = np.stack([2 * columns + rows, columns * rows], axis=-1)
+    points = np.array([[1.5, 2.25], [0, 0], [5, 4], [-3, 9]], np.float32)
+    np.testing.assert_allclose(sample(field, points), [[5.25, 3.375], [0, 0], [14, 20], [4, 0]], atol=1e-5)
+
+
+def test_patches_notice_what_hides_a_point() -> None:
+    first, second = grey()
+    seeds, _ = place(first, np.ones_like(first, bool), step=6)
+    beside = neighbours(seeds.grid, len(seeds.points))
+    appearance = Appearance.of(first, seeds.points, beside)
+    moved = seeds.points + np.float32([2, 0])
+    everything = np.ones(len(moved), bool)
+    inner = ((moved > 12) & (moved < (84, 60))).all(axis=1)
+    assert appearance.agrees(second, moved, everything)[inner].all()
+    hidden = second.copy()
+    hidden[:, :40] = np.random.default_rng(3).integers(0, 255, (72, 40))
+    seen = appearance.agrees(hidden, moved, everything)
+    assert seen[inner & (moved[:, 0] > 48)].all()
+    assert not seen[inner & (moved[:, 0] < 34)].any()
+
+
+def test_noise_is_estimated_on_texture() -> None:
+    clean = grey(1)[0].astype(float)
+    clean = cv2.GaussianBlur(clean, (0, 0), 3)
+    noisy = np.clip(clean + np.random.default_rng(0).normal(0, 5, clean.shape), 0, 255).astype(np.uint8)
+    assert noise_variance(noisy) == pytest.approx(25, rel=0.25)
+
+
+def test_grids_lose_points_without_a_face_and_keep_their_order() -> None:
+    image = grey(1)[0]
+    seeds, share = place(image, np.ones_like(image, bool), step=8)
+    assert share > 0.9
+    rows, columns = seeds.grid.shape
+    assert len(quads(seeds.grid)) == (rows - 1) * (columns - 1)
+    wanted = np.ones(len(seeds.points), bool)
+    wanted[seeds.grid[0, 1]] = False  # the corner beside it loses its only face
+    grid, kept = keep(seeds.grid, wanted)
+    gone = set(range(len(seeds.points))) - set(kept.tolist())
+    assert gone == {int(seeds.grid[0, 0]), int(seeds.grid[0, 1])}
+    np.testing.assert_array_equal(np.sort(grid[grid >= 0]), np.arange(len(kept)))
+    beside = neighbours(grid, len(kept))
+    assert beside[grid[0, 2]].tolist() == [-1, grid[0, 3], -1, grid[1, 2]]
+
+
+def test_the_store_returns_frames_in_any_order() -> None:
+    frames = [np.full((20, 30), value, np.uint8) for value in range(CACHED + 6)]
+    with FrameStore() as store:
+        for frame in frames:
+            store.append(frame)
+        assert len(store) == len(frames)
+        for index in [*range(len(frames)), *reversed(range(len(frames)))]:
+            np.testing.assert_array_equal(store.read(index), frames[index])
+
+
+def test_names_sort_by_their_numbers() -> None:
+    assert sorted(["b2", "a10", "a9", "a", "B1"], key=natural) == ["a", "a9", "a10", "B1", "b2"]
+
+
+def test_a_rendered_film_shows_what_its_truth_states() -> None:
+    film = render_film(sphere(4, 400, degrees=10), size=(96, 72), noise=0.0)
+    row, column = np.nonzero(cv2.erode(film.region(0).astype(np.uint8), np.ones((15, 15))))
+    points = np.stack([column, row], axis=1).astype(float)
+    tracks, visible, shapes = film.follow(points, 0)
+    np.testing.assert_allclose(tracks[0], points, atol=1e-9)
+    assert visible[:2].mean() > 0.99
+    centre = np.array([95, 71]) / 2
+    np.testing.assert_allclose(film.focal * shapes[..., :2] / shapes[..., 2:] + centre, tracks, atol=1e-9)
+    first, second = (cv2.cvtColor(film.frame(index), cv2.COLOR_RGB2GRAY).astype(np.float32) for index in (0, 1))
+
+    def difference(offset: float) -> float:
+        x, y = (np.ascontiguousarray(tracks[1:2, :, axis] + offset, dtype=np.float32) for axis in (0, 1))
+        return float(np.abs(cv2.remap(second, x, y, cv2.INTER_CUBIC)[0] - first[row, column]).mean())
+
+    assert difference(0.0) < 0.4 * min(difference(0.3), difference(-0.3))
+    assert not np.isfinite(film.follow(np.array([[1.0, 1.0], [500.0, 5.0]]), 0)[0]).any()
+
+
+def test_rendered_films_are_written_in_known_containers_only(tmp_path: Path) -> None:
+    film = render_film(sphere(3, 50), size=(32, 32))
+    with pytest.raises(FilmError, match=r"got film\.gif"):
+        film.write(tmp_path / "film.gif")
+    with pytest.raises(FilmError) as caught:
+        film.write(tmp_path / "missing" / "film.avi")
+    assert caught.value.code == "unwritable_film"

@@ -1,0 +1,279 @@
+"""Tracks of rendered films against their truth, and what the tracker makes of awkward films."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import cv2
+import films
+import numpy as np
+import pytest
+from pliant.solver.gallery import face, flag, sphere
+from pliant.tracking import FilmError, TrackedFilm, TrackingStep, TrackingStopped, track_film
+from pliant.tracking.rendering import RenderedFilm
+
+FRAMES = 16
+
+
+@pytest.fixture(scope="module")
+def turning(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RenderedFilm]:
+    path = tmp_path_factory.mktemp("films") / "sphere.avi"
+    return path, films.rendered(sphere(FRAMES, 600, degrees=20), path, size=(96, 72))
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("face", marks=pytest.mark.slow),
+        pytest.param("flag", marks=pytest.mark.slow),
+        "sphere",
+        pytest.param("occluded", marks=pytest.mark.slow),
+    ],
+)
+def test_tracks_agree_with_the_truth(tmp_path: Path, name: str) -> None:
+    sequence = {
+        "face": lambda: face(20, 1500, degrees=25),
+        "flag": lambda: flag(20, 1500, degrees=30),
+        "sphere": lambda: sphere(20, 800, degrees=30),
+        "occluded": lambda: flag(20, 1500, degrees=20),
+    }[name]()
+    film = films.rendered(sequence, tmp_path / "film.avi", occluder=name == "occluded")
+    start = 5 if name == "occluded" else 10
+    tracked = track_film(tmp_path / "film.avi", region=film.region(start), region_frame=start)
+    result = films.accuracy(tracked, film)
+    assert result["median"] <= 0.3, result
+    assert result["p95"] <= 1.5, result
+    assert result["precision"] >= 0.97, result
+    assert result["recall"] >= 0.8, result
+    assert tracked.template == start
+    # Confidence says something: the surer half of the visible points is the more accurate.
+    true, seen, _ = film.follow(tracked.tracks[start].astype(float), start)
+    right = tracked.visibility & seen & np.isfinite(true).all(axis=2)
+    right[start] = False
+    error, sure = np.linalg.norm(tracked.tracks - true, axis=2)[right], tracked.confidence[right]
+    middle = np.median(sure)
+    assert np.median(error[sure > middle]) < 0.9 * np.median(error[sure <= middle])
+
+
+def test_the_result_is_a_mesh_in_the_films_pixels(turning: tuple[Path, RenderedFilm], tmp_path: Path) -> None:
+    path, film = turning
+    tracked = track_film(path, region=film.region(8), region_frame=8, grid_step=3)
+    count = tracked.tracks.shape[1]
+    assert tracked.tracks.shape == (FRAMES, count, 2)
+    assert (tracked.tracks.dtype, tracked.visibility.dtype, tracked.confidence.dtype) == (np.float32, bool, np.float32)
+    assert tracked.image_size == (96, 72)
+    assert tracked.fps == pytest.approx(30)
+    assert tracked.visibility[8].all()
+    np.testing.assert_array_equal(tracked.confidence > 0, tracked.visibility)
+    np.testing.assert_array_equal(np.sort(tracked.grid[tracked.grid >= 0]), np.arange(count))
+    assert set(tracked.faces.ravel()) == set(range(count)), "every point belongs to a face"
+    corners = tracked.tracks[8][tracked.faces]
+    np.testing.assert_allclose(corners[:, 3] - corners[:, 0], np.tile([3, 0], (len(corners), 1)), atol=1e-4)
+    np.testing.assert_allclose(corners[:, 1] - corners[:, 0], np.tile([0, 3], (len(corners), 1)), atol=1e-4)
+    column, row = np.round(tracked.tracks[8]).astype(int).T
+    assert film.region(8)[row, column].mean() > 0.97
+    np.testing.assert_allclose(tracked.uv * [96, 72] - 0.5, tracked.tracks[8], atol=1e-4)
+    assert np.abs(tracked.template_image.astype(int) - film.frame(8)).mean() < 6, "the template in colour"
+    tracked.save_npz(tmp_path / "tracks.npz")
+    with np.load(tmp_path / "tracks.npz") as stored:
+        np.testing.assert_array_equal(stored["tracks"], tracked.tracks)
+        np.testing.assert_array_equal(stored["faces"], tracked.faces)
+        assert tuple(stored["image_size"]) == (96, 72)
+        assert int(stored["template"]) == 8
+
+
+def test_the_contact_sheet_shows_film_and_tracks(turning: tuple[Path, RenderedFilm]) -> None:
+    path, film = turning
+    tracked = track_film(path, region=film.region(8), region_frame=8, grid_step=3)
+    sheet = tracked.contact_sheet()
+    assert len(sheet) < 200_000
+    picture = cv2.imdecode(np.frombuffer(sheet, np.uint8), cv2.IMREAD_COLOR)
+    assert picture.shape == (2 * 240, 3 * 320, 3)
+    bare = cv2.resize(film.frame(0), (320, 240), interpolation=cv2.INTER_AREA)[..., ::-1]
+    drawn = np.abs(picture[:240, :320].astype(int) - bare).max(axis=2) > 80
+    outside = ~cv2.resize(film.region(0).astype(np.uint8), (320, 240)).astype(bool)
+    outside[215:, :80] = False  # the time
+    assert drawn[~outside].mean() > 0.03
+    assert drawn[outside].mean() < 0.02
+
+
+def test_the_result_does_not_depend_on_threads(turning: tuple[Path, RenderedFilm]) -> None:
+    path, film = turning
+    before = cv2.getNumThreads()
+    one, two = (
+        track_film(path, region=film.region(8), region_frame=8, grid_step=3, threads=threads) for threads in (1, 2)
+    )
+    for name in ("tracks", "visibility", "confidence", "faces"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
+    assert cv2.getNumThreads() == before
+
+
+def test_a_region_is_carried_to_another_template(turning: tuple[Path, RenderedFilm]) -> None:
+    path, film = turning
+    steps: list[TrackingStep] = []
+    tracked = track_film(path, region=film.region(0), template_frame=9, grid_step=3, on_step=steps.append)
+    assert tracked.template == 9
+    column, row = np.round(tracked.tracks[9]).astype(int).T
+    assert film.region(9)[row, column].mean() > 0.95
+    covered = cv2.dilate(_mask(tracked, 9, (72, 96)), np.ones((5, 5), np.uint8)) > 0
+    assert (covered & film.region(9)).sum() > 0.65 * film.region(9).sum()
+    assert {step.stage for step in steps} == {"read", "locate", "track"}
+    assert [step.done for step in steps if step.stage == "track"] == list(range(2, FRAMES + 1))
+    assert steps[0] == TrackingStep("read", 1, None)
+
+
+def _mask(tracked: TrackedFilm, frame: int, shape: tuple[int, int]) -> np.ndarray:
+    mask = np.zeros(shape, np.uint8)
+    column, row = np.round(tracked.tracks[frame]).astype(int).T
+    mask[row, column] = 1
+    return mask
+
+
+@pytest.mark.parametrize("stage", ["read", "locate", "track"])
+def test_tracking_stops_at_every_stage(turning: tuple[Path, RenderedFilm], stage: str) -> None:
+    path, film = turning
+    reached = threading.Event()
+    steps: list[TrackingStep] = []
+
+    def on_step(step: TrackingStep) -> None:
+        steps.append(step)
+        if step.stage == stage:
+            reached.set()
+
+    with pytest.raises(TrackingStopped, match="stopped before it finished"):
+        track_film(path, region=film.region(0), template_frame=9, on_step=on_step, should_stop=reached.is_set)
+    assert [step.stage for step in steps].count(stage) == 1, "nothing more happens after the request"
+
+
+def test_pictures_are_not_read_again_after_a_stop(turning: tuple[Path, RenderedFilm]) -> None:
+    path, film = turning
+    last = threading.Event()
+
+    def on_step(step: TrackingStep) -> None:
+        if step.stage == "track" and step.done == FRAMES:
+            last.set()
+
+    with pytest.raises(TrackingStopped):
+        track_film(path, region=film.region(8), region_frame=8, on_step=on_step, should_stop=last.is_set)
+
+
+def test_without_a_region_everything_is_tracked_with_a_warning(turning: tuple[Path, RenderedFilm]) -> None:
+    path, _ = turning
+    tracked = track_film(path, frames=":8", grid_step=6)
+    assert 8 // 3 <= tracked.template < 8 - 8 // 3
+    assert np.ptp(tracked.tracks[tracked.template], axis=0).min() > 50
+    assert any("Draw around the thing" in note for note in tracked.warnings)
+    assert any("Only 8 frames" in note for note in tracked.warnings)
+
+
+def test_a_selection_keeps_the_films_frame_numbers(turning: tuple[Path, RenderedFilm]) -> None:
+    path, film = turning
+    tracked = track_film(path, region=film.region(8), region_frame=8, frames="2::3", grid_step=3)
+    np.testing.assert_array_equal(tracked.film.frame_indices, [2, 5, 8, 11, 14])
+    assert tracked.template == 2
+    np.testing.assert_allclose(tracked.frame_times, np.array([2, 5, 8, 11, 14]) / 30, atol=2e-3)
+    assert tracked.fps == pytest.approx(10, rel=0.01)
+    assert films.accuracy(tracked, film)["median"] < 0.5
+
+
+def test_only_the_templates_shot_is_tracked(tmp_path: Path) -> None:
+    one, other = (films.textured_pictures(10, (96, 72), seed=seed) for seed in (0, 7))
+    path = films.write_film(tmp_path / "film.mkv", one + other)
+    polygon = [(20, 20), (70, 20), (70, 55), (20, 55)]
+    tracked = track_film(path, region=polygon, region_frame=14)
+    assert tracked.film.cuts == (10,)
+    np.testing.assert_array_equal(tracked.film.frame_indices, np.arange(10, 20))
+    assert any("has a cut (at frame 10)" in note for note in tracked.warnings)
+    assert tracked.visibility.mean() > 0.9
+
+
+def test_a_still_film_gets_a_warning(tmp_path: Path) -> None:
+    path = films.write_film(tmp_path / "film.mkv", films.textured_pictures(1, (96, 72)) * 12)
+    tracked = track_film(path, region=[(20, 20), (70, 20), (70, 55), (20, 55)])
+    assert any("Nothing moves" in note for note in tracked.warnings)
+
+
+def test_a_film_of_three_frames_is_tracked_and_one_of_two_refused(tmp_path: Path) -> None:
+    pictures = films.textured_pictures(3, (96, 72))
+    tracked = track_film(films.write_film(tmp_path / "three.mkv", pictures))
+    assert tracked.tracks.shape[0] == 3
+    assert any("Only 3 frames" in note for note in tracked.warnings)
+    with pytest.raises(FilmError, match="at least 3 frames, got 2") as caught:
+        track_film(films.write_film(tmp_path / "two.mkv", pictures[:2]))
+    assert caught.value.code == "too_few_frames"
+
+
+def test_a_shot_too_short_is_refused(tmp_path: Path) -> None:
+    pictures = films.textured_pictures(12, (96, 72)) + films.textured_pictures(2, (96, 72), seed=7)
+    with pytest.raises(FilmError, match="between two cuts"):
+        track_film(films.write_film(tmp_path / "film.mkv", pictures), region=np.ones((72, 96), bool), region_frame=13)
+
+
+def test_a_region_without_texture_is_refused(tmp_path: Path) -> None:
+    pictures = films.textured_pictures(6, (96, 72))
+    for picture in pictures:
+        picture[10:60, 10:60] = 120
+    mask = np.zeros((72, 96), bool)
+    mask[18:52, 18:52] = True
+    with pytest.raises(FilmError, match="film a surface with a pattern") as caught:
+        track_film(films.write_film(tmp_path / "film.mkv", pictures), region=mask)
+    assert (caught.value.code, caught.value.field) == ("no_texture", "region")
+
+
+def test_frames_that_share_nothing_are_refused(tmp_path: Path) -> None:
+    random = np.random.default_rng(0)
+    pictures = [random.integers(0, 256, (96, 128, 3), dtype=np.uint8) for _ in range(16)]
+    path = films.write_film(tmp_path / "film.mkv", pictures)
+    region = [(20, 20), (100, 20), (100, 75), (20, 75)]
+    with pytest.raises(FilmError, match="Film more slowly") as caught:
+        track_film(path, region=region)
+    assert caught.value.code == "tracks_lost"
+
+
+def test_a_region_that_is_gone_before_the_template_is_refused(tmp_path: Path) -> None:
+    pictures = [picture.copy() for picture in films.textured_pictures(14, (96, 72))]
+    for number, picture in enumerate(pictures):
+        picture[max(14, 72 - 6 * number) :] = 120  # a blank panel rises and covers the region
+    path = films.write_film(tmp_path / "film.mkv", pictures)
+    with pytest.raises(FilmError, match="Draw the region in the template frame itself") as caught:
+        track_film(path, region=[(10, 20), (40, 20), (40, 55), (10, 55)], template_frame=13)
+    assert caught.value.code == "region_lost"
+
+
+def test_uneven_times_and_a_broken_tail_get_warnings(tmp_path: Path) -> None:
+    pictures = films.textured_pictures(24, (96, 72))
+    path = films.with_uneven_times(films.write_film(tmp_path / "film.mp4", pictures), first=12)
+    tracked = track_film(path, region=np.ones((72, 96), bool))
+    assert any("time between frames varies" in note for note in tracked.warnings)
+    path = films.write_film(tmp_path / "film.avi", pictures)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    tracked = track_film(path, region=np.ones((72, 96), bool))
+    assert 3 <= len(tracked.tracks) < 20
+    assert any("its end is damaged or missing" in note for note in tracked.warnings)
+
+
+def test_large_films_are_reduced_and_tracks_stay_in_their_pixels(tmp_path: Path) -> None:
+    pictures = [cv2.resize(p, (768, 576), interpolation=cv2.INTER_CUBIC) for p in films.textured_pictures(6, (96, 72))]
+    path = films.write_film(tmp_path / "film.mkv", pictures)
+    tracked = track_film(path, region=[(200, 150), (500, 150), (500, 400), (200, 400)], longest_side=192)
+    step = np.diff(tracked.tracks, axis=0)[tracked.visibility[1:] & tracked.visibility[:-1]]
+    np.testing.assert_allclose(np.median(step, axis=0), [8, 0], atol=0.3)
+    assert tracked.template_image.shape == (576, 768, 3)
+
+
+@pytest.mark.parametrize(
+    ("option", "value"), [("grid_step", 0.0), ("grid_step", 1000.0), ("longest_side", 10), ("threads", 0)]
+)
+def test_options_out_of_range_are_refused(option: str, value: float) -> None:
+    with pytest.raises(FilmError) as caught:
+        track_film("film.mp4", **{option: value})  # type: ignore[arg-type]
+    assert (caught.value.code, caught.value.field) == ("out_of_range", option)
+
+
+@pytest.mark.parametrize("field", ["region_frame", "template_frame"])
+@pytest.mark.parametrize("frame", [-1, 16])
+def test_frames_outside_the_film_are_refused(turning: tuple[Path, RenderedFilm], field: str, frame: int) -> None:
+    with pytest.raises(FilmError) as caught:
+        track_film(turning[0], **{field: frame})  # type: ignore[arg-type]
+    assert (caught.value.code, caught.value.field) == ("no_such_frame", field)

@@ -1,0 +1,40 @@
+"""The sandbox loads its parser and no more: it is started for every file, and less of it can be attacked."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pliant.solver
+import pliant.worker.formats
+import pytest
+from pliant.worker.formats.reading.parsers import PARSERS
+
+LISTED = """
+import sys
+import pliant.worker.formats.reading.sandbox
+from pliant.worker.formats.reading.parsers import PARSERS
+PARSERS[sys.argv[1]].load()
+print(*sys.modules)
+"""
+NEEDED = {"matlab5": {"scipy.io"}, "matlab73": {"h5py"}, "ply": {"plyfile"}, "obj": {"plyfile"}, "png": {"PIL"}}
+HEAVY = {"scipy.io", "scipy.linalg", "scipy.sparse", "h5py", "PIL", "pydantic", "pliant.solver.reconstruct"}
+ALSO = {"matlab5": {"scipy.sparse", "scipy.linalg"}}
+"""What comes with what is needed."""
+
+
+@pytest.mark.parametrize("parser", PARSERS)
+def test_a_sandbox_loads_its_parser_and_no_more(parser: str) -> None:
+    ran = subprocess.run([sys.executable, "-I", "-c", LISTED, parser], capture_output=True, text=True, check=True)
+    loaded = set(ran.stdout.split())
+    needed = NEEDED.get(parser, set())
+    assert needed <= loaded
+    assert loaded & HEAVY <= needed | ALSO.get(parser, set())
+
+
+@pytest.mark.parametrize("package", [pliant.solver, pliant.worker.formats])
+def test_names_that_are_looked_up_when_used_are_all_there(package: object) -> None:
+    for name in package.__all__:  # type: ignore[attr-defined]
+        assert getattr(package, name).__name__ == name
+    with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
+        package.nonsense  # type: ignore[attr-defined]  # noqa: B018

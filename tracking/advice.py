@@ -1,0 +1,65 @@
+"""What may spoil a reconstruction from a film, in sentences that say what to film instead."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from pliant.tracking.decoding.film import Film
+from pliant.tracking.survey import Survey
+
+SHORT = 10
+"""Frames below which a film rarely holds enough motion for a shape."""
+
+STILL = 0.01
+"""Motion below this share of the region's size counts as none: about the noise of the tracks on a region of 50 pixels."""
+
+UNEVEN = 1.5
+"""Ratio of longest to median time between frames above which the rate counts as variable."""
+
+
+def warnings_before(film: Film, found: Survey, start: int, stop: int, *, whole: bool, rough: float) -> list[str]:
+    """Judge the film itself: region, shots, length, rate, texture."""
+    notes = []
+    if whole:
+        notes.append(
+            "No region was given, so everything in the picture is tracked, background included. Draw around the thing."
+        )
+    if found.cuts:
+        places = ", ".join(str(found.indices[cut]) for cut in found.cuts)
+        notes.append(
+            f"The film has a cut (at frame {places}). Only frames {found.indices[start]} to {found.indices[stop - 1]} are "
+            "tracked. Film the thing in one take."
+        )
+    if found.broken_tail:
+        notes.append(
+            f"The film states {film.stated_frames} frames but ends after {found.indices[-1] + 1}; its end is damaged or missing."
+        )
+    if stop - start < SHORT:
+        notes.append(f"Only {stop - start} frames are tracked. Film two seconds or more, while the thing turns.")
+    steps = np.diff(found.times[start:stop])
+    if film.container in ("mp4", "matroska", "avi", "gif") and steps.max() > UNEVEN * np.median(steps):
+        notes.append("The time between frames varies; frame_times holds the true times.")
+    if rough < 0.5:
+        notes.append(
+            f"Only {rough:.0%} of the region has texture; the mesh has holes elsewhere. Film in focus and in good light, or "
+            "give the surface a pattern."
+        )
+    return notes
+
+
+def warnings_of(tracks: NDArray[np.float32], visible: NDArray[np.bool_], template: int) -> list[str]:
+    """Judge the tracks: motion and hidden share."""
+    notes = []
+    size = float(np.hypot(*np.ptp(tracks[template], axis=0)))
+    moved = np.where(visible, np.linalg.norm(tracks - tracks[template], axis=2), 0).max(axis=0)
+    if np.median(moved) < STILL * size:
+        notes.append(
+            "Nothing moves in this film, so it holds no information about depth. Turn the thing by 30° or more to both sides, "
+            "or walk around it."
+        )
+    if visible.mean() < 0.5:
+        notes.append(
+            f"The points are visible in only {visible.mean():.0%} of the frames. Turn the thing less far, keep hands out of the "
+            "picture, or move more slowly."
+        )
+    return notes

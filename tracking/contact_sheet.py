@@ -1,0 +1,77 @@
+"""Tracks drawn over some frames of their film, to judge them at a glance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+COLUMNS = 3
+ACROSS = 20
+"""Points drawn across the region, about: every point would hide the picture."""
+
+TAIL = 6
+"""Frames of each track's past that are drawn."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sheet:
+    """What a contact sheet shows; see `TrackedFilm` for the arrays that have its names."""
+
+    thumbnails: NDArray[np.uint8]
+    thumbnail_frames: NDArray[np.int64]
+    tracks: NDArray[np.float32]
+    visibility: NDArray[np.bool_]
+    grid: NDArray[np.int32]
+    template: int
+    frame_times: NDArray[np.float64]
+    width: int
+    """Of the film in pixels."""
+
+
+def draw_contact_sheet(sheet: Sheet, *, quality: int = 85) -> bytes:
+    """Draw visible points and their last steps over every thumbnail; returns a JPEG.
+
+    A point's colour is its place in the template, so that the same surface has the same colour in all pictures.
+    """
+    frames = [int(frame) for frame in sheet.thumbnail_frames]
+    colours = _colours(sheet.tracks[sheet.template])
+    pictures = [_draw(picture, frame, sheet, colours) for picture, frame in zip(sheet.thumbnails, frames, strict=True)]
+    columns = min(COLUMNS, len(pictures))
+    pictures += [np.zeros_like(pictures[0])] * (-len(pictures) % columns)
+    rows = [np.hstack(pictures[start : start + columns]) for start in range(0, len(pictures), columns)]
+    whole = cv2.cvtColor(np.vstack(rows), cv2.COLOR_RGB2BGR)
+    return bytes(cv2.imencode(".jpg", whole, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes())
+
+
+def _draw(picture: NDArray[np.uint8], frame: int, sheet: Sheet, colours: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    canvas = picture.copy()
+    scale = canvas.shape[1] / sheet.width
+    every = max(1, round(float(np.sqrt((sheet.grid >= 0).sum())) / ACROSS))
+    row, column = np.nonzero(sheet.grid >= 0)
+    chosen = np.sort(sheet.grid[row, column][(row % every == 0) & (column % every == 0)])
+    rows = slice(max(0, frame - TAIL), frame + 1)
+    paths = np.clip((sheet.tracks[rows, chosen] + 0.5) * scale - 0.5, -1e4, 1e4)
+    seen = sheet.visibility[rows, chosen]
+    for number in np.flatnonzero(seen[-1]):
+        colour = tuple(int(level) for level in colours[chosen[number]])
+        path = np.round(paths[seen[:, number], number] * 16).astype(np.int32)
+        cv2.polylines(canvas, [path[:, None]], False, colour, 1, cv2.LINE_AA, 4)
+        cv2.circle(canvas, tuple(int(value) for value in path[-1]), 22, colour, -1, cv2.LINE_AA, 4)
+    time = f"{sheet.frame_times[frame]:.2f} s"
+    for shade, width in ((0, 3), (255, 1)):
+        cv2.putText(
+            canvas, time, (6, canvas.shape[0] - 8), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (shade,) * 3, width, cv2.LINE_AA
+        )
+    return canvas
+
+
+def _colours(points: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Hue by the angle around the middle of the template's points, saturation by the distance, shape `(P, 3)`, RGB."""
+    offset = points - points.mean(axis=0)
+    angle = np.arctan2(offset[:, 1], offset[:, 0]) / (2 * np.pi) % 1.0
+    radius = np.linalg.norm(offset, axis=1)
+    hsv = np.stack([angle * 179, 90 + 165 * radius / max(radius.max(), 1e-6), np.full(len(angle), 255.0)], axis=1)
+    return np.asarray(cv2.cvtColor(hsv.astype(np.uint8)[None], cv2.COLOR_HSV2RGB)[0], dtype=np.uint8)

@@ -1,0 +1,1 @@
+"""Open films and decode them frame by frame, after checking what they are."""

@@ -1,0 +1,162 @@
+"""Recognise films by their content, before any decoder sees them.
+
+FFmpeg chooses a demuxer by probing, and some of its formats (HLS, concat, SDP, DASH) are texts that name other files or
+addresses. Only the binary containers below pass, and a QuickTime file whose samples lie elsewhere does not.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO, Literal
+
+from pliant.tracking.errors import FilmError
+
+Container = Literal["mp4", "matroska", "avi", "gif", "zip", "folder"]
+
+ACCEPTED = "an mp4, mov, webm, mkv or avi film, an animated GIF, a zip of pictures, or a folder of pictures"
+MAX_BOXES = 20_000
+"""Boxes of an MP4 file that are looked at. A fragmented film has two for every fragment of about a second."""
+
+MAX_STREAMS = 16
+"""Streams in one film: a camera writes two to five (picture, sound, metadata)."""
+
+MP4_BOXES = {b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip", b"pnot"}
+NESTED = {b"moov", b"trak", b"mdia", b"minf", b"dinf"}
+TEXTS = (b"#EXT", b"ffconcat", b"v=0", b"<?xml", b"<MPD", b"[playlist]", b"http", b"rtsp", b"file:")
+
+
+def recognise(path: Path) -> Container:
+    """Tell which kind of film a path is.
+
+    Raises
+    ------
+    FilmError
+        It does not exist, is empty, is a playlist, refers to other files, holds no picture, or is none of the accepted kinds.
+    """
+    if path.is_dir():
+        return "folder"
+    try:
+        with path.open("rb") as stream:
+            return _recognise_stream(stream, path.name)
+    except OSError as error:
+        raise _refusal("unreadable_film", f"{path.name}: {error.strerror}", "Check the path.") from error
+
+
+def _recognise_stream(stream: BinaryIO, name: str) -> Container:
+    head = stream.read(4096)
+    if not head:
+        raise _refusal("empty_film", f"{name}, which is empty", "Copy the film again.")
+    if head[4:8] in MP4_BOXES:
+        _check_mp4(stream, name)
+        return "mp4"
+    if head[:4] == b"\x1aE\xdf\xa3" and (b"webm" in head[:64] or b"matroska" in head[:64]):
+        return "matroska"
+    if head[:4] == b"RIFF" and head[8:12] == b"AVI ":
+        _check_avi(head, name)
+        return "avi"
+    if head[:6] in (b"GIF87a", b"GIF89a"):
+        return "gif"
+    if head[:4] == b"PK\x03\x04":
+        return "zip"
+    if head.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(TEXTS):
+        raise _refusal(
+            "playlist", f"{name}, a playlist or text that refers to other files",
+            "Pass the film itself; other files and addresses are never opened.",
+        )  # fmt: skip
+    raise _refusal("unsupported_film", f"{name}, which is none of these", "Convert it: ffmpeg -i FILM film.mp4")
+
+
+def _check_mp4(stream: BinaryIO, name: str) -> None:
+    """Walk the boxes of an MP4 or QuickTime file: an index, a picture track, and samples in this file only."""
+    end = os.fstat(stream.fileno()).st_size
+    kinds: list[bytes] = []
+    streams = 0
+    for count, (kind, body) in enumerate(_boxes(stream, 0, end)):
+        if count > MAX_BOXES:
+            raise _refusal(
+                "unsupported_film", f"{name} with over {MAX_BOXES} boxes", "Convert it: ffmpeg -i FILM film.mp4"
+            )
+        kinds.append(kind)
+        streams += kind == b"trak"
+        if streams > MAX_STREAMS:
+            raise _refusal(
+                "too_many_streams",
+                f"{name} with over {MAX_STREAMS} streams",
+                "Keep the picture: ffmpeg -i FILM -map 0:v:0 film.mp4",
+            )
+        if kind == b"hdlr":
+            kinds.append(b"hdlr:" + body[8:12])
+        if kind == b"dref" and not _self_contained(body):
+            raise _refusal(
+                "external_reference", f"{name}, whose samples lie in another file",
+                "Export the film with its media inside; other files and addresses are never opened.",
+            )  # fmt: skip
+        if kind in (b"cmov", b"rmra"):
+            raise _refusal(
+                "external_reference", f"{name} with a {kind.decode()} box", "Convert it: ffmpeg -i FILM film.mp4"
+            )
+    if b"moov" not in kinds:
+        raise _refusal(
+            "truncated_film", f"{name}, which has no index (moov): it was cut off before the recording ended",
+            "Copy it again, or film again.",
+        )  # fmt: skip
+    if b"hdlr:vide" not in kinds:
+        raise _refusal("no_picture", f"{name}, which holds sound but no picture", "Pass a film with a picture track.")
+
+
+def _boxes(stream: BinaryIO, start: int, end: int) -> Iterator[tuple[bytes, bytes]]:
+    """Yield type and first bytes of all boxes, going into those of `NESTED`."""
+    pending = [(start, end)]
+    while pending:
+        place, stop = pending.pop()
+        while place + 8 <= stop:
+            stream.seek(place)
+            header = stream.read(16)
+            if len(header) < 8:
+                break
+            size, kind = struct.unpack(">I4s", header[:8])
+            inner = place + 8
+            if size == 1 and len(header) == 16:
+                size, inner = struct.unpack(">Q", header[8:])[0], place + 16
+            size = stop - place if size == 0 else size
+            if size < inner - place:
+                break
+            following = min(place + size, stop)
+            stream.seek(inner)
+            yield kind, stream.read(min(4096, following - inner)) if kind in (b"hdlr", b"dref") else b""
+            if kind in NESTED:
+                pending.append((inner, following))
+            place = following
+
+
+def _self_contained(body: bytes) -> bool:
+    """Whether all data references of a `dref` box say that the samples are in the same file (flag 1)."""
+    count = int.from_bytes(body[4:8], "big")
+    place = 8
+    for _ in range(min(count, MAX_STREAMS)):
+        if len(body) < place + 12:
+            return False
+        size = int.from_bytes(body[place : place + 4], "big")
+        if not body[place + 11] & 1 or size < 12:
+            return False
+        place += size
+    return count <= MAX_STREAMS
+
+
+def _check_avi(head: bytes, name: str) -> None:
+    """Read the number of streams from the main header."""
+    place = head.find(b"avih")
+    if place < 0 or len(head) < place + 36:
+        raise _refusal("truncated_film", f"{name} without its header (avih)", "Copy it again.")
+    streams = int.from_bytes(head[place + 32 : place + 36], "little")
+    if streams > MAX_STREAMS:
+        raise _refusal(
+            "too_many_streams", f"{name} with {streams} streams", "Keep the picture: ffmpeg -i FILM -map 0:v:0 film.mp4"
+        )
+
+
+def _refusal(code: str, got: str, hint: str) -> FilmError:
+    return FilmError(code, field="film", expected=ACCEPTED, got=got, hint=hint)

@@ -1,0 +1,25 @@
+"""What a film may cost."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class FilmLimits:
+    """Limits of one film; a film beyond any of them is refused.
+
+    The defaults admit a minute of 4K film from a telephone.
+    """
+
+    bytes: int = 1 << 30
+    """Size of the file, or of all pictures together."""
+
+    frames: int = 3600
+    """Frames that are used, after `frames` selected some."""
+
+    pixels: int = 4096 * 2304
+    """Width × height."""
+
+    seconds: float = 600.0
+    """Playing time up to the last frame that is used."""

@@ -1,0 +1,171 @@
+"""Films made of pictures: an animated GIF, a zip, or a folder."""
+
+from __future__ import annotations
+
+import io
+import re
+import warnings
+import zipfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageOps
+from pliant.tracking.decoding.limits import FilmLimits
+from pliant.tracking.errors import FilmError
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp")
+FORMATS = ("PNG", "JPEG", "WEBP", "BMP")
+DEFAULT_DURATION = 100
+"""Milliseconds that a GIF frame without a duration is shown, as browsers do."""
+
+LARGEST_DIRECTORY = 4 << 20
+"""Bytes of a zip's directory: 40,000 files with names of 50 letters."""
+
+Colour = NDArray[np.uint8]
+
+
+@contextmanager
+def readable(name: str) -> Iterator[None]:
+    """Turn what Pillow and zipfile raise on broken files into one error."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # `checked` applies the film's own limit
+            yield
+    except FilmError:
+        raise
+    except (OSError, SyntaxError, ValueError, EOFError, IndexError, zipfile.BadZipFile, Image.DecompressionBombError,
+            NotImplementedError, RuntimeError, OverflowError) as error:  # fmt: skip
+        raise FilmError(
+            "broken_picture", field="film", expected="pictures that can be decoded", got=f"{name}: {error}",
+            hint="Save it again as PNG or JPEG.",
+        ) from error  # fmt: skip
+
+
+def natural(name: str) -> tuple[tuple[int, str], ...]:
+    """Sort key under which frame 10 follows frame 9."""
+    parts = re.findall(r"\d+|\D+", name.lower())
+    return tuple((int(part[:18]), "") if part.isdecimal() else (-1, part) for part in parts)
+
+
+def read_picture(data: bytes | Path, name: str, limits: FilmLimits) -> Colour:
+    """Decode a picture upright, shape `(H, W, 3)`, RGB; its size is checked first.
+
+    Raises
+    ------
+    FilmError
+        Not a picture of an accepted format, broken, or of too many pixels.
+    """
+    with readable(name), Image.open(io.BytesIO(data) if isinstance(data, bytes) else data, formats=FORMATS) as picture:
+        checked(picture.size, name, limits)
+        return np.asarray(ImageOps.exif_transpose(picture).convert("RGB"))
+
+
+def checked(size: tuple[int, int], name: str, limits: FilmLimits) -> tuple[int, int]:
+    """Return a size of at least 16×16 and at most the limit's pixels.
+
+    Raises
+    ------
+    FilmError
+        Too small or too large.
+    """
+    width, height = size
+    if width * height > limits.pixels:
+        raise FilmError(
+            "too_many_pixels", field="film", expected=f"at most {limits.pixels:,} pixels a frame",
+            got=f"{name} of {width}×{height}", hint="Scale the film down: ffmpeg -i FILM -vf scale=1280:-2 film.mp4",
+        )  # fmt: skip
+    if min(width, height) < 16:
+        raise FilmError(
+            "too_small", field="film", expected="frames of at least 16×16 pixels", got=f"{name} of {width}×{height}",
+            hint="Film at 640×480 or more.",
+        )  # fmt: skip
+    return width, height
+
+
+def gif_frames(path: Path, limits: FilmLimits) -> Iterator[tuple[float, Colour]]:
+    """Yield time in seconds and picture of the frames of a GIF."""
+    with readable(path.name), Image.open(path, formats=("GIF",)) as film:
+        checked(film.size, path.name, limits)
+        time, index = 0.0, 0
+        while True:
+            try:
+                film.seek(index)
+            except EOFError:
+                return
+            yield time / 1000, np.asarray(film.convert("RGB"))
+            time += film.info.get("duration", 0) or DEFAULT_DURATION
+            index += 1
+
+
+def folder_pictures(path: Path, limits: FilmLimits) -> list[tuple[str, Callable[[], bytes]]]:
+    """List the pictures of a folder in natural order, each with a function that reads it.
+
+    Raises
+    ------
+    FilmError
+        No pictures, or more bytes than the limit.
+    """
+    files = sorted(
+        (file for file in path.iterdir() if file.suffix.lower() in SUFFIXES and file.is_file() and file.name[0] != "."),
+        key=lambda file: natural(file.name),
+    )
+    _check_list(path.name, len(files), sum(file.stat().st_size for file in files), limits)
+    return [(file.name, file.read_bytes) for file in files]
+
+
+def zip_pictures(path: Path, limits: FilmLimits) -> list[tuple[str, Callable[[], bytes]]]:
+    """List the pictures of a zip in natural order, each with a function that unpacks it.
+
+    Raises
+    ------
+    FilmError
+        Broken, encrypted, no pictures, or pictures that unpack to more bytes than the limit.
+    """
+    with readable(path.name):
+        _check_directory(path)
+        with zipfile.ZipFile(path) as archive:
+            entries = [
+                entry
+                for entry in archive.infolist()
+                if entry.filename.lower().endswith(SUFFIXES) and not re.search(r"(^|/)(\.|__MACOSX/)", entry.filename)
+            ]
+    entries.sort(key=lambda entry: natural(entry.filename))
+    _check_list(path.name, len(entries), sum(entry.file_size for entry in entries), limits)
+    return [(entry.filename, lambda entry=entry: _unpack(path, entry)) for entry in entries]  # type: ignore[misc]
+
+
+def _unpack(path: Path, entry: zipfile.ZipInfo) -> bytes:
+    """Read one picture of a zip; never more than its directory entry states, which the limit covers."""
+    with readable(entry.filename), zipfile.ZipFile(path) as archive, archive.open(entry) as stream:
+        return stream.read(entry.file_size)
+
+
+def _check_directory(path: Path) -> None:
+    """Refuse a zip whose directory would fill the memory before its entries can be counted."""
+    size = path.stat().st_size
+    with path.open("rb") as stream:
+        stream.seek(max(0, size - 65_557))
+        tail = stream.read()
+    end = tail.rfind(b"PK\x05\x06")
+    directory = int.from_bytes(tail[end + 12 : end + 16], "little") if end >= 0 else 0
+    if directory > LARGEST_DIRECTORY:
+        raise FilmError(
+            "too_many_pictures", field="film", expected=f"a zip directory of at most {LARGEST_DIRECTORY:,} bytes",
+            got=f"{directory:,} in {path.name}", hint="Put fewer pictures in the zip.",
+        )  # fmt: skip
+
+
+def _check_list(name: str, count: int, size: int, limits: FilmLimits) -> None:
+    if count == 0:
+        raise FilmError(
+            "no_picture", field="film", expected=f"pictures ({', '.join(SUFFIXES)})", got=f"none in {name}",
+            hint="Export the film's frames as PNG or JPEG, numbered in order.",
+        )  # fmt: skip
+    if size > limits.bytes:
+        raise FilmError(
+            "too_many_bytes", field="film", expected=f"pictures of at most {limits.bytes:,} bytes together",
+            got=f"{size:,} in {name}", hint="Use fewer or smaller pictures.",
+        )  # fmt: skip

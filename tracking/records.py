@@ -1,0 +1,138 @@
+"""What the tracker reports and returns."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pliant.tracking.contact_sheet import Sheet, draw_contact_sheet
+
+Stage = Literal["read", "locate", "track"]
+
+
+@dataclass(frozen=True, slots=True)
+class TrackingStep:
+    """Progress of one stage."""
+
+    stage: Stage
+    """"read": decode the film; "locate": find the region in the template; "track": follow the points."""
+
+    done: int
+    """Frames of this stage that are done."""
+
+    total: int | None
+    """Frames of this stage; None while the film's length is not known."""
+
+
+OnStep = Callable[[TrackingStep], None]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FilmInfo:
+    """What was found in a film."""
+
+    name: str
+    container: str
+    size: tuple[int, int]
+    """Width and height in pixels, upright: rotation flags are applied."""
+
+    fps: float
+    """Frames a second, from the times of the frames used."""
+
+    frame_indices: NDArray[np.int64]
+    """Numbers of the frames used, counted in the whole film from 0, shape `(F,)`."""
+
+    frame_times: NDArray[np.float64]
+    """Seconds from the film's start, shape `(F,)`; not evenly spaced for films of variable rate."""
+
+    cuts: tuple[int, ...]
+    """Frame numbers at which a new shot begins."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackedFilm:
+    """Dense tracks of a film, in the film's own pixels: x right, y down, the first pixel's centre at (0, 0)."""
+
+    film: FilmInfo
+    tracks: NDArray[np.float32]
+    """Shape `(F, P, 2)`; the best guess where a point is hidden."""
+
+    visibility: NDArray[np.bool_]
+    """Shape `(F, P)`."""
+
+    confidence: NDArray[np.float32]
+    """1 / (1 + σ²) with σ² the track's variance in square pixels of the tracker's frames; 0 where hidden, shape `(F, P)`."""
+
+    grid: NDArray[np.int32]
+    """Point of every grid cell, −1 for holes, shape `(rows, columns)`."""
+
+    faces: NDArray[np.int32]
+    """Quads of the grid, shape `(T, 4)`, counter-clockwise as the template shows them."""
+
+    template: int
+    """Index of the template among the F frames."""
+
+    template_image: NDArray[np.uint8]
+    """The template in colour, shape `(H, W, 3)`, RGB."""
+
+    uv: NDArray[np.float32]
+    """Texture coordinates in the template image, shape `(P, 2)`, in [0, 1]: u right, v down, (0, 0) its upper left corner."""
+
+    thumbnails: NDArray[np.uint8]
+    """Some frames in colour, 320 pixels wide, shape `(N, h, w, 3)`."""
+
+    thumbnail_frames: NDArray[np.int64]
+    """Their indices among the F frames, shape `(N,)`."""
+
+    warnings: tuple[str, ...]
+    """What may spoil a reconstruction, in sentences."""
+
+    @property
+    def frame_times(self) -> NDArray[np.float64]:
+        """Seconds from the film's start, shape `(F,)`."""
+        return self.film.frame_times
+
+    @property
+    def fps(self) -> float:
+        """Frames a second."""
+        return self.film.fps
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """Width and height of the film in pixels."""
+        return self.film.size
+
+    def save_npz(self, path: Path | str) -> None:
+        """Write tracks, mesh and times as a compressed NumPy archive.
+
+        Keys: `tracks`, `visibility`, `confidence`, `faces`, `grid`, `uv`, `template`, `template_image`, `frame_indices`,
+        `frame_times`, `fps`, `image_size` (width, height).
+        """
+        with Path(path).open("wb") as stream:  # an open file keeps NumPy from adding a suffix
+            np.savez_compressed(
+                stream,
+                tracks=self.tracks,
+                visibility=self.visibility,
+                confidence=self.confidence,
+                faces=self.faces,
+                grid=self.grid,
+                uv=self.uv,
+                template=self.template,
+                template_image=self.template_image,
+                frame_indices=self.film.frame_indices,
+                frame_times=self.film.frame_times,
+                fps=self.film.fps,
+                image_size=np.array(self.film.size),
+            )
+
+    def contact_sheet(self, *, quality: int = 85) -> bytes:
+        """Draw the tracks over some frames, as one small JPEG picture."""
+        sheet = Sheet(
+            self.thumbnails, self.thumbnail_frames, self.tracks, self.visibility, self.grid, self.template,
+            self.frame_times, self.image_size[0],
+        )  # fmt: skip
+        return draw_contact_sheet(sheet, quality=quality)

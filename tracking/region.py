@@ -1,0 +1,148 @@
+"""The region to track: a mask picture or a polygon, and its place in another frame."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from PIL import Image, UnidentifiedImageError
+from pliant.tracking.appearance import Appearance
+from pliant.tracking.errors import FilmError, TrackingStopped
+from pliant.tracking.flow import Bools, Floats, Grey, match
+from pliant.tracking.records import OnStep, TrackingStep
+from pliant.tracking.seeding import Seeds, neighbours, quads
+
+Region = NDArray[np.bool_] | NDArray[np.uint8] | Sequence[Sequence[float]] | Path | str
+
+LONG_STEP = 2
+"""Frames between the stations on a region's way to the template; longer ones lose fast motion."""
+
+
+def read_region(region: Region, size: tuple[int, int]) -> Bools:
+    """Turn a region into a mask, shape `(H, W)`.
+
+    Parameters
+    ----------
+    region
+        A path to a mask picture of the film's size, its array `(H, W)` (bool, or uint8 with 128 and more inside), or a
+        polygon, `(N, 2)` pixels with N ≥ 3. Where a picture has transparency, opaque is inside.
+    size
+        Width and height of the film.
+
+    Raises
+    ------
+    FilmError
+        Not a mask or polygon, another size than the film's, or empty.
+    """
+    if isinstance(region, str | Path):
+        mask = _from_picture(Path(region), size)
+    else:
+        given = np.asarray(region)
+        polygon = given.ndim == 2 and given.shape[1] == 2 and given.dtype != bool and given.shape != size[::-1]
+        mask = _from_polygon(given, size) if polygon else _from_array(given)
+    if mask.shape != size[::-1]:
+        raise _refusal(
+            "wrong_region_size", f"a mask of {size[0]}×{size[1]} pixels, the film's size",
+            f"{mask.shape[1]}×{mask.shape[0]}", "Draw the region on a frame of this film, upright as it is shown.",
+        )  # fmt: skip
+    if not mask.any():
+        raise _refusal("empty_region", "some pixels inside", "none", "Draw around the thing to track.")
+    return mask
+
+
+def transport(
+    read: Callable[[int], Grey],
+    seeds: Seeds,
+    start: int,
+    end: int,
+    *,
+    pool: ThreadPoolExecutor,
+    on_step: OnStep,
+    should_stop: Callable[[], bool],
+) -> Bools:
+    """Carry a region from one frame to another and return its mask there.
+
+    The grid's points are carried from the start and, in steps, from frame to frame; the better of the two wins, as in
+    `chaining`. The mask is the union of the faces whose corners all arrive, closed over one grid step.
+    """
+    points, seen = seeds.points, np.ones(len(seeds.points), dtype=bool)
+    variance = np.zeros(len(points), dtype=np.float32)
+    appearance = Appearance.of(read(start), seeds.points, neighbours(seeds.grid, len(points)))
+    direction = 1 if end > start else -1
+    stations = [*range(start, end, direction * LONG_STEP), end]
+    for before, here in itertools.pairwise(stations):
+        on_step(TrackingStep("locate", abs(before - start), abs(end - start)))
+        if should_stop():
+            raise TrackingStopped
+        ways = [(start, seeds.points, np.ones_like(seen), np.zeros_like(variance)), (before, points, seen, variance)]
+        frame = read(here)
+        found = [done.result() for done in [pool.submit(match, read(way[0]), frame, way[1]) for way in ways]]
+        sees = np.stack([way[2] & ~m.lost for way, m in zip(ways, found, strict=True)])
+        sums = np.stack([way[3] + m.gap for way, m in zip(ways, found, strict=True)])
+        best = np.lexsort((sums, ~sees), axis=0)[0]
+        every = np.arange(len(best))
+        points = np.stack([m.points for m in found])[best, every]
+        seen, variance = appearance.agrees(frame, points, sees[best, every]), sums[best, every]
+    return _cover(points, seen, seeds, read(end).shape)
+
+
+def _cover(points: Floats, seen: Bools, seeds: Seeds, shape: tuple[int, ...]) -> Bools:
+    """Fill the faces of the grid that arrived."""
+    mask = np.zeros(shape, dtype=np.uint8)
+    faces = quads(seeds.grid)
+    corners = np.round(points[faces[seen[faces].all(axis=1)]]).astype(np.int32)
+    for corner in corners:
+        cv2.fillConvexPoly(mask, corner, 1)
+    step = int(np.ceil(np.abs(seeds.points[faces[:, 2]] - seeds.points[faces[:, 0]]).max())) if len(faces) else 1
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * step + 1, 2 * step + 1))
+    return np.asarray(cv2.morphologyEx(mask, cv2.MORPH_CLOSE, disc) > 0)
+
+
+def _from_picture(path: Path, size: tuple[int, int]) -> Bools:
+    try:
+        with Image.open(path, formats=("PNG", "JPEG", "WEBP", "BMP", "GIF")) as picture:
+            if picture.size != size:
+                return np.zeros(picture.size[::-1], dtype=bool)  # refused for its size, never decoded
+            if picture.mode in ("RGBA", "LA", "PA") or "transparency" in picture.info:
+                alpha = np.asarray(picture.convert("RGBA"))[..., 3]
+                if alpha.min() < 128:
+                    return np.asarray(alpha >= 128)
+            return np.asarray(np.asarray(picture.convert("L")) >= 128)
+    except (OSError, UnidentifiedImageError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise _refusal(
+            "unreadable_region", "a PNG, JPEG, WebP, BMP or GIF picture", f"{path.name}: {error}",
+            "Save the mask as PNG: white inside, black outside.",
+        ) from error  # fmt: skip
+
+
+def _from_array(given: NDArray[np.generic]) -> Bools:
+    if given.ndim != 2 or given.dtype not in (np.dtype(bool), np.dtype(np.uint8)):
+        raise _refusal(
+            "wrong_region", "a mask (H, W) of bool or uint8, or a polygon (N, 2) with N ≥ 3",
+            f"shape {given.shape}, dtype {given.dtype}", "Convert the array.",
+        )  # fmt: skip
+    return np.asarray(given if given.dtype == bool else np.asarray(given, dtype=np.uint8) >= 128, dtype=bool)
+
+
+def _from_polygon(given: ArrayLike, size: tuple[int, int]) -> Bools:
+    try:
+        corners = np.asarray(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        corners = np.full((1, 2), np.nan)
+    if len(corners) < 3 or not np.isfinite(corners).all() or np.abs(corners).max() > 1e6:
+        raise _refusal(
+            "wrong_polygon", "a polygon of at least 3 corners with finite pixel coordinates",
+            f"{len(corners)} corners", "Draw around the thing to track.",
+        )  # fmt: skip
+    mask = np.zeros(size[::-1], dtype=np.uint8)
+    cv2.fillPoly(mask, [np.round(corners).astype(np.int32)], 1)
+    return np.asarray(mask > 0)
+
+
+def _refusal(code: str, expected: str, got: str, hint: str) -> FilmError:
+    return FilmError(code, field="region", expected=expected, got=got, hint=hint)

@@ -1,0 +1,5 @@
+"""Films with exact truth, for demonstrations, tests and benchmarks."""
+
+from pliant.tracking.rendering.rendered_film import RenderedFilm, render_film
+
+__all__ = ["RenderedFilm", "render_film"]

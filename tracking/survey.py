@@ -1,0 +1,159 @@
+"""One pass over a film: its frames for the tracker, their times and sharpness, and where shots begin."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pliant.tracking.decoding.film import Film
+from pliant.tracking.errors import FilmError, TrackingStopped
+from pliant.tracking.flow import Grey
+from pliant.tracking.frame_store import FrameStore
+from pliant.tracking.records import OnStep, TrackingStep
+
+ENLARGED_TO, LARGEST_ENLARGEMENT = 480, 3.0
+"""Small films are enlarged to this longest side in pixels, at most so many times: DIS matches at half the resolution it is
+given. On rendered films of 160×120, enlarging three times halves the median error (.53 to .25 px)."""
+
+THUMBNAIL = 96
+"""Longest side of the pictures in which cuts are sought, pixels."""
+
+ALIKE, CUT = 0.7, 0.4
+"""Correlation of successive thumbnails, the first carried by the flow: within a shot usually above the one, across a cut below
+the other."""
+
+AROUND = 4
+"""Frames before and after a cut that are consulted: fast motion stays unlike for several frames, a cut is one step."""
+
+BROKEN_SHARE = 0.95
+"""A film that decodes to less than this share of the frames it states has a broken tail; containers round by a few frames."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Survey:
+    """What one pass found; rows are selected frames."""
+
+    indices: NDArray[np.int64]
+    """Frame numbers in the whole film, shape `(N,)`."""
+
+    times: NDArray[np.float64]
+    """Seconds, shape `(N,)`."""
+
+    sharpness: NDArray[np.float64]
+    """Variance of the Laplacian over the variance of the grey levels, shape `(N,)`."""
+
+    cuts: tuple[int, ...]
+    """Rows at which a new shot begins."""
+
+    scale: float
+    """Pixels of the stored frames per pixel of the film."""
+
+    broken_tail: bool
+    """The film ends before the frames it states."""
+
+
+def survey(
+    film: Film, store: FrameStore, *, longest_side: int, on_step: OnStep, should_stop: Callable[[], bool]
+) -> Survey:
+    """Decode a film into a store of grey frames in the tracker's size.
+
+    Raises
+    ------
+    FilmError
+        Fewer than 3 frames, or what `Film.frames` raises.
+    TrackingStopped
+        `should_stop` returned True.
+    """
+    scale = tracking_scale(film.size, longest_side)
+    size = (max(16, round(film.size[0] * scale)), max(16, round(film.size[1] * scale)))
+    indices, times, sharpness, likeness = [], [], [], [1.0]
+    before: Grey | None = None
+    for frame in film.frames():
+        if should_stop():
+            raise TrackingStopped
+        grey = np.asarray(cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+        if size != film.size:
+            grey = np.asarray(
+                cv2.resize(grey, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC), np.uint8
+            )
+        store.append(grey)
+        indices.append(frame.index)
+        times.append(frame.time)
+        sharpness.append(float(cv2.Laplacian(grey, cv2.CV_32F).var() / (grey.var() + 1.0)))
+        small = _thumbnail(grey)
+        if before is not None:
+            likeness.append(_likeness(before, small))
+        before = small
+        on_step(TrackingStep("read", len(indices), None))
+    if len(indices) < 3:
+        raise FilmError(
+            "too_few_frames", field="film", expected="at least 3 frames", got=str(len(indices)),
+            hint="Film two seconds or more, while the thing turns.",
+        )  # fmt: skip
+    return Survey(
+        np.array(indices), np.array(times), np.array(sharpness), find_cuts(np.array(likeness)), scale,
+        _ends_early(film, indices[-1]),
+    )  # fmt: skip
+
+
+def tracking_scale(size: tuple[int, int], longest_side: int) -> float:
+    """Choose the scale of the tracker's frames: large films are reduced, small ones enlarged."""
+    longest = max(size)
+    if longest > longest_side:
+        return longest_side / longest
+    return float(np.clip(min(ENLARGED_TO, longest_side) / longest, 1.0, LARGEST_ENLARGEMENT))
+
+
+def find_cuts(likeness: NDArray[np.float64]) -> tuple[int, ...]:
+    """Find single unlike steps among alike ones.
+
+    Parameters
+    ----------
+    likeness
+        Correlation of every frame with the one before, shape `(N,)`; the first is 1.
+    """
+    cuts = []
+    for t in np.flatnonzero(likeness < CUT):
+        around = np.concatenate([likeness[max(0, t - AROUND) : t], likeness[t + 1 : t + 1 + AROUND]])
+        if np.median(around) > ALIKE:
+            cuts.append(int(t))
+    return tuple(cuts)
+
+
+def sharpest(sharpness: NDArray[np.float64], start: int, stop: int) -> int:
+    """Return the sharpest frame of the middle third of a shot."""
+    first, last = start + (stop - start) // 3, stop - (stop - start) // 3
+    return first + int(np.argmax(sharpness[first : max(last, first + 1)]))
+
+
+def _thumbnail(grey: Grey) -> Grey:
+    factor = THUMBNAIL / max(grey.shape)
+    size = (max(16, round(grey.shape[1] * factor)), max(16, round(grey.shape[0] * factor)))
+    return np.asarray(
+        cv2.GaussianBlur(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), (0, 0), 1.0), dtype=np.uint8
+    )
+
+
+def _likeness(first: Grey, second: Grey) -> float:
+    """Correlation of two thumbnails, as they are or the first carried along the flow, whichever is higher."""
+    search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+    flow = search.calc(second, first, None)  # type: ignore[call-overload]
+    height, width = first.shape
+    x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    carried = cv2.remap(first, x + flow[..., 0], y + flow[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return max(_correlation(first, second), _correlation(np.asarray(carried, dtype=np.uint8), second))
+
+
+def _correlation(first: Grey, second: Grey) -> float:
+    """Correlation with one grey level of noise added to both variances, so that two blank pictures are alike."""
+    a, b = first - first.mean(), second - second.mean()
+    return float(((a * b).mean() + 1.0) / np.sqrt(((a**2).mean() + 1.0) * ((b**2).mean() + 1.0)))
+
+
+def _ends_early(film: Film, last: int) -> bool:
+    start, stop, step = film.selection
+    reachable = film.stated_frames if stop is None else min(stop, film.stated_frames)
+    return film.stated_frames > 0 and last + step < BROKEN_SHARE * reachable and start < reachable

@@ -1,0 +1,122 @@
+"""The record of what a client submits, and the writing of a new job: quota, inputs, record, queue, in this order."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from pliant.schemas.job import Status
+from pliant.schemas.options import Options
+from pliant.worker.errors import QuotaExceeded, StoreUnavailable, TooManyQueued
+from pliant.worker.records import Records, Stored, Webhook
+from pliant.worker.settings import Settings
+from pliant.worker.store.blobs import Blobs
+from pliant.worker.store.queue import Queue
+from pliant.worker.uploads.service import Uploads
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Submission:
+    """What a client asks for, besides the input files."""
+
+    options: Options
+    """How to solve and which files to write."""
+
+    name: str = ""
+    """The user's label."""
+
+    id: str | None = None
+    """The client's own id: 3–64 letters, digits, underscores, dashes; None: one is made."""
+
+    idempotency_key: str | None = None
+    """A repeated request with the same key returns the first job; a key is kept as long as its job."""
+
+    fingerprint: str | None = None
+    """SHA-256 of the whole request, which distinguishes a repeated request from a different one."""
+
+    webhook: Webhook | None = None
+    """Called when the job has ended."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Acceptance:
+    """Writes new jobs to the stores."""
+
+    records: Records
+    blobs: Blobs
+    queue: Queue
+    settings: Settings
+
+    def check_quota(self, more: int) -> None:
+        """Check that `more` bytes fit beside what jobs and uploads hold or have reserved.
+
+        Raises
+        ------
+        QuotaExceeded
+            They do not.
+        """
+        quota = self.settings.disk_quota
+        if quota > 0 and (used := self.records.used() + self._uploaded()) + more > quota:
+            raise QuotaExceeded(used=used, quota=quota)
+
+    def create(self, stored: Stored, put: Callable[[str], object], *, max_queued: int) -> Stored:
+        """Store inputs, then the record, then the queue entry; a failure in between leaves nothing that was promised.
+
+        Parameters
+        ----------
+        stored : Stored
+            The new record.
+        put : callable
+            Stores the inputs under a blob key.
+        max_queued : int
+            Jobs of this owner that may be queued at once; 0: any number.
+
+        Returns
+        -------
+        Stored
+            The new record, or the one that already has its idempotency key or id.
+
+        Raises
+        ------
+        TooManyQueued, QuotaExceeded
+            Nothing is kept.
+        """
+        put(stored.inputs)
+        quota = self.settings.disk_quota
+        most = max(1, quota - self._uploaded()) if quota > 0 else 0
+        try:
+            kept = self.records.create(stored, max_queued=max_queued, max_bytes=most)
+        except (TooManyQueued, QuotaExceeded):
+            self.blobs.delete(stored.inputs)
+            raise
+        if kept.inputs != stored.inputs:
+            self.blobs.delete(stored.inputs)
+            return kept
+        try:
+            if self._over_running_limit(stored):
+                self.queue.hold(stored.attempt_id)
+            else:
+                self.queue.push(stored.job.id, stored.attempt_id)
+        except StoreUnavailable:
+            return kept  # the record is safe, and the reconciler queues what the queue lacks
+        return kept
+
+    def _uploaded(self) -> int:
+        return Uploads.open(self.settings).used()
+
+    def _over_running_limit(self, stored: Stored) -> bool:
+        """Return True if the new job waits until fewer jobs of its owner run; the reconciler queues it then.
+
+        Counted after the record was written, so two simultaneous submissions cannot both miss each other.
+        """
+        most = self.settings.max_running if stored.max_running is None else stored.max_running
+        unfinished = (Status.QUEUED, Status.RUNNING, Status.CANCELLING)
+        return most > 0 and self.records.count(unfinished, owner=stored.owner) > most
+
+
+def key_digest(idempotency_key: str | None, owner: str | None) -> str | None:
+    """Return the digest under which an owner's idempotency key is stored."""
+    if idempotency_key is None:
+        return None
+    return hashlib.sha256(f"{owner or ''}\n{idempotency_key}".encode()).hexdigest()

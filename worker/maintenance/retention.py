@@ -1,0 +1,136 @@
+"""Retention: removes expired jobs and uploads, and files that belong to no job or attempt."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import timedelta
+
+from pliant.worker.errors import UnknownJob
+from pliant.worker.jobs import lifecycle
+from pliant.worker.jobs.service import Jobs
+from pliant.worker.jobs.validation import LARGEST_PAGE
+from pliant.worker.uploads.service import Uploads
+
+logger = logging.getLogger(__name__)
+
+TIDY_EVERY = 30.0
+"""Seconds between two looks for what has expired."""
+
+SWEEP_EVERY = 3600.0
+"""Seconds between two looks for files that belong to no job."""
+
+ORPHAN_AGE = timedelta(hours=6)
+"""A file of an unknown job is removed when it is older: a younger one may belong to a submission that has no record yet."""
+
+DEAD_AGE = timedelta(minutes=1)
+"""Scratch directories of ended attempts are removed when they are older: until then their worker may be reading them."""
+
+JUMP = 60.0
+"""Seconds by which the wall clock and the monotonic clock must diverge between two looks for it to be a jump."""
+
+HOLD = 3600.0
+"""Seconds after a jump of the clock in which nothing expires: a wrong clock is mostly corrected soon, a deletion never."""
+
+
+@dataclass(slots=True, kw_only=True)
+class Retention:
+    """Removes what is no longer kept."""
+
+    jobs: Jobs
+    _ahead: float | None = None
+    """Seconds that the wall clock is ahead of the monotonic clock."""
+    _held_until: float | None = None
+    _tidied: float | None = None
+    _swept: float | None = None
+
+    def tick(self, now: float) -> bool:
+        """Do what is due at monotonic time `now`; return True if it tidied.
+
+        Raises
+        ------
+        StoreUnavailable
+            A store does not answer; what was due stays due.
+        """
+        self._check_clock(now)
+        tidied = self._tidied is None or now >= self._tidied + TIDY_EVERY
+        if tidied:
+            if self._held_until is None or now >= self._held_until:
+                self._expire()
+                self._expire_uploads()
+            self._clear_work()
+            self._remove_deleted()
+            self.jobs.queue.tidy()
+            self._tidied = now
+        if self._swept is None or now >= self._swept + SWEEP_EVERY:
+            self._sweep()
+            self._swept = now
+        return tidied
+
+    def _check_clock(self, now: float) -> None:
+        """Suspend expiry for a while if the wall clock has jumped, since expiry depends on it alone."""
+        ahead = self.jobs.clock().timestamp() - now
+        if self._ahead is not None and abs(ahead - self._ahead) > JUMP:
+            self._held_until = now + HOLD
+            logger.warning("the clock jumped by %.0f s; nothing expires for %.0f s", ahead - self._ahead, HOLD)
+        self._ahead = ahead
+
+    def _expire(self) -> None:
+        """Remove the jobs that have expired. A job that is not finished, or has no `expires_at`, is never touched."""
+        now, cursor = self.jobs.clock(), None
+        while True:
+            page = self.jobs.page(cursor=cursor, limit=LARGEST_PAGE, statuses=lifecycle.FINAL)
+            for job in page.jobs:
+                if job.expires_at is not None and job.expires_at <= now:
+                    with suppress(UnknownJob):
+                        self.jobs.delete(job.id)
+                        logger.info("job %s: expired and removed", job.id)
+            cursor = page.next
+            if cursor is None:
+                return
+
+    def _expire_uploads(self) -> None:
+        """Remove uploads that were neither continued nor used for longer than they are kept."""
+        for id in Uploads.open(self.jobs.settings).expire(self.jobs.clock()):
+            logger.info("upload %s: expired and removed", id)
+
+    def _remove_deleted(self) -> None:
+        """Remove the files of deleted jobs that the blob store did not remove when it was asked to."""
+        for id, deleted_at in self.jobs.records.deleted().items():
+            for key, written in self.jobs.blobs.list(f"jobs/{id}/"):
+                if written <= deleted_at and not is_wanted(self.jobs, key):
+                    self.jobs.blobs.delete(key)
+            self.jobs.records.forget_deleted(id)
+
+    def _sweep(self) -> None:
+        """Remove files that belong to no job or attempt: of submissions without a record, of attempts that were killed."""
+        oldest = self.jobs.clock() - ORPHAN_AGE
+        for key, written in self.jobs.blobs.list("jobs/"):
+            wanted = is_wanted(self.jobs, key)
+            if wanted is False or (wanted is None and written < oldest):
+                self.jobs.blobs.delete(key)
+                logger.info("removed %s, which belongs to no job or attempt", key)
+
+    def _clear_work(self) -> None:
+        """Remove scratch directories of ended attempts whose worker was killed before it could."""
+        work, oldest = self.jobs.settings.work, self.jobs.clock() - DEAD_AGE
+        for directory in work.iterdir() if work.exists() else ():
+            with suppress(FileNotFoundError):
+                if directory.stat().st_mtime < oldest.timestamp() and not self._is_running(directory.name):
+                    shutil.rmtree(directory, ignore_errors=True)
+
+    def _is_running(self, attempt_id: str) -> bool:
+        return self.jobs.records.look(attempt_id.rpartition("-")[0], attempt_id) in lifecycle.ACTIVE
+
+
+def is_wanted(jobs: Jobs, key: str) -> bool | None:
+    """Return True if a job needs a file, False if it does not; None: there is no such job, or not yet."""
+    try:
+        held = jobs.records.get(key.split("/")[1])
+    except UnknownJob:
+        return None
+    running = held.job.status in lifecycle.ACTIVE and f"/{held.attempt_id}/" in key
+    published = held.prefix is not None and key.startswith(held.prefix)
+    return key == held.inputs or running or published
