@@ -358,11 +358,12 @@ def _loop(
         if should_stop is not None and should_stop():
             return history, Outcome.STOPPED
         before = history[-1]
-        after = no_higher(before, step(problem, before, should_stop=should_stop))
+        computed = step(problem, before, should_stop=should_stop)
+        after = no_higher(before, computed)
         history[-1] = before.summary()
         history.append(after)
         tell(_told("reweight", after, settings, unit))
-        outcome = terminate(before, after, tolerance=settings.tolerance, max_reweightings=settings.max_reweightings)
+        outcome = terminate(before, computed, tolerance=settings.tolerance, max_reweightings=settings.max_reweightings)
         if outcome is not None:
             return history, outcome
 

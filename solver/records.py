@@ -321,6 +321,7 @@ class Outcome(StrEnum):
 
     CONVERGED = "converged"
     MAX_REWEIGHTINGS = "max_reweightings"
+    REJECTED = "rejected"
     STOPPED = "stopped"
 
     @property
@@ -334,6 +335,10 @@ _SENTENCES = {
     Outcome.MAX_REWEIGHTINGS: (
         "Stopped at the largest number of reweightings before the objective settled. The result is usable; "
         "raise max_reweightings or tolerance if it must settle."
+    ),
+    Outcome.REJECTED: (
+        "The last step would have raised the objective by more than the tolerance and was rejected; the shapes are those before it. "
+        "Try precision float64 or weaker weights if they are not good enough."
     ),
     Outcome.STOPPED: "Stopped on request; the shapes are those of the last finished step.",
 }

@@ -67,8 +67,9 @@ def choose_weights(
     laplacian: Laplacian | None,
     settings: Settings,
 ) -> tuple[Weights, float, dict[str, str]]:
-    """Return the weights, the estimated noise (normalised units) and one sentence for each choice."""
+    """Return the weights, the noise they are for (standard deviation, normalised units) and one sentence for each choice."""
     rough = roughness_of(normalised)
+    noise = rough.noise if covariance is None else noise_std(covariance)
     if settings.preset == "paper":
         chosen, reason = PAPER, "The paper's values."
     elif covariance is not None:
@@ -87,7 +88,7 @@ def choose_weights(
         given = replace(given, spatial=0.0)
     if settings.prior != "smooth+low_rank":
         given = replace(given, low_rank=0.0)
-    return given, rough.noise, {"weights": reason}
+    return given, noise, {"weights": reason}
 
 
 def without_effect(settings: Settings) -> tuple[str, ...]:
@@ -132,13 +133,18 @@ def roughness_of(normalised: Normalised) -> Roughness:
     return Roughness(typical / magnified(order), float((seen.max(axis=1) > max(FAR * typical, FAR_AT_LEAST)).mean()))
 
 
+def noise_std(covariance: ShapeCovariance) -> float:
+    """Return the standard deviation of the noise that the Gaussian prior is weighed against, normalised units."""
+    return max(float(covariance.noise**0.5), FINEST)
+
+
 def _from_covariance(covariance: ShapeCovariance, settings: Settings) -> tuple[Weights, str]:
     """Return the weights with which the energy is the negative logarithm of a probability, times a constant.
 
     Residuals of Laplace's distribution with standard deviation σ have the density exp(−√2 |r| / σ), so that
     |r| + (σ / 2√2) xᵀQx is what to minimise; Gaussian ones make it r² + σ² xᵀQx.
     """
-    sigma = max(covariance.noise**0.5, FINEST)
+    sigma = noise_std(covariance)
     scale = float(np.clip(sigma, SCALES[0], LARGEST_SCALE))
     strength = sigma / 8**0.5 if settings.loss == "l1" else sigma**2
     chosen = replace(PAPER, temporal=strength, spatial=0.0, robust_scale=scale)

@@ -28,8 +28,8 @@ from pliant.solver.records import Floats
 from scipy import linalg
 from scipy.linalg import lapack
 
-DENSE_ROWS = 180
-"""2F up to which V is factored whatever q: below, calls cost more than arithmetic."""
+DENSE_ROWS = 210
+"""2F up to which V is factored whatever q: the other form is not faster there."""
 
 DENSE_SHARE = 0.55
 """Share of q and of the columns of F₀, together, in 2F above which factoring V is faster: measured for 2F = 240 … 714."""
@@ -170,6 +170,9 @@ class Explained:
         means = linalg.cho_solve((root, True), solved.T @ factor, check_finite=False)
         rest = factor - columns @ means
         left, strayed = _solved(walk, model, rest)
+        slip = linalg.cho_solve((root, True), columns.T @ left - means, check_finite=False)  # what rounding left of M
+        means, rest = means + slip, rest - columns @ slip
+        left, strayed = left - solved @ slip, strayed - walked @ slip
         log_det = 2 * frames * float(np.log(noise)) + walk.log_det + 2 * float(np.log(np.diag(root)).sum())
         trace = float(np.einsum("ij,ij->", rest, left)) + float((means**2).sum())
         return cls(model, walk, solved, walked, root, means, left, strayed, 0.5 * (log_det + trace) / frames)
@@ -200,6 +203,20 @@ class Explained:
         return result
 
 
+def negative_log_likelihoods(model: ImageModel, tracks: Floats) -> Floats:
+    """Return −log of the density of each column of tracks `(2F, P)`, per frame, up to a constant, shape `(P,)`."""
+    rows, frames = len(tracks), len(model.walk)
+    if rows <= DENSE_ROWS:
+        factor = linalg.cho_factor(model.covariance(), lower=True)
+        log_det = 2 * float(np.log(np.diag(factor[0])).sum())
+        squares = (tracks * linalg.cho_solve(factor, tracks)).sum(axis=0)
+    else:
+        found = Explained.of(model, tracks)
+        squares = ((tracks - model.columns @ found.means) * found.left).sum(axis=0) + (found.means**2).sum(axis=0)
+        log_det = 2 * frames * found.value - float(squares.sum())
+    return np.asarray(0.5 * (log_det + squares) / frames)
+
+
 def inverted(matrix: Floats) -> tuple[Floats, float]:
     """Return inverse and log-determinant of a positive definite matrix.
 
@@ -213,8 +230,8 @@ def inverted(matrix: Floats) -> tuple[Floats, float]:
     if not np.isfinite(log_det):
         raise np.linalg.LinAlgError("the covariance of the images is not positive definite")
     inverse = np.asarray(lapack.dpotri(factor, lower=1, overwrite_c=1)[0])
-    lower = np.tril(inverse)
-    return lower + np.tril(inverse, -1).T, log_det
+    inverse[np.diag_indices(len(inverse))] /= 2  # above the diagonal, the factor has zeros
+    return inverse + inverse.T, log_det
 
 
 def _solved(walk: WalkPosterior, model: ImageModel, columns: Floats) -> tuple[Floats, Floats]:

@@ -15,11 +15,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from pliant.solver.model.image_density import negative_log_likelihoods
 from pliant.solver.model.marginal_likelihood import NOISE_FLOOR
 from pliant.solver.model.shape_covariance import MOST_MODES, ShapeCovariance, annealed
 from pliant.solver.records import Floats
 from pliant.solver.tracks.noise import typical_roughness
-from scipy import linalg
 
 COUNTS = (0, 2, 4, 8, 16, 32, MOST_MODES)
 """Numbers of modes tried."""
@@ -117,7 +117,5 @@ def improbability(covariance: ShapeCovariance, pairs: Floats, other: Floats) -> 
 
     The tenth of them that is least probable does not count: what completion left of gross outliers.
     """
-    factor = linalg.cho_factor(covariance.of_image(pairs), lower=True)
-    log_det = 2 * float(np.log(np.diag(factor[0])).sum())
-    each = np.sort((other * linalg.cho_solve(factor, other)).sum(axis=0))
-    return 0.5 * (log_det + float(each[: -(-9 * len(each) // 10)].mean())) / len(pairs)
+    each = np.sort(negative_log_likelihoods(covariance.image_model(pairs), other))
+    return float(each[: -(-9 * len(each) // 10)].mean())

@@ -23,10 +23,10 @@ from numpy.typing import NDArray
 from pliant.solver.model.image_density import Explained, ImageModel, factor_of, inverted
 from pliant.solver.model.marginal_likelihood import root_matrix
 from pliant.solver.model.random_walk import (
+    WalkPosterior,
     coloured,
     random_walk,
     walk_bands,
-    walk_precision,
     whitened,
     whitener,
 )
@@ -42,6 +42,9 @@ no more."""
 
 MOST_MODES = 64
 """Columns of L at most."""
+
+BEGUN_WEIGHT = 1e-3
+"""Weight of HᵀH against the data in the shapes to start from, normalised units."""
 
 ABOVE = 2.0
 """A mode counts if its variance is this many times what the random walk explains of it."""
@@ -107,6 +110,13 @@ class ShapeCovariance:
         image: Floats = rows @ self.extent @ rows.T + (rows @ self.play @ rows.T) * wide
         image[np.diag_indices(len(rows))] += self.noise
         return image
+
+    def image_model(self, pairs: Floats) -> ImageModel:
+        """Return the same by its parts."""
+        frames, walk = len(pairs), pairs @ root_matrix(self.play)
+        middle = (pairs @ root_matrix(self.extent))[:, :, None]
+        columns = np.concatenate([middle, self.modes[:, None, :, None] * walk[:, :, None]], axis=2)
+        return ImageModel(columns.reshape(2 * frames, -1), walk, self.noise, self.drift)
 
     def axes(self) -> tuple[Floats, Floats]:
         """Return B (3×3) and a (3,) with A₁ = B Bᵀ and A₀ = B diag(a) Bᵀ: in axes x = B y the coordinates are independent."""
@@ -208,17 +218,14 @@ def begin(gram: Floats, pairs: Floats, *, noise: float = QUIET, most: int = MOST
     most : int
         Columns of L at most.
     """
-    frames = len(pairs)
-    walk, _ = walk_precision(frames)
-    normal = np.kron(1e-3 * walk, np.eye(3)).reshape(frames, 3, frames, 3)
-    index = np.arange(frames)
-    normal[index, :, index, :] += np.einsum("fic,fid->fcd", pairs, pairs)
-    seen = np.zeros((frames, 3, frames, 2))
-    seen[index, :, index, :] = pairs.transpose(0, 2, 1)
-    inverse = linalg.solve(normal.reshape(3 * frames, -1), seen.reshape(3 * frames, -1), assume_a="pos")
-    second = (inverse @ gram @ inverse.T).reshape(frames, 3, frames, 3)
-    extent = second.mean(axis=(0, 2)) + 1e-6 * np.eye(3)
-    whole = np.einsum("fcgc->fg", second) / 3
+    frames, factor = len(pairs), factor_of(gram)
+    seen = pairs.transpose(0, 2, 1) @ factor.reshape(frames, 2, -1)
+    walk = WalkPosterior.of(pairs, noise_variance=1.0, walk_variance=walk_bands(frames)[1] / BEGUN_WEIGHT)
+    shapes = walk.solve(seen)
+    mean = shapes.mean(axis=0)
+    extent = mean @ mean.T + 1e-6 * np.eye(3)
+    flat = shapes.reshape(frames, -1)
+    whole = flat @ flat.T / 3
     middle = whole.mean(axis=0)
     deformed = whole - middle - middle[:, None] + middle.mean()
     modes, drift = _split(deformed, WARM, most)
@@ -305,19 +312,15 @@ def _linear_round(
     """
     frames, count = covariance.modes.shape
     root0, root1 = root_matrix(covariance.extent), root_matrix(covariance.play)
-    walk = pairs @ root1
-    columns = np.concatenate(
-        [(pairs @ root0)[:, :, None], covariance.modes[:, None, :, None] * walk[:, :, None]], axis=2
-    )
-    model = ImageModel(columns.reshape(2 * frames, -1), walk, covariance.noise, covariance.drift)
+    model = covariance.image_model(pairs)
+    walk, columns = model.walk, model.columns.reshape(frames, 2, count + 1, 3)
     seen = Explained.of(model, factor)
     found = seen.terms()
     by_columns = -frames * found.by_columns.reshape(columns.shape)
     by_walk = -frames * found.by_walk  # [K B (τT ⊗ I)]_ff
     extents = np.einsum("fic,fid->cd", columns[:, :, 0], by_columns[:, :, 0])
-    plays = np.einsum("fikc,fikd->cd", columns[:, :, 1:], by_columns[:, :, 1:]) + np.einsum(
-        "fic,fid->cd", walk, by_walk
-    )
+    own, by_own = (each[:, :, 1:].transpose(2, 0, 1, 3).reshape(count, -1) for each in (columns, by_columns))
+    plays = own.reshape(-1, 3).T @ by_own.reshape(-1, 3) + np.einsum("fic,fid->cd", walk, by_walk)
     along = whitened(covariance.modes)
 
     def spread(vectors: Floats) -> Floats:  # C̃ times them
@@ -327,10 +330,10 @@ def _linear_round(
     def product(vectors: Floats) -> Floats:
         wide = spread(vectors)
         images = walk[:, :, :, None] * coloured(wide)[:, None, None]
-        moved = seen.surplus(images.reshape(2 * frames, -1)).reshape(images.shape)
-        return wide + spread(coloured(np.einsum("fic,fick->fk", walk, moved), transposed=True)) / 3
+        moved = seen.surplus(images.reshape(2 * frames, -1)).reshape(frames, 6, -1)
+        return wide + spread(coloured((walk.reshape(frames, 1, 6) @ moved)[:, 0], transposed=True)) / 3
 
-    inner = np.einsum("fikc,filc->kl", columns[:, :, 1:], by_columns[:, :, 1:])
+    inner = own @ by_own.T
     square = along.T @ along + 2 * covariance.drift * np.eye(count)
     total = float((along**2).sum()) + frames * covariance.drift
     total += (float((square * inner).sum()) + covariance.drift * float((walk * by_walk).sum())) / 3

@@ -99,10 +99,12 @@ def operator_at(problem: Problem, state: State) -> Operator:
 
 
 def terminate(before: State, after: State, *, tolerance: float, max_reweightings: int) -> Outcome | None:
-    """Return how the solve ended, or None to go on.
+    """Return how the solve ended, or None to go on; `after` is the step as computed, before `no_higher`.
 
-    Converged when the objective's relative change over one reweighting is below `tolerance`.
+    Converged when the objective's relative change over one reweighting is below `tolerance`, rejected when it rises by more.
     """
+    if after.objective - before.objective > tolerance * abs(before.objective):
+        return Outcome.REJECTED
     if before.objective - after.objective <= tolerance * abs(before.objective):
         return Outcome.CONVERGED
     if after.reweighting >= max_reweightings:

@@ -10,7 +10,7 @@ the cost does not depend on P; one pass then carries every point onto the basis.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,6 +105,9 @@ def complete(normalised: Normalised, *, seed: int = 0, rank: int = 0) -> Complet
     InvalidInput
         Hardly any point is seen in two frames.
     """
+    most = float(normalised.visible.max())
+    if 0 < most < 1:  # only the ratios of confidences count
+        normalised = replace(normalised, visible=normalised.visible / most)
     random = np.random.default_rng(seed)
     chosen = choose_points(normalised.visible, random)
     again = seen_again(normalised.visible)
@@ -116,7 +119,7 @@ def complete(normalised: Normalised, *, seed: int = 0, rank: int = 0) -> Complet
     points, weight = normalised.points[:, chosen], normalised.visible[:, chosen]
     basis, spread, scale = fit_basis(points, weight, random, rank)
     outliers = fill(points, weight, basis, spread, scale)[1]
-    clean = outliers == 0.0 and bool((normalised.visible > 0).all())
+    clean = outliers == 0.0 and bool((normalised.visible == 1).all())
     filling = None if clean else Filling(basis, spread, scale)
     gram, translations, sample = _carry(normalised, filling, chosen)
     return Completed(gram, sample, translations, 0 if clean else basis.shape[2], outliers, filling)
@@ -228,12 +231,17 @@ def predict(basis: Floats, coefficients: Floats) -> Floats:
 
 
 def fill(points: Floats, weight: Floats, basis: Floats, spread: Floats, scale: float) -> tuple[Floats, float]:
-    """Return points with hidden entries predicted and outliers replaced, and the share of seen entries replaced."""
+    """Return points with hidden entries predicted and outliers replaced, and the share of seen entries replaced.
+
+    An entry of confidence c in between is drawn to its prediction, c times itself and 1 − c times that: expectation maximisation's
+    completion of an observation whose noise variance is 1/c times as large.
+    """
     coefficients, _ = coefficients_of(points, weight, basis, spread, scale, sweeps=4)
     predicted = predict(basis, coefficients)
     wrong = gross(points, weight, predicted, scale)
-    keep = (weight > 0) & ~wrong
-    return np.where(keep[..., None], points, predicted), float(wrong.sum() / max((weight > 0).sum(), 1))
+    trust = np.where(wrong, 0.0, weight)[..., None]
+    filled = np.where(trust == 1, points, predicted + trust * (points - predicted))
+    return filled, float(wrong.sum() / max((weight > 0).sum(), 1))
 
 
 def gross(points: Floats, weight: Floats, predicted: Floats, scale: float) -> NDArray[np.bool_]:

@@ -95,3 +95,20 @@ def test_a_stop_is_remembered() -> None:
     monitor = Monitor(should_stop=lambda: next(answers))
     assert [monitor(), monitor(), monitor()] == [False, True, True]
     assert monitor.stopped
+
+
+def test_a_step_that_raises_the_objective_is_rejected_and_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    from dataclasses import replace
+
+    from pliant.solver import reconstruct
+
+    taken: list[float] = []
+
+    def worse(problem, state, **more):  # type: ignore[no-untyped-def]
+        taken.append(state.objective)
+        return replace(state, shapes=state.shapes + 1, objective=2 * state.objective, reweighting=state.reweighting + 1)
+
+    monkeypatch.setattr(reconstruct, "step", worse)
+    found = solve(small(), settings=Settings(prior="smooth", refine_rotations=False))
+    assert found.outcome is Outcome.REJECTED
+    assert found.trace.objective[-1] == taken[0]

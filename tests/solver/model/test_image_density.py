@@ -6,7 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pliant.solver.model.image_density import ImageModel, dense_terms, factor_of, inverted, terms, woodbury_terms
+from pliant.solver.model.image_density import (
+    ImageModel,
+    dense_terms,
+    factor_of,
+    inverted,
+    negative_log_likelihoods,
+    terms,
+    woodbury_terms,
+)
 from pliant.solver.model.random_walk import WalkPosterior, random_walk
 from pliant.solver.model.so3 import exponential
 
@@ -116,3 +124,11 @@ def test_what_is_not_finite_is_refused(form: object) -> None:
         inverted(-np.eye(3))
     with pytest.raises(np.linalg.LinAlgError, match="finite"), np.errstate(all="ignore"):
         terms(model, np.full_like(factor, np.inf))
+
+
+@pytest.mark.parametrize("frames", [9, 100])
+def test_each_point_has_the_density_of_the_definition(frames: int) -> None:
+    model, factor = drawn(frames, 2)
+    image = model.covariance()
+    expected = np.linalg.slogdet(image)[1] + (factor * np.linalg.solve(image, factor)).sum(axis=0)
+    np.testing.assert_allclose(negative_log_likelihoods(model, factor), expected / (2 * frames), rtol=1e-9)
