@@ -14,10 +14,14 @@ import numpy as np
 import pytest
 from crafting import png
 from PIL import Image
+from pliant.cli import app
+from pliant.cli.session import Session
+from pliant.client import BadArgument, Client
 from pliant.schemas.job import Job, Status
 from pliant.service.submission import FILES
 from pliant.worker.execution import attempt
 from serving import Running, tracks, until
+from typer.testing import CliRunner
 
 PICTURES = films.textured_pictures(10, (96, 72))
 QUICK = {"outputs": [], "max_reweightings": 2, "grid_step": 6, "refine_rotations": False}
@@ -179,3 +183,21 @@ def test_cancelling_stops_the_tracking(running: Running, http: httpx.Client, tmp
     assert stage == ["track"]
     assert done.status is Status.CANCELLED
     assert done.artifacts == []
+
+
+def test_client_and_command_line_send_films(running: Running, film: bytes, tmp_path: Path) -> None:
+    path, region = tmp_path / "film.mp4", tmp_path / "mask.png"
+    path.write_bytes(film)
+    region.write_bytes(mask())
+    with Client(running.url) as client:
+        job = client.submit(film=path, region=region, options=QUICK)
+        assert job.record.interpretation.mesh_source == "film"
+        for wrong in ({}, {"tracks": np.zeros((4, 9, 2)), "film": path}):
+            with pytest.raises(BadArgument, match="expected one of them"):
+                client.submit(**wrong)  # type: ignore[arg-type]
+        with pytest.raises(BadArgument, match="visible goes with an array"):
+            client.submit(film=path, visible=np.ones((10, 4)))
+    command = ["submit", str(path), "--region", str(region), "--url", running.url, "--json"]
+    ran = CliRunner().invoke(app, command, obj=Session())
+    assert ran.exit_code == 0, ran.output
+    assert json.loads(ran.stdout)["interpretation"]["format"] == "film (mp4)"

@@ -229,8 +229,8 @@ def _reconstruct(
     attempt: Attempt, stored: Stored, inputs: Path, results: Path, *, reconstruct: Callable[..., Finished] | None
 ) -> Finished:
     """Solve stored tracks, or track and solve a stored film."""
-    from pliant.worker.execution.film import reconstruct_film
     from pliant.worker.execution import pipeline
+    from pliant.worker.execution.film import reconstruct_film
     from pliant.worker.films.sources import FilmBounds, is_source, open_source
     from pliant.worker.formats import load_inputs
 
