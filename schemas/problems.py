@@ -397,6 +397,12 @@ class ProblemCode(StrEnum):
     TRACKS_LOST = ("tracks_lost", 422, "Tracks lost",
      "Too few points stay visible through the film.",
      "Film more slowly and with more light.")
+    UNWRITABLE_FILM = ("unwritable_film", None, "Film cannot be written",
+     "`pliant.tracking.rendering` could not write a film to the given path.",
+     "Check the folder and its permissions.")
+    STOPPED = ("stopped", None, "Tracking stopped",
+     "`pliant.tracking.track_film` stopped because its `should_stop` returned True. There is no result.",
+     "None needed.")
 
     # Meaning of the input
     AMBIGUOUS_LAYOUT = ("ambiguous_layout", 422, "Ambiguous layout",
