@@ -195,7 +195,7 @@ def test_client_and_command_line_send_films(running: Running, film: bytes, tmp_p
         for wrong in ({}, {"tracks": np.zeros((4, 9, 2)), "film": path}):
             with pytest.raises(BadArgument, match="expected one of them"):
                 client.submit(**wrong)  # type: ignore[arg-type]
-        with pytest.raises(BadArgument, match="visible goes with an array"):
+        with pytest.raises(BadArgument, match="only valid with an array"):
             client.submit(film=path, visible=np.ones((10, 4)))
     command = ["submit", str(path), "--region", str(region), "--url", running.url, "--json"]
     ran = CliRunner().invoke(app, command, obj=Session())
