@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from pliant.cli.films import is_film
 from pliant.cli.ids import find_job
 from pliant.cli.paths import output_folder
 from pliant.cli.session import (
@@ -18,6 +19,7 @@ from pliant.cli.session import (
     Json,
     Mesh,
     OptionPairs,
+    Region,
     Rotations,
     Session,
     Timeout,
@@ -39,6 +41,7 @@ def submit(
     mesh: Mesh = None,
     ground_truth: GroundTruth = None,
     rotations: Rotations = None,
+    region: Region = None,
     option: OptionPairs = None,
     name: Annotated[str, typer.Option("--name", "-n", help="Your own label.")] = "",
     job_id: Annotated[
@@ -61,7 +64,7 @@ def submit(
     timeout: Timeout = None,
     as_json: Json = False,
 ) -> None:
-    """Submit tracks to a service and print the job."""
+    """Submit tracks or a film to a service and print the job."""
     from pliant.client.progress import progress_bar
 
     session: Session = ctx.obj
@@ -69,10 +72,13 @@ def submit(
     options = parse_options(option)
     if output is not None:
         output_folder(output, force=force)
+    film = is_film(tracks, region)
     with session.client(url, as_json=as_json) as client:
         with progress_bar(line_every=LINE_EVERY) as bar:
             job = client.submit(
-                tracks,
+                None if film else tracks,
+                film=tracks if film else None,
+                region=region,
                 mesh=mesh,
                 ground_truth=ground_truth,
                 rotations=rotations,

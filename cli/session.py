@@ -28,7 +28,14 @@ OptionPairs = Annotated[
     typer.Option("--option", "-O", help="An option, e.g. -O loss=huber; may be repeated.", metavar="NAME=VALUE"),
 ]
 Tracks = Annotated[
-    Path, typer.Argument(help="Track file, in any format `pliant inspect` reads.", show_default=False, readable=False)
+    Path,
+    typer.Argument(
+        help="Track file, in any format `pliant inspect` reads; or a film.", show_default=False, readable=False
+    ),
+]
+Region = Annotated[
+    Path | None,
+    typer.Option("--region", help="Of a film: mask picture of its size; white is tracked.", readable=False),
 ]
 """Paths are checked by the commands: one exit code and one form of message for every wrong path."""
 Mesh = Annotated[

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from pliant.cli.films import is_film, refuse_parts_of_tracks, solve_film
 from pliant.cli.paths import input_file, output_folder
 from pliant.cli.session import (
     LINE_EVERY,
@@ -15,6 +16,7 @@ from pliant.cli.session import (
     Json,
     Mesh,
     OptionPairs,
+    Region,
     Rotations,
     Tracks,
     parse_options,
@@ -38,14 +40,16 @@ def solve(
     mesh: Mesh = None,
     ground_truth: GroundTruth = None,
     rotations: Rotations = None,
+    region: Region = None,
     option: OptionPairs = None,
     threads: Threads = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Reconstruct in this process, without a service: the same code, the same files."""
+    """Reconstruct tracks or a film in this process, without a service: the same code, the same files."""
     ctx.obj.json = as_json
-    check_inputs(tracks, ground_truth, rotations)
+    check_inputs(None if tracks.is_dir() else tracks, ground_truth, rotations)
+    input_file(region, "region")
     output_folder(output, force=force)
     from pliant.worker.settings import NUMERICAL_THREADS
 
@@ -57,6 +61,12 @@ def solve(
     from pliant.worker.execution.pipeline import reconstruct
     from pliant.worker.formats import read_inputs
 
+    if is_film(tracks, region):
+        refuse_parts_of_tracks(mesh=mesh, ground_truth=ground_truth, rotations=rotations)
+        given = parse_options(option)
+        done = solve_film(tracks, output, region=region, options=given, threads=threads, as_json=as_json)
+        show_finished(done, output, as_json=as_json)
+        return
     options = checked_options(parse_options(option))
     inputs = read_inputs(
         tracks=tracks, mesh=file_or_word(mesh), ground_truth=ground_truth, rotations=rotations, options=options
@@ -106,7 +116,7 @@ def inspect(
         show_understood(interpretation)
 
 
-def check_inputs(tracks: Path, ground_truth: Path | None, rotations: Path | None) -> None:
+def check_inputs(tracks: Path | None, ground_truth: Path | None, rotations: Path | None) -> None:
     """Check the paths of the inputs; a mesh may be a word, so its reader checks it."""
     for path, name in ((tracks, "tracks"), (ground_truth, "ground_truth"), (rotations, "rotations")):
         input_file(path, name)

@@ -121,7 +121,9 @@ class CountedFile:
 class Inputs:
     """The inputs of a job as the caller gave them."""
 
-    tracks: Source
+    tracks: Source | None
+    film: Path | str | None = None
+    region: Path | str | None = None
     visible: ArrayLike | None = None
     mesh: Source | tuple[int, int] | None = None
     ground_truth: Source | None = None
@@ -136,7 +138,17 @@ class Inputs:
             An input cannot be sent.
         """
         texts = dict(fields)
-        files = {"tracks": tracks_file(self.tracks, self.visible, folder)}
+        if (self.tracks is None) == (self.film is None):
+            raise BadArgument(
+                f"tracks, film: expected one of them, got {'both' if self.film is not None else 'neither'}."
+            )
+        if self.film is not None:
+            _alone(self.visible)
+            files = {"film": existing_file(self.film, "film")}
+        elif self.tracks is not None:
+            files = {"tracks": tracks_file(self.tracks, self.visible, folder)}
+        if self.region is not None:
+            files["region"] = existing_file(self.region, "region")
         if self.mesh is not None:
             part = mesh_part(self.mesh, folder)
             if isinstance(part, str):

@@ -57,7 +57,9 @@ class Problem(Record):
 class Progress(Record):
     """How far a running job is."""
 
-    stage: str = Field(description="`loading`, `cameras`, `initialise`, `reweight`, `finish` or `exporting`.")
+    stage: str = Field(
+        description="`track` (films), `loading`, `cameras`, `initialise`, `reweight`, `finish` or `exporting`."
+    )
     fraction: float = Field(ge=0, le=1)
     reweighting: int = 0
     max_reweightings: int = 0
@@ -84,7 +86,7 @@ class Interpretation(Record):
     num_points: int
     num_faces: int
     hidden_fraction: float = Field(description="Share of the F·P observations that carry no weight.")
-    mesh_source: str = Field(description="`given`, `grid`, `delaunay` or `none`.")
+    mesh_source: str = Field(description="`given`, `grid`, `delaunay`, `film` or `none`.")
     mesh_grid: tuple[int, int] | None = Field(
         None, description="Rows and columns, where the points are a whole grid, row after row."
     )

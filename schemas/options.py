@@ -35,6 +35,8 @@ def _in_order(given: tuple[Output, ...]) -> tuple[Output, ...]:
     return tuple(name for name in get_args(Output) if name in given)
 
 
+Pixel = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
+
 Outputs = Annotated[tuple[Output, ...], Field(max_length=64), BeforeValidator(_listed), AfterValidator(_in_order)]
 
 
@@ -198,4 +200,32 @@ class Options(BaseModel):
         le=1000,
         description="A point seen in fewer frames than this is left out of the solve. It keeps its place in the result, where it "
         "follows its neighbours on the mesh.",
+    )
+
+    template_frame: Annotated[int, Field(ge=0, le=10_000_000)] | None = Field(
+        None,
+        description="Of a film: the frame whose points are followed to both ends, counted in the whole film from 0; null: the region's "
+        "frame, or a sharp one in the middle where no region is given.",
+    )
+    grid_step: Annotated[float, Field(ge=1, le=100, allow_inf_nan=False)] | None = Field(
+        None,
+        description="Of a film: distance of neighbouring points in the film's pixels; null: so that the region holds about 4,000 points.",
+    )
+    longest_side: int = Field(
+        960,
+        ge=64,
+        le=4096,
+        description="Of a film: longest side of the frames that are tracked, pixels; larger films are reduced. Tracks stay in the film's "
+        "own pixels.",
+    )
+    region_frame: int = Field(
+        0,
+        ge=0,
+        le=10_000_000,
+        description="Of a film: the frame that the region was drawn on, counted in the whole film from 0.",
+    )
+    region_polygon: Annotated[tuple[tuple[Pixel, Pixel], ...], Field(min_length=3, max_length=1000)] | None = Field(
+        None,
+        description="Of a film: corners [x, y] around what is to be tracked, in the film's pixels, y down, instead of a mask picture; "
+        "null: the mask, or the whole picture.",
     )

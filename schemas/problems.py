@@ -96,6 +96,9 @@ class ProblemCode(StrEnum):
     MISSING_PART = ("missing_part", 422, "Missing part",
      "A required part, usually `tracks`, is absent.",
      "Add it.")
+    CONFLICTING_PARTS = ("conflicting_parts", 422, "Conflicting parts",
+     "A form has parts that exclude each other: a film beside tracks, or a mask picture beside `region_polygon`.",
+     "Leave one of them out.")
     NOT_A_FILE = ("not_a_file", 422, "Part is not a file",
      "A part that must be a file was sent as text.",
      "Give the part a file name, as `curl -F tracks=@FILE` does.")
@@ -308,6 +311,98 @@ class ProblemCode(StrEnum):
      "No array or column of a known name was found; `got` lists what is there.",
      "Name the tracks `tracks` or `W`, the truth `shapes` or `S`, the cameras `rotations`, the mesh `faces` or `grid`, "
      "intrinsics `intrinsics`.")
+
+    # Films
+    FILM_UNAVAILABLE = ("film_unavailable", 422, "Films not supported here",
+     "A film was sent to an installation without OpenCV.",
+     "Install `pliant[film]` beside service and worker, or send tracks.")
+    UNSUPPORTED_FILM = ("unsupported_film", 422, "Unsupported film",
+     "The content of the file is none of mp4, mov, webm, mkv, avi, animated GIF or a zip of pictures.",
+     "Convert it: `ffmpeg -i FILM film.mp4`.")
+    UNREADABLE_FILM = ("unreadable_film", 422, "Unreadable film",
+     "The film's file cannot be opened.",
+     "Check the path and its permissions.")
+    EMPTY_FILM = ("empty_film", 422, "Empty film",
+     "The film's file has no bytes.",
+     "Copy the film again.")
+    PLAYLIST = ("playlist", 422, "Playlist",
+     "The file is a playlist or text that refers to other files or addresses, which are never opened.",
+     "Send the film itself.")
+    EXTERNAL_REFERENCE = ("external_reference", 422, "External reference",
+     "The film's samples lie in another file.",
+     "Export the film with its media inside.")
+    TRUNCATED_FILM = ("truncated_film", 422, "Truncated film",
+     "The film was cut off before the recording ended: its index or header is missing.",
+     "Copy it again, or film again.")
+    UNDECODABLE_FILM = ("undecodable_film", 422, "Undecodable film",
+     "The film holds no picture that can be decoded.",
+     "Convert it: `ffmpeg -i FILM film.mp4`.")
+    NO_PICTURE = ("no_picture", 422, "No picture",
+     "The film holds sound only, or the zip no pictures.",
+     "Send a film with a picture track.")
+    BROKEN_PICTURE = ("broken_picture", 422, "Broken picture",
+     "A picture of a zip or GIF cannot be decoded.",
+     "Save it again as PNG or JPEG.")
+    CHANGING_SIZE = ("changing_size", 422, "Changing size",
+     "The frames of the film differ in size.",
+     "Export all frames in one size.")
+    TOO_SMALL = ("too_small", 422, "Film too small",
+     "The frames are smaller than 16×16 pixels.",
+     "Film at 640×480 or more.")
+    TOO_MANY_STREAMS = ("too_many_streams", 422, "Too many streams",
+     "The film has more than 16 streams.",
+     "Keep the picture: `ffmpeg -i FILM -map 0:v:0 film.mp4`.")
+    TOO_MANY_PICTURES = ("too_many_pictures", 422, "Too many pictures",
+     "A zip lists more pictures than can be looked at.",
+     "Put fewer pictures in the zip.")
+    TOO_MANY_BYTES = ("too_many_bytes", 422, "Too many bytes",
+     "The film, or the pictures of a zip unpacked, are larger than this installation accepts.",
+     "Cut the film, or compress it more.")
+    TOO_MANY_PIXELS = ("too_many_pixels", 422, "Too many pixels",
+     "The frames are larger than 4096×2304 pixels.",
+     "Scale the film down: `ffmpeg -i FILM -vf scale=1280:-2 film.mp4`.")
+    TOO_MANY_FRAMES = ("too_many_frames", 422, "Too many frames",
+     "More frames are to be tracked than this installation accepts.",
+     "Select some with `frames`, for example `0:3000:2`.")
+    TOO_LONG = ("too_long", 422, "Film too long",
+     "The film plays for longer than ten minutes up to the last frame that is used.",
+     "Select a part with `frames`, or cut the film.")
+    WRONG_SELECTION = ("wrong_selection", 422, "Wrong selection of frames",
+     "The option `frames` selects nothing from a film; negative numbers are not possible there.",
+     "Write `start:stop:step`, for example `0:300:2`.")
+    NO_SUCH_FRAME = ("no_such_frame", 422, "No such frame",
+     "`template_frame` or `region_frame` lies beyond the film's end.",
+     "Frames are counted in the whole film from 0.")
+    UNREADABLE_REGION = ("unreadable_region", 422, "Unreadable region",
+     "The region is no picture that can be read.",
+     "Save the mask as PNG: white inside, black outside.")
+    WRONG_REGION = ("wrong_region", 422, "Wrong region",
+     "A region given as an array is neither a mask `(H, W)` nor a polygon `(N, 2)`.",
+     "Convert the array.")
+    WRONG_REGION_SIZE = ("wrong_region_size", 422, "Wrong size of the region",
+     "The mask picture has another size than the film.",
+     "Draw the region on a frame of this film, upright as it is shown.")
+    WRONG_POLYGON = ("wrong_polygon", 422, "Wrong polygon",
+     "The polygon has fewer than three corners, or coordinates that are not finite.",
+     "Draw around the thing to track.")
+    EMPTY_REGION = ("empty_region", 422, "Empty region",
+     "The region holds no pixel of the film.",
+     "Draw around the thing to track.")
+    REGION_LOST = ("region_lost", 422, "Region lost",
+     "The region cannot be followed from the frame it was drawn on to the template.",
+     "Draw it on the template frame (`region_frame`), or choose a nearer `template_frame`.")
+    NO_TEXTURE = ("no_texture", 422, "No texture",
+     "The region has too little texture to follow.",
+     "Draw a larger region, or film a surface with a pattern, in focus and in good light.")
+    TRACKS_LOST = ("tracks_lost", 422, "Tracks lost",
+     "Too few points stay visible through the film.",
+     "Film more slowly and with more light.")
+    UNWRITABLE_FILM = ("unwritable_film", None, "Film cannot be written",
+     "`pliant.tracking.rendering` could not write a film to the given path.",
+     "Check the folder and its permissions.")
+    STOPPED = ("stopped", None, "Tracking stopped",
+     "`pliant.tracking.track_film` stopped because its `should_stop` returned True. There is no result.",
+     "None needed.")
 
     # Meaning of the input
     AMBIGUOUS_LAYOUT = ("ambiguous_layout", 422, "Ambiguous layout",

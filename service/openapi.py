@@ -96,6 +96,16 @@ SUBMIT_BODY: dict[str, Any] = {
                         "description": "The 2-D tracks: npz with `tracks (F, P, 2)` and optionally `visibility (F, P)`, "
                         "or the output of a point tracker; the documentation lists all formats.",
                     },
+                    "film": {
+                        **_FILE,
+                        "description": "Instead of tracks: an mp4, mov, webm, mkv or avi film, an animated GIF, or a zip of pictures. "
+                        "Its points are tracked when the job runs; large films are better sent as an upload.",
+                    },
+                    "region": {
+                        **_FILE,
+                        "description": "What to track in the film: a mask picture of its size, white inside. Omitted: the option "
+                        "`region_polygon`, or the whole picture.",
+                    },
                     "mesh": {
                         "anyOf": [_FILE, {"type": "string", "pattern": "^([0-9]{1,6}x[0-9]{1,6}|none)$"}],
                         "description": "A mesh file whose vertex i is point i, or the text ROWSxCOLUMNS for a pixel grid. "
@@ -129,7 +139,7 @@ SUBMIT_BODY: dict[str, Any] = {
                             "type": "string",
                             "description": f"Id of a complete upload (`PUT /v1/uploads/ID`) to use as the part `{part}`.",
                         }
-                        for part in ("tracks", "mesh", "ground_truth", "rotations")
+                        for part in ("film", "region", "tracks", "mesh", "ground_truth", "rotations")
                     },
                 },
             },

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,8 @@ from pliant.service.problems import Refusal, from_validation, wrong_input
 from pliant.service.settings import ServiceSettings
 from pliant.worker.artifacts import kinds_for
 from pliant.worker.errors import Conflict, UnknownUpload
+from pliant.worker.films.sources import FilmBounds, FilmSource, save_source
+from pliant.worker.films.tracker import check_film, described, film_options
 from pliant.worker.formats import Limits, store_inputs
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.jobs.submission import Submission
@@ -21,7 +24,9 @@ from pliant.worker.uploads.service import Uploads
 from pliant.worker.webhooks.message import parse_webhook
 from pydantic import ValidationError
 
-FILES = frozenset({"tracks", "mesh", "ground_truth", "rotations"})
+OF_TRACKS = ("tracks", "mesh", "ground_truth", "rotations")
+OF_FILM = ("film", "region")
+FILES = frozenset({*OF_TRACKS, *OF_FILM})
 UPLOADS = {f"{part}_upload": part for part in sorted(FILES)}
 """Text parts that name an upload, and the part that each stands for."""
 TEXTS = frozenset({"mesh", "options", "name", "webhook", "webhook_secret", *UPLOADS})
@@ -99,8 +104,8 @@ def accept(
     if known is not None:
         return known, False
     canonical = folder / "canonical.npz"
-    interpretation = read_form(form, options, limits, target=canonical)
-    job = jobs.submit(canonical, submission, interpretation=interpretation)
+    interpretation, options = read_form(form, options, limits, target=canonical)
+    job = jobs.submit(canonical, replace(submission, options=options), interpretation=interpretation)
     return job, True
 
 
@@ -143,26 +148,69 @@ def with_uploads(form: Form, folder: Path, uploads: Uploads) -> Form:
     return Form(files=files, texts=texts)
 
 
-def read_form(form: Form, options: Options, limits: Limits, *, target: Path | None) -> Interpretation:
+def read_form(form: Form, options: Options, limits: Limits, *, target: Path | None) -> tuple[Interpretation, Options]:
     """Read, check and interpret the files of a form, and store them if a target is given. Blocks; call it on a thread.
+
+    A film is only opened, not tracked.
+
+    Returns
+    -------
+    interpretation : Interpretation
+        How the files were read.
+    options : Options
+        Those given, completed by what a film states.
 
     Raises
     ------
     Refusal, InvalidInput
-        A part is missing, or cannot be read.
+        A part is missing, contradicts another one, or cannot be read.
     """
-    if "tracks" not in form.files:
+    is_film = any(part in form.files for part in OF_FILM)
+    if is_film:
+        _check_film_parts(form)
+    elif "tracks" not in form.files:
         raise missing("tracks")
     kinds_for(options)  # refuses outputs that this installation cannot write
+    if is_film:
+        return _read_film(form, options, limits, target)
     files: dict[str, Path | str | None] = {part: file.path for part, file in form.files.items()}
     if form.texts.get("mesh", "").strip():
         files["mesh"] = form.texts["mesh"].strip()
-    return store_inputs(**files, options=options, limits=limits, target=target)  # type: ignore[arg-type]
+    return store_inputs(**files, options=options, limits=limits, target=target), options  # type: ignore[arg-type]
+
+
+def _check_film_parts(form: Form) -> None:
+    """Refuse a region without a film, and a film beside parts that belong to tracks."""
+    if "film" not in form.files:
+        raise missing("film")
+    others = [part for part in OF_TRACKS if part in form.files or form.texts.get(part, "").strip()]
+    if others:
+        raise wrong_input(
+            ProblemCode.CONFLICTING_PARTS,
+            field=others[0],
+            expected="a film with its region, or tracks with what belongs to them",
+            got=f"film and {', '.join(others)}",
+            hint="Leave one of them out: the tracks and the mesh of a film are made from it.",
+        )
+
+
+def _read_film(form: Form, options: Options, limits: Limits, target: Path | None) -> tuple[Interpretation, Options]:
+    region = form.files.get("region")
+    source = FilmSource(form.files["film"].path, None if region is None else region.path)
+    facts = check_film(source, options, FilmBounds(max_bytes=limits.max_bytes))
+    options = film_options(options, facts)
+    interpretation = described(facts, options)
+    if target is not None:
+        save_source(source, interpretation, target)
+    return interpretation, options
 
 
 def missing(part: str) -> Refusal:
     """Return the refusal of a form without a required part."""
-    hint = f"Add the part, as in curl's -F {part}=@{part}.npz."
+    if part == "film":
+        hint = "A region belongs to a film: add it, as in curl's -F film=@film.mp4."
+    else:
+        hint = f"Add the part, as in curl's -F {part}=@{part}.npz, or a film: -F film=@film.mp4."
     return wrong_input(ProblemCode.MISSING_PART, field=part, expected="a file", got="none", hint=hint)
 
 

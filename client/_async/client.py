@@ -92,8 +92,10 @@ class AsyncClient:
 
     async def submit(
         self,
-        tracks: Source,
+        tracks: Source | None = None,
         *,
+        film: Path | str | None = None,
+        region: Path | str | None = None,
         visible: ArrayLike | None = None,
         mesh: Source | tuple[int, int] | None = None,
         ground_truth: Source | None = None,
@@ -107,13 +109,18 @@ class AsyncClient:
         on_upload: OnBytes | None = None,
         timeout: float | None = None,
     ) -> AsyncRemoteJob:
-        """Submit tracks for reconstruction and return the queued job.
+        """Submit tracks or a film for reconstruction and return the queued job.
 
         Parameters
         ----------
         tracks : array_like, mapping or path
             Points (F, P, 2) in pixels, NaN or masked where hidden; or the dictionary of a tracker (CoTracker, TAPIR, …);
             or the path of a file in any format that the service reads.
+        film : path, optional
+            A film instead of tracks: mp4, mov, webm, mkv, avi, animated GIF or a zip of pictures. The job tracks its points.
+        region : path, optional
+            What to track in the film: a mask picture of its size, white inside. Without it and without the option
+            `region_polygon`, the whole picture.
         visible : array_like, optional
             Shape (F, P), bool or confidence in [0, 1]; only with an array of tracks.
         mesh : array_like, (rows, columns), path, optional
@@ -148,7 +155,9 @@ class AsyncClient:
         BadArgument, APIStatusError, Unreachable, WaitTimeout
             See `pliant.client.errors`.
         """
-        inputs = Inputs(tracks=tracks, visible=visible, mesh=mesh, ground_truth=ground_truth, rotations=rotations)
+        inputs = Inputs(
+            tracks=tracks, film=film, region=region, visible=visible, mesh=mesh, ground_truth=ground_truth, rotations=rotations
+        )  # fmt: skip
         with tempfile.TemporaryDirectory(prefix="pliant-submit-") as folder:
             job = await operations.submit(
                 self._exchange(timeout, "the submission"),

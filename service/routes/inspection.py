@@ -46,9 +46,10 @@ async def inspect(request: Request, core: Core, bounds: Bound, uploads: MyUpload
 def interpret(form: Form, folder: Path, uploads: Uploads, limits: Limits) -> Inspection:
     """Read a form as for a job, and return the interpretation with a sample. Blocks; call it on a thread."""
     whole, canonical = with_uploads(form, folder, uploads), folder / "canonical.npz"
-    found = read_form(whole, parse_options(whole.texts.get("options", "")), limits, target=canonical)
+    found, _ = read_form(whole, parse_options(whole.texts.get("options", "")), limits, target=canonical)
     # Inputs too large to be parsed in this process are too large to be sampled in it.
-    sample = sample_of(load_inputs(canonical)) if canonical.stat().st_size <= LARGE else []
+    tracked = "film" not in whole.files and canonical.stat().st_size <= LARGE
+    sample = sample_of(load_inputs(canonical)) if tracked else []
     return Inspection(**found.model_dump(), sample=sample)
 
 

@@ -73,7 +73,7 @@ def opened(folder: Path) -> Iterator[House]:
 def send(house: House, attack: Attack) -> Outcome:
     content = attack.make()
     files = {attack.part: ("../../../etc/cron.d/x", content)}
-    if attack.part != "tracks":
+    if attack.part not in ("tracks", "film"):
         files["tracks"] = ("tracks.npy", HONEST)
     began = time.perf_counter()
     with watched(house.service) as memory:

@@ -228,4 +228,28 @@ MESHES = (
            ("unknown_format",), part="mesh"),
 )  # fmt: skip
 
-ATTACKS = (*ZIPS, *HEADERS, *NUMBERS, *HDF5, *MAT5, *TEXT, *MESHES)
+
+def mp4_box(kind: bytes, body: bytes = b"") -> bytes:
+    return struct.pack(">I4s", 8 + len(body), kind) + body
+
+
+FTYP = mp4_box(b"ftyp", b"isom\0\0\2\0isom")
+DREF = mp4_box(b"dref", struct.pack(">II", 0, 1) + mp4_box(b"url ", b"\0\0\0\0http://169.254.169.254/x\0"))
+LARGE_PICTURE = png(6000, 6000, data=zlib.compress(bytes(1000)))
+
+FILMS = (
+    Attack("film playlist", "an HLS playlist of /etc/passwd", lambda: b"#EXTM3U\n#EXTINF:1,\nfile:///etc/passwd\n", ("playlist",), part="film"),
+    Attack("film list", "an ffconcat list of /etc/passwd", lambda: b"ffconcat version 1.0\nfile /etc/passwd\n", ("playlist",), part="film"),
+    Attack("film elsewhere", "an MP4 whose samples lie at http://169.254.169.254/", lambda: FTYP + mp4_box(b"moov", mp4_box(b"trak",
+           mp4_box(b"mdia", mp4_box(b"minf", mp4_box(b"dinf", DREF))))), ("external_reference",), part="film"),
+    Attack("film of 1,000 streams", "an MP4 with 1,000 tracks", lambda: FTYP + mp4_box(b"moov", mp4_box(b"trak") * 1000),
+           ("too_many_streams",), part="film"),
+    Attack("film without index", "an MP4 cut off before its index", lambda: FTYP + mp4_box(b"mdat", bytes(1 << 20)), ("truncated_film",), part="film"),
+    Attack("film of huge pictures", "a zip of pictures that state 6,000 × 6,000 pixels", lambda: archive(*((f"{n}.png", LARGE_PICTURE)
+           for n in range(3))), ("too_many_pixels",), part="film"),
+    Attack("film of no pictures", "a zip of tracks as film", lambda: archive(("tracks.npy", HONEST)), ("no_picture",), part="film"),
+    Attack("GIF of 60,000 × 60,000", "an animated GIF that states a huge size", lambda: b"GIF89a" + struct.pack("<HH", 60_000, 60_000) + bytes(20),
+           ("too_many_pixels", "broken_picture"), part="film"),
+)  # fmt: skip
+
+ATTACKS = (*ZIPS, *HEADERS, *NUMBERS, *HDF5, *MAT5, *TEXT, *MESHES, *FILMS)

@@ -83,10 +83,16 @@ def _written(
             put(file)
             file.flush()
             os.fsync(file.fileno())
-        with aside.open("rb") as file:
-            digest = hashlib.file_digest(file, "sha256").hexdigest()
-        size = aside.stat().st_size
         aside.replace(directory / name)
     finally:
         aside.unlink(missing_ok=True)
-    return Artifact(name=name, media_type=media_type, bytes=size, sha256=digest, description=description)
+    return described(directory / name, media_type, description)
+
+
+def described(file: Path, media_type: str, description: str) -> Artifact:
+    """Return the record of a result file that is whole."""
+    with file.open("rb") as stream:
+        digest = hashlib.file_digest(stream, "sha256").hexdigest()
+    return Artifact(
+        name=file.name, media_type=media_type, bytes=file.stat().st_size, sha256=digest, description=description
+    )

@@ -136,6 +136,7 @@ class Attempt:
             return lifecycle.succeed(
                 held, attempt_id=self.attempt_id, prefix=self.prefix, artifacts=end.artifacts, metrics=end.metrics,
                 outcome=end.outcome, sentence=end.sentence, warnings=end.warnings, now=now, retention=settings.retention,
+                interpretation=end.interpretation,
             )  # fmt: skip
 
         with contextlib.suppress(StoreUnavailable):
@@ -201,20 +202,12 @@ def work(
     """
     try:
         from pliant.solver import threads_limited
-        from pliant.worker.execution import pipeline
-        from pliant.worker.formats import load_inputs
 
         file = directory / "inputs.npz"
         attempt.wait_for_store(lambda: attempt.jobs.blobs.fetch(stored.inputs, file))
         results = directory / "artifacts"
         with threads_limited(attempt.jobs.settings.threads_per_job):
-            finished = (reconstruct or pipeline.reconstruct)(
-                load_inputs(file),
-                stored.job.options,
-                results,
-                on_progress=attempt.tell,
-                should_stop=attempt.should_stop,
-            )
+            finished = _reconstruct(attempt, stored, file, results, reconstruct=reconstruct)
         attempt.store(finished, results)
     except Interrupted:
         late = time.monotonic() >= attempt.deadline
@@ -230,6 +223,30 @@ def work(
         return problem
     attempt.log(f"{finished.sentence} {_listed([each.name for each in finished.artifacts])}")
     return finished
+
+
+def _reconstruct(
+    attempt: Attempt, stored: Stored, inputs: Path, results: Path, *, reconstruct: Callable[..., Finished] | None
+) -> Finished:
+    """Solve stored tracks, or track and solve a stored film."""
+    from pliant.worker.execution import pipeline
+    from pliant.worker.execution.film import reconstruct_film
+    from pliant.worker.films.sources import FilmBounds, is_source, open_source
+    from pliant.worker.formats import load_inputs
+
+    options = stored.job.options
+    if not is_source(inputs):
+        return (reconstruct or pipeline.reconstruct)(
+            load_inputs(inputs), options, results, on_progress=attempt.tell, should_stop=attempt.should_stop
+        )
+    settings, scratch = attempt.jobs.settings, inputs.with_name("film")
+    memory = min(FilmBounds().memory, settings.memory_limit or FilmBounds().memory)
+    source = open_source(inputs, inputs.with_name("source"))
+    scratch.mkdir()
+    return reconstruct_film(
+        source, options, results, scratch=scratch, threads=settings.threads_per_job, bounds=FilmBounds(memory=memory),
+        on_progress=attempt.tell, should_stop=attempt.should_stop,
+    )  # fmt: skip
 
 
 def _listed(names: Sequence[str]) -> str:

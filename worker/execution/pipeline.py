@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from pliant.schemas.job import Artifact, Progress
+from pliant.schemas.job import Artifact, Interpretation, Progress
 from pliant.schemas.options import SOLVER_FIELDS, Options
 from pliant.solver import Outcome, Settings, Solution, Step, solve
 from pliant.solver.evaluation.metrics import evaluate
@@ -36,6 +36,9 @@ class Finished:
 
     artifacts: tuple[Artifact, ...]
     """The files, named as they lie in the directory."""
+
+    interpretation: Interpretation | None = None
+    """How the inputs were read, where that was not known before the job ran: the tracks of a film."""
 
 
 def solver_settings(options: Options, *, y_up: bool = False) -> Settings:
@@ -91,11 +94,39 @@ def reconstruct(
     """
     # What cannot be written is refused before anything is computed.
     kinds_for(options, size=(inputs.tracks.num_frames, inputs.tracks.num_points))
-    reporter = Reporter(on_progress if on_progress is not None else _silent)
+    reporter = Reporter(on_progress if on_progress is not None else silent)
+    halt = Halt(should_stop, options.time_limit)
+    return solve_and_write(inputs, options, directory, reporter=reporter, halt=halt, solver=solver)
+
+
+def solve_and_write(
+    inputs: Inputs,
+    options: Options,
+    directory: Path,
+    *,
+    reporter: Reporter,
+    halt: Halt,
+    spent: Mapping[str, float] | None = None,
+    solver: Callable[..., Solution] | None = None,
+) -> Finished:
+    """Do what `reconstruct` does, as a part of a longer job.
+
+    Parameters
+    ----------
+    inputs, options, directory
+        As in `reconstruct`.
+    reporter : Reporter
+        Gets the parts `loading`, `solving` and `exporting`.
+    halt : Halt
+        Whether to stop.
+    spent : mapping, optional
+        Seconds of earlier parts, for the report.
+    solver : callable, optional
+        As in `reconstruct`.
+    """
     directory.mkdir(parents=True, exist_ok=True)
     reporter.part("loading", 1.0)
     began = time.perf_counter()
-    halt = _Halt(should_stop, options.time_limit)
     solution = (solver or solve)(
         inputs.tracks,
         inputs.mesh,
@@ -108,7 +139,7 @@ def reconstruct(
         halt.check()
     solved = time.perf_counter()
     metrics = _metrics(inputs, solution)
-    seconds = {"solve": solved - began, "metrics": time.perf_counter() - solved}
+    seconds = {**(spent or {}), "solve": solved - began, "metrics": time.perf_counter() - solved}
     report = build_report(inputs, solution, options, metrics=metrics, seconds=seconds)
 
     def exported(done: float) -> None:
@@ -127,7 +158,7 @@ def reconstruct(
 
 
 @dataclass(slots=True)
-class _Halt:
+class Halt:
     """Whether to stop, and why; once asked for, it stays so."""
 
     should_stop: Callable[[], bool] | None
@@ -136,6 +167,7 @@ class _Halt:
     reason: Interrupted | TimedOut | None = None
 
     def asked(self) -> bool:
+        """Return True once the job is to stop."""
         if self.reason is None and self.should_stop is not None and self.should_stop():
             self.reason = Interrupted()
         if self.reason is None and self.limit is not None and time.monotonic() > self.began + self.limit:
@@ -143,6 +175,7 @@ class _Halt:
         return self.reason is not None
 
     def check(self) -> None:
+        """Raise the reason to stop, if there is one."""
         if self.asked() and self.reason is not None:
             raise self.reason
 
@@ -166,5 +199,6 @@ def _told(reporter: Reporter, step: Step) -> None:
     )
 
 
-def _silent(progress: Progress) -> None:
+def silent(progress: Progress) -> None:
+    """Take progress that nobody asked for."""
     del progress

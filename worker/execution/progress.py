@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 
@@ -11,6 +11,9 @@ from pliant.schemas.job import Progress
 
 SHARES = {"loading": (0.0, 0.02), "solving": (0.02, 0.85), "exporting": (0.85, 1.0)}
 """Where each part of a job begins and ends on the way from 0 to 1."""
+
+FILM_SHARES = {"track": (0.0, 0.5), "loading": (0.5, 0.51), "solving": (0.51, 0.93), "exporting": (0.93, 1.0)}
+"""The same for a film, by the times of films of a few seconds on two cores."""
 
 WORTH_ESTIMATING = 0.05
 """Share that must be done before the time left is extrapolated from the time spent."""
@@ -26,10 +29,13 @@ class Reporter:
         Given every `Progress`.
     clock : callable
         Monotonic seconds.
+    shares : mapping
+        The parts of the job.
     """
 
     tell: Callable[[Progress], None]
     clock: Callable[[], float] = time.monotonic
+    shares: Mapping[str, tuple[float, float]] = field(default_factory=lambda: SHARES)
     _began: float | None = None
     _furthest: float = 0.0
     _last: dict[str, int | float | None] = field(default_factory=dict)
@@ -50,7 +56,7 @@ class Reporter:
         Parameters
         ----------
         part : str
-            A key of `SHARES`.
+            A key of `shares`.
         stage : str, optional
             The user's word for it; by default the part's own.
         """
@@ -61,7 +67,7 @@ class Reporter:
             "reweighting": reweighting, "max_reweightings": max_reweightings, "objective": objective, "residual": residual,
         }  # fmt: skip
         self._last |= {name: value for name, value in told.items() if value is not None}
-        low, high = SHARES[part]
+        low, high = self.shares[part]
         self._furthest = max(self._furthest, low + (high - low) * min(max(done, 0.0), 1.0))
         fraction, spent = self._furthest, now - self._began
         left = spent * (1 - fraction) / fraction if fraction >= WORTH_ESTIMATING else None

@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from datetime import datetime, timedelta
 
-from pliant.schemas.job import Artifact, Problem, Progress, Status
+from pliant.schemas.job import Artifact, Interpretation, Problem, Progress, Status
 from pliant.worker.errors import NotAllowedNow, StaleAttempt
 from pliant.worker.records import Stored
 
@@ -63,8 +63,11 @@ def succeed(
     warnings: Sequence[str],
     now: datetime,
     retention: float,
+    interpretation: Interpretation | None = None,
 ) -> Stored:
-    """Publish the result. A job whose cancellation was asked for meanwhile ends cancelled, as its owner was told.
+    """Publish the result, and the interpretation where the job found it out.
+
+    A job whose cancellation was requested meanwhile ends cancelled, as its owner was told.
 
     Raises
     ------
@@ -80,6 +83,7 @@ def succeed(
         "sentence": sentence,
         "warnings": list(warnings),
         "artifacts": list(artifacts),
+        **({} if interpretation is None else {"interpretation": interpretation}),
     }
     job = stored.job.model_copy(update=update)
     size = stored.bytes + sum(each.bytes for each in artifacts)

@@ -1,8 +1,9 @@
 """Run a module of this package in a process of its own that has limits, and get its answer or its refusal.
 
-Two processes are started this way: the isolated reader, which reads large inputs, and the sandbox, which parses formats whose
-parsers are not trusted. Both receive a JSON request on standard input and write a JSON answer to standard output, which is a
-temporary file, so that the parent never holds more than `MAX_ANSWER` bytes of it. Both end with their parent.
+Three processes are started this way: the isolated reader, which reads large inputs, the sandbox, which parses formats whose parsers
+are not trusted, and the film process, which decodes and tracks films. They receive a JSON request on standard input and write a JSON
+answer to standard output, which is a temporary file, so that the parent never holds more than `MAX_ANSWER` bytes of it. They end
+with their parent. A process that takes long may send progress over a pipe, one JSON object a line.
 """
 
 from __future__ import annotations
@@ -10,9 +11,11 @@ from __future__ import annotations
 import json
 import os
 import resource
+import select
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -29,6 +32,12 @@ MAX_ANSWER = 1 << 20
 
 ERRORS_KEPT = 4096
 """Bytes of standard error that the parent reads."""
+
+MAX_LINE = 4096
+"""Bytes of one line of progress; longer ones are dropped."""
+
+POLL = 0.1
+"""Seconds between two looks at a process that may be stopped."""
 
 PARTS = ("code", "field", "expected", "got", "hint")
 """Attributes of `InvalidInput` that a refusal carries."""
@@ -48,6 +57,9 @@ class Ended:
     overdue: bool = False
     """True if it was killed because it took too long."""
 
+    stopped: bool = False
+    """True if it was killed because `should_stop` returned True."""
+
 
 def run_contained(
     module: str,
@@ -57,6 +69,8 @@ def run_contained(
     directory: str | None = None,
     descriptors: tuple[int, ...] = (),
     environment: Mapping[str, str] | None = None,
+    on_line: Callable[[dict[str, Any]], None] | None = None,
+    should_stop: Callable[[], bool] | None = None,
 ) -> Ended:
     """Start `python -I -m module`, wait for it, and return how it ended. It inherits nothing but what is passed.
 
@@ -74,7 +88,31 @@ def run_contained(
         Open files that it inherits.
     environment : mapping, optional
         Variables it gets besides those that keep the numerical libraries to one thread.
+    on_line : callable, optional
+        Called with every JSON object that the process writes to the descriptor `progress` of its request.
+    should_stop : callable, optional
+        Called every `POLL` seconds; the process is killed once it returns True.
     """
+    with _Progress(on_line) as progress:
+        stated = dict(request) if progress.target is None else {**request, "progress": progress.target}
+        passed = descriptors if progress.target is None else (*descriptors, progress.target)
+        return _run(
+            module, stated, seconds=seconds, directory=directory, descriptors=passed, environment=environment,
+            progress=progress, should_stop=should_stop,
+        )  # fmt: skip
+
+
+def _run(
+    module: str,
+    request: Mapping[str, Any],
+    *,
+    seconds: float,
+    directory: str | None,
+    descriptors: tuple[int, ...],
+    environment: Mapping[str, str] | None,
+    progress: _Progress,
+    should_stop: Callable[[], bool] | None,
+) -> Ended:
     threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
     with tempfile.TemporaryFile() as given, tempfile.TemporaryFile() as answer, tempfile.TemporaryFile() as errors:
         given.write(json.dumps(dict(request)).encode())
@@ -83,11 +121,14 @@ def run_contained(
             [sys.executable, "-I", "-m", module, str(os.getpid())], env={**(environment or {}), **threads},
             stdin=given, stdout=answer, stderr=errors, pass_fds=descriptors, cwd=directory,
         )  # fmt: skip
-        overdue = False
+        overdue = stopped = False
+        until = time.monotonic() + seconds
         try:
-            process.wait(timeout=seconds)
-        except subprocess.TimeoutExpired:
-            overdue = True
+            while process.poll() is None and not (overdue or stopped):
+                overdue = time.monotonic() >= until
+                stopped = should_stop is not None and should_stop()
+                progress.wait(process, until if should_stop is None else min(until, time.monotonic() + POLL))
+            progress.read()
         finally:
             if process.returncode is None:
                 process.kill()
@@ -95,7 +136,54 @@ def run_contained(
         answer.seek(0)
         errors.seek(max(0, errors.seek(0, os.SEEK_END) - ERRORS_KEPT))
         last = errors.read().decode(errors="replace")
-        return Ended(process.returncode, answer.read(MAX_ANSWER + 1), last, overdue)
+        return Ended(process.returncode, answer.read(MAX_ANSWER + 1), last, overdue, stopped)
+
+
+class _Progress:
+    """The pipe over which a contained process sends its progress; none if nobody listens."""
+
+    def __init__(self, on_line: Callable[[dict[str, Any]], None] | None) -> None:
+        self._on_line = on_line
+        self._source: int | None = None
+        self._rest = b""
+        self.target: int | None = None
+        """Descriptor that the process writes to."""
+
+    def __enter__(self) -> _Progress:
+        if self._on_line is not None:
+            self._source, self.target = os.pipe()
+            os.set_blocking(self._source, False)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for descriptor in (self._source, self.target):
+            if descriptor is not None:
+                os.close(descriptor)
+
+    def wait(self, process: subprocess.Popen[bytes], until: float) -> None:
+        """Return when the process has ended, at a time of the monotonic clock, or after the next progress."""
+        seconds = max(0.0, until - time.monotonic())
+        if self._source is None:
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(timeout=seconds)
+        elif select.select([self._source], [], [], min(seconds, POLL))[0]:
+            self.read()
+
+    def read(self) -> None:
+        """Pass on what has arrived, at most one pipe's worth."""
+        if self._source is None or self._on_line is None:
+            return
+        try:
+            *lines, self._rest = (self._rest + os.read(self._source, 1 << 16)).split(b"\n")
+        except BlockingIOError:
+            return
+        if len(self._rest) > MAX_LINE:
+            self._rest = b""
+        for line in lines:
+            with suppress(ValueError):
+                stated = json.loads(line)
+                if isinstance(stated, dict):
+                    self._on_line(stated)
 
 
 def refusal_in(ended: Ended) -> dict[str, Any] | None:

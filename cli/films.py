@@ -1,0 +1,71 @@
+"""`pliant solve` for films: the film is decoded in a process of its own, then solved in this one."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pliant.cli.session import LINE_EVERY
+from pliant.cli.show import out
+
+if TYPE_CHECKING:
+    from pliant.worker.execution.pipeline import Finished
+
+
+def is_film(path: Path, region: Path | None) -> bool:
+    """Return True if a command's input is a film: by its content and name, or because a region was given."""
+    from pliant.worker.films.sources import looks_like_film
+
+    return region is not None or looks_like_film(path)
+
+
+def refuse_parts_of_tracks(**parts: object) -> None:
+    """Refuse inputs that belong to tracks beside a film.
+
+    Raises
+    ------
+    BadArgument
+        One was given.
+    """
+    from pliant.client.errors import BadArgument
+
+    given = [f"--{name.replace('_', '-')}" for name, part in parts.items() if part is not None]
+    if given:
+        raise BadArgument(
+            f"{', '.join(given)}: expected tracks, got a film. Leave it out: the mesh of a film is made from it; "
+            "to use other inputs, run `pliant track` and solve its tracks.npz."
+        )
+
+
+def solve_film(
+    film: Path, output: Path, *, region: Path | None, options: dict[str, Any], threads: int | None, as_json: bool
+) -> Finished:
+    """Track and reconstruct a film; `tracks.npz` and `contact_sheet.jpg` lie beside the other files.
+
+    Raises
+    ------
+    InvalidInput
+        The film, the region or an option cannot be used.
+    """
+    from pliant.client.multipart import checked_options
+    from pliant.client.progress import progress_bar
+    from pliant.solver import threads_limited
+    from pliant.worker.execution.film import reconstruct_film
+    from pliant.worker.films.sources import FilmSource
+    from pliant.worker.films.tracker import check_film, described, film_options
+    from pliant.worker.settings import usable_cores
+
+    source, checked = FilmSource(film, region), checked_options(options)
+    facts = check_film(source, checked)
+    checked = film_options(checked, facts)
+    if not as_json:
+        out().print(described(facts, checked).notes[0], markup=False, highlight=False)
+    with (
+        tempfile.TemporaryDirectory(prefix="pliant-film-") as scratch,
+        progress_bar(line_every=LINE_EVERY) as bar,
+        threads_limited(threads),
+    ):
+        return reconstruct_film(
+            source, checked, output, scratch=Path(scratch), threads=threads or usable_cores(), on_progress=bar.on_step
+        )

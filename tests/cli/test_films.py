@@ -1,0 +1,58 @@
+"""`pliant solve` takes a film, writes its tracks beside the shapes, and refuses what does not belong to a film."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import films
+import numpy as np
+import pytest
+from PIL import Image
+from pliant.cli import app
+from pliant.cli.exits import Exit
+from typer.testing import CliRunner, Result
+
+QUICK = ["-O", "outputs=[]", "-O", "max_reweightings=2", "-O", "grid_step=6", "-O", "refine_rotations=false"]
+
+
+@pytest.fixture(scope="module")
+def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("film")
+    mask = np.zeros((72, 96), np.uint8)
+    mask[20:55, 20:70] = 255
+    Image.fromarray(mask).save(folder / "mask.png")
+    return films.write_film(folder / "film.mp4", films.textured_pictures(10, (96, 72)))
+
+
+def solve(*arguments: object) -> Result:
+    return CliRunner().invoke(app, ["solve", *map(str, arguments)], env={"COLUMNS": "200"})
+
+
+def test_a_film_is_solved_and_its_tracks_lie_beside_the_shapes(film: Path, tmp_path: Path) -> None:
+    ran = solve(film, "--region", film.with_name("mask.png"), "-o", tmp_path, "--json", "--threads", 1, *QUICK)
+    assert ran.exit_code == 0, ran.output
+    files = json.loads(ran.stdout)["files"]
+    assert list(files)[:2] == ["tracks.npz", "contact_sheet.jpg"]
+    assert all(Path(path).is_file() for path in files.values())
+    with np.load(files["tracks.npz"]) as tracks, np.load(files["shapes.npz"]) as shapes:
+        assert shapes["shapes"].shape[:2] == tracks["tracks"].shape[:2]
+        assert {"visibility", "confidence", "image_size"} <= set(tracks.files)
+    options = json.loads(Path(files["report.json"]).read_text())["options"]
+    assert (options["fps"], options["image_size"]) == (30.0, "96x72")
+    words = solve(film, "-o", tmp_path, "--force", "-O", "frames=:5", *QUICK).output
+    assert "A film of 96×72 pixels, 5 of 10 frames, 30 frames a second." in words
+    assert "No region was given" in words
+
+
+def test_wrong_films_and_parts_are_refused_in_a_sentence(film: Path, tmp_path: Path) -> None:
+    ran = solve(film, "--mesh", "3x4", "-o", tmp_path)
+    assert ran.exit_code == Exit.REFUSED
+    assert "--mesh: expected tracks, got a film" in ran.output
+    ran = solve(film, "-o", tmp_path, "-O", "template_frame=99", *QUICK)
+    assert ran.exit_code == Exit.REFUSED
+    assert "options.template_frame" in ran.output
+    (tmp_path / "list.mp4").write_text("#EXTM3U\n/etc/passwd\n")
+    ran = solve(tmp_path / "list.mp4", "-o", tmp_path)
+    assert ran.exit_code == Exit.REFUSED
+    assert "other files and addresses are never opened" in " ".join(ran.output.split())

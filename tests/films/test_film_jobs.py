@@ -1,0 +1,259 @@
+"""Films as inputs of jobs: the contained process, its limits, and what becomes of the tracks."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import films
+import numpy as np
+import pytest
+from PIL import Image
+from pliant.schemas.job import Progress
+from pliant.schemas.options import Options
+from pliant.solver.errors import InvalidInput
+from pliant.worker.errors import Interrupted, TimedOut
+from pliant.worker.execution.film import reconstruct_film
+from pliant.worker.films import tracker
+from pliant.worker.films.inputs import read_tracked
+from pliant.worker.films.sources import FilmBounds, FilmSource, is_source, looks_like_film, open_source, save_source
+from pliant.worker.films.tracker import Tracked, check_film, described, film_options, track_film
+from pliant.worker.formats import Inputs
+from pliant.worker.processes.contained import MAX_LINE, Ended, _Progress
+from pliant.worker.processes.no_network import forbid_network
+
+SIZE = (96, 72)
+
+
+@pytest.fixture(scope="module")
+def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A texture that moves to the right, a pixel a frame."""
+    return films.write_film(tmp_path_factory.mktemp("film") / "film.mkv", films.textured_pictures(10, SIZE))
+
+
+@pytest.fixture(scope="module")
+def region(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    mask = np.zeros(SIZE[::-1], np.uint8)
+    mask[20:55, 20:70] = 255
+    path = tmp_path_factory.mktemp("region") / "mask.png"
+    Image.fromarray(mask).save(path)
+    return path
+
+
+def refusal(source: FilmSource, options: Options = Options(), bounds: FilmBounds = FilmBounds()) -> InvalidInput:  # noqa: B008
+    with pytest.raises(InvalidInput) as refused:
+        check_film(source, options, bounds)
+    return refused.value
+
+
+def test_a_film_is_checked_without_being_tracked(film: Path, region: Path) -> None:
+    facts = check_film(FilmSource(film, region), Options(frames="2:10:2"))
+    assert (facts.container, facts.width, facts.height, facts.fps) == ("matroska", *SIZE, 15.0)
+    options = film_options(Options(), facts)
+    assert (options.image_size, options.fps) == ("96x72", 15.0)
+    assert film_options(Options(fps=24), facts).fps == 24
+    stated = described(facts, options)
+    assert stated.mesh_source == "film"
+    assert "96×72 pixels" in stated.notes[0]
+
+
+def test_a_portrait_film_is_upright(tmp_path: Path) -> None:
+    path = films.turned_by_90(films.write_film(tmp_path / "film.mp4", films.textured_pictures(6, SIZE)))
+    facts = check_film(FilmSource(path), Options())
+    assert (facts.width, facts.height, facts.frames) == (72, 96, 6)
+
+
+def test_what_does_not_fit_the_film_is_refused_with_the_option_at_fault(
+    film: Path, region: Path, tmp_path: Path
+) -> None:
+    Image.new("L", (10, 10), 255).save(tmp_path / "small.png")
+    wrong = refusal(FilmSource(film, tmp_path / "small.png"))
+    assert (wrong.code, wrong.field) == ("wrong_region_size", "region")
+    outside = Options(region_polygon=[(500, 500), (600, 500), (600, 600)])
+    wrong = refusal(FilmSource(film), outside)
+    assert (wrong.code, wrong.field) == ("empty_region", "options.region_polygon")
+    assert refusal(FilmSource(film, region), outside).code == "conflicting_parts"
+    assert refusal(FilmSource(film), Options(frames="-5:")).field == "options.frames"
+    assert refusal(FilmSource(film), Options(frames="50:60")).code == "too_few_frames"
+    assert refusal(FilmSource(film), bounds=FilmBounds(max_pixels=1000)).code == "too_many_pixels"
+    assert refusal(FilmSource(film), bounds=FilmBounds(max_bytes=1000)).code == "too_many_bytes"
+    pictures = {f"{number}.png": films.png(each) for number, each in enumerate(films.textured_pictures(4))}
+    many = films.zip_of(tmp_path / "many.zip", pictures)
+    assert refusal(FilmSource(many), bounds=FilmBounds(max_frames=3)).code == "too_many_frames"
+
+
+def test_too_little_memory_or_time_is_a_refusal(film: Path, tmp_path: Path) -> None:
+    large = films.zip_of(tmp_path / "large.zip", {"1.png": films.png(np.zeros((2000, 3000, 3), np.uint8))})
+    assert refusal(FilmSource(large), bounds=FilmBounds(memory=50 << 20)).code == "too_large"
+    late = refusal(FilmSource(film), bounds=FilmBounds(check_seconds=0.01))
+    assert late.code == "too_slow"
+    assert "longest_side" in late.hint
+
+
+def test_how_the_film_process_died_becomes_a_sentence() -> None:
+    def code_of(code: int, answer: bytes = b"") -> str:
+        fault = tracker._fault(Ended(code, answer, ""), FilmBounds(), 1.0)
+        assert isinstance(fault, InvalidInput)
+        return fault.code
+
+    assert code_of(-signal.SIGSEGV) == "damaged_file"
+    assert code_of(-signal.SIGKILL) == "too_large"
+    assert code_of(-signal.SIGXCPU) == "too_slow"
+    assert code_of(3, b"no JSON") == "damaged_file"
+    assert isinstance(tracker._fault(Ended(1, b"", "Traceback"), FilmBounds(), 1.0), RuntimeError)
+    with pytest.raises(InvalidInput, match="confuses its decoder"):
+        tracker._answer(Tracked, Ended(0, b'{"container": 3}', ""), FilmBounds(), 1.0)
+
+
+def test_a_film_and_its_region_are_stored_byte_for_byte(film: Path, region: Path, tmp_path: Path) -> None:
+    source = FilmSource(film, region)
+    facts = check_film(source, Options())
+    save_source(source, described(facts, Options()), tmp_path / "inputs.npz")
+    assert is_source(tmp_path / "inputs.npz")
+    back = open_source(tmp_path / "inputs.npz", tmp_path / "back")
+    assert back.film.read_bytes() == film.read_bytes()
+    assert back.region is not None
+    assert back.region.read_bytes() == region.read_bytes()
+    np.savez(tmp_path / "tracks.npz", tracks=np.zeros(3))
+    (tmp_path / "text").write_text("no zip")
+    assert not is_source(tmp_path / "tracks.npz")
+    assert not is_source(tmp_path / "text")
+    newer = films.zip_of(tmp_path / "newer.npz", {"film.json": b'{"version": 99}'})
+    with pytest.raises(InvalidInput, match="version 99"):
+        open_source(newer, tmp_path / "a")
+    with pytest.raises(InvalidInput, match="cannot be read back"):
+        open_source(films.zip_of(tmp_path / "bad.npz", {"film.json": b"[]"}), tmp_path / "b")
+
+
+def test_what_is_a_film_on_a_command_line(film: Path, tmp_path: Path) -> None:
+    np.savez(tmp_path / "tracks.npz", tracks=np.zeros(3))
+    np.save(tmp_path / "tracks.npy", np.zeros(3))
+    (tmp_path / "list.mp4").write_text("#EXTM3U\n")
+    (tmp_path / "broken.zip").write_bytes(b"PK\x03\x04")
+    pictures = films.zip_of(tmp_path / "pictures.zip", {"1.png": b""})
+    moved = tmp_path / "named-like-tracks.npy"
+    moved.write_bytes(film.read_bytes())
+    films.write_film(tmp_path / "a.avi", films.textured_pictures(3))
+    given = (film, moved, pictures, tmp_path, tmp_path / "list.mp4", tmp_path / "missing.mov", tmp_path / "a.avi")
+    assert [path for path in given if not looks_like_film(path)] == []
+    others = (tmp_path / "tracks.npz", tmp_path / "tracks.npy", tmp_path / "broken.zip", tmp_path / "missing.npz")
+    assert [path for path in others if looks_like_film(path)] == []
+
+
+def test_a_film_becomes_shapes_tracks_and_a_contact_sheet(film: Path, region: Path, tmp_path: Path) -> None:
+    told: list[Progress] = []
+    (tmp_path / "scratch").mkdir()
+    options = Options(outputs=(), max_reweightings=2, grid_step=6, refine_rotations=False)
+    done = reconstruct_film(
+        FilmSource(film, region), options, tmp_path / "out", scratch=tmp_path / "scratch", on_progress=told.append
+    )
+    names = [each.name for each in done.artifacts]
+    assert names[:2] == ["tracks.npz", "contact_sheet.jpg"]
+    assert {"shapes.npz", "report.json"} < set(names)
+    stages = [each.stage for each in told]
+    assert stages[0] == "track"
+    assert stages.count("track") > 2
+    assert [each.fraction for each in told] == sorted(each.fraction for each in told)
+    assert told[-1].fraction == 1.0
+    with np.load(tmp_path / "out" / "tracks.npz") as tracks, np.load(tmp_path / "out" / "shapes.npz") as shapes:
+        assert tracks["image_size"].tolist() == list(SIZE)
+        assert shapes["shapes"].shape == (*tracks["tracks"].shape[:2], 3)
+        assert tracks["tracks"][tracks["template"], :, 0].min() >= 20  # inside the region
+    assert done.interpretation is not None
+    assert done.interpretation.num_points == shapes_count(tmp_path / "out")
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["seconds"]["track"] > 0
+    with Image.open(tmp_path / "out" / "contact_sheet.jpg") as sheet:
+        assert sheet.format == "JPEG"
+
+
+def shapes_count(folder: Path) -> int:
+    with np.load(folder / "shapes.npz") as shapes:
+        return int(shapes["shapes"].shape[1])
+
+
+def test_stopping_kills_the_film_process(film: Path, tmp_path: Path) -> None:
+    for name, options, should_stop, expected in (
+        ("a", Options(), lambda: True, Interrupted),
+        ("b", Options(time_limit=0.05), None, TimedOut),
+    ):
+        (tmp_path / name).mkdir()
+        began = time.monotonic()
+        with pytest.raises(expected):
+            reconstruct_film(
+                FilmSource(film), options, tmp_path / "out", scratch=tmp_path / name, should_stop=should_stop
+            )
+        assert time.monotonic() - began < 10
+        assert not (tmp_path / "out").exists()
+    (tmp_path / "c").mkdir()
+    with pytest.raises(Interrupted):
+        track_film(FilmSource(film), Options(), tmp_path / "c", should_stop=lambda: True)
+
+
+def tracks_file(path: Path, **more: np.ndarray) -> Path:
+    points = np.random.default_rng(0).uniform(0, 50, (4, 9, 2)).astype(np.float32)
+    arrays = {"tracks": points, "visibility": np.ones((4, 9), bool), "confidence": np.full((4, 9), 0.5, np.float32),
+              "grid": np.arange(9, dtype=np.int32).reshape(3, 3)}  # fmt: skip
+    np.savez(path, **(arrays | more))
+    return path
+
+
+def test_tracks_weigh_what_the_tracker_is_sure_of(tmp_path: Path) -> None:
+    seen = np.ones((4, 9), bool)
+    seen[1, 3] = False
+    tracked = Tracked(container="mp4", warnings=("Only 4 frames.",))
+    inputs = read_tracked(tracks_file(tmp_path / "a.npz", visibility=seen), tracked, Options())
+    assert isinstance(inputs, Inputs)
+    assert inputs.tracks.visible[1, 3] == 0
+    assert inputs.tracks.visible[0, 0] == 0.5
+    assert inputs.interpretation.notes[-1] == "Only 4 frames."
+    assert inputs.selection is None
+    fewer = read_tracked(tmp_path / "a.npz", tracked, Options(stride=2))
+    assert fewer.selection is not None
+    assert fewer.tracks.num_points == 4
+    with pytest.raises(InvalidInput, match="without confidence or grid"):
+        read_tracked(tracks_file(tmp_path / "b.npz", confidence=np.ones((3, 9))), tracked, Options())
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="seccomp")
+def test_the_film_process_has_no_network_and_starts_no_programs() -> None:
+    script = textwrap.dedent("""
+        import socket, subprocess, threading
+        from pliant.worker.processes.no_network import forbid_network
+        print(forbid_network())
+        for attempt in (socket.socket, lambda: subprocess.run(["/bin/true"])):
+            try:
+                attempt()
+            except PermissionError as error:
+                print(error.errno)
+        thread = threading.Thread(target=print, args=("thread",))
+        thread.start()
+        thread.join()
+    """)
+    ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert ran.stdout.split() == ["True", str(errno.EACCES), str(errno.EACCES), "thread"]
+    socket.socket().close()  # here it still works
+
+
+def test_there_is_no_filter_for_an_unknown_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("platform.machine", lambda: "pdp11")
+    assert not forbid_network()
+
+
+def test_progress_is_passed_on_and_nonsense_dropped() -> None:
+    heard: list[dict[str, object]] = []
+    with _Progress(heard.append) as progress:
+        assert progress.target is not None
+        progress.read()
+        for piece in (b'{"done": 0.5}\nnonsense\n[1]\n' + b"x" * (MAX_LINE + 1), b'{"done": 0.7}\n{"do', b'ne": 1}\n'):
+            os.write(progress.target, piece)
+            progress.read()
+    assert heard == [{"done": 0.5}, {"done": 0.7}, {"done": 1}]

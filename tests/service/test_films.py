@@ -1,0 +1,203 @@
+"""Films over HTTP: refused in a sentence or accepted at once, tracked by the worker, stopped in the middle."""
+
+from __future__ import annotations
+
+import io
+import json
+import threading
+import zlib
+from pathlib import Path
+
+import films
+import httpx
+import numpy as np
+import pytest
+from crafting import png
+from PIL import Image
+from pliant.cli import app
+from pliant.cli.session import Session
+from pliant.client import BadArgument, Client
+from pliant.schemas.job import Job, Status
+from pliant.service.submission import FILES
+from pliant.worker.execution import attempt
+from serving import Running, tracks, until
+from typer.testing import CliRunner
+
+PICTURES = films.textured_pictures(10, (96, 72))
+QUICK = {"outputs": [], "max_reweightings": 2, "grid_step": 6, "refine_rotations": False}
+
+
+@pytest.fixture(scope="module")
+def film(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    return films.write_film(tmp_path_factory.mktemp("film") / "film.mp4", PICTURES).read_bytes()
+
+
+def mask(size: tuple[int, int] = (96, 72)) -> bytes:
+    pixels = np.zeros(size[::-1], np.uint8)
+    pixels[20:55, 20:70] = 255
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, "PNG")
+    return buffer.getvalue()
+
+
+def parts(film: bytes | None, **more: object) -> dict[str, object]:
+    given: dict[str, object] = {} if film is None else {"film": ("../film.mp4", film)}
+    for name, value in more.items():
+        text = name not in FILES
+        given[name] = (None, value if isinstance(value, str) else json.dumps(value)) if text else (f"{name}.x", value)
+    return given
+
+
+def send(http: httpx.Client, film: bytes | None, **more: object) -> Job:
+    answer = http.post("/v1/jobs", files=parts(film, **more))
+    assert answer.status_code == 202, answer.text
+    return Job.model_validate_json(answer.content)
+
+
+def work(running: Running, id: str) -> Job:
+    """Do as the worker's job process does."""
+    attempt.run(id, running.jobs.records.get(id).attempt_id, settings=running.jobs.settings, worker="w")
+    return running.jobs.get(id)
+
+
+def test_a_film_becomes_a_job_with_tracks_and_shapes(running: Running, http: httpx.Client, film: bytes) -> None:
+    job = send(http, film, region=mask(), options=QUICK)
+    assert (job.options.image_size, job.options.fps) == ("96x72", 30.0)
+    assert (job.interpretation.mesh_source, job.interpretation.num_frames) == ("film", 10)
+    assert running.left_on_disk == []
+    done = work(running, job.id)
+    assert done.status is Status.SUCCEEDED, done.error
+    names = [each.name for each in done.artifacts]
+    assert names[:2] == ["tracks.npz", "contact_sheet.jpg"]
+    assert done.interpretation.num_points > 16
+    sheet = http.get(f"/v1/jobs/{job.id}/artifacts/contact_sheet.jpg")
+    assert sheet.headers["content-type"] == "image/jpeg"
+    with np.load(io.BytesIO(http.get(f"/v1/jobs/{job.id}/artifacts/tracks.npz").content)) as held:
+        assert held["tracks"].shape == (10, done.interpretation.num_points, 2)
+
+
+def test_without_a_region_the_whole_picture_is_tracked_with_a_warning(
+    running: Running, http: httpx.Client, film: bytes
+) -> None:
+    done = work(running, send(http, film, options=QUICK).id)
+    assert done.status is Status.SUCCEEDED, done.error
+    assert any("No region was given" in sentence for sentence in done.warnings)
+
+
+def test_a_film_comes_as_an_upload_too_and_is_the_same_request(http: httpx.Client, film: bytes) -> None:
+    for id, content in (("the-film", film), ("the-mask", mask())):
+        assert http.put(f"/v1/uploads/{id}", content=content).is_success
+    key = {"Idempotency-Key": "once"}
+    named = {"film_upload": (None, "the-film"), "region_upload": (None, "the-mask")}
+    first = http.post("/v1/jobs", files=named, headers=key)
+    assert first.status_code == 202, first.text
+    again = http.post("/v1/jobs", files=parts(film, region=mask()), headers=key)
+    assert again.json()["id"] == first.json()["id"]
+    put = http.put("/v1/jobs/my-film", files=parts(film, options={"region_polygon": [[20, 20], [70, 20], [45, 55]]}))
+    assert put.status_code == 202, put.text
+
+
+def test_inspection_opens_a_film_and_tracks_nothing(running: Running, http: httpx.Client, film: bytes) -> None:
+    before = running.waiting
+    answer = http.post("/v1/inspect", files=parts(film, region=mask()))
+    assert answer.status_code == 200, answer.text
+    assert (answer.json()["num_frames"], answer.json()["num_points"], answer.json()["sample"]) == (10, 0, [])
+    assert running.waiting == before
+
+
+def huge(path: Path) -> bytes:
+    """Pictures that state 5,000 × 5,000 pixels."""
+    picture = png(5000, 5000, data=zlib.compress(bytes(1000)))
+    return films.zip_of(path, dict.fromkeys(("1.png", "2.png", "3.png"), picture)).read_bytes()
+
+
+BAD: dict[str, tuple[dict[str, object], str, str]] = {
+    "playlist": ({"film": b"#EXTM3U\nfile:///etc/passwd\n"}, "playlist", "film"),
+    "no film": ({"film": b"hello, I am a film"}, "unsupported_film", "film"),
+    "empty": ({"film": b""}, "empty_film", "film"),
+    "region alone": ({"region": mask()}, "missing_part", "film"),
+    "film and tracks": ({"film": b"x", "tracks": tracks()}, "conflicting_parts", "tracks"),
+    "film and mesh": ({"film": b"x", "mesh": "3x4"}, "conflicting_parts", "mesh"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_what_is_no_film_is_refused_in_a_sentence(running: Running, http: httpx.Client, case: str) -> None:
+    given, code, field = BAD[case]
+    files = {name: (None, value) if isinstance(value, str) else (name, value) for name, value in given.items()}
+    refused(running, http, files, code, field)
+
+
+def refused(running: Running, http: httpx.Client, files: dict[str, object], code: str, field: str) -> None:
+    before = running.waiting
+    answer = http.post("/v1/jobs", files=files)
+    problem = answer.json()
+    assert (answer.status_code, problem["code"], problem["field"]) == (422, code, field), problem
+    assert problem["hint"]
+    assert "/tmp" not in problem["detail"]
+    assert running.left_on_disk == []
+    assert running.waiting == before
+
+
+def test_broken_and_hostile_films_are_refused(
+    running: Running, http: httpx.Client, film: bytes, tmp_path: Path
+) -> None:
+    refused(running, http, parts(film[: len(film) // 2]), "truncated_film", "film")
+    refused(running, http, parts(film, region=mask((10, 10))), "wrong_region_size", "region")
+    refused(running, http, parts(film, region=b"no picture"), "unreadable_region", "region")
+    refused(running, http, parts(film, options={"region_polygon": [[900, 900], [910, 900], [910, 910]]}),
+            "empty_region", "options.region_polygon")  # fmt: skip
+    refused(
+        running, http, parts(film, options={"region_polygon": [[1, 1]]}), "invalid_option", "options.region_polygon"
+    )
+    refused(running, http, parts(huge(tmp_path / "huge.zip")), "too_many_pixels", "film")
+    bomb = films.zip_of(tmp_path / "bomb.zip", {"1.png": films.png(PICTURES[0]), "2.png": bytes(3 << 20)})
+    refused(running, http, parts(bomb.read_bytes()), "too_few_frames", "film")
+
+
+def test_a_film_that_fails_while_it_is_tracked_is_a_failed_job_with_a_remedy(
+    running: Running, http: httpx.Client, tmp_path: Path
+) -> None:
+    grey = films.write_film(tmp_path / "grey.mkv", [np.full((72, 96, 3), 128, np.uint8)] * 5)
+    done = work(running, send(http, grey.read_bytes()).id)
+    assert done.status is Status.FAILED
+    assert done.error is not None
+    assert (done.error.code, done.error.field) == ("no_texture", "region")
+    assert "pattern" in done.error.detail
+
+
+def test_cancelling_stops_the_tracking(running: Running, http: httpx.Client, tmp_path: Path) -> None:
+    long = films.write_film(tmp_path / "long.mkv", films.textured_pictures(150, (320, 240)))
+    id = send(http, long.read_bytes(), options={"grid_step": 4}).id
+    stage: list[str] = []
+
+    def cancel() -> None:
+        until(lambda: (progress := running.jobs.get(id).progress) is not None and progress.stage == "track")
+        stage.append(running.jobs.get(id).progress.stage)  # type: ignore[union-attr]
+        http.post(f"/v1/jobs/{id}/cancel")
+
+    canceller = threading.Thread(target=cancel)
+    canceller.start()
+    done = work(running, id)
+    canceller.join()
+    assert stage == ["track"]
+    assert done.status is Status.CANCELLED
+    assert done.artifacts == []
+
+
+def test_client_and_command_line_send_films(running: Running, film: bytes, tmp_path: Path) -> None:
+    path, region = tmp_path / "film.mp4", tmp_path / "mask.png"
+    path.write_bytes(film)
+    region.write_bytes(mask())
+    with Client(running.url) as client:
+        job = client.submit(film=path, region=region, options=QUICK)
+        assert job.record.interpretation.mesh_source == "film"
+        for wrong in ({}, {"tracks": np.zeros((4, 9, 2)), "film": path}):
+            with pytest.raises(BadArgument, match="expected one of them"):
+                client.submit(**wrong)  # type: ignore[arg-type]
+        with pytest.raises(BadArgument, match="only valid with an array"):
+            client.submit(film=path, visible=np.ones((10, 4)))
+    command = ["submit", str(path), "--region", str(region), "--url", running.url, "--json"]
+    ran = CliRunner().invoke(app, command, obj=Session())
+    assert ran.exit_code == 0, ran.output
+    assert json.loads(ran.stdout)["interpretation"]["format"] == "film (mp4)"

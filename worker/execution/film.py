@@ -1,0 +1,96 @@
+"""A whole job from a film: track it in the film process, solve, write the files."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from pliant.schemas.job import Artifact, Progress
+from pliant.schemas.options import Options
+from pliant.worker.artifacts import described, kinds_for
+from pliant.worker.errors import Interrupted
+from pliant.worker.execution.pipeline import Finished, Halt, silent, solve_and_write
+from pliant.worker.execution.progress import FILM_SHARES, Reporter
+from pliant.worker.films.inputs import read_tracked
+from pliant.worker.films.sources import FilmBounds, FilmSource
+from pliant.worker.films.tracker import track_film
+
+FILES = {
+    "tracks.npz": (
+        "application/zip",
+        "The film's tracks (F, P, 2) in its pixels, visibility, confidence, grid, faces, texture coordinates and times.",
+    ),
+    "contact_sheet.jpg": ("image/jpeg", "The tracks drawn over some frames of the film."),
+}
+"""Files of a film besides those of its reconstruction: media type and description."""
+
+
+def reconstruct_film(
+    source: FilmSource,
+    options: Options,
+    directory: Path,
+    *,
+    scratch: Path,
+    threads: int = 1,
+    bounds: FilmBounds = FilmBounds(),  # noqa: B008 - frozen
+    on_progress: Callable[[Progress], None] | None = None,
+    should_stop: Callable[[], bool] | None = None,
+) -> Finished:
+    """Track, solve, measure, write the files.
+
+    Parameters
+    ----------
+    source : FilmSource
+        Film and region.
+    options : Options
+        How to track, solve and write; see `film_options`.
+    directory : Path
+        Where the files go; made if need be.
+    scratch : Path
+        An empty folder for the film process.
+    threads : int
+        Threads for optical flow.
+    bounds : FilmBounds
+        What the film may cost.
+    on_progress, should_stop : callable, optional
+        As in `reconstruct`; the first stage is `track`.
+
+    Raises
+    ------
+    Interrupted, TimedOut
+        As `reconstruct`.
+    InvalidInput
+        The film cannot be tracked or its tracks cannot be solved.
+    """
+    kinds_for(options)
+    reporter = Reporter(on_progress if on_progress is not None else silent, shares=FILM_SHARES)
+    halt = Halt(should_stop, options.time_limit)
+    reporter.part("track", 0.0)
+    began = time.perf_counter()
+    try:
+        tracked = track_film(
+            source, options, scratch, bounds=bounds, threads=threads,
+            on_progress=lambda done: reporter.part("track", done), should_stop=halt.asked,
+        )  # fmt: skip
+    except Interrupted:
+        halt.check()
+        raise
+    inputs = read_tracked(scratch / "tracks.npz", tracked, options)
+    spent = {"track": time.perf_counter() - began}
+    directory.mkdir(parents=True, exist_ok=True)
+    artifacts = [_moved(scratch / name, directory) for name in FILES]
+    finished = solve_and_write(inputs, options, directory, reporter=reporter, halt=halt, spent=spent)
+    return replace(
+        finished,
+        artifacts=(*artifacts, *finished.artifacts),
+        warnings=(*tracked.warnings, *finished.warnings),
+        interpretation=inputs.interpretation,
+    )
+
+
+def _moved(file: Path, directory: Path) -> Artifact:
+    shutil.move(file, directory / file.name)
+    return described(directory / file.name, *FILES[file.name])

@@ -1,0 +1,186 @@
+"""The film process: the one place where films are decoded. It has limits, no network, and a scratch folder of its own."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import resource
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pliant.solver.errors import InvalidInput
+from pliant.worker.films.sources import FilmBounds
+from pliant.worker.formats.errors import refusal, too_large
+from pliant.worker.processes.contained import limit_process, serve
+from pliant.worker.processes.no_network import forbid_network
+
+if TYPE_CHECKING:
+    from pliant.tracking import Film, FilmError, FilmLimits, TrackingStep
+
+OPEN_FILES = 256
+"""Descriptors that the process may have: libraries, the film, the frame store."""
+
+PROGRESS_EVERY = 0.2
+"""Least seconds between two lines of progress."""
+
+SHARES = {"read": (0.0, 0.15), "locate": (0.15, 0.25), "track": (0.25, 1.0)}
+"""Where each stage of the tracker begins and ends on the way from 0 to 1, by its usual time."""
+
+LEAST_FRAMES = 3
+"""Frames that a reconstruction needs."""
+
+FULL = ("Insufficient memory", "can't start new thread")
+"""What OpenCV and Python say when the address space is full."""
+
+OPTIONS = ("frames", "template_frame", "grid_step", "longest_side", "region_frame")
+"""Fields of a `FilmError` that are options of the job."""
+
+
+def main() -> int:
+    """Check or track the film of the request on standard input; answer on standard output."""
+    return serve(_answer)
+
+
+def _answer(request: dict[str, Any]) -> str:
+    forbid_network()
+    try:
+        import pliant.tracking as tracking
+    except ImportError as error:
+        raise refusal(
+            "film_unavailable", "film", expected="tracks, or a service with OpenCV", got="a film",
+            hint="Install OpenCV beside service and worker (pip install 'pliant[film]'), or send tracks.",
+        ) from error  # fmt: skip
+    bounds = FilmBounds(**request["bounds"])
+    seconds = bounds.check_seconds if request["action"] == "check" else bounds.track_seconds * request["threads"]
+    limit_process(
+        {
+            resource.RLIMIT_AS: bounds.memory,
+            resource.RLIMIT_CPU: max(1, round(seconds)),
+            resource.RLIMIT_FSIZE: bounds.scratch_bytes,
+            resource.RLIMIT_CORE: 0,
+            resource.RLIMIT_NOFILE: OPEN_FILES,
+        }
+    )
+    try:
+        return json.dumps(_ACTIONS[request["action"]](request, bounds))
+    except tracking.FilmError as error:
+        raise _refused(error, request) from error
+    except Exception as error:
+        if _for_want_of_memory(error):
+            raise _too_costly(bounds) from error
+        raise
+
+
+def _check(request: dict[str, Any], bounds: FilmBounds) -> dict[str, Any]:
+    """Open the film, decode its first frame, and read the region."""
+    from pliant.tracking import FilmError, open_film
+    from pliant.tracking.region import read_region
+
+    options = request["options"]
+    film = open_film(Path(request["film"]), frames=options["frames"], limits=_limits(bounds))
+    start, stop, step = film.selection
+    count = len(range(film.stated_frames)[start:stop:step]) if film.stated_frames else None
+    if count is not None and count > bounds.max_frames:
+        raise FilmError(
+            "too_many_frames", field="film", expected=f"at most {bounds.max_frames} frames", got=str(count),
+            hint="Select some with frames, for example 0:3000:2.",
+        )  # fmt: skip
+    if next(film.frames(), None) is None or (count is not None and count < LEAST_FRAMES):
+        raise FilmError(
+            "too_few_frames", field="film", expected=f"at least {LEAST_FRAMES} frames", got=str(count or 0),
+            hint="Film for longer, or widen the selection.",
+        )  # fmt: skip
+    region = _region(request)
+    if region is not None:
+        read_region(region, film.size)
+    return {
+        "container": film.container, "width": film.size[0], "height": film.size[1], "fps": film.fps / step,
+        "stated_frames": film.stated_frames, "frames": count or 0,
+    }  # fmt: skip
+
+
+def _track(request: dict[str, Any], bounds: FilmBounds) -> dict[str, Any]:
+    """Track the film; write `tracks.npz` and `contact_sheet.jpg` into the scratch folder."""
+    from pliant.tracking import track_film
+
+    options, folder = request["options"], Path(request["folder"])
+    tracked = track_film(
+        _opened(request, bounds),
+        region=_region(request),
+        region_frame=options["region_frame"],
+        template_frame=options["template_frame"],
+        grid_step=options["grid_step"],
+        longest_side=options["longest_side"],
+        threads=request["threads"],
+        on_step=_reporter(request["progress"]),
+    )
+    tracked.save_npz(folder / "tracks.npz")
+    (folder / "contact_sheet.jpg").write_bytes(tracked.contact_sheet())
+    return {"container": tracked.film.container, "warnings": list(tracked.warnings)}
+
+
+_ACTIONS: dict[str, Callable[[dict[str, Any], FilmBounds], dict[str, Any]]] = {"check": _check, "track": _track}
+
+
+def _opened(request: dict[str, Any], bounds: FilmBounds) -> Film:
+    from pliant.tracking import open_film
+
+    return open_film(Path(request["film"]), frames=request["options"]["frames"], limits=_limits(bounds))
+
+
+def _limits(bounds: FilmBounds) -> FilmLimits:
+    from pliant.tracking import FilmLimits
+
+    return FilmLimits(bounds.max_bytes, bounds.max_frames, bounds.max_pixels, bounds.max_seconds)
+
+
+def _region(request: dict[str, Any]) -> Path | list[list[float]] | None:
+    polygon: list[list[float]] | None = request["options"]["region_polygon"]
+    return polygon if request["region"] is None else Path(request["region"])
+
+
+def _reporter(target: int) -> Callable[[TrackingStep], None]:
+    """Return a callback that writes the share that is done to a descriptor, at most every `PROGRESS_EVERY` seconds."""
+    after = 0.0
+
+    def report(step: TrackingStep) -> None:
+        nonlocal after
+        now = time.monotonic()
+        if now < after:
+            return
+        after = now + PROGRESS_EVERY
+        low, high = SHARES[step.stage]
+        done = low if not step.total else low + (high - low) * min(1.0, step.done / step.total)
+        os.write(target, json.dumps({"done": done}).encode() + b"\n")
+
+    return report
+
+
+def _refused(error: FilmError, request: dict[str, Any]) -> InvalidInput:
+    """Return the refusal with the job's own names; where its files lie concerns nobody."""
+    field = f"options.{error.field}" if error.field in OPTIONS else error.field
+    if field == "region" and request["region"] is None and request["options"]["region_polygon"] is not None:
+        field = "options.region_polygon"
+    got = error.got
+    for name in ("film", "region"):
+        if request[name] is not None:
+            got = got.replace(f"{Path(request[name]).parent}{os.sep}", "")
+    return InvalidInput(error.code, field=field, expected=error.expected, got=got, hint=error.hint)
+
+
+def _for_want_of_memory(error: Exception) -> bool:
+    """Tell a limit on memory or on files from other failures."""
+    full = isinstance(error, OSError) and error.errno in (errno.ENOMEM, errno.EFBIG)
+    return isinstance(error, MemoryError) or full or any(sign in str(error) for sign in FULL)
+
+
+def _too_costly(bounds: FilmBounds) -> InvalidInput:
+    return too_large("film", expected=f"a film that needs at most {bounds.memory >> 20} MiB", got="one that needs more")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

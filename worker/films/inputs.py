@@ -1,0 +1,62 @@
+"""The inputs of a solve from a tracked film."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from pliant.schemas.job import Interpretation
+from pliant.schemas.options import Options
+from pliant.solver import Mesh, Tracks
+from pliant.worker.films.tracker import Tracked
+from pliant.worker.formats.errors import damaged
+from pliant.worker.formats.reading.arrays import read_file
+from pliant.worker.formats.records import Inputs, Limits, Selection
+from pliant.worker.formats.tracks.decimation import thin
+from pliant.worker.formats.tracks.selection import hide_seldom_seen
+
+WANTED = frozenset(("tracks", "visibility", "confidence", "grid"))
+
+
+def read_tracked(file: Path, tracked: Tracked, options: Options, *, limits: Limits = Limits()) -> Inputs:  # noqa: B008 - frozen
+    """Read the `tracks.npz` of a film as the inputs of a solve: points in the film's pixels, y down, and their grid as mesh.
+
+    Parameters
+    ----------
+    file : Path
+        As the film process wrote it; read with the checks of an uploaded file.
+    tracked : Tracked
+        What else was found.
+    options : Options
+        `stride`, `max_points` and `min_seen`.
+    limits : Limits
+        Largest arrays.
+
+    Raises
+    ------
+    InvalidInput
+        The arrays do not fit together, or an option leaves too few points.
+    """
+    arrays = read_file(file, field="film", limits=limits, wanted=WANTED)
+    if set(arrays) < WANTED or arrays["tracks"].shape[:2] != arrays["confidence"].shape:
+        raise damaged("film", "tracks without confidence or grid")
+    points = arrays["tracks"].astype(np.float64)
+    visible = np.where(arrays["visibility"].astype(bool), arrays["confidence"], 0).astype(np.float64)
+    given = points.shape[1]
+    kept, mesh, how = thin(points, visible, Mesh.from_grid(arrays["grid"]), options)
+    points, visible = points[:, kept], visible[:, kept]
+    confidence, left_out, seldom = hide_seldom_seen(points, visible, mesh, options)
+    checked = Tracks.from_arrays(points, confidence)
+    hidden = float((checked.visible == 0).mean())
+    notes = [
+        f"{given} points of the film were tracked; {hidden:.1%} of the observations are hidden and carry no weight."
+    ]
+    stated = Interpretation(
+        num_frames=checked.num_frames, num_points=checked.num_points, num_faces=0 if mesh is None else len(mesh.faces),
+        hidden_fraction=hidden, mesh_source="film", has_ground_truth=False, has_rotations=False, layout="tracks (F, P, 2)",
+        format=f"film ({tracked.container})", given_points=given, num_left_out=len(left_out),
+        left_out_points=left_out[:1000].tolist(), notes=[*notes, *how, *seldom, *tracked.warnings],
+    )  # fmt: skip
+    frames = np.arange(checked.num_frames)
+    selection = Selection(frames, kept, (len(frames), given))
+    return Inputs(checked, mesh, None, None, stated, selection if selection.narrows else None)

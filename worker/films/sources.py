@@ -1,0 +1,136 @@
+"""A film and the region to track in it: as files, and stored together as the inputs of a job."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+from pliant.schemas.job import Interpretation
+from pliant.worker.formats.errors import damaged
+
+VERSION = 1
+_MARK, _FILM, _REGION = "film.json", "film", "region"
+"""Members of a stored source: version and file names, the film, the mask picture."""
+
+SUFFIXES = (".mp4", ".m4v", ".mov", ".webm", ".mkv", ".avi", ".gif", ".m3u8", ".3gp")
+PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".bmp")
+
+
+@dataclass(frozen=True, slots=True)
+class FilmSource:
+    """What is to be tracked."""
+
+    film: Path
+    """A film, a zip of pictures, or (on the command line) a folder of pictures."""
+
+    region: Path | None = None
+    """Mask picture of the film's size; None: the option `region_polygon`, or the whole picture."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FilmBounds:
+    """How much one film may cost; the limits of its playing time and frames are those of `pliant.tracking.FilmLimits`."""
+
+    max_bytes: int = 1 << 30
+    """Size of the film's file, or of all pictures of a zip."""
+
+    max_frames: int = 3600
+    """Frames that are tracked."""
+
+    max_pixels: int = 4096 * 2304
+    """Width × height of a frame."""
+
+    max_seconds: float = 600.0
+    """Playing time up to the last frame that is tracked."""
+
+    check_seconds: float = 30.0
+    """Wall time of the check at submission."""
+
+    track_seconds: float = 3600.0
+    """Wall time of tracking."""
+
+    memory: int = 4 << 30
+    """Address space of the process that decodes."""
+
+    scratch_bytes: int = 8 << 30
+    """Size of one file that this process writes: the grey frames of the film, packed without loss."""
+
+
+def looks_like_film(path: Path) -> bool:
+    """Return True for what a command line should take for a film instead of tracks: by content, then by name."""
+    if path.is_dir():
+        return True
+    try:
+        with path.open("rb") as file:
+            head = file.read(16)
+    except OSError:
+        return path.suffix.lower() in SUFFIXES
+    if head[4:8] in (b"ftyp", b"moov", b"mdat", b"wide") or head.startswith((b"\x1aE\xdf\xa3", b"GIF8")):
+        return True
+    if head.startswith(b"RIFF") and head[8:12] == b"AVI ":
+        return True
+    if head.startswith(b"PK") and path.suffix.lower() != ".npz":
+        return _holds_pictures(path)
+    return path.suffix.lower() in SUFFIXES
+
+
+def _holds_pictures(path: Path) -> bool:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return any(name.lower().endswith(PICTURES) for name in archive.namelist())
+    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError):
+        return False
+
+
+def save_source(source: FilmSource, interpretation: Interpretation, target: Path) -> None:
+    """Store film and region in one file, uncompressed; `open_source` gives them back byte for byte."""
+    stated = {
+        "version": VERSION,
+        "film": source.film.suffix.lower(),
+        "region": None if source.region is None else source.region.suffix.lower(),
+        "interpretation": interpretation.model_dump(mode="json"),
+    }
+    with zipfile.ZipFile(target, "w", zipfile.ZIP_STORED) as archive:
+        archive.writestr(_MARK, json.dumps(stated))
+        archive.write(source.film, _FILM)
+        if source.region is not None:
+            archive.write(source.region, _REGION)
+
+
+def is_source(path: Path) -> bool:
+    """Return True for a file that `save_source` wrote, False for other inputs of a job."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return _MARK in archive.namelist()
+    except zipfile.BadZipFile:
+        return False
+
+
+def open_source(path: Path, folder: Path) -> FilmSource:
+    """Unpack a stored source into a folder, which is made.
+
+    Raises
+    ------
+    InvalidInput
+        Code damaged_file, when the file is not one of ours or was damaged.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            stated = json.loads(archive.read(_MARK))
+            if stated["version"] != VERSION:
+                raise damaged("inputs", f"a stored film of version {stated['version']} instead of {VERSION}")
+            film = _unpacked(archive, _FILM, folder / f"film{stated['film']}")
+            region = stated["region"]
+            return FilmSource(film, None if region is None else _unpacked(archive, _REGION, folder / f"region{region}"))
+    except (zipfile.BadZipFile, KeyError, ValueError, TypeError) as error:
+        raise damaged("inputs", "a stored film that cannot be read back") from error
+
+
+def _unpacked(archive: zipfile.ZipFile, member: str, target: Path) -> Path:
+    with archive.open(member) as source, target.open("wb") as file:
+        shutil.copyfileobj(source, file, 1 << 20)
+    return target

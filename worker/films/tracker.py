@@ -1,0 +1,193 @@
+"""Have a film checked or tracked by the film process, and take over what it found."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Annotated, Any, TypeVar
+
+from pliant.schemas.job import Interpretation
+from pliant.schemas.options import Options
+from pliant.solver.errors import InvalidInput
+from pliant.worker.errors import Interrupted
+from pliant.worker.films.sources import FilmBounds, FilmSource
+from pliant.worker.formats.errors import damaged, refusal, too_large
+from pliant.worker.processes.contained import DONE, REFUSED, Ended, refusal_in, run_contained
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+MODULE = "pliant.worker.films.contained_process"
+NEEDED = {"frames", "template_frame", "grid_step", "longest_side", "region_frame", "region_polygon"}
+"""Options that the film process reads."""
+
+Count = Annotated[int, Field(ge=0, lt=2**40)]
+Words = Annotated[str, Field(max_length=1000)]
+
+
+class FilmFacts(BaseModel):
+    """What the check of a film found."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    container: Words
+    width: Annotated[int, Field(ge=1, le=10**5)]
+    height: Annotated[int, Field(ge=1, le=10**5)]
+    fps: Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)]
+    """Frames a second of the frames that are used, as the file states them."""
+
+    stated_frames: Count
+    """Frames in the file, as it states them; 0 if it does not."""
+
+    frames: Count
+    """Of these, frames that the option `frames` selects; 0 if unknown."""
+
+
+class Tracked(BaseModel):
+    """What tracking found, besides the files."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    container: Words
+    warnings: Annotated[tuple[Words, ...], Field(max_length=100)]
+
+
+def check_film(source: FilmSource, options: Options, bounds: FilmBounds = FilmBounds()) -> FilmFacts:  # noqa: B008 - frozen
+    """Open a film and its region without tracking it: seconds, whatever the film's length.
+
+    Raises
+    ------
+    InvalidInput
+        No film, beyond the limits, or a region or an option that does not fit it.
+    """
+    _check_region(source, options)
+    with TemporaryDirectory(prefix="pliant-film-") as scratch:
+        ended = _run("check", source, options, bounds, Path(scratch), threads=1)
+    return _answer(FilmFacts, ended, bounds, bounds.check_seconds)
+
+
+def track_film(
+    source: FilmSource,
+    options: Options,
+    scratch: Path,
+    *,
+    bounds: FilmBounds = FilmBounds(),  # noqa: B008 - frozen
+    threads: int = 1,
+    on_progress: Callable[[float], None] | None = None,
+    should_stop: Callable[[], bool] | None = None,
+) -> Tracked:
+    """Track a film; `tracks.npz` and `contact_sheet.jpg` are then in the scratch folder.
+
+    Parameters
+    ----------
+    source, options, bounds
+        The film, how to track it, and what it may cost.
+    scratch : Path
+        An empty folder.
+    threads : int
+        Threads for optical flow.
+    on_progress : callable, optional
+        Called with the share that is done, in [0, 1].
+    should_stop : callable, optional
+        Called ten times a second; the film process is killed once it returns True.
+
+    Raises
+    ------
+    InvalidInput
+        A film that cannot be tracked; the error states what to do, or what to film instead.
+    Interrupted
+        `should_stop` returned True.
+    """
+    _check_region(source, options)
+
+    def on_line(stated: dict[str, Any]) -> None:
+        done = stated.get("done")
+        if on_progress is not None and isinstance(done, int | float) and 0 <= done <= 1:
+            on_progress(float(done))
+
+    ended = _run("track", source, options, bounds, scratch, threads=threads, on_line=on_line, should_stop=should_stop)
+    if ended.stopped:
+        raise Interrupted
+    return _answer(Tracked, ended, bounds, bounds.track_seconds)
+
+
+def described(facts: FilmFacts, options: Options) -> Interpretation:
+    """Return what is known of the inputs before the film is tracked."""
+    of_all = f" of {facts.stated_frames}" if facts.frames and facts.frames != facts.stated_frames else ""
+    count = f"{facts.frames}{of_all} frames" if facts.frames else "frames not counted yet"
+    return Interpretation(
+        num_frames=facts.frames, num_points=0, num_faces=0, hidden_fraction=0.0, mesh_source="film",
+        has_ground_truth=False, has_rotations=False, layout="tracks (F, P, 2)", format=f"film ({facts.container})",
+        given_frames=facts.stated_frames or None,
+        notes=[f"A film of {facts.width}×{facts.height} pixels, {count}, {options.fps:.3g} frames a second. "
+               "Its points are tracked when the job runs."],
+    )  # fmt: skip
+
+
+def film_options(options: Options, facts: FilmFacts) -> Options:
+    """Fill in what the film states: the picture's size, and the frame rate where the job gives none."""
+    known: dict[str, Any] = {"image_size": f"{facts.width}x{facts.height}"}
+    if "fps" not in options.model_fields_set:
+        known["fps"] = facts.fps
+    return options.model_copy(update=known)
+
+
+def _check_region(source: FilmSource, options: Options) -> None:
+    if source.region is not None and options.region_polygon is not None:
+        raise refusal(
+            "conflicting_parts", "options.region_polygon", expected="a mask picture or a polygon", got="both",
+            hint="Leave one of them out.",
+        )  # fmt: skip
+
+
+def _run(
+    action: str, source: FilmSource, options: Options, bounds: FilmBounds, scratch: Path, *, threads: int,
+    on_line: Callable[[dict[str, Any]], None] | None = None, should_stop: Callable[[], bool] | None = None,
+) -> Ended:  # fmt: skip
+    request = {
+        "action": action, "film": str(source.film.absolute()), "threads": max(1, min(threads, 64)),
+        "region": None if source.region is None else str(source.region.absolute()),
+        "options": options.model_dump(mode="json", include=NEEDED),
+        "bounds": asdict(bounds), "folder": str(scratch.absolute()),
+    }  # fmt: skip
+    return run_contained(
+        MODULE,
+        request,
+        seconds=bounds.check_seconds if action == "check" else bounds.track_seconds,
+        directory=str(scratch),
+        environment={"TMPDIR": str(scratch.absolute()), "MALLOC_ARENA_MAX": "2"},
+        on_line=on_line,
+        should_stop=should_stop,
+    )
+
+
+Answer = TypeVar("Answer", FilmFacts, Tracked)
+
+
+def _answer(kind: type[Answer], ended: Ended, bounds: FilmBounds, seconds: float) -> Answer:
+    if ended.code == DONE:
+        try:
+            return kind.model_validate_json(ended.answer)
+        except ValidationError:
+            raise damaged("film", "a film that confuses its decoder") from None
+    raise _fault(ended, bounds, seconds)
+
+
+def _fault(ended: Ended, bounds: FilmBounds, seconds: float) -> Exception:
+    if ended.code == REFUSED:
+        parts = refusal_in(ended)
+        if parts is None:
+            return damaged("film", "a film that confuses its decoder")
+        del parts["choices"]
+        return InvalidInput(parts.pop("code"), **parts)
+    if ended.overdue or ended.code == -signal.SIGXCPU:
+        return refusal(
+            "too_slow", "film", expected=f"a film that is decoded and tracked within {seconds:g} s", got="one that takes longer",
+            hint="Select fewer frames, lower longest_side, or convert the film: ffmpeg -i FILM -vf scale=1280:-2 film.mp4",
+        )  # fmt: skip
+    if ended.code == -signal.SIGKILL:
+        return too_large("film", expected=f"a film that is tracked within {bounds.memory >> 20} MiB", got="more")
+    if ended.code < 0:
+        return damaged("film", f"a film that stops its decoder (signal {-ended.code})")
+    return RuntimeError(f"the film process ended with {ended.code}: {ended.errors}")
