@@ -37,6 +37,15 @@ class Finished:
     artifacts: tuple[Artifact, ...]
     """The files, named as they lie in the directory."""
 
+    verdict: str | None = None
+    """`good`, `with_care` or `do_not_use`; None where the solver did not judge the result."""
+
+    verdict_reasons: tuple[str, ...] = ()
+    """A sentence for each sign against the result, the gravest first."""
+
+    trust_sentence: str | None = None
+    """The expected error and what depth rests on, in words."""
+
 
 def solver_settings(options: Options, *, y_up: bool = False) -> Settings:
     """Return the solver's part of a job's options; `y_up` as the tracks were read."""
@@ -117,10 +126,14 @@ def reconstruct(
 
     artifacts = write_artifacts(inputs, solution, options, report, directory, on_progress=exported)
     exported(1.0)
+    trust = solution.trust
     return Finished(
         metrics=metrics,
         outcome=solution.outcome.value,
         sentence=solution.outcome.sentence,
+        verdict=None if trust is None else trust.verdict.value,
+        verdict_reasons=() if trust is None else trust.reasons,
+        trust_sentence=None if trust is None else trust.sentence,
         warnings=tuple(solution.choices.warnings),
         artifacts=tuple(artifacts),
     )

@@ -63,6 +63,9 @@ def succeed(
     warnings: Sequence[str],
     now: datetime,
     retention: float,
+    verdict: str | None = None,
+    verdict_reasons: Sequence[str] = (),
+    trust_sentence: str | None = None,
 ) -> Stored:
     """Publish the result. A job whose cancellation was asked for meanwhile ends cancelled, as its owner was told.
 
@@ -78,6 +81,9 @@ def succeed(
         "metrics": dict(metrics),
         "outcome": outcome,
         "sentence": sentence,
+        "verdict": verdict,
+        "verdict_reasons": list(verdict_reasons),
+        "trust_sentence": trust_sentence,
         "warnings": list(warnings),
         "artifacts": list(artifacts),
     }
