@@ -21,7 +21,7 @@ POINT = r"^-?\d{1,7}(\.\d{1,9})?,-?\d{1,7}(\.\d{1,9})?$"
 
 Weight = Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
 
-Output = Literal["glb", "ply", "obj", "usd", "mat", "csv"]
+Output = Literal["glb", "ply", "obj", "usd", "mdd", "mat", "csv"]
 """A result file that is written if asked for; `shapes.npz`, `report.json` and `preview.bin` always are."""
 
 
@@ -131,17 +131,19 @@ class Options(BaseModel):
     outputs: Outputs = Field(
         ("glb", "ply", "csv"),
         description="Files to write besides shapes.npz, report.json and preview.bin. glb: animated glTF. ply, obj: one mesh a frame, in a "
-        "zip. usd: USD with time samples. mat: MATLAB. csv: metrics of every frame and of every point.",
+        "zip. usd: USD with time samples. mdd: point cache for Blender, Maya and Houdini. mat: MATLAB. "
+        "csv: metrics of every frame and of every point.",
     )
     normals: Literal["static", "animated", "none"] = Field(
         "static",
         description="static: those of the first shape, in shapes.glb alone. animated: they move with the shape, and are in every "
         "frame of PLY, OBJ and USD, too. none: viewers make their own.",
     )
-    colours: Literal["none", "error"] = Field(
+    colours: Literal["none", "error", "expected_error"] = Field(
         "none",
         description="none: no colours. error: points are coloured by their distance from the ground truth, or by their reprojection "
-        "residual where there is none: in every frame in PLY, OBJ and USD, by the mean over frames in shapes.glb.",
+        "residual where there is none. expected_error: by the error that the solver expects, in percent of the object's size; only "
+        "prior gaussian estimates it. PLY, OBJ and USD are coloured in every frame, shapes.glb by the mean over frames.",
     )
     glb_quantized: bool = Field(
         False,

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from pliant.schemas.job import Interpretation
 from pliant.schemas.options import Options
 from pliant.solver import Camera, Choices, Mesh, Outcome, Solution, Trace, Tracks
-from pliant.worker.formats import GroundTruth, Inputs
+from pliant.solver.evaluation.trust import assess
+from pliant.worker.formats import GroundTruth, Inputs, Texture
+from scipy.spatial.transform import Rotation
 
 
 def moving_sheet(frames: int, rows: int, columns: int) -> np.ndarray:
@@ -29,12 +32,14 @@ def make_result(
     y_axis: str = "down",
     truth: bool = False,
     hidden: bool = False,
+    std: bool = True,
+    texture: bool = False,
     **options: Any,
 ) -> tuple[Inputs, Solution, Options]:
     """Inputs and the solution that belongs to them.
 
     `mesh` is grid, triangles or none; with `truth` the result is off by a smooth error; with `hidden` a third of the observations and
-    the whole of point 3 and frame 2 are hidden.
+    the whole of point 3 and frame 2 are hidden; without `std` the solver has estimated no deviations.
     """
     shapes = moving_sheet(frames, rows, columns)
     points = rows * columns
@@ -64,7 +69,22 @@ def make_result(
         ),
         seconds={"cameras": 0.5},
     )  # fmt: skip
+    spread = np.linspace(0.5, 2.0, frames * points).reshape(frames, points) if std else None
+    turned = Rotation.from_rotvec(np.linspace(0, 0.8, frames)[:, None] * [0, 1, 0]).as_matrix()
+    trust = assess(shapes, turned, solution.residuals, visible, scales=np.ones(frames), shapes_std=spread)
+    solution = replace(solution, shapes_std=spread, trust=trust)
+    if texture:
+        inputs = replace(inputs, texture=make_texture(rows, columns))
     return inputs, solution, Options(**options)
+
+
+def make_texture(rows: int, columns: int) -> Texture:
+    """A smooth picture, red from left to right and green from top to bottom, with a place for each point of a sheet's grid."""
+    y, x = np.mgrid[0:96, 0:128]
+    picture = np.stack([255 * x / 127, 255 * y / 95, 0 * x + 128.0], axis=-1)
+    down, right = np.mgrid[0:rows, 0:columns].reshape(2, -1)
+    uv = np.column_stack([0.1 + 0.8 * right / columns, 0.2 + 0.7 * down / rows])
+    return Texture.from_tracked(np.rint(picture).astype(np.uint8), uv)
 
 
 def _off(frames: int, points: int) -> np.ndarray:

@@ -7,14 +7,16 @@ from dataclasses import dataclass
 from typing import IO, Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pliant.schemas.options import Options, Output
 from pliant.solver import InvalidInput
 from pliant.worker.artifacts import matlab, preview, usd
 from pliant.worker.artifacts.animation import animate
 from pliant.worker.artifacts.colours import linear
 from pliant.worker.artifacts.frames_zip import OnProgress, write_obj_zip, write_ply_zip
-from pliant.worker.artifacts.geometry import triangles_of, viewer_scale
+from pliant.worker.artifacts.geometry import Floats, triangles_of, viewer_scale
 from pliant.worker.artifacts.glb import write_glb
+from pliant.worker.artifacts.mdd import write_mdd
 from pliant.worker.artifacts.result import Result
 from pliant.worker.artifacts.tables import write_frames_csv, write_points_csv
 
@@ -35,8 +37,11 @@ class Kind:
     write: Callable[[Result, IO[bytes], OnProgress], dict[str, Any]]
     """Writes the file; returns what the report should say of it."""
 
+    textured: bool | None = None
+    """Whether it is written only with, or only without, a picture on the surface; None: either way."""
 
-def kinds_for(options: Options, *, size: tuple[int, int] = (0, 0)) -> list[Kind]:
+
+def kinds_for(options: Options, *, size: tuple[int, int] = (0, 0), textured: bool = False) -> list[Kind]:
     """Return what a job's options ask for, in the order of writing.
 
     Parameters
@@ -45,6 +50,8 @@ def kinds_for(options: Options, *, size: tuple[int, int] = (0, 0)) -> list[Kind]
         Of the job.
     size : tuple of int
         Frames and points, as far as they are known.
+    textured : bool
+        There is a picture to put on the surface.
 
     Raises
     ------
@@ -62,13 +69,15 @@ def kinds_for(options: Options, *, size: tuple[int, int] = (0, 0)) -> list[Kind]
             "output_unavailable", field="options.outputs", expected="less than 2 GiB of shapes for mat",
             got=f"{size[0]} frames of {size[1]} points", hint="Leave mat out; shapes.npz holds the same arrays.",
         )  # fmt: skip
-    return [kind for kind in KINDS if kind.output is None or kind.output in options.outputs]
+    wanted = [kind for kind in KINDS if kind.output is None or kind.output in options.outputs]
+    return [kind for kind in wanted if kind.textured in (None, textured)]
 
 
 def _npz(result: Result, file: IO[bytes], on_progress: OnProgress) -> dict[str, Any]:
     solution, camera = result.solution, result.solution.camera
     chosen = result.inputs.selection
     sources = {} if chosen is None else {"source_frames": chosen.frames, "source_points": chosen.points}
+    spread = {} if solution.shapes_std is None else {"shapes_std": solution.shapes_std.astype(np.float32)}
     np.savez(
         file,
         allow_pickle=False,
@@ -83,6 +92,7 @@ def _npz(result: Result, file: IO[bytes], on_progress: OnProgress) -> dict[str, 
         faces=result.faces,
         residuals=solution.residuals.astype(np.float32),
         weights=solution.weights.astype(np.float32),
+        **spread,
         trace_objective=solution.trace.objective,
         trace_residual=solution.trace.residual,
         trace_iterations=solution.trace.iterations,
@@ -97,15 +107,22 @@ def _glb(result: Result, file: IO[bytes], on_progress: OnProgress) -> dict[str, 
     colours = None
     if painted is not None:
         animation.extras.update(painted.said())
-        shares = np.hstack([linear(painted.mean()), np.ones((shapes.shape[1], 1))])
-        colours = np.rint(shares * 65535).astype(np.uint16)
+        colours = _rgba(painted.mean())
+    elif result.texture is None and result.picture_colours is not None:
+        colours = _rgba(result.picture_colours)
     on_progress(0.4)
     write_glb(
         file, animation, triangles_of(result.faces), fps=options.fps, node={"scale": [viewer_scale(shapes)] * 3},
         normals=options.normals, quantized=options.glb_quantized, colours=colours,
-        on_progress=lambda part: on_progress(0.4 + 0.6 * part),
+        texture=result.texture, on_progress=lambda part: on_progress(0.4 + 0.6 * part),
     )  # fmt: skip
     return animation.extras
+
+
+def _rgba(colours: Floats) -> NDArray[np.uint16]:
+    """Return colours `(P, 3)`, sRGB, as glTF stores them: linear light and opaque, 65535 for 1."""
+    shares = np.hstack([linear(colours), np.ones((len(colours), 1))])
+    return np.asarray(np.rint(shares * 65535).astype(np.uint16))
 
 
 def _painted(write: Callable[[Result, IO[bytes], OnProgress], None]) -> Callable[..., dict[str, Any]]:
@@ -139,12 +156,14 @@ def _preview(result: Result, file: IO[bytes]) -> None:
 
 
 KINDS = (
-    Kind("shapes.npz", None, "application/zip", "All arrays: shapes (F, P, 3), cameras, faces, residuals, weights, trace.", 2, _npz),
+    Kind("shapes.npz", None, "application/zip", "All arrays: shapes (F, P, 3), deviations, cameras, faces, residuals, weights.", 2, _npz),
     Kind("shapes.glb", "glb", "model/gltf-binary", "The moving mesh as animated glTF, y up.", 2, _glb),
     Kind("shapes_ply.zip", "ply", "application/zip", "One binary PLY for each frame.", 6, _painted(write_ply_zip)),
     Kind("shapes_obj.zip", "obj", "application/zip", "One OBJ for each frame.", 30, _painted(write_obj_zip)),
-    Kind("shapes.usdc", "usd", "application/octet-stream", "The moving mesh as USD, y up.", 3, _painted(usd.write_usd)),
+    Kind("shapes.usdc", "usd", "application/octet-stream", "The moving mesh as USD, y up.", 3, _painted(usd.write_usd), textured=False),
+    Kind("shapes.usdz", "usd", "model/vnd.usdz+zip", "USD, y up, with its picture.", 3, _painted(usd.write_usdz), textured=True),
     Kind("shapes.mat", "mat", "application/x-matlab-data", "The same arrays for MATLAB; faces from 1.", 2, _at_once(matlab.write_mat)),
+    Kind("shapes.mdd", "mdd", "application/octet-stream", "Point cache for Blender, Maya and Houdini, y up.", 2, _painted(write_mdd)),
     Kind("metrics_frames.csv", "csv", "text/csv", "Metrics of every frame.", 2, _at_once(write_frames_csv)),
     Kind("metrics_points.csv", "csv", "text/csv", "Metrics of every point.", 2, _at_once(write_points_csv)),
     Kind(preview.NAME, None, preview.MEDIA_TYPE, preview.DESCRIPTION, 1, _at_once(_preview)),

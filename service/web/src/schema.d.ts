@@ -323,6 +323,21 @@ export interface components {
              */
             sentence: string | null;
             /**
+             * Verdict
+             * @description Whether the result can be used, judged without ground truth; null: not judged.
+             */
+            verdict: ("good" | "with_care" | "do_not_use") | null;
+            /**
+             * Verdict Reasons
+             * @description A sentence with a figure for each sign against the result, the gravest first.
+             */
+            verdict_reasons: string[];
+            /**
+             * Trust Sentence
+             * @description The expected error and what depth rests on, in words.
+             */
+            trust_sentence: string | null;
+            /**
              * Warnings
              * @description What the user should read about this result.
              */
@@ -358,11 +373,36 @@ export interface components {
             method: "pseudo_inverse" | "temporal" | "spatio_temporal" | "robust";
             /**
              * Camera
-             * @description scaled_orthographic estimates one scale per frame (real video); orthographic has none.
-             * @default scaled_orthographic
+             * @description perspective: a pinhole camera. scaled_orthographic: no perspective, one scale per frame. orthographic: no scales. auto: perspective where the tracks are clearly more probable with it, else scaled_orthographic.
+             * @default auto
              * @enum {string}
              */
-            camera: "scaled_orthographic" | "orthographic";
+            camera: "auto" | "perspective" | "scaled_orthographic" | "orthographic";
+            /**
+             * Focal
+             * @description Focal length in pixels of the tracks; null: estimated where the camera is perspective.
+             * @default null
+             */
+            focal: number | null;
+            /**
+             * Field Of View
+             * @description Horizontal angle of view in degrees, instead of focal: focal = width / (2 tan(angle / 2)). Needs image_size.
+             * @default null
+             */
+            field_of_view: number | null;
+            /**
+             * Principal Point
+             * @description Principal point X,Y in pixels, e.g. 319.5,239.5; null: the centre of image_size, or of the tracks without it.
+             * @default null
+             */
+            principal_point: string | null;
+            /**
+             * Surface
+             * @description isometric: a sheet that bends without stretching, such as paper or cloth, seen in perspective. free: no such assumption. auto: isometric where the tracks are those of a sheet and its edge lengths single out a focal length; needs image_size or focal.
+             * @default auto
+             * @enum {string}
+             */
+            surface: "auto" | "isometric" | "free";
             /**
              * Basis Size
              * @description Number K of basis shapes in the factorization that gives the rotations; null: chosen from the data.
@@ -472,14 +512,14 @@ export interface components {
             fps: number;
             /**
              * Outputs
-             * @description Files to write besides shapes.npz, report.json and preview.bin. glb: animated glTF. ply, obj: one mesh a frame, in a zip. usd: USD with time samples. mat: MATLAB. csv: metrics of every frame and of every point.
+             * @description Files to write besides shapes.npz, report.json and preview.bin. glb: animated glTF. ply, obj: one mesh a frame, in a zip. usd: USD with time samples. mdd: point cache for Blender, Maya and Houdini. mat: MATLAB. csv: metrics of every frame and of every point.
              * @default [
              *       "glb",
              *       "ply",
              *       "csv"
              *     ]
              */
-            outputs: ("glb" | "ply" | "obj" | "usd" | "mat" | "csv")[];
+            outputs: ("glb" | "ply" | "obj" | "usd" | "mdd" | "mat" | "csv")[];
             /**
              * Normals
              * @description static: those of the first shape, in shapes.glb alone. animated: they move with the shape, and are in every frame of PLY, OBJ and USD, too. none: viewers make their own.
@@ -489,11 +529,11 @@ export interface components {
             normals: "static" | "animated" | "none";
             /**
              * Colours
-             * @description none: no colours. error: points are coloured by their distance from the ground truth, or by their reprojection residual where there is none: in every frame in PLY, OBJ and USD, by the mean over frames in shapes.glb.
+             * @description none: no colours. error: points are coloured by their distance from the ground truth, or by their reprojection residual where there is none. expected_error: by the error that the solver expects, in percent of the object's size; only prior gaussian estimates it. PLY, OBJ and USD are coloured in every frame, shapes.glb by the mean over frames.
              * @default none
              * @enum {string}
              */
-            colours: "none" | "error";
+            colours: "none" | "error" | "expected_error";
             /**
              * Glb Quantized
              * @description Write shapes.glb with 16-bit positions (KHR_mesh_quantization): two thirds of the size, and rounded to about a 65,000th of the largest extent.
@@ -530,7 +570,7 @@ export interface components {
             coordinates: "auto" | "pixels" | "unit" | "signed";
             /**
              * Image Size
-             * @description WIDTHxHEIGHT of the picture in pixels, e.g. 640x480; needed where coordinates are fractions of it.
+             * @description WIDTHxHEIGHT of the picture in pixels, e.g. 640x480; needed where coordinates are fractions of it. Its centre is the principal point of a perspective camera.
              * @default null
              */
             image_size: string | null;
