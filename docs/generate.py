@@ -74,8 +74,10 @@ def settings() -> str:
         found = re.search(r"\s*\((PLIANT_\w+)[^)]*\)", note)
         if found is not None and found[1] not in {variable for variable, _, _ in of_worker.VARIABLES.values()}:
             value = getattr(service_defaults, name)
-            value = value // 2**20 if found[1].endswith("_MB") else value
-            service.append((f"`{found[1]}`", _default(value), note.replace(found[0], "")))
+            note = note.replace(found[0], "")
+            if found[1].endswith("_MB"):  # the class has bytes
+                value, note = value // 2**20, note.replace("in bytes", "in MiB")
+            service.append((f"`{found[1]}`", _default(value), note))
     heads = ("variable", "default", "meaning")
     return f"## Storage and work\n\n{_table(heads, worker)}\n\n## Access control and rate limits\n\n{_table(heads, service)}"
 
