@@ -3,8 +3,9 @@
     python docs/generate.py build/docs
 
 Markers: `options` (JSON schema of the job options), `settings` (environment variables), `cli` (the commands' help), `rest`
-(OpenAPI document). A fence such as ``bash not-run: REASON`` becomes ``bash``, because Markdown renderers other than GitHub's
-take a longer line for text. Pages, links and anchors are checked by the strict build that follows in `make docs`.
+(OpenAPI document), `errors` (table of error codes). A fence such as ``bash not-run: REASON`` becomes ``bash``, because Markdown
+renderers other than GitHub's take a longer line for text. Pages, links and anchors are checked by the strict build that follows in
+`make docs`.
 """
 
 from __future__ import annotations
@@ -22,6 +23,13 @@ from typing import Any
 
 DOCS = Path(__file__).resolve().parent
 MARKER = re.compile(r"^<!-- generated: (\w+) -->$", re.MULTILINE)
+ERROR_GROUPS = {
+    "Failed jobs": "Codes of a job's `error`. Any code of an input error below can appear there, too.",
+    "Meaning of the input": "The solver raises the same codes as `InvalidInput`.",
+    "Command line and start-up": "These end a command or stop the start of a process.",
+}
+"""Sentences below the headings of groups of error codes."""
+
 NOTE = re.compile(r"^( *```\w+) not-run: .*$", re.MULTILINE)
 
 
@@ -66,10 +74,31 @@ def settings() -> str:
         found = re.search(r"\s*\((PLIANT_\w+)[^)]*\)", note)
         if found is not None and found[1] not in {variable for variable, _, _ in of_worker.VARIABLES.values()}:
             value = getattr(service_defaults, name)
-            value = value // 2**20 if found[1].endswith("_MB") else value
-            service.append((f"`{found[1]}`", _default(value), note.replace(found[0], "")))
+            note = note.replace(found[0], "")
+            if found[1].endswith("_MB"):  # the class has bytes
+                value, note = value // 2**20, note.replace("in bytes", "in MiB")
+            service.append((f"`{found[1]}`", _default(value), note))
     heads = ("variable", "default", "meaning")
     return f"## Storage and work\n\n{_table(heads, worker)}\n\n## Access control and rate limits\n\n{_table(heads, service)}"
+
+
+def errors() -> str:
+    """Return a section for every error code, grouped by the comments of the table."""
+    from pliant.schemas.problems import ProblemCode
+
+    parts = []
+    for line in inspect.getsource(ProblemCode).splitlines():
+        if title := re.fullmatch(r" {4}# ([A-Z].*)", line):
+            parts.append(f"## {title[1]}")
+            parts += [ERROR_GROUPS[title[1]]] if title[1] in ERROR_GROUPS else []
+        elif entry := re.match(r" {4}([A-Z][A-Z0-9_]*) = \(", line):
+            parts.append(_error(ProblemCode[entry[1]]))
+    return "\n\n".join(parts)
+
+
+def _error(code: Any) -> str:
+    status = "" if code.status is None else f"**Status {code.status}**{', retryable' if code.retryable else ''}. "
+    return f"### {code.value}\n\n{status}{code.cause}\n\n**Remedy:** {code.remedy}"
 
 
 def cli() -> str:
@@ -221,7 +250,13 @@ def _table(heads: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
     return "\n".join(f"| {line} |" for line in lines)
 
 
-GENERATORS: dict[str, Callable[[], str]] = {"options": options, "settings": settings, "cli": cli, "rest": rest}
+GENERATORS: dict[str, Callable[[], str]] = {
+    "options": options,
+    "settings": settings,
+    "cli": cli,
+    "rest": rest,
+    "errors": errors,
+}
 
 if __name__ == "__main__":
     main(Path(sys.argv[1]))

@@ -30,11 +30,11 @@ SHOWN = {"text", "mermaid", "http"}
 """Languages that are run, parsed, or only shown."""
 
 SLOW = {
-    "docs/explanation/depth.md", "docs/how-to/outliers.md", "docs/how-to/tokens.md", "docs/reference/artifacts.md",
-    "docs/reference/cli.md", "docs/reference/rest.md", "docs/reference/sdk.md", "docs/tutorials/blender.md", "docs/tutorials/compare.md",
-    "docs/tutorials/python.md",
+    "docs/explanation/depth.md", "docs/explanation/trust.md", "docs/how-to/camera.md", "docs/how-to/film-to-tracks.md",
+    "docs/how-to/outliers.md", "docs/how-to/tokens.md", "docs/reference/artifacts.md", "docs/reference/cli.md", "docs/reference/rest.md",
+    "docs/reference/sdk.md", "docs/tutorials/blender.md", "docs/tutorials/compare.md", "docs/tutorials/python.md",
 }  # fmt: skip
-"""Pages whose code solves several jobs or starts an embedded Valkey, left to `make test-slow`."""
+"""Pages whose code solves several jobs, tracks a film or starts an embedded Valkey, left to `make test-slow`."""
 
 ADDRESS = "http://127.0.0.1:8000"
 SIZE = re.compile(r"\bface\(\d+, \d+\)")

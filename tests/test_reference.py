@@ -38,15 +38,21 @@ def headings(page: str) -> list[str]:
     return re.findall(r"^### (.+)$", (REFERENCE / page).read_text(encoding="utf-8"), re.MULTILINE)
 
 
-def test_the_page_of_error_codes_has_exactly_the_codes_of_the_table() -> None:
-    documented = headings("errors.md")
-    assert len(documented) == len(set(documented))
-    assert set(documented) == {code.value for code in ProblemCode}
+def test_every_error_code_is_generated_with_cause_and_remedy(generate: ModuleType) -> None:
+    sections = re.split(r"^### ", generate.errors(), flags=re.MULTILINE)
+    assert sections[0].strip() == "## Requests"
+    assert [text.partition("\n")[0] for text in sections[1:]] == [code.value for code in ProblemCode]
+    for code, text in zip(ProblemCode, sections[1:], strict=True):
+        assert code.cause in text
+        assert f"**Remedy:** {code.remedy}" in text
 
 
-def test_every_error_code_has_a_remedy() -> None:
-    sections = re.split(r"^### ", (REFERENCE / "errors.md").read_text(encoding="utf-8"), flags=re.MULTILINE)[1:]
-    assert [text.partition("\n")[0] for text in sections if "**Remedy:**" not in text] == []
+def test_groups_of_error_codes_have_their_sentences(generate: ModuleType) -> None:
+    text = generate.errors()
+    assert {
+        title for title in generate.ERROR_GROUPS if f"## {title}\n\n{generate.ERROR_GROUPS[title]}" not in text
+    } == set()
+    assert "### timed_out\n\n**Status 504**, retryable. " in text
 
 
 def test_every_warning_of_the_source_is_documented_and_no_other() -> None:
