@@ -11,6 +11,7 @@ import { Files, Metrics, saveLink } from "./results";
 import { Snippets } from "./snippets";
 import { type Job, type Progress, isFinal } from "./types";
 import { Understood } from "./understood";
+import { VerdictBox } from "./verdict";
 import { STATUS_WORDS, ago, bytes, percent, standing, title } from "./words";
 
 export interface DetailEvents {
@@ -27,6 +28,7 @@ export class Detail {
   private readonly status = h("span", { class: "status" });
   private readonly when = h("span", { class: "muted" });
   private readonly actions = h("div", { class: "row actions" });
+  private readonly verdict = new VerdictBox();
   private readonly figures = new Figures();
   private readonly standing = h("p", { class: "standing", role: "status" });
   private readonly meter = h("progress", { max: 1, value: 0, "aria-label": "Progress of this job" });
@@ -51,6 +53,7 @@ export class Detail {
       "article",
       { class: "detail", "aria-labelledby": "job-title" },
       h("header", { class: "detail-head" }, h("div", {}, this.heading, h("p", { class: "row" }, this.status, this.when)), this.actions),
+      this.verdict.element,
       this.figures.element,
       this.standing,
       h("div", { class: "meter" }, this.meter, this.share),
@@ -112,6 +115,7 @@ export class Detail {
     this.showMeter(job);
     this.showActions(job);
     fill(this.failure, JSON.stringify(job.error), () => (job.error ? [refusalBox(job.error)] : []));
+    this.verdict.show(job);
     this.figures.show(job);
     this.understood.show(job);
     this.metrics.show(job);
