@@ -7,7 +7,7 @@ import { follow } from "./events";
 import { refusalBox } from "./refusal";
 import { Figures } from "./figures";
 import { newer, progressed } from "./news";
-import { Files, Metrics, saveLink } from "./results";
+import { Files, Metrics, Sheet, saveLink } from "./results";
 import { Snippets } from "./snippets";
 import { type Job, type Progress, isFinal } from "./types";
 import { Understood } from "./understood";
@@ -39,6 +39,7 @@ export class Detail {
   private readonly curves = new Curves();
   private readonly understood = new Understood();
   private readonly metrics = new Metrics();
+  private readonly sheet = new Sheet();
   private readonly files = new Files();
   private readonly snippets = new Snippets();
   private readonly leaving = new AbortController();
@@ -60,6 +61,7 @@ export class Detail {
       this.trouble,
       this.failure,
       this.stage,
+      this.sheet.element,
       this.curves.element,
       h("div", { class: "panels" }, h("div", {}, this.metrics.element), h("div", {}, this.understood.element, this.files.element)),
       this.snippets.element,
@@ -119,6 +121,7 @@ export class Detail {
     this.figures.show(job);
     this.understood.show(job);
     this.metrics.show(job);
+    this.sheet.show(job);
     this.files.show(job);
     this.snippets.show(job);
     this.events.onJob(job);

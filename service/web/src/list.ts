@@ -140,7 +140,9 @@ export class JobList {
   private write(row: Row, job: Job): void {
     const seen = job.interpretation;
     say(row.name, title(job));
-    say(row.about, `${count(seen.num_frames, "frame")}, ${count(seen.num_points, "point")}, ${ago(job.created_at)}`);
+    const sizes = [seen.num_frames > 0 && count(seen.num_frames, "frame"), seen.num_points > 0 && count(seen.num_points, "point")];
+    const about = [seen.mesh_source === "film" && "film", ...sizes, ago(job.created_at)].filter(Boolean).join(", ");
+    say(row.about, about);
     const verdict = verdictOf(job);
     fill(row.status, verdict ?? place(job), () => [verdict ? badge(verdict) : place(job)]);
     row.status.dataset["status"] = job.status;

@@ -44,7 +44,7 @@ export interface Schema {
 }
 
 /** The input files of a job, by the name of their form part. */
-export const PARTS = ["tracks", "mesh", "ground_truth", "rotations"] as const;
+export const PARTS = ["film", "tracks", "mesh", "ground_truth", "rotations"] as const;
 export type Part = (typeof PARTS)[number];
 
 export function isFinal(status: Status): boolean {
