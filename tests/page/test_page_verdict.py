@@ -19,7 +19,7 @@ pytestmark = [
 ]
 
 AXE = Path(__file__).parents[2] / "service" / "web" / "node_modules" / "axe-core" / "axe.min.js"
-TRUST = "Expected error 3 % of the object's size (interval 2 to 5 %)."
+TRUST = "Expected error about 3 % of the object's size; depth rests on 9° of turn."
 REASONS = ["The camera turns by 9°. Turn by 30° or more.", "12 % of the observations are hidden."]
 
 
@@ -47,11 +47,15 @@ def test_the_verdict_stands_above_the_viewer_and_in_the_list(
 ) -> None:
     reasons = [] if verdict == "good" else REASONS
     judge(page, url, finished, verdict=verdict, verdict_reasons=reasons, trust_sentence=TRUST, sentence="Converged.")
+    report = httpx.get(f"{url}/v1/jobs/{finished}/artifacts/report.json").json()
+    report |= {"expected_error": 0.03, "expected_error_interval": [0.02, 0.051]}
+    page.route("**/report.json", lambda route: route.fulfill(json=report))
     page.goto(f"{url}/#job={finished}")
     page.reload()
     box = page.get_by_role("region", name="Verdict")
     expect(box).to_contain_text(words)
     expect(box).to_contain_text(TRUST)
+    expect(box).to_contain_text("In about nine of ten sequences the true error is between 2.0 % and 5.1 %.")
     expect(box.locator("svg")).to_be_visible()
     assert box.get_by_role("listitem").all_inner_texts() == reasons
     expect(box).to_contain_text("Solver: Converged.")

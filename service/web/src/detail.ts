@@ -198,7 +198,10 @@ export class Detail {
     const preview = job.artifacts.find((artifact) => artifact.name === PREVIEW);
     if (job.artifacts.some((artifact) => artifact.name === "report.json")) {
       getReport(job.id)
-        .then((report) => this.curves.report(report))
+        .then((report) => {
+          this.curves.report(report);
+          this.verdict.report(report);
+        })
         .catch((error: unknown) => {
           if (!(error instanceof Refusal)) throw error; // the charts keep what they saw live
         });

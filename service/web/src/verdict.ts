@@ -2,6 +2,7 @@
 
 import { fill, h, svg } from "./dom";
 import type { Job, Verdict } from "./types";
+import { percent } from "./words";
 
 export const VERDICTS: Record<Verdict, string> = { good: "Good", with_care: "Use with care", do_not_use: "Do not use" };
 
@@ -34,6 +35,7 @@ export function verdictOf(job: Job): Verdict | null {
 export class VerdictBox {
   private readonly badge = h("p", {});
   private readonly trust = h("p", { class: "trust" });
+  private readonly interval = h("p", {});
   private readonly reasons = h("ul", { class: "reasons" });
   private readonly outcome = h("p", { class: "outcome" });
   readonly element = h(
@@ -42,6 +44,7 @@ export class VerdictBox {
     h("h3", { id: "verdict-title", class: "visually-hidden" }, "Verdict"),
     this.badge,
     this.trust,
+    this.interval,
     this.reasons,
     this.outcome,
   );
@@ -56,5 +59,15 @@ export class VerdictBox {
     fill(this.trust, job.trust_sentence ?? "", () => [job.trust_sentence]);
     fill(this.reasons, reasons.join("\n"), () => reasons.map((reason) => h("li", {}, reason)));
     fill(this.outcome, job.sentence ?? "", () => [job.sentence && `Solver: ${job.sentence}`]);
+  }
+
+  /** Show what only the report has: the interval of the expected error, as shares of the object's size. */
+  report(report: Record<string, unknown>): void {
+    const interval = report["expected_error_interval"];
+    if (!Array.isArray(interval)) return;
+    const [low, high] = interval.map(Number);
+    if (low === undefined || high === undefined) return;
+    const words = `In about nine of ten sequences the true error is between ${percent(low)} and ${percent(high)}.`;
+    fill(this.interval, words, () => [words]);
   }
 }
