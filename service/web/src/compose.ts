@@ -55,7 +55,9 @@ export class Compose {
 
   /** Load options and examples. */
   async load(): Promise<void> {
-    this.options.load(await getOptions());
+    const schema = await getOptions();
+    this.options.load(schema);
+    if (schema.properties && "region_polygon" in schema.properties) this.slots.acceptFilms();
     try {
       const { examples } = await listExamples();
       this.offered = examples;
@@ -110,7 +112,7 @@ export class Compose {
     if (this.sending) return;
     const form = this.form();
     if (form === null) {
-      this.answer.replaceChildren(h("p", { class: "sentence bad" }, "Choose a track file first, or try an example."));
+      this.answer.replaceChildren(h("p", { class: "sentence bad" }, `Choose a ${this.slots.hasFilms ? "film or track file" : "track file"} first, or try an example.`));
       this.slots.focus("tracks");
       return;
     }
@@ -141,10 +143,11 @@ export class Compose {
 
   private form(): FormData | null {
     const form = new FormData();
-    form.append("options", JSON.stringify(this.options.values()));
+    const { region } = this.slots;
+    form.append("options", JSON.stringify({ ...this.options.values(), ...(region && { region_polygon: region }) }));
     if (this.label.value.trim()) form.append("name", this.label.value.trim());
     const { files, grid } = this.slots.given;
-    if (!files.some(([part]) => part === "tracks")) return null;
+    if (!files.some(([part]) => part === "tracks" || part === "film")) return null;
     if (grid) form.append("mesh", grid);
     for (const [part, file] of files) form.append(part, file, file.name);
     return form;

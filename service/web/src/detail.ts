@@ -7,10 +7,11 @@ import { follow } from "./events";
 import { refusalBox } from "./refusal";
 import { Figures } from "./figures";
 import { newer, progressed } from "./news";
-import { Files, Metrics, saveLink } from "./results";
+import { Files, Metrics, Sheet, saveLink } from "./results";
 import { Snippets } from "./snippets";
 import { type Job, type Progress, isFinal } from "./types";
 import { Understood } from "./understood";
+import { VerdictBox } from "./verdict";
 import { STATUS_WORDS, ago, bytes, percent, standing, title } from "./words";
 
 export interface DetailEvents {
@@ -27,6 +28,7 @@ export class Detail {
   private readonly status = h("span", { class: "status" });
   private readonly when = h("span", { class: "muted" });
   private readonly actions = h("div", { class: "row actions" });
+  private readonly verdict = new VerdictBox();
   private readonly figures = new Figures();
   private readonly standing = h("p", { class: "standing", role: "status" });
   private readonly meter = h("progress", { max: 1, value: 0, "aria-label": "Progress of this job" });
@@ -37,6 +39,7 @@ export class Detail {
   private readonly curves = new Curves();
   private readonly understood = new Understood();
   private readonly metrics = new Metrics();
+  private readonly sheet = new Sheet();
   private readonly files = new Files();
   private readonly snippets = new Snippets();
   private readonly leaving = new AbortController();
@@ -51,12 +54,14 @@ export class Detail {
       "article",
       { class: "detail", "aria-labelledby": "job-title" },
       h("header", { class: "detail-head" }, h("div", {}, this.heading, h("p", { class: "row" }, this.status, this.when)), this.actions),
+      this.verdict.element,
       this.figures.element,
       this.standing,
       h("div", { class: "meter" }, this.meter, this.share),
       this.trouble,
       this.failure,
       this.stage,
+      this.sheet.element,
       this.curves.element,
       h("div", { class: "panels" }, h("div", {}, this.metrics.element), h("div", {}, this.understood.element, this.files.element)),
       this.snippets.element,
@@ -112,9 +117,11 @@ export class Detail {
     this.showMeter(job);
     this.showActions(job);
     fill(this.failure, JSON.stringify(job.error), () => (job.error ? [refusalBox(job.error)] : []));
+    this.verdict.show(job);
     this.figures.show(job);
     this.understood.show(job);
     this.metrics.show(job);
+    this.sheet.show(job);
     this.files.show(job);
     this.snippets.show(job);
     this.events.onJob(job);
@@ -191,7 +198,10 @@ export class Detail {
     const preview = job.artifacts.find((artifact) => artifact.name === PREVIEW);
     if (job.artifacts.some((artifact) => artifact.name === "report.json")) {
       getReport(job.id)
-        .then((report) => this.curves.report(report))
+        .then((report) => {
+          this.curves.report(report);
+          this.verdict.report(report);
+        })
         .catch((error: unknown) => {
           if (!(error instanceof Refusal)) throw error; // the charts keep what they saw live
         });

@@ -16,10 +16,10 @@ export class Figures {
 }
 
 function figures(job: Job): [string, string][] {
-  const rows: [string, string][] = [
-    ["Frames", whole.format(job.interpretation.num_frames)],
-    ["Points", whole.format(job.interpretation.num_points)],
-  ];
+  const rows: [string, string][] = [];
+  const { num_frames: frames, num_points: points } = job.interpretation;
+  if (frames > 0) rows.push(["Frames", whole.format(frames)]);
+  if (points > 0) rows.push(["Points", whole.format(points)]); // none before a film is tracked
   const { e3d_sequence: error, reprojection_median: residual } = job.metrics ?? {};
   if (error !== undefined) rows.push(["3-D error", percent(error)]);
   if (residual !== undefined) rows.push(["Reprojection", number(residual)]);

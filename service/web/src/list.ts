@@ -1,10 +1,11 @@
 // The list of jobs, newest first.
 
 import { type Refusal, listJobs } from "./api";
-import { button, h, say } from "./dom";
+import { button, fill, h, say } from "./dom";
 import { follow } from "./events";
 import { newer, progressed } from "./news";
 import { type Job, type Progress, isFinal } from "./types";
+import { badge, verdictOf } from "./verdict";
 import { STATUS_WORDS, ago, count, percent, title } from "./words";
 
 /** Running jobs that are followed beside the one that is shown; a browser opens six connections to a host. */
@@ -139,8 +140,11 @@ export class JobList {
   private write(row: Row, job: Job): void {
     const seen = job.interpretation;
     say(row.name, title(job));
-    say(row.about, `${count(seen.num_frames, "frame")}, ${count(seen.num_points, "point")}, ${ago(job.created_at)}`);
-    say(row.status, place(job));
+    const sizes = [seen.num_frames > 0 && count(seen.num_frames, "frame"), seen.num_points > 0 && count(seen.num_points, "point")];
+    const about = [seen.mesh_source === "film" && "film", ...sizes, ago(job.created_at)].filter(Boolean).join(", ");
+    say(row.about, about);
+    const verdict = verdictOf(job);
+    fill(row.status, verdict ?? place(job), () => [verdict ? badge(verdict) : place(job)]);
     row.status.dataset["status"] = job.status;
     row.meter.hidden = job.status !== "running";
     row.meter.value = job.progress?.fraction ?? 0;

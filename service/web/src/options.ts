@@ -5,6 +5,8 @@ import type { Options, Schema } from "./types";
 
 /** Shown by name at the top; the rest is folded away. */
 const FIRST = ["method", "preset"];
+/** Not in the form: the region is drawn, on the first frame. */
+const DRAWN = ["region_polygon", "region_frame"];
 
 const LABELS: Record<string, string> = {
   pseudo_inverse: "pseudo-inverse",
@@ -31,7 +33,7 @@ export class OptionsForm {
   load(schema: Schema): void {
     const properties = schema.properties ?? {};
     const names = Object.keys(properties);
-    const rest = names.filter((name) => !FIRST.includes(name));
+    const rest = names.filter((name) => !FIRST.includes(name) && !DRAWN.includes(name));
     this.fields = [];
     this.first.replaceChildren(...FIRST.filter((name) => names.includes(name)).map((name) => this.row(name, properties)));
     const changed = h("span", { class: "muted" });

@@ -27,27 +27,61 @@ export async function peek(file: File): Promise<Entry[]> {
 }
 
 async function members(file: File): Promise<Entry[]> {
+  const found: Entry[] = [];
+  for (const { name, offset, method } of await listing(file, 16)) {
+    const entry = await member(file, offset, method);
+    if (entry) found.push({ ...entry, name: name.replace(/\.npy$/, "") });
+  }
+  return found;
+}
+
+/** Where a member of a zip file is. */
+export interface Member {
+  name: string;
+  offset: number;
+  method: number;
+  /** Bytes in the file. */
+  packed: number;
+}
+
+/** Return the first members of a zip file, in the order of its directory. */
+export async function listing(file: File, most = 10_000): Promise<Member[]> {
   const tail = new DataView(await file.slice(Math.max(0, file.size - 66000)).arrayBuffer());
   let end = tail.byteLength - 22;
   while (end >= 0 && tail.getUint32(end, true) !== END) end -= 1;
   if (end < 0) return [];
   const from = tail.getUint32(end + 16, true);
   const directory = new DataView(await file.slice(from, from + tail.getUint32(end + 12, true)).arrayBuffer());
-  const found: Entry[] = [];
+  const found: Member[] = [];
   let at = 0;
-  while (at + 46 <= directory.byteLength && directory.getUint32(at, true) === CENTRAL && found.length < 16) {
+  while (at + 46 <= directory.byteLength && directory.getUint32(at, true) === CENTRAL && found.length < most) {
     const nameLength = directory.getUint16(at + 28, true);
     const name = new TextDecoder().decode(new Uint8Array(directory.buffer, at + 46, nameLength));
-    const entry = await member(file, directory.getUint32(at + 42, true), directory.getUint16(at + 10, true));
-    if (entry) found.push({ ...entry, name: name.replace(/\.npy$/, "") });
+    const [method, packed] = [directory.getUint16(at + 10, true), directory.getUint32(at + 20, true)];
+    found.push({ name, offset: directory.getUint32(at + 42, true), method, packed });
     at += 46 + nameLength + directory.getUint16(at + 30, true) + directory.getUint16(at + 32, true);
   }
   return found;
 }
 
-async function member(file: File, offset: number, method: number): Promise<Omit<Entry, "name"> | null> {
+/** Return a member's content, or null where the browser has no way to unpack it. */
+export async function unpacked(file: File, { offset, method, packed }: Member, type: string): Promise<Blob | null> {
+  const start = await contentOf(file, offset);
+  const content = file.slice(start, start + packed, type);
+  if (method === 0) return content;
+  if (method !== 8) return null;
+  const stream = content.stream().pipeThrough(new DecompressionStream("deflate-raw"));
+  return new Blob([await new Response(stream).arrayBuffer()], { type });
+}
+
+/** Return where a member's content begins, behind its local header. */
+async function contentOf(file: File, offset: number): Promise<number> {
   const local = new DataView(await file.slice(offset, offset + 30).arrayBuffer());
-  const start = offset + 30 + local.getUint16(26, true) + local.getUint16(28, true);
+  return offset + 30 + local.getUint16(26, true) + local.getUint16(28, true);
+}
+
+async function member(file: File, offset: number, method: number): Promise<Omit<Entry, "name"> | null> {
+  const start = await contentOf(file, offset);
   const packed = file.slice(start, start + 16384);
   if (method === 0) return header(new Uint8Array(await packed.arrayBuffer()));
   if (method !== 8) return null;

@@ -1,6 +1,6 @@
 // The metrics and the files of a job.
 
-import { artifactPath, call, headers } from "./api";
+import { Refusal, artifactPath, call, headers } from "./api";
 import { fill, h } from "./dom";
 import type { Artifact, Job } from "./types";
 import { bytes, number } from "./words";
@@ -53,6 +53,47 @@ function metricHead(name: string): HTMLElement {
   if (known === undefined) return h("th", { scope: "row" }, h("code", {}, name));
   const [title, meaning] = known;
   return h("th", { scope: "row" }, h("span", { class: "metric" }, title), h("span", { class: "hint" }, h("code", {}, name), ` ${meaning}`));
+}
+
+const SHEET = "contact_sheet.jpg";
+
+/** The panel "Film": frames with the tracks drawn over them. */
+export class Sheet {
+  private readonly figure = h("figure", { class: "sheet" });
+  readonly element = h(
+    "section",
+    { class: "panel", "aria-labelledby": "sheet-title", hidden: true },
+    h("h3", { id: "sheet-title" }, "Tracked film"),
+    this.figure,
+  );
+
+  show(job: Job): void {
+    const sheet = job.artifacts.find(({ name }) => name === SHEET);
+    this.element.hidden = sheet === undefined;
+    if (sheet === undefined) return;
+    fill(this.figure, `${job.id} ${sheet.sha256}`, () => {
+      const picture = h("img", { alt: "Frames of the film with the tracks drawn over them" });
+      addressOf(artifactPath(job.id, SHEET))
+        .then((address) => (picture.src = address))
+        .catch((error: unknown) => {
+          if (!(error instanceof Refusal)) throw error; // the words in place of the picture remain
+        });
+      const link = saveLink(job, sheet, `Save ${SHEET}`);
+      return [picture, h("figcaption", { class: "hint" }, `${sheet.description} Check that the points stay on the object. `, link)];
+    });
+  }
+}
+
+/** Return an address for a picture: the path itself, or its content where the request needs a token. */
+async function addressOf(path: string): Promise<string> {
+  if (!("Authorization" in headers())) return path;
+  const content = await (await call(path)).blob();
+  return new Promise((resolve, reject) => {
+    const reader = new FileReader(); // the page's policy admits data: for pictures, not blob:
+    reader.onload = () => resolve(String(reader.result));
+    reader.onerror = () => reject(reader.error as DOMException);
+    reader.readAsDataURL(content);
+  });
 }
 
 /** The panel "Files". */

@@ -1,11 +1,15 @@
-// The files of a new job: four places, filled by drop or by choice, each saying what it holds.
+// The files of a new job: a film, or tracks with a mesh. Each place is filled by drop or by choice, and shows what it holds.
 
 import { button, h, uniqueId } from "./dom";
+import { looksLikeFilm } from "./film";
+import { Filming } from "./filming";
 import { type Entry, describe, peek } from "./peek";
+import type { Point } from "./region";
 import { PARTS, type Part } from "./types";
 import { bytes } from "./words";
 
 const PLACES: Record<Part, { label: string; hint: string }> = {
+  film: { label: "Film", hint: "mp4, mov, webm, avi, gif, zip of pictures" },
   tracks: { label: "Tracks", hint: "npz, npy, mat, csv …" },
   mesh: { label: "Mesh", hint: "optional: obj, ply, glb, npz" },
   ground_truth: { label: "Ground truth", hint: "optional: used to measure errors" },
@@ -23,23 +27,41 @@ interface Slot {
 
 export class Slots {
   readonly element = h("div", { class: "zone" });
+  /** True where the service tracks films. */
+  hasFilms = false;
   private readonly slots = new Map<Part, Slot>();
+  private readonly filming = new Filming(() => this.onChange());
+  private readonly title = h("p", { class: "zone-title" }, "Drop tracks and a mesh here");
   private readonly grid = h("input", { type: "text", id: "grid", placeholder: "rows×columns", size: 10, autocomplete: "off" });
 
   /** `onChange` is told when another set of files is there. */
   constructor(private readonly onChange: () => void) {
-    const title = h("p", { class: "zone-title" }, "Drop tracks and a mesh here");
     const promise = h("p", { class: "hint" }, "Files are sent to this service only.");
-    this.element.append(title, promise, ...PARTS.map((part) => this.slot(part)));
+    this.element.append(this.title, promise, ...PARTS.map((part) => this.slot(part)));
+    this.arrange();
     this.grid.addEventListener("change", onChange);
     this.acceptDrops();
   }
 
-  /** The files there are, and a grid's size where there is no mesh file. */
+  /** Offer the place for a film: the service tracks films. */
+  acceptFilms(): void {
+    this.hasFilms = true;
+    this.title.textContent = "Drop a film here, or tracks and a mesh";
+    this.arrange();
+  }
+
+  /** The files to send, and a grid's size where there is no mesh file. A film is sent alone: its tracks are made of it. */
   get given(): { files: [Part, File][]; grid: string } {
+    const film = this.file("film");
+    if (film) return { files: [["film", film]], grid: "" };
     const files = PARTS.map((part): [Part, File | null] => [part, this.file(part)]);
     const grid = this.file("mesh") ? "" : this.grid.value.trim().replace("×", "x");
     return { files: files.filter((one): one is [Part, File] => one[1] !== null), grid };
+  }
+
+  /** What to track in the film: corners in its pixels; null: the whole picture. */
+  get region(): Point[] | null {
+    return this.file("film") && this.filming.outline;
   }
 
   file(part: Part): File | null {
@@ -58,7 +80,12 @@ export class Slots {
 
   /** Put dropped files where their names and contents say they belong. */
   async take(files: File[]): Promise<void> {
-    for (const file of files) await this.show(roleOf(file.name, await peek(file), this.file("tracks") !== null), file);
+    for (const file of files) {
+      const entries = await peek(file);
+      const part = this.hasFilms && looksLikeFilm(file, entries) ? "film" : roleOf(file.name, entries, this.file("tracks") !== null);
+      await this.show(part, file);
+      if (part === "tracks") await this.show("film", null); // the last drop wins
+    }
     if (files.length > 0) this.onChange();
   }
 
@@ -84,6 +111,7 @@ export class Slots {
     const pick = h("span", { class: "pick", "aria-hidden": "true" }, "Choose");
     slot.row.append(slot.input, choose, pick, slot.hint, slot.remove, slot.contents);
     if (part === "mesh") slot.row.append(h("span", { class: "grid-size" }, h("label", { for: "grid" }, "or points on a grid"), this.grid));
+    if (part === "film") slot.row.append(this.filming.element);
     return slot.row;
   }
 
@@ -100,12 +128,22 @@ export class Slots {
     slot.hint.textContent = file === null ? PLACES[part].hint : `${file.name}, ${bytes(file.size)}`;
     slot.contents.textContent = "";
     if (part === "mesh") (this.grid.parentElement as HTMLElement).hidden = file !== null;
+    if (part === "film") {
+      this.arrange();
+      void this.filming.show(file);
+    }
     if (file === null) {
       slot.input.value = "";
       return;
     }
     const entries = await peek(file);
     if (slot.file === file && entries.length > 0) slot.contents.textContent = describe(entries);
+  }
+
+  /** A film takes the place of tracks and all that belongs to them. */
+  private arrange(): void {
+    const hasFilm = this.file("film") !== null;
+    for (const [part, slot] of this.slots) slot.row.hidden = part === "film" ? !this.hasFilms : hasFilm;
   }
 
   private acceptDrops(): void {

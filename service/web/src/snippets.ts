@@ -72,6 +72,7 @@ function given(job: Job, schema: Schema): Given {
 /** The parts of the form, with names that stand for the reader's own files; a grid and "no mesh" are said in words. */
 function parts(job: Job): [string, string][] {
   const seen = job.interpretation;
+  if (ofFilm(job)) return [["film", "film.mp4"]];
   const found: [string, string][] = [["tracks", "tracks.npz"]];
   if (seen.mesh_grid) found.push(["mesh", seen.mesh_grid.join("x")]);
   else if (seen.mesh_source === "given" || seen.mesh_source === "grid") found.push(["mesh", "mesh.npz"]);
@@ -80,6 +81,8 @@ function parts(job: Job): [string, string][] {
   if (seen.has_rotations) found.push(["rotations", "cameras.npz"]);
   return found;
 }
+
+const ofFilm = (job: Job): boolean => job.interpretation.mesh_source === "film";
 
 /** Write the job as a program. */
 export function snippet(job: Job, options: Given, language: Language, url: string): string {
@@ -98,7 +101,7 @@ function python(job: Job, chosen: Given, url: string): string {
   const name = job.name ? `    name=${JSON.stringify(job.name)},\n` : "";
   return (
     `from pliant.client import Client\n\n` +
-    `job = Client(${JSON.stringify(url)}).submit(\n    "tracks.npz",\n${files.join("")}${name}${options ? `    options={${options}},\n` : ""})\n` +
+    `job = Client(${JSON.stringify(url)}).submit(\n    ${ofFilm(job) ? 'film="film.mp4"' : '"tracks.npz"'},\n${files.join("")}${name}${options ? `    options={${options}},\n` : ""})\n` +
     `shapes = job.wait(timeout=3600).shapes  # array (${job.interpretation.num_frames}, ${job.interpretation.num_points}, 3)\n`
   );
 }
@@ -109,14 +112,14 @@ function shell(job: Job, chosen: Given, url: string): string {
   const files = parts(job)
     .slice(1)
     .map(([part, file]) => `--${part.replace("_", "-")} ${file}`);
-  const options = chosen.map(([name, value]) => `--option ${quote(`${name}=${String(value)}`)}`);
+  const options = chosen.map(([name, value]) => `--option ${quote(`${name}=${typeof value === "object" ? JSON.stringify(value) : String(value)}`)}`);
   const name = job.name ? [`--name ${quote(job.name)}`] : [];
-  return `${["pliant submit tracks.npz", ...files, ...name, `--url ${quote(url)}`, ...options, "--output result"].join(" \\\n  ")}\n`;
+  return `${[`pliant submit ${ofFilm(job) ? "film.mp4" : "tracks.npz"}`, ...files, ...name, `--url ${quote(url)}`, ...options, "--output result"].join(" \\\n  ")}\n`;
 }
 
 function curl(job: Job, chosen: Given, url: string): string {
   const fields = [
-    ...parts(job).map(([part, file]) => `-F ${part}=${file.endsWith(".npz") ? "@" : ""}${file}`),
+    ...parts(job).map(([part, file]) => `-F ${part}=${/\.(npz|mp4)$/.test(file) ? "@" : ""}${file}`),
     ...(job.name ? [`-F ${quote(`name=${job.name}`)}`] : []),
     ...(chosen.length > 0 ? [`-F ${quote(`options=${JSON.stringify(Object.fromEntries(chosen))}`)}`] : []),
   ];

@@ -16,7 +16,14 @@ export type Interpretation = Schemas["Interpretation"];
 export type Inspection = Schemas["Inspection"];
 /** Options by name: the form is built from the schema at /v1/options. */
 export type Options = Record<string, unknown>;
-export type Job = Omit<Schemas["Job"], "options" | "error"> & { options: Options; error: Problem | null };
+export type Verdict = "good" | "with_care" | "do_not_use";
+/** Judged without ground truth; missing in the records of older services, null where a job was not judged. */
+interface Trust {
+  verdict?: Verdict | null;
+  verdict_reasons?: string[];
+  trust_sentence?: string | null;
+}
+export type Job = Omit<Schemas["Job"], "options" | "error" | keyof Trust> & Trust & { options: Options; error: Problem | null };
 export type JobPage = Omit<Schemas["JobPage"], "jobs"> & { jobs: Job[] };
 
 /** The part of a JSON Schema that the options' schema uses. */
@@ -37,7 +44,7 @@ export interface Schema {
 }
 
 /** The input files of a job, by the name of their form part. */
-export const PARTS = ["tracks", "mesh", "ground_truth", "rotations"] as const;
+export const PARTS = ["film", "tracks", "mesh", "ground_truth", "rotations"] as const;
 export type Part = (typeof PARTS)[number];
 
 export function isFinal(status: Status): boolean {

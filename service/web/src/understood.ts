@@ -11,10 +11,13 @@ const MESHES: Record<string, string> = {
   grid: "from the grid",
   delaunay: "made by triangulating the best-seen frame",
   none: "none: points alone",
+  film: "from the grid of tracked points",
 };
 
 /** What the service made of the inputs, as terms and words. */
 function facts(seen: Interpretation): [string, string][] {
+  // A film is opened before a job is made of it, and tracked when the job runs.
+  if (seen.num_points === 0) return [["Film", seen.num_frames > 0 ? count(seen.num_frames, "frame") : "frames not counted yet"]];
   return [
     ["Tracks", `${count(seen.num_frames, "frame")} of ${count(seen.num_points, "point")}, ${percent(seen.hidden_fraction)} hidden`],
     ["Layout", `${seen.layout}, y ${seen.y_axis}`],
@@ -75,7 +78,7 @@ export class Inspection {
   private asking: AbortController | null = null;
   private timer = 0;
 
-  /** `form` gives what would be sent, null where there are no tracks yet; `refused` shows why it would be refused. */
+  /** `form` gives what would be sent, null where there is neither a film nor tracks; `refused` shows why it would be refused. */
   constructor(
     private readonly form: () => FormData | null,
     private readonly refused: (refusal: Refusal | null) => void,

@@ -71,6 +71,7 @@ export const STATUS_WORDS: Record<Status, string> = {
 };
 
 const STAGES: Record<string, string> = {
+  track: "Tracking the film",
   loading: "Reading the tracks",
   cameras: "Estimating the cameras",
   initialise: "First shapes",
@@ -101,7 +102,8 @@ export function standing(job: Job): string {
     case "cancelling":
       return "Stopping at the next iteration.";
     case "succeeded":
-      return job.sentence ?? "Done.";
+      // The verdict's section shows the sentence beside the verdict: that the solver converged does not make a result good.
+      return job.verdict ? "" : `${job.sentence ?? "Done."} The quality of this result was not assessed.`;
     case "failed":
       return job.error?.detail ?? "The job failed; its log has the details.";
     case "cancelled":

@@ -1,0 +1,67 @@
+// A film as a chosen file: how it is recognised, and its first frame as the browser decodes it.
+
+import { type Entry, listing, unpacked } from "./peek";
+
+const FILMS = /\.(mp4|m4v|mov|webm|mkv|avi|gif|3gp)$/i;
+const PICTURES: [RegExp, string][] = [
+  [/\.png$/i, "image/png"],
+  [/\.jpe?g$/i, "image/jpeg"],
+  [/\.webp$/i, "image/webp"],
+  [/\.bmp$/i, "image/bmp"],
+];
+/** A browser that has not decoded the first frame after this long, milliseconds, is taken not to decode the film. */
+const PATIENCE = 15_000;
+
+/** Return true for a film by its media type or name, and for a zip that holds no arrays. */
+export function looksLikeFilm(file: File, entries: Entry[]): boolean {
+  if (file.type.startsWith("video/") || FILMS.test(file.name)) return true;
+  return /\.zip$/i.test(file.name) && entries.length === 0;
+}
+
+/** Return the first frame in the film's own pixels, or null if this browser cannot decode it. */
+export async function firstFrame(file: File): Promise<ImageBitmap | null> {
+  try {
+    if (/\.gif$/i.test(file.name)) return await createImageBitmap(file);
+    if (/\.zip$/i.test(file.name)) return await firstPicture(file);
+    return await decoded(file);
+  } catch (error) {
+    // Not the picture that its name promises, or cut off: the service states what is wrong with it.
+    if (error instanceof DOMException || error instanceof RangeError || error instanceof TypeError) return null;
+    throw error;
+  }
+}
+
+async function firstPicture(file: File): Promise<ImageBitmap | null> {
+  const members = (await listing(file)).filter(({ name }) => !/(^|\/)(__MACOSX\/|\.)/.test(name));
+  const pictures = members.filter(({ name }) => PICTURES.some(([pattern]) => pattern.test(name)));
+  const [first] = pictures.sort((one, other) => one.name.localeCompare(other.name, "en", { numeric: true }));
+  if (first === undefined) return null;
+  const type = PICTURES.find(([pattern]) => pattern.test(first.name))?.[1] ?? "";
+  const picture = await unpacked(file, first, type);
+  return picture && createImageBitmap(picture);
+}
+
+async function decoded(file: File): Promise<ImageBitmap | null> {
+  const video = document.createElement("video");
+  video.muted = true;
+  video.playsInline = true;
+  video.preload = "auto";
+  const url = URL.createObjectURL(file);
+  try {
+    const shown = await new Promise<boolean>((resolve) => {
+      const timer = setTimeout(() => resolve(false), PATIENCE);
+      const settle = (answer: boolean): void => {
+        clearTimeout(timer);
+        resolve(answer);
+      };
+      video.addEventListener("loadeddata", () => settle(video.videoWidth > 0));
+      video.addEventListener("error", () => settle(false));
+      video.src = url;
+    });
+    return shown ? await createImageBitmap(video) : null;
+  } finally {
+    video.removeAttribute("src");
+    video.load();
+    URL.revokeObjectURL(url);
+  }
+}

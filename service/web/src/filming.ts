@@ -1,0 +1,79 @@
+// What the form shows of a chosen film: its first frame, the region drawn on it, and what makes a good film.
+
+import { fill, button, h } from "./dom";
+import { RegionDialog } from "./draw";
+import { firstFrame } from "./film";
+import { type Point, type Region, described, paint, polygon } from "./region";
+
+const ADVICE = "Film advice: turn by 30° or more, keep it sharp, and keep the object large in the picture.";
+const UNDECODED =
+  "This browser cannot show the film, so no region can be drawn on it and the whole picture is tracked. " +
+  "Most browsers show MP4 (H.264) and WebM.";
+/** Longest side of the small picture, in its own pixels. */
+const SIDE = 640;
+
+export class Filming {
+  private readonly canvas = h("canvas", { role: "img", "aria-label": "First frame of the film" });
+  private readonly words = h("p", { class: "hint", role: "status" });
+  private readonly draw = button("Draw a region", () => this.edit());
+  private readonly clear = button("Whole picture", () => this.choose(null), { class: "quiet" });
+  readonly element = h(
+    "div",
+    { class: "filming", hidden: true },
+    h("p", { class: "hint" }, ADVICE),
+    this.canvas,
+    this.words,
+    h("div", { class: "row" }, this.draw, this.clear),
+  );
+  private film: File | null = null;
+  private picture: ImageBitmap | null = null;
+  private region: Region | null = null;
+
+  /** `onChange` is called when another region has been chosen. */
+  constructor(private readonly onChange: () => void) {}
+
+  /** The option `region_polygon`; null: the whole picture. */
+  get outline(): Point[] | null {
+    return this.region && polygon(this.region);
+  }
+
+  /** Show another film, or none. */
+  async show(film: File | null): Promise<void> {
+    this.film = film;
+    this.picture?.close();
+    this.picture = this.region = null;
+    this.element.hidden = film === null;
+    this.write(film ? "Reading the first frame…" : "");
+    if (film === null) return;
+    const picture = await firstFrame(film);
+    if (this.film !== film) {
+      picture?.close();
+      return;
+    }
+    this.picture = picture;
+    this.write(picture ? described(null) : UNDECODED);
+  }
+
+  private edit(): void {
+    if (this.picture) new RegionDialog(this.picture, this.region, (region) => this.choose(region)).open();
+  }
+
+  private choose(region: Region | null): void {
+    this.region = region;
+    this.write(described(region));
+    this.onChange();
+  }
+
+  private write(words: string): void {
+    const { picture } = this;
+    fill(this.words, words, () => [words]);
+    this.canvas.hidden = this.draw.hidden = picture === null;
+    this.clear.hidden = this.region === null;
+    this.draw.textContent = this.region ? "Change the region" : "Draw a region";
+    if (picture === null) return;
+    const scale = SIDE / Math.max(picture.width, picture.height);
+    this.canvas.width = Math.round(picture.width * scale);
+    this.canvas.height = Math.round(picture.height * scale);
+    paint(this.canvas, picture, this.outline ?? []);
+  }
+}

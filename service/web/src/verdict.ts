@@ -1,0 +1,73 @@
+// Whether a result can be used: a badge with an icon and words, the expected error, and the reasons.
+
+import { fill, h, svg } from "./dom";
+import type { Job, Verdict } from "./types";
+import { percent } from "./words";
+
+export const VERDICTS: Record<Verdict, string> = { good: "Good", with_care: "Use with care", do_not_use: "Do not use" };
+
+/** A shape for each verdict, so that colour is not the only difference. */
+const ICONS: Record<Verdict, [outline: string, sign: string]> = {
+  good: ["M8 1a7 7 0 1 0 0 14A7 7 0 0 0 8 1z", "M4.7 8.3l2.3 2.3 4.4-4.9"],
+  with_care: ["M8 1.2L15.4 14.4H.6z", "M8 5.6v4.2M8 11.9v.6"],
+  do_not_use: ["M5 1h6l4 4v6l-4 4H5l-4-4V5z", "M5.4 5.4l5.2 5.2M10.6 5.4l-5.2 5.2"],
+};
+
+/** Return the badge of a verdict. */
+export function badge(verdict: Verdict): HTMLElement {
+  const [outline, sign] = ICONS[verdict];
+  const icon = svg(
+    "svg",
+    { viewBox: "0 0 16 16", width: 16, height: 16, "aria-hidden": "true" },
+    svg("path", { d: outline, class: "badge-outline" }),
+    svg("path", { d: sign, class: "badge-sign" }),
+  );
+  return h("span", { class: "badge", "data-verdict": verdict }, icon, VERDICTS[verdict]);
+}
+
+/** Return the verdict of a finished job, or null where none was reached or the page does not know it. */
+export function verdictOf(job: Job): Verdict | null {
+  const { status, verdict } = job;
+  return status === "succeeded" && verdict && verdict in VERDICTS ? verdict : null;
+}
+
+/** The section "Verdict", hidden for jobs that have none. */
+export class VerdictBox {
+  private readonly badge = h("p", {});
+  private readonly trust = h("p", { class: "trust" });
+  private readonly interval = h("p", {});
+  private readonly reasons = h("ul", { class: "reasons" });
+  private readonly outcome = h("p", { class: "outcome" });
+  readonly element = h(
+    "section",
+    { class: "verdict", "aria-labelledby": "verdict-title", hidden: true },
+    h("h3", { id: "verdict-title", class: "visually-hidden" }, "Verdict"),
+    this.badge,
+    this.trust,
+    this.interval,
+    this.reasons,
+    this.outcome,
+  );
+
+  show(job: Job): void {
+    const verdict = verdictOf(job);
+    this.element.hidden = verdict === null;
+    if (verdict === null) return;
+    this.element.dataset["verdict"] = verdict;
+    const reasons = job.verdict_reasons ?? [];
+    fill(this.badge, verdict, () => [badge(verdict)]);
+    fill(this.trust, job.trust_sentence ?? "", () => [job.trust_sentence]);
+    fill(this.reasons, reasons.join("\n"), () => reasons.map((reason) => h("li", {}, reason)));
+    fill(this.outcome, job.sentence ?? "", () => [job.sentence && `Solver: ${job.sentence}`]);
+  }
+
+  /** Show what only the report has: the interval of the expected error, as shares of the object's size. */
+  report(report: Record<string, unknown>): void {
+    const interval = report["expected_error_interval"];
+    if (!Array.isArray(interval)) return;
+    const [low, high] = interval.map(Number);
+    if (low === undefined || high === undefined) return;
+    const words = `In about nine of ten sequences the true error is between ${percent(low)} and ${percent(high)}.`;
+    fill(this.interval, words, () => [words]);
+  }
+}

@@ -1,0 +1,319 @@
+"""A film in the page: recognised, its first frame shown, a region drawn on it and sent, its tracks shown with the result."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from browsing import why_not
+from paging import drop, until
+from playwright.sync_api import Page, Route, expect
+
+pytestmark = [
+    pytest.mark.chromium,
+    pytest.mark.skipif(why_not() is not None and not os.environ.get("CI"), reason=str(why_not())),
+]
+cv2 = pytest.importorskip("cv2")
+
+AXE = Path(__file__).parents[2] / "service" / "web" / "node_modules" / "axe-core" / "axe.min.js"
+WIDTH, HEIGHT = 320, 240
+RED, BLUE = (40, 40, 210), (210, 40, 40)  # BGR
+
+KEEP_SENT = """() => {
+  const send = XMLHttpRequest.prototype.send;
+  XMLHttpRequest.prototype.send = function (form) {
+    window.sent = [...form].map(([name, value]) => [name, value instanceof File ? value.name : value]);
+    return send.call(this, form);
+  };
+}"""
+
+
+def picture(colour: tuple[int, int, int], name: str = ".png") -> bytes:
+    frame = np.full((HEIGHT, WIDTH, 3), colour, np.uint8)
+    cv2.circle(frame, (WIDTH // 2, HEIGHT // 2), 70, (235, 235, 235), -1)
+    return bytes(cv2.imencode(name, frame)[1])
+
+
+@pytest.fixture(scope="session")
+def films(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """Films of six frames, the first of them red, the others blue; an mp4 in a codec that browsers do not decode."""
+    folder, found = tmp_path_factory.mktemp("films"), {}
+    frames = [cv2.imdecode(np.frombuffer(picture(RED if i == 0 else BLUE), np.uint8), 1) for i in range(6)]
+    for name, codec in (("film.webm", "VP80"), ("old.mp4", "mp4v")):
+        writer = cv2.VideoWriter(str(folder / name), cv2.VideoWriter_fourcc(*codec), 5, (WIDTH, HEIGHT))
+        assert writer.isOpened()
+        for frame in frames:
+            writer.write(frame)
+        writer.release()
+        found[name] = (folder / name).read_bytes()
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("film/10.png", picture(BLUE))
+        archive.writestr("film/9.png", picture(RED))
+        archive.writestr("__MACOSX/film/._1.png", b"not a picture")
+    return {**found, "pictures.zip": packed.getvalue()}
+
+
+@pytest.fixture
+def filming(page: Page, url: str, finished: str) -> Page:
+    """The front page of a service that tracks films; jobs are answered with a record instead of being made."""
+    page.add_init_script(f"({KEEP_SENT})()")
+    page.route(f"{url}/", with_films_allowed)
+    page.route("**/v1/options", with_film_options)
+    page.route("**/v1/inspect", lambda route: route.fulfill(json=film_record(url, finished)["interpretation"]))
+    page.goto(url)
+    page.get_by_text("Drop a film here").wait_for()
+    return page
+
+
+def with_films_allowed(route: Route) -> None:
+    """Serve the page with a policy that lets it decode a chosen film, which has an address of the scheme blob:."""
+    answer = route.fetch()
+    policy = answer.headers["content-security-policy"]
+    if "media-src" not in policy:
+        policy = f"{policy}; media-src 'self' blob:"
+    route.fulfill(response=answer, headers={**answer.headers, "content-security-policy": policy})
+
+
+def with_film_options(route: Route) -> None:
+    answer = route.fetch()
+    schema = answer.json()
+    schema["properties"].setdefault("region_polygon", {"type": "array", "default": None, "description": "Drawn."})
+    route.fulfill(response=answer, body=json.dumps(schema))
+
+
+def film_record(url: str, finished: str, **fields: Any) -> dict[str, Any]:
+    """Return the record of a film's job that runs, made of the record of a job that ended."""
+    record = httpx.get(f"{url}/v1/jobs/{finished}").json()
+    read = {"num_frames": 6, "num_points": 0, "num_faces": 0, "mesh_source": "film", "format": "film (webm)"}
+    notes = ["A film of 320×240 pixels, 6 frames, 5 frames a second. Its points are tracked when the job runs."]
+    record["interpretation"] |= {**read, "notes": notes, "has_ground_truth": False}
+    progress = {"stage": "track", "fraction": 0.2, "updated_at": record["finished_at"], "seconds_left": 30.0}
+    progress |= {"reweighting": 0, "max_reweightings": 0, "objective": None, "residual": None}
+    running = {"status": "running", "progress": progress, "metrics": None, "artifacts": [], "finished_at": None}
+    return {**record, **running, "name": "a film", "sentence": None, **fields}
+
+
+def answer_with(page: Page, record: dict[str, Any]) -> None:
+    def jobs(route: Route) -> None:
+        if route.request.method == "POST":
+            route.fulfill(status=202, json=record)
+        else:
+            route.fulfill(json={"jobs": [record], "next": None})
+
+    page.route("**/v1/jobs", jobs)
+    page.route("**/v1/jobs?*", jobs)
+    page.route(f"**/v1/jobs/{record['id']}", lambda route: route.fulfill(json=record))
+    page.route(f"**/v1/jobs/{record['id']}/events", lambda route: route.fulfill(status=404, json={}))
+
+
+def drag(page: Page, *places: tuple[float, float]) -> None:
+    """Draw along places given as shares of the picture's width and height."""
+    box = page.get_by_role("application").bounding_box()
+    assert box is not None
+    at = [(box["x"] + x * box["width"], box["y"] + y * box["height"]) for x, y in places]
+    page.mouse.move(*at[0])
+    page.mouse.down()
+    for place in at[1:]:
+        page.mouse.move(*place, steps=6)
+    page.mouse.up()
+
+
+def colour_at_corner(page: Page) -> list[int]:
+    canvas = page.get_by_role("img", name="First frame of the film")
+    read = "(it) => [...it.getContext('2d').getImageData(4, 4, 1, 1).data].slice(0, 3)"
+    return list(canvas.evaluate(read))
+
+
+def sent_options(page: Page) -> dict[str, Any]:
+    return dict(json.loads(dict(page.evaluate("window.sent"))["options"]))
+
+
+@pytest.mark.parametrize("name", ["film.webm", "pictures.zip"])
+def test_a_dropped_film_shows_its_first_frame_in_place_of_tracks(
+    filming: Page, films: dict[str, bytes], name: str
+) -> None:
+    drop(filming, {name: films[name]})
+    expect(filming.locator("[data-part=film]")).to_contain_text(name)
+    filming.get_by_role("img", name="First frame of the film").wait_for()
+    red, green, blue = colour_at_corner(filming)
+    assert red > 150
+    assert max(green, blue) < 90
+    expect(filming.get_by_text("turn by 30° or more, keep it sharp, and keep the object large")).to_be_visible()
+    expect(filming.get_by_text("No region: the whole picture is tracked.")).to_be_visible()
+    expect(filming.get_by_role("region", name="How your files are interpreted")).to_contain_text("6 frames")
+    for part in ("tracks", "mesh", "ground_truth", "rotations"):
+        expect(filming.locator(f"[data-part={part}]")).to_be_hidden()
+    filming.get_by_role("button", name="Remove film").click()
+    expect(filming.locator("[data-part=tracks]")).to_be_visible()
+    expect(filming.get_by_role("img", name="First frame of the film")).to_be_hidden()
+
+
+def test_a_region_drawn_with_the_mouse_is_sent_with_the_film(
+    filming: Page, url: str, films: dict[str, bytes], finished: str
+) -> None:
+    answer_with(filming, film_record(url, finished))
+    drop(filming, {"film.webm": films["film.webm"]})
+    filming.get_by_role("button", name="Draw a region").click()
+    status = filming.get_by_role("dialog").get_by_role("status")
+    drag(filming, (0.5, 0.5), (0.501, 0.501))
+    expect(status).to_have_text("That region is too small. Drag to draw it.")
+    drag(filming, (0.2, 0.2), (0.8, 0.2), (0.8, 0.8), (0.2, 0.8))
+    expect(status).to_contain_text("Lasso with")
+    filming.get_by_role("button", name="Rectangle").click()
+    drag(filming, (0.75, 0.75), (0.25, 0.5))
+    expect(status).to_contain_text("Rectangle, 160 × 60 pixels at 80, 120.")
+    filming.get_by_role("button", name="Undo").click()
+    expect(status).to_contain_text("Lasso with")
+    filming.get_by_role("button", name="Use this region").click()
+    expect(filming.get_by_role("dialog")).to_have_count(0)
+    expect(filming.get_by_role("button", name="Change the region")).to_be_focused()
+    filming.get_by_role("button", name="Reconstruct").click()
+    expect(filming.get_by_text("Tracking the film; about 30 seconds left.")).to_be_visible()
+
+    assert {name: value for name, value in filming.evaluate("window.sent") if name != "options"} == {
+        "film": "film.webm"
+    }
+    corners = np.array(sent_options(filming)["region_polygon"])
+    assert 4 < len(corners) <= 500
+    assert corners.min(0) == pytest.approx([0.2 * WIDTH, 0.2 * HEIGHT], abs=2)
+    assert corners.max(0) == pytest.approx([0.8 * WIDTH, 0.8 * HEIGHT], abs=2)
+
+
+def test_a_region_by_keyboard_alone(filming: Page, url: str, films: dict[str, bytes], finished: str) -> None:
+    answer_with(filming, film_record(url, finished))
+    drop(filming, {"film.webm": films["film.webm"]})
+    filming.get_by_role("button", name="Draw a region").press("Enter")
+    expect(filming.get_by_role("application")).to_be_focused()
+    status = filming.get_by_role("dialog").get_by_role("status")
+    keys = filming.keyboard
+    keys.press("ArrowRight")
+    expect(status).to_have_text("Rectangle, 160 × 120 pixels at 80, 60.")
+    keys.press("ArrowRight")
+    keys.press("ArrowUp")
+    keys.press("Shift+ArrowDown")
+    keys.press("Shift+ArrowLeft")
+    expect(status).to_have_text("Rectangle, 157 × 123 pixels at 83, 57.")
+    keys.press("Control+z")
+    expect(status).to_have_text("Rectangle, 160 × 123 pixels at 83, 57.")
+    for _ in range(60):
+        keys.press("ArrowLeft")
+    expect(status).to_have_text("Rectangle, 160 × 123 pixels at 0, 57.")
+    keys.press("Enter")
+    expect(filming.get_by_role("dialog")).to_have_count(0)
+    filming.get_by_role("button", name="Change the region").press("Enter")
+    keys.press("ArrowDown")
+    keys.press("Escape")  # leaves the region as it was
+    expect(filming.get_by_role("dialog")).to_have_count(0)
+    filming.get_by_role("button", name="Reconstruct").press("Enter")
+    expect(filming.get_by_text("Tracking the film")).to_be_visible()
+    assert sent_options(filming)["region_polygon"] == [[0, 57], [160, 57], [160, 180], [0, 180]]
+
+
+def test_a_region_drawn_with_a_finger(filming: Page, films: dict[str, bytes]) -> None:
+    filming.set_viewport_size({"width": 390, "height": 844})
+    drop(filming, {"film.webm": films["film.webm"]})
+    filming.get_by_role("button", name="Draw a region").click()
+    box = filming.get_by_role("application").bounding_box()
+    assert box is not None
+    touches = filming.context.new_cdp_session(filming)
+
+    def touch(kind: str, *places: tuple[float, float]) -> None:
+        points = [{"x": box["x"] + x * box["width"], "y": box["y"] + y * box["height"]} for x, y in places]
+        touches.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+
+    touch("touchStart", (0.25, 0.25))
+    for place in ((0.5, 0.2), (0.75, 0.25), (0.75, 0.75), (0.25, 0.75)):
+        touch("touchMove", place)
+    touch("touchEnd")
+    status = filming.get_by_role("dialog").get_by_role("status")
+    expect(status).to_contain_text("Lasso with")
+    expect(status).to_contain_text("160 × 132 pixels")
+
+
+def test_a_film_that_the_browser_cannot_show_is_sent_whole(
+    filming: Page, url: str, films: dict[str, bytes], finished: str
+) -> None:
+    answer_with(filming, film_record(url, finished))
+    drop(filming, {"old.mp4": films["old.mp4"]})
+    expect(filming.get_by_text("This browser cannot show the film")).to_be_visible()
+    expect(filming.get_by_role("button", name="Draw a region")).to_be_hidden()
+    filming.get_by_role("button", name="Reconstruct").click()
+    expect(filming.get_by_text("Tracking the film")).to_be_visible()
+    assert dict(filming.evaluate("window.sent"))["film"] == "old.mp4"
+    assert "region_polygon" not in sent_options(filming)
+
+
+def test_a_service_without_films_offers_no_place_for_one(page: Page, url: str) -> None:
+    def without(route: Route) -> None:
+        answer = route.fetch()
+        schema = answer.json()
+        schema["properties"].pop("region_polygon", None)
+        route.fulfill(response=answer, body=json.dumps(schema))
+
+    page.route("**/v1/options", without)
+    page.goto(url)
+    page.reload()
+    page.get_by_label("Preset").wait_for()
+    expect(page.get_by_text("Drop tracks and a mesh here")).to_be_visible()
+    expect(page.locator("[data-part=film]")).to_be_hidden()
+
+
+def test_the_result_of_a_film_shows_its_contact_sheet(filming: Page, url: str, finished: str) -> None:
+    sheet = picture(RED, ".jpg")
+    made = [
+        {"name": name, "media_type": kind, "bytes": len(sheet), "sha256": "0" * 64, "description": words}
+        for name, kind, words in (
+            ("contact_sheet.jpg", "image/jpeg", "The tracks drawn over some frames of the film."),
+            ("tracks.npz", "application/zip", "The tracks."),
+        )
+    ]
+    record = film_record(url, finished, status="succeeded", artifacts=made, sentence="Converged.")
+    answer_with(filming, record)
+    filming.route("**/contact_sheet.jpg", lambda route: route.fulfill(body=sheet, content_type="image/jpeg"))
+    filming.evaluate("sessionStorage.setItem('pliant-token', '')")
+    for token in ("", "a-token"):  # with a token, the picture cannot be loaded by its address
+        filming.evaluate("(token) => sessionStorage.setItem('pliant-token', token)", token)
+        filming.goto(f"{url}/#job={finished}")
+        filming.reload()
+        shown = filming.get_by_role("region", name="Tracked film").get_by_role("img")
+        until(lambda shown=shown: shown.evaluate("(it) => it.naturalWidth") == WIDTH)  # type: ignore[misc]
+        address = str(shown.get_attribute("src"))
+        assert address.startswith("data:" if token else "v1/jobs/")
+    files = filming.get_by_role("region", name="Files").get_by_role("link")
+    assert files.all_inner_texts() == ["contact_sheet.jpg", "tracks.npz"]
+    expect(filming.get_by_role("region", name="Use from code")).to_contain_text('film="film.mp4"')
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [1280, 390])
+def test_form_and_dialog_have_no_accessibility_finding(
+    filming: Page, films: dict[str, bytes], scheme: str, width: int
+) -> None:
+    if not AXE.is_file() and not os.environ.get("CI"):
+        pytest.skip("axe-core is not installed; say `make page`")
+    filming.emulate_media(color_scheme=scheme, reduced_motion="reduce")  # type: ignore[arg-type]
+    filming.set_viewport_size({"width": width, "height": 800 if width == 1280 else 844})
+
+    def check(name: str) -> None:
+        filming.evaluate(AXE.read_text())
+        found = filming.evaluate("axe.run().then((found) => found.violations)")
+        assert [(one["id"], [node["html"] for node in one["nodes"]]) for one in found] == [], name
+        assert filming.evaluate("document.documentElement.scrollWidth") <= width
+        if folder := os.environ.get("PLIANT_SCREENSHOTS"):
+            filming.screenshot(path=f"{folder}/{name}-{width}-{scheme}.png")
+
+    drop(filming, {"film.webm": films["film.webm"]})
+    filming.get_by_role("button", name="Draw a region").click()
+    drag(filming, (0.3, 0.3), (0.5, 0.15), (0.7, 0.3), (0.75, 0.6), (0.5, 0.85), (0.25, 0.6))
+    check("region")
+    filming.get_by_role("button", name="Use this region").click()
+    filming.get_by_role("button", name="Change the region").scroll_into_view_if_needed()
+    check("film")

@@ -1,0 +1,101 @@
+"""The verdict on a result in the page: above the viewer, in the list, and left out for jobs without one."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from browsing import why_not
+from paging import DONE
+from playwright.sync_api import Page, Route, expect
+
+pytestmark = [
+    pytest.mark.chromium,
+    pytest.mark.skipif(why_not() is not None and not os.environ.get("CI"), reason=str(why_not())),
+]
+
+AXE = Path(__file__).parents[2] / "service" / "web" / "node_modules" / "axe-core" / "axe.min.js"
+TRUST = "Expected error about 3 % of the object's size; depth rests on 9° of turn."
+REASONS = ["The camera turns by 9°. Turn by 30° or more.", "12 % of the observations are hidden."]
+
+
+def judge(page: Page, url: str, id: str, **fields: Any) -> None:
+    """Show the job as if its record had these fields: each verdict needs a result of its own otherwise."""
+    record = {**httpx.get(f"{url}/v1/jobs/{id}").json(), **fields}
+    record = {name: value for name, value in record.items() if value is not ...}
+
+    def listed(route: Route) -> None:
+        answer = route.fetch()
+        jobs = answer.json()
+        jobs["jobs"] = [record if job["id"] == id else job for job in jobs["jobs"]]
+        route.fulfill(response=answer, body=json.dumps(jobs))
+
+    page.route(f"**/v1/jobs/{id}", lambda route: route.fulfill(json=record))
+    page.route("**/v1/jobs?*", listed)
+    page.route("**/v1/jobs", listed)
+
+
+@pytest.mark.parametrize(
+    ("verdict", "words"), [("good", "Good"), ("with_care", "Use with care"), ("do_not_use", "Do not use")]
+)
+def test_the_verdict_stands_above_the_viewer_and_in_the_list(
+    page: Page, url: str, finished: str, verdict: str, words: str
+) -> None:
+    reasons = [] if verdict == "good" else REASONS
+    judge(page, url, finished, verdict=verdict, verdict_reasons=reasons, trust_sentence=TRUST, sentence="Converged.")
+    report = httpx.get(f"{url}/v1/jobs/{finished}/artifacts/report.json").json()
+    report |= {"expected_error": 0.03, "expected_error_interval": [0.02, 0.051]}
+    page.route("**/report.json", lambda route: route.fulfill(json=report))
+    page.goto(f"{url}/#job={finished}")
+    page.reload()
+    box = page.get_by_role("region", name="Verdict")
+    expect(box).to_contain_text(words)
+    expect(box).to_contain_text(TRUST)
+    expect(box).to_contain_text("In about nine of ten sequences the true error is between 2.0 % and 5.1 %.")
+    expect(box.locator("svg")).to_be_visible()
+    assert box.get_by_role("listitem").all_inner_texts() == reasons
+    expect(box).to_contain_text("Solver: Converged.")
+    expect(page.get_by_text("Converged.")).to_have_count(1)  # beside the verdict, nowhere alone
+    expect(page.get_by_role("link", name="a finished face")).to_contain_text(words)
+    canvas = page.locator(".view canvas")
+    canvas.wait_for(timeout=DONE)
+    above, below = box.bounding_box(), canvas.bounding_box()
+    assert above is not None
+    assert below is not None
+    assert above["y"] + above["height"] <= below["y"]
+
+
+def test_a_job_without_a_verdict_shows_none(page: Page, url: str, finished: str) -> None:
+    judge(page, url, finished, verdict=..., verdict_reasons=..., trust_sentence=..., sentence="Converged.")
+    page.goto(f"{url}/#job={finished}")
+    page.reload()
+    expect(page.get_by_text("Converged. The quality of this result was not assessed.")).to_be_visible()
+    expect(page.get_by_role("region", name="Verdict")).to_have_count(0)
+    expect(page.locator(".badge")).to_have_count(0)
+    expect(page.get_by_role("link", name="a finished face")).to_contain_text("Done")
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_every_badge_can_be_read_in_both_themes(page: Page, url: str, finished: str, scheme: str) -> None:
+    if not AXE.is_file() and not os.environ.get("CI"):
+        pytest.skip("axe-core is not installed; say `make page`")
+    page.emulate_media(color_scheme=scheme, reduced_motion="reduce")  # type: ignore[arg-type]
+    for width, verdict in ((1280, "good"), (390, "with_care"), (390, "do_not_use")):
+        page.set_viewport_size({"width": width, "height": 844})
+        page.unroute_all()
+        judge(page, url, finished, verdict=verdict, verdict_reasons=REASONS, trust_sentence=TRUST)
+        page.goto(f"{url}/#job={finished}")
+        page.reload()
+        page.get_by_role("region", name="Verdict").wait_for()
+        if width == 390:
+            page.get_by_role("heading", name="Jobs").click()
+        page.evaluate(AXE.read_text())
+        found = page.evaluate("axe.run().then((found) => found.violations)")
+        assert [(one["id"], [node["html"] for node in one["nodes"]]) for one in found] == [], verdict
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        if folder := os.environ.get("PLIANT_SCREENSHOTS"):
+            page.screenshot(path=f"{folder}/verdict-{verdict}-{width}-{scheme}.png")
