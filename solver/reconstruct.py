@@ -342,7 +342,7 @@ def _with_the_rest(
         f"{sparse:.1%} of the points were seen in fewer than {WELL_OBSERVED_SHARE:.0%} of the frames ({never:.1%} in none): "
         "placed on the surface, then moved to their observations."
     )
-    return whole, replace(choices, reasons={**choices.reasons, "seldom_seen": reason}), state
+    return whole, replace(choices, reasons={**choices.reasons, "sparsely_observed": reason}), state
 
 
 def _loop(

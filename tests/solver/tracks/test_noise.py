@@ -85,7 +85,7 @@ def test_strong_noise_is_learned_though_a_small_start_misses_it() -> None:
     small = improve(
         begin(gram, PAIRS, noise_variance=START_NOISE_VARIANCE), gram, PAIRS, iterations=60, warm=ANNEALING_START
     )
-    assert small.noise**0.5 < SIGMA / 3
+    assert small.noise_variance**0.5 < SIGMA / 3
     assert learned(gram, PAIRS, max_modes=8, noisy_start=True).noise_variance ** 0.5 == pytest.approx(SIGMA, rel=0.15)
 
 
