@@ -14,7 +14,7 @@ from pliant.solver.evaluation.metrics import e3d_frame
 from pliant.solver.gallery import corrupt_tracks, face
 from pliant.solver.shapes.initialization import pseudo_inverse, uniform_solution
 from pliant.solver.shapes.setup import build_problem
-from pliant.solver.tracks.normalization import normalise
+from pliant.solver.tracks.normalization import normalize
 
 from benchmarks import baselines
 from benchmarks.apart import Measured, Stopwatch, apart
@@ -88,9 +88,9 @@ def run_ours(watch: Stopwatch, work: Workload) -> Ours:
     best = float(solution.trace.objective[-1])
     valued = [entry for entry in history if entry[2] is not None]
     reached = next((wall, cpu) for wall, cpu, value in valued if value <= GAP * best)
-    normalised = normalise(case.tracks)
+    normalized = normalize(case.tracks)
     return Ours(
-        reached, valued[0][:2], best, (solution.camera.translations - normalised.centroid) / normalised.unit,
+        reached, valued[0][:2], best, (solution.camera.translations - normalized.centroid) / normalized.unit,
         int(solution.trace.iterations.sum()), len(solution.trace.objective) - 1, dict(solution.seconds),
         None if case.shapes is None else e3d_frame(solution.shapes, case.shapes), case.tracks.points.shape[:2],
     )  # fmt: skip
@@ -115,7 +115,7 @@ def prepare(tracks: Tracks, mesh: Mesh | None, cameras: KnownCamera, settings: S
     still = np.zeros((tracks.num_frames, 2))
     scales = np.ones(tracks.num_frames) if cameras.scales is None else cameras.scales
     estimate = CameraEstimate(cameras.rotations, scales, still, 0, np.zeros((0, 0)), np.zeros((len(scales), 0, 2)))
-    problem, _ = build_problem(normalise(tracks), estimate, mesh, settings)
+    problem, _ = build_problem(normalize(tracks), estimate, mesh, settings)
     return problem, uniform_solution(problem, still)
 
 

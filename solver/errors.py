@@ -1,9 +1,9 @@
 """Errors of the solver.
 
     SolverError                 base: catch this one
-    ├── InvalidInput            what came in cannot be solved; says both sides and what to do
+    ├── InvalidInput            invalid input: states expected and got, and what to do
     │   └── InvalidSettings     one of the settings is out of its range
-    └── NotFinite               the arithmetic overflowed; no shapes
+    └── NotFinite               the arithmetic overflowed; no result
 
 Not converging is not an error: see `pliant.solver.Outcome`.
 """
@@ -12,11 +12,11 @@ from __future__ import annotations
 
 
 class SolverError(Exception):
-    """The solver could not answer."""
+    """The solver failed."""
 
 
 class NotFinite(SolverError):
-    """The arithmetic left the numbers: infinity or NaN where the energy should be. Never handed out as a result."""
+    """Overflow: the energy is infinite or NaN. Never returned as a result."""
 
     code = "not_finite"
 
@@ -25,7 +25,7 @@ class NotFinite(SolverError):
 
 
 class InvalidInput(SolverError):
-    """An input is not what it must be.
+    """An input is invalid.
 
     Attributes
     ----------
@@ -34,7 +34,7 @@ class InvalidInput(SolverError):
     field : str
         The input at fault, e.g. ``"tracks"`` or ``"mesh.faces"``.
     expected, got : str
-        Both sides, in words.
+        What was expected and what was given.
     hint : str
         What the user can do about it.
     """

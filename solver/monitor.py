@@ -1,4 +1,4 @@
-"""Progress and cancellation of one solve, in one object: every question whether to stop is also a unit of work done."""
+"""Progress and cancellation of one solve: every call of `should_stop` also counts one unit of work."""
 
 from __future__ import annotations
 
@@ -7,20 +7,22 @@ from dataclasses import replace
 
 from pliant.solver.records import Step
 
-FINEST = 0.002
-"""Least growth of the fraction that is reported on its own: at most 500 calls of `on_step` beside those of the stages."""
+MIN_FRACTION_STEP = 0.002
+"""Least increase of the fraction that is reported on its own: at most 500 calls of `on_step` besides those of the
+stages."""
 
 REWEIGHTING_UNITS = 100
-"""Conjugate-gradient iterations of one reweighting, about: 20 to 300."""
+"""Typical number of conjugate-gradient iterations per reweighting; 20 to 300 occur."""
 
-NEARLY = 0.9
+EXPECTED_SHARE = 0.9
 """Share of a stage's span that its expected units fill; further units approach its end."""
 
 
 class Monitor:
-    """Reports steps whose fraction never falls, and remembers a request to stop.
+    """Reports steps with a fraction that never decreases, and remembers a request to stop.
 
-    Calling it counts one unit of work and returns whether to stop: it is handed down as `should_stop`. Once that was True it stays True.
+    A call counts one unit of work and returns whether to stop; pass it on as `should_stop`. Once it returned True it
+    keeps doing so.
 
     Parameters
     ----------
@@ -54,25 +56,25 @@ class Monitor:
             self.stopped = bool(self._should_stop())
         self._units += 1
         fraction = self._begun + self._span * _filled(self._units / self._expected)
-        if fraction >= self._last.fraction + FINEST:
-            self._report(replace(self._last, fraction=fraction))
+        if fraction >= self._last.fraction + MIN_FRACTION_STEP:
+            self._emit(replace(self._last, fraction=fraction))
         return self.stopped
 
-    def tell(self, step: Step) -> None:
+    def report(self, step: Step) -> None:
         """Report a step, its fraction raised to that of the step before if it is lower."""
         share = self._share
         fraction = step.fraction if step.stage == "cameras" else share + (1 - share) * step.fraction
-        self._report(replace(step, fraction=max(fraction, self._last.fraction)))
+        self._emit(replace(step, fraction=max(fraction, self._last.fraction)))
         if step.stage != "cameras":
             self._begun, self._expected, self._units = self._last.fraction, REWEIGHTING_UNITS, 0
             self._span = (1 - self._begun) / (2 + max(step.max_reweightings - step.reweighting, 0))
 
-    def _report(self, step: Step) -> None:
+    def _emit(self, step: Step) -> None:
         self._last = step
         if self._on_step is not None:
             self._on_step(step)
 
 
 def _filled(share: float) -> float:
-    """Return the part of a stage done after this share of its expected units: it rises for ever and stays below 1."""
-    return NEARLY * share if share <= 1 else 1 - (1 - NEARLY) / share
+    """Return the completed part of a stage after this share of its expected units: increasing and below 1."""
+    return EXPECTED_SHARE * share if share <= 1 else 1 - (1 - EXPECTED_SHARE) / share

@@ -1,4 +1,4 @@
-"""The door's `solve`: cameras, then shapes, the loop written once."""
+"""`solve`: cameras first, then shapes by iteratively reweighted least squares."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from pliant.solver.cameras.camera_choice import with_camera_choice
 from pliant.solver.cameras.depth_rounds import settled
 from pliant.solver.cameras.estimation import CameraEstimate, estimate_cameras, given_cameras
 from pliant.solver.cameras.isometry import IsometricVerdict, isometric_surface
-from pliant.solver.cameras.joint_refinement import LEARNED_FRAMES, learn, learned_frames, telling_frames
+from pliant.solver.cameras.joint_refinement import LEARNED_FRAMES, informative_frames, learn, learned_frames
 from pliant.solver.cameras.lens import given_lens
 from pliant.solver.cameras.perspective import Perspective, orthographic
-from pliant.solver.cameras.planar_ambiguity import is_flat
-from pliant.solver.energy.hyperparameters import FINEST
+from pliant.solver.cameras.planar_ambiguity import is_planar
+from pliant.solver.energy.hyperparameters import MIN_NOISE_STD
 from pliant.solver.energy.objective import residuals
 from pliant.solver.energy.problem import Problem
 from pliant.solver.energy.robust_loss import largest_weight
 from pliant.solver.errors import InvalidInput, InvalidSettings
 from pliant.solver.evaluation.trust import assess
-from pliant.solver.model.model_order import Support
+from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.monitor import Monitor
 from pliant.solver.records import (
@@ -42,26 +42,27 @@ from pliant.solver.settings import Settings
 from pliant.solver.shapes.initialization import pseudo_inverse, uniform_solution
 from pliant.solver.shapes.irls import init, no_higher, step, terminate
 from pliant.solver.shapes.isometric_solution import centre_downwards, downwards, isometric_solution
-from pliant.solver.shapes.outlier_rejection import without_outliers
+from pliant.solver.shapes.outlier_rejection import reject_outliers
 from pliant.solver.shapes.perspective_shapes import corrected_again, seen_in_perspective
 from pliant.solver.shapes.setup import build_problem, with_bending
-from pliant.solver.shapes.sparsely_observed import SELDOM, OftenSeen, draw_the_rest, often_seen
+from pliant.solver.shapes.sparsely_observed import WELL_OBSERVED_SHARE, WellObserved, place_the_rest, well_observed
 from pliant.solver.shapes.state import State
 from pliant.solver.shapes.uncertainty import bounded_by_neighbours, position_std
 from pliant.solver.tracks.completion import seen_again
-from pliant.solver.tracks.noise import SPOILED
-from pliant.solver.tracks.normalization import Normalised, normalise
+from pliant.solver.tracks.noise import OUTLIER_SHARE
+from pliant.solver.tracks.normalization import Normalized, normalize
 
 CAMERA_UNITS, KNOWN_UNITS = 7000, 800
-"""Iterations and rounds that cameras and covariance take, and the covariance alone: measured 6,300 to 11,000, for progress only."""
+"""Iterations and rounds for cameras and covariance (6,300 to 11,000 occur), and for the covariance alone; used for
+progress only."""
 
 UNIT_SECONDS, FRAME_SECONDS, POINT_SECONDS = 2e-4, 1.2e-5, 8e-6
-"""Seconds of one of them, beside those for each frame learned from, and of the shapes for each frame of each point: measured with
-10 to 357 frames on one core. Only their ratios count, for the share of progress that cameras get."""
+"""Seconds per unit, per unit and frame, and for the shapes per frame and point; from 10 to 357 frames on one core.
+Only their ratios matter, for the cameras' share of the progress."""
 
 DEPTH_ROUNDS, DEPTH_SETTLED = 4, 1e-4
-"""Times that tracks are corrected with the depths of the shapes found, at most, and the RMS change of the corrected tracks, normalised
-units, below which they are not corrected again."""
+"""Maximum number of corrections of the tracks by the depths of the shapes, and the RMS change of the corrected
+tracks, normalized units, below which they end."""
 
 
 def solve(
@@ -86,9 +87,9 @@ def solve(
     settings : Settings, optional
         Method, weights, precision; the defaults are meant to need no change.
     on_step : callable, optional
-        Told after every unit of work.
+        Called after every unit of work.
     should_stop : callable, optional
-        Asked between units of work; once it says True, the solve ends with `Outcome.STOPPED` and the last shapes.
+        Called between units of work; once it returns True, the solve ends with `Outcome.STOPPED` and the last shapes.
 
     Raises
     ------
@@ -102,25 +103,25 @@ def solve(
     settings = settings if settings is not None else Settings()
     _check_fit(tracks, mesh, cameras)
     monitor = _monitored(tracks, cameras, settings, on_step, should_stop)
-    on_step, should_stop, tell = monitor.tell, monitor, monitor.tell
+    on_step, should_stop, report = monitor.report, monitor, monitor.report
     began = time.perf_counter()
-    normalised = normalise(tracks)
-    lens = given_lens(tracks, normalised, settings, cameras)
+    normalized = normalize(tracks)
+    lens = given_lens(tracks, normalized, settings, cameras)
     verdict = _isometric(tracks, cameras, settings, should_stop)
     if verdict is not None and verdict.surface is not None:
         seconds = {"cameras": time.perf_counter() - began}
-        solution = isometric_solution(tracks, verdict, settings, unit=normalised.unit, seconds=seconds)
-        tell(Step("finish", 1.0, max_reweightings=settings.max_reweightings))
+        solution = isometric_solution(tracks, verdict, settings, unit=normalized.unit, seconds=seconds)
+        report(Step("finish", 1.0, max_reweightings=settings.max_reweightings))
         return solution
-    estimate, covariance = _learned(normalised, cameras, settings, lens, on_step=on_step, should_stop=should_stop)
-    tell(Step("cameras", 0.0, max_reweightings=settings.max_reweightings))
+    estimate, covariance = _learned(normalized, cameras, settings, lens, on_step=on_step, should_stop=should_stop)
+    report(Step("cameras", 0.0, max_reweightings=settings.max_reweightings))
     seconds = {"cameras": time.perf_counter() - began}
 
     began = time.perf_counter()
-    flat = orthographic(normalised, estimate.perspective)
+    flat = orthographic(normalized, estimate.perspective)
     start, outliers = _initialised(flat, estimate, covariance, mesh, settings), estimate.outliers
-    if outliers > SPOILED and _resists(start.problem):
-        start = _trimmed(start, outliers, should_stop)
+    if outliers > OUTLIER_SHARE and _resists(start.problem):
+        start = _with_outliers_rejected(start, outliers, should_stop)
         cleaned = _cleaned(tracks, start)
         if cleaned is not None and not (should_stop is not None and should_stop()):
             again = time.perf_counter()
@@ -130,23 +131,23 @@ def solve(
             )  # fmt: skip
             seconds["cameras"] += time.perf_counter() - again
             began += time.perf_counter() - again
-            normalised, flat = cleaned, orthographic(cleaned, estimate.perspective)
+            normalized, flat = cleaned, orthographic(cleaned, estimate.perspective)
             start = _initialised(flat, estimate, covariance, mesh, settings)
-        start = _told_of_outliers(start, tracks, outliers)
+        start = _with_outlier_reason(start, tracks, outliers)
     part, problem, choices, state = start.part, start.problem, start.choices, start.state
-    tell(_told("initialise", state, settings, normalised.unit))
+    report(_step_of("initialise", state, settings, normalized.unit))
     seconds["initialise"] = time.perf_counter() - began
 
     began = time.perf_counter()
     kept = None if part is None else part.kept
-    history, outcome = _loop(problem, [state], settings, normalised.unit, tell, should_stop)
+    history, outcome = _loop(problem, [state], settings, normalized.unit, report, should_stop)
     for _ in range(DEPTH_ROUNDS if estimate.perspective is not None and estimate.perspective.bends else 0):
         if outcome is Outcome.STOPPED:
             break
-        problem, flat, changed = corrected_again(problem, history[-1], normalised, flat, estimate, kept)
+        problem, flat, changed = corrected_again(problem, history[-1], normalized, flat, estimate, kept)
         corrected = init(problem, history[-1].shapes, history[-1].translations)
         history.append(replace(corrected, reweighting=history[-1].reweighting))
-        history, outcome = _loop(problem, history, settings, normalised.unit, tell, should_stop)
+        history, outcome = _loop(problem, history, settings, normalized.unit, report, should_stop)
         if changed < DEPTH_SETTLED:
             break
     if part is not None and covariance is not None:
@@ -155,32 +156,32 @@ def solve(
     seconds["shapes"] = time.perf_counter() - began
 
     began = time.perf_counter()
-    if normalised.visible is not tracks.visible:  # outliers are reported, not hidden
-        normalised = _as_given(normalised, tracks)
+    if normalized.visible is not tracks.visible:  # outliers are reported, not hidden
+        normalized = _as_given(normalized, tracks)
         problem = replace(
-            problem, points=np.ascontiguousarray(normalised.points.transpose(0, 2, 1), dtype=problem.points.dtype)
+            problem, points=np.ascontiguousarray(normalized.points.transpose(0, 2, 1), dtype=problem.points.dtype)
         )
     outcome = Outcome.STOPPED if monitor.stopped else outcome
     choices = with_camera_choice(
-        choices, estimate.perspective, settings, unit=normalised.unit, given=cameras is not None
+        choices, estimate.perspective, settings, unit=normalized.unit, given=cameras is not None
     )
     solution = finish(
-        problem, history, outcome, normalised=normalised, estimate=estimate, choices=choices, seconds=seconds
+        problem, history, outcome, normalized=normalized, estimate=estimate, choices=choices, seconds=seconds
     )
     if estimate.perspective is not None:
-        solution = seen_in_perspective(solution, tracks, estimate.perspective, normalised.unit, kept)
-    solution = assessed(solution, problem, estimate, covariance, normalised.unit, seed=settings.seed)
+        solution = seen_in_perspective(solution, tracks, estimate.perspective, normalized.unit, kept)
+    solution = assessed(solution, problem, estimate, covariance, normalized.unit, seed=settings.seed)
     if verdict is not None:
         solution = replace(solution, choices=_with_verdict(solution.choices, verdict, settings))
     seconds["finish"] = time.perf_counter() - began
-    tell(_told("finish", history[-1], settings, normalised.unit, fraction=1.0))
+    report(_step_of("finish", history[-1], settings, normalized.unit, fraction=1.0))
     return solution
 
 
 def _isometric(
     tracks: Tracks, cameras: KnownCamera | None, settings: Settings, should_stop: Callable[[], bool] | None
 ) -> IsometricVerdict | None:
-    """Return whether the surface is isometric; None where that is not asked."""
+    """Return whether the surface is isometric; None where this is not tested."""
     if settings.surface == "isometric" and cameras is not None:
         raise InvalidSettings(
             "invalid_option", field="options.surface", expected="auto or free where rotations are given", got="'isometric'",
@@ -199,7 +200,7 @@ def _isometric(
 
 
 def _with_verdict(choices: Choices, verdict: IsometricVerdict, settings: Settings) -> Choices:
-    """Return the choices with why the surface is free; a warning where it was required not to be."""
+    """Return the choices with the reason for a free surface, and a warning if an isometric one was required."""
     warnings = choices.warnings
     if settings.surface == "isometric":
         warnings = (*warnings, f"The surface could not be taken as isometric and is free. {verdict.reason}")
@@ -211,10 +212,10 @@ def _with_verdict(choices: Choices, verdict: IsometricVerdict, settings: Setting
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Start:
-    """Where the loop begins."""
+    """Start of the main loop."""
 
-    part: OftenSeen | None
-    """The points that the problem is of; None: all of them."""
+    part: WellObserved | None
+    """The well-observed points, to which the problem is restricted; None for all points."""
 
     problem: Problem
     choices: Choices
@@ -222,7 +223,7 @@ class _Start:
 
 
 def _learned(
-    normalised: Normalised,
+    normalized: Normalized,
     cameras: KnownCamera | None,
     settings: Settings,
     lens: Perspective | None,
@@ -231,82 +232,83 @@ def _learned(
     should_stop: Callable[[], bool] | None,
     before: CameraEstimate | None = None,
 ) -> tuple[CameraEstimate, ShapeCovariance | None]:
-    """Return the cameras, and the covariance of the shapes if that is the prior; `before`: as they were with outliers."""
+    """Return the cameras, and the covariance of the shapes if it is the prior; `before` is the estimate with outliers."""
     rank = 0 if before is None else before.rank
     if cameras is not None:
-        estimate = given_cameras(normalised, cameras, settings, rank=rank)
+        estimate = given_cameras(normalized, cameras, settings, rank=rank)
     else:
-        estimate = estimate_cameras(normalised, settings, on_step=on_step, should_stop=should_stop, rank=rank)
+        estimate = estimate_cameras(normalized, settings, on_step=on_step, should_stop=should_stop, rank=rank)
     if before is not None:
         estimate = replace(estimate, outliers=max(estimate.outliers, before.outliers))
     estimate = replace(estimate, perspective=lens)
-    shown = telling_frames(normalised.visible)
+    shown = informative_frames(normalized.visible)
     if not settings.gaussian:
         if lens is not None:
             estimate = settled(
-                estimate, normalised, learned_frames(shown), support=Support(), turning=cameras is None and settings.refine_rotations,
+                estimate, normalized, learned_frames(shown), model_order=ModelOrder(),
+                turning=cameras is None and settings.refine_rotations,
                 should_stop=should_stop,
             )  # fmt: skip
         return estimate, None
-    # The sides of a thin sheet hang on little; what completion puts in the place of outliers is enough to turn them over.
-    spoiled_sheet = estimate.outliers > SPOILED and is_flat(estimate.gram)
+    # The pose signs of a plane are weakly determined; completed outliers are enough to flip them.
+    corrupted_plane = estimate.outliers > OUTLIER_SHARE and is_planar(estimate.gram)
     return learn(
         estimate,
         shown,
-        turning=cameras is None and settings.refine_rotations and not spoiled_sheet,
-        zooming=settings.zooming,
+        turning=cameras is None and settings.refine_rotations and not corrupted_plane,
+        estimates_scales=settings.estimates_scales,
         seed=settings.seed,
-        normalised=normalised,
+        normalized=normalized,
         should_stop=should_stop,
     )
 
 
 def _initialised(
-    normalised: Normalised,
+    normalized: Normalized,
     estimate: CameraEstimate,
     covariance: ShapeCovariance | None,
     mesh: Mesh | None,
     settings: Settings,
 ) -> _Start:
-    part = None if covariance is None or settings.temporal_weight == 0 else often_seen(normalised, mesh)
+    part = None if covariance is None or settings.temporal_weight == 0 else well_observed(normalized, mesh)
     if part is None:
-        problem, choices = build_problem(normalised, estimate, mesh, settings, covariance)
+        problem, choices = build_problem(normalized, estimate, mesh, settings, covariance)
     else:
-        problem, choices = build_problem(part.normalised, estimate, part.mesh, settings, covariance)
+        problem, choices = build_problem(part.normalized, estimate, part.mesh, settings, covariance)
     return _Start(part, *with_bending(problem, choices, _start(problem, estimate, settings), settings))
 
 
 def _resists(problem: Problem) -> bool:
-    """Whether outliers are taken out; the paper's prior keeps them, and so does one of no weight."""
+    """Whether outliers are rejected: only with a Gaussian prior of positive weight."""
     return problem.quadratic is not None and problem.weights.temporal > 0
 
 
-def _trimmed(start: _Start, outliers: float, should_stop: Callable[[], bool] | None) -> _Start:
-    kept, state = without_outliers(start.problem, start.state, outliers, should_stop=should_stop)
+def _with_outliers_rejected(start: _Start, outliers: float, should_stop: Callable[[], bool] | None) -> _Start:
+    kept, state = reject_outliers(start.problem, start.state, outliers, should_stop=should_stop)
     return replace(start, problem=kept, state=state)
 
 
-def _cleaned(tracks: Tracks, start: _Start) -> Normalised | None:
-    """Return the tracks with what was left out hidden, to begin anew from; None if nothing was, or too little would be left.
+def _cleaned(tracks: Tracks, start: _Start) -> Normalized | None:
+    """Return the tracks with rejected observations hidden, to start again; None if none were rejected or too few points remain.
 
-    What a camera's estimate puts in the place of an outlier that it has not recognised bends everything after it. Measured, faces
-    with 10 % outliers: 10 frames .072 → .059, 99 frames .028 → .017.
+    An unrecognised outlier biases the completion and everything after it. Faces with 10 % outliers: .072 without a
+    second start, .059 with it.
     """
     visible = _kept(tracks, start)
     if (visible == tracks.visible).all() or seen_again(visible) < MIN_POINTS:
         return None
-    return normalise(Tracks.from_arrays(tracks.points, visible))
+    return normalize(Tracks.from_arrays(tracks.points, visible))
 
 
 def _kept(tracks: Tracks, start: _Start) -> Floats:
-    """Return the confidence of the tracks without what was left out, shape `(F, P)`."""
+    """Return the confidence of the tracks without rejected observations, shape `(F, P)`."""
     visible = np.array(tracks.visible)
     points = slice(None) if start.part is None else start.part.kept
     visible[:, points] = np.where(start.problem.confidence > 0, visible[:, points], 0.0)
     return visible
 
 
-def _told_of_outliers(start: _Start, tracks: Tracks, outliers: float) -> _Start:
+def _with_outlier_reason(start: _Start, tracks: Tracks, outliers: float) -> _Start:
     share = 1 - np.count_nonzero(_kept(tracks, start)) / np.count_nonzero(tracks.visible)
     reason = (
         f"{share:.1%} of what was seen is left out as gross outliers; {outliers:.1%} looked like it before the fit."
@@ -315,14 +317,14 @@ def _told_of_outliers(start: _Start, tracks: Tracks, outliers: float) -> _Start:
     return replace(start, choices=choices)
 
 
-def _as_given(normalised: Normalised, tracks: Tracks) -> Normalised:
-    """Return all that was given in the units and about the centroids of what is left of it."""
-    points = (tracks.points - normalised.centroid[:, None]) / normalised.unit
-    return replace(normalised, points=np.where(tracks.visible[..., None] > 0, points, 0.0), visible=tracks.visible)
+def _as_given(normalized: Normalized, tracks: Tracks) -> Normalized:
+    """Return all observations in the unit and about the centroids of the remaining ones."""
+    points = (tracks.points - normalized.centroid[:, None]) / normalized.unit
+    return replace(normalized, points=np.where(tracks.visible[..., None] > 0, points, 0.0), visible=tracks.visible)
 
 
 def _with_the_rest(
-    part: OftenSeen,
+    part: WellObserved,
     whole: Problem,
     covariance: ShapeCovariance,
     problem: Problem,
@@ -330,17 +332,17 @@ def _with_the_rest(
     state: State,
     outliers: float,
 ) -> tuple[Problem, Choices, State]:
-    """Return problem and state of all points from those of the points often seen, and the reason."""
+    """Return problem, choices and state of all points, given those of the well-observed points."""
     confidence = whole.confidence.copy()
     confidence[:, part.kept] = problem.confidence
     whole = replace(whole, confidence=confidence)
-    seldom, never = 1 - len(part.kept) / confidence.shape[1], float((confidence == 0).all(axis=0).mean())
-    whole, state = draw_the_rest(part, whole, covariance, state, spoiled=outliers > SPOILED)
+    sparse, never = 1 - len(part.kept) / confidence.shape[1], float((confidence == 0).all(axis=0).mean())
+    whole, state = place_the_rest(part, whole, covariance, state, spoiled=outliers > OUTLIER_SHARE)
     reason = (
-        f"{seldom:.1%} of the points were seen in fewer than {SELDOM:.0%} of the frames ({never:.1%} in none): drawn along the "
-        "surface, then moved to what was seen of them."
+        f"{sparse:.1%} of the points were seen in fewer than {WELL_OBSERVED_SHARE:.0%} of the frames ({never:.1%} in none): "
+        "placed on the surface, then moved to their observations."
     )
-    return whole, replace(choices, reasons={**choices.reasons, "seldom_seen": reason}), state
+    return whole, replace(choices, reasons={**choices.reasons, "sparsely_observed": reason}), state
 
 
 def _loop(
@@ -348,10 +350,10 @@ def _loop(
     history: list[State],
     settings: Settings,
     unit: float,
-    tell: Callable[[Step], None],
+    report: Callable[[Step], None],
     should_stop: Callable[[], bool] | None,
 ) -> tuple[list[State], Outcome]:
-    """Step until `terminate` says how it ended. Only the newest state keeps its arrays."""
+    """Step until `terminate` returns an outcome. Only the newest state keeps its arrays."""
     if settings.method == "pseudo_inverse":
         return history, Outcome.CONVERGED
     while True:
@@ -362,7 +364,7 @@ def _loop(
         after = no_higher(before, computed)
         history[-1] = before.summary()
         history.append(after)
-        tell(_told("reweight", after, settings, unit))
+        report(_step_of("reweight", after, settings, unit))
         outcome = terminate(before, computed, tolerance=settings.tolerance, max_reweightings=settings.max_reweightings)
         if outcome is not None:
             return history, outcome
@@ -373,15 +375,15 @@ def finish(
     history: list[State],
     outcome: Outcome,
     *,
-    normalised: Normalised,
+    normalized: Normalized,
     estimate: CameraEstimate,
     choices: Choices,
     seconds: dict[str, float],
 ) -> Solution:
     """Turn the last state into a Solution in the tracks' unit."""
-    state, unit = history[-1], normalised.unit
+    state, unit = history[-1], normalized.unit
     left = residuals(problem, state.shapes, state.translations).astype(np.float64)
-    seen = normalised.visible > 0
+    seen = normalized.visible > 0
     length = np.where(seen, np.hypot(left[:, 0], left[:, 1]), 0.0)
     top = largest_weight(problem.loss, problem.weights.robust_scale)
     trust = np.where(seen, state.omega.mean(axis=1, dtype=np.float64) / top, 0.0)
@@ -389,7 +391,7 @@ def finish(
     camera = Camera(
         np.array(estimate.rotations, dtype=np.float64),
         np.array(estimate.scales, dtype=np.float64),
-        normalised.centroid + unit * state.translations,
+        normalized.centroid + unit * state.translations,
     )
     trace = Trace(
         np.array([s.objective for s in history]),
@@ -404,8 +406,8 @@ def finish(
 
 
 INFLATION = 1.6
-"""Factor from the posterior standard deviation with known cameras and prior to one with estimated ones. Chosen on ten face scans and
-face landmarks, clean and corrupted, whose errors exceed the posterior's 90 % quantile by 1.3 to 2."""
+"""Factor from the posterior standard deviation with known cameras and prior to that with estimated ones. On ten face
+scans and face landmarks, clean and corrupted, errors exceed the posterior's 90 % quantile by 1.3 to 2."""
 
 
 def assessed(
@@ -422,7 +424,7 @@ def assessed(
     confidence = np.asarray(problem.confidence, dtype=np.float64)
     if covariance is not None:
         projections = np.asarray(estimate.scales)[:, None, None] * np.asarray(estimate.rotations)[:, :2]
-        noise = max(covariance.noise**0.5, FINEST)
+        noise = max(covariance.noise_variance**0.5, MIN_NOISE_STD)
         std = INFLATION * unit * position_std(covariance, projections, confidence, noise_std=noise, seed=seed)
         std = bounded_by_neighbours(std, solution.shapes, confidence)
         modes = covariance.modes.shape[1]
@@ -434,7 +436,7 @@ def assessed(
         confidence,
         scales=solution.camera.scales,
         shapes_std=std,
-        planar=is_flat(estimate.gram),
+        planar=is_planar(estimate.gram),
         modes=modes,
     )
     return replace(solution, shapes_std=std, trust=trust)
@@ -460,7 +462,7 @@ def _check_fit(tracks: Tracks, mesh: Mesh | None, cameras: KnownCamera | None) -
         )  # fmt: skip
 
 
-def _told(stage: str, state: State, settings: Settings, unit: float, *, fraction: float | None = None) -> Step:
+def _step_of(stage: str, state: State, settings: Settings, unit: float, *, fraction: float | None = None) -> Step:
     done = 0.95 * min(1.0, (1 + state.reweighting) / (1 + settings.max_reweightings))
     return Step(
         stage,
@@ -479,7 +481,7 @@ def _monitored(
     on_step: Callable[[Step], None] | None,
     should_stop: Callable[[], bool] | None,
 ) -> Monitor:
-    """Return what counts the solve's progress: the cameras' share of it follows from the sizes."""
+    """Return the monitor of the solve; the cameras' share of the progress follows from the sizes."""
     learning = settings.gaussian
     units = (CAMERA_UNITS if learning else CAMERA_UNITS // 5) if cameras is None else KNOWN_UNITS if learning else 1
     each = UNIT_SECONDS + FRAME_SECONDS * min(tracks.num_frames, LEARNED_FRAMES)

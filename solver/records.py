@@ -361,7 +361,7 @@ class Step:
     """Upper bound."""
 
     objective: float | None = None
-    """E after this step, normalised units; None before there is one."""
+    """E after this step, normalized units; None before there is one."""
 
     residual: float | None = None
     """Median visible reprojection residual, the tracks' unit; None before there is one."""
@@ -372,7 +372,7 @@ class Trace:
     """Per-reweighting history, arrays of equal length; entry 0 is the initialisation."""
 
     objective: Floats
-    """E, normalised units; never rises, but where tracks are corrected anew for perspective."""
+    """E, normalized units; never rises, but where tracks are corrected anew for perspective."""
 
     residual: Floats
     """Median visible reprojection residual, the tracks' unit."""
@@ -407,7 +407,7 @@ class Choices:
     low_rank_weight: float
     laplacian: str
     unit: float
-    """RMS radius of the centred tracks, the tracks' unit: one normalised unit."""
+    """RMS radius of the centred tracks, the tracks' unit: one normalized unit."""
     noise: float
     """Estimated standard deviation of the track noise, the tracks' unit."""
     camera: str = "scaled_orthographic"

@@ -1,6 +1,6 @@
 """The one record of settings; every field is explained by its formula.
 
-The energy that these settings shape, in normalised units (per-frame centroid of the visible points removed, then
+The energy that these settings shape, in normalized units (per-frame centroid of the visible points removed, then
 divided by the RMS of what is left; λ is therefore dimensionless)::
 
     E(S) = Σ_fp v_fp ρ(w_fp − s_f R_f S_fp)  +  λ1 ‖H S‖_F²  +  λ2 ‖A vec(S)‖²  (+ λ3 Σ_i log-det-like rank penalty)
@@ -76,7 +76,7 @@ class Settings:
     """λ2, dimensionless; None takes the preset's. Unused without a mesh."""
 
     robust_scale: float | None = None
-    """ε of the smoothed L1 (r ↦ √(r² + ε²)) or δ of Huber, in normalised units; None takes the preset's."""
+    """ε of the smoothed L1 (r ↦ √(r² + ε²)) or δ of Huber, in normalized units; None takes the preset's."""
 
     temporal_order: Literal[1, 2] | None = None
     """Order of the difference operator H; None takes the preset's. Without effect, and said so, with the Gaussian prior."""
@@ -123,7 +123,7 @@ class Settings:
         return self.prior == "gaussian" and self.method == "robust" and self.preset == "auto"
 
     @property
-    def zooming(self) -> bool:
+    def estimates_scales(self) -> bool:
         """True if every frame may have its own scale."""
         return self.camera != "orthographic"
 

@@ -25,7 +25,7 @@ def with_camera_choice(
     settings : Settings
         Of the solve.
     unit : float
-        One normalised unit in the tracks' unit.
+        One normalized unit in the tracks' unit.
     given : bool
         Whether rotations were given, which settles the sign of depth.
     """

@@ -21,11 +21,11 @@ from pliant.solver.cameras.perspective import (
     depths_of,
     mirrored,
 )
-from pliant.solver.model.model_order import Support
+from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.shape_covariance import ShapeCovariance, annealed
 from pliant.solver.model.so3 import exponential, logarithm
 from pliant.solver.records import Floats, read_only
-from pliant.solver.tracks.normalization import Normalised
+from pliant.solver.tracks.normalization import Normalized
 
 ROUNDS = 3
 """Updates of depths, covariance, cameras and κ every time that cameras were found or refined."""
@@ -36,10 +36,10 @@ LEARNING = 60
 
 def settled(
     estimate: CameraEstimate,
-    normalised: Normalised,
+    normalized: Normalized,
     used: NDArray[np.intp],
     *,
-    support: Support,
+    model_order: ModelOrder,
     turning: bool,
     should_stop: Callable[[], bool] | None = None,
 ) -> CameraEstimate:
@@ -49,11 +49,11 @@ def settled(
     ----------
     estimate : CameraEstimate
         Of the tracks as they are, with `perspective` as far as it is given.
-    normalised : Normalised
+    normalized : Normalized
         The tracks as they are.
     used : array of int, shape (F',)
         Frames to learn from.
-    support : Support
+    model_order : Support
         Modes at most, and the noise to begin with.
     turning : bool
         False leaves the rotations, but for the sign of depth.
@@ -67,7 +67,7 @@ def settled(
     )  # fmt: skip
     rotations, scales = np.asarray(estimate.rotations), np.asarray(estimate.scales)
     view, covariance = search(
-        view.sample[used], rotations[used], scales[used], view, support=support, should_stop=should_stop
+        view.sample[used], rotations[used], scales[used], view, model_order=model_order, should_stop=should_stop
     )
     if not view.bends:
         return replace(estimate, perspective=view)
@@ -80,19 +80,19 @@ def settled(
     for _ in range(ROUNDS):
         if should_stop is not None and should_stop():
             break
-        found = _relearned(view, found, used, support)
+        found = _relearned(view, found, used, model_order)
         found, view = _with_focal(view, found, used, turning=turning)
-    return _applied(estimate, normalised, used, found, view)
+    return _applied(estimate, normalized, used, found, view)
 
 
 def settled_again(
     estimate: CameraEstimate,
-    normalised: Normalised,
+    normalized: Normalized,
     used: NDArray[np.intp],
     found: Learned,
     scales: Floats,
     *,
-    support: Support,
+    model_order: ModelOrder,
     should_stop: Callable[[], bool] | None = None,
 ) -> tuple[CameraEstimate, Learned]:
     """Return the estimate with tracks corrected anew, now that cameras and covariance are refined, and both refined once more.
@@ -105,9 +105,9 @@ def settled_again(
     for _ in range(ROUNDS):
         if should_stop is not None and should_stop():
             break
-        whole = _relearned(view, whole, used, support)
+        whole = _relearned(view, whole, used, model_order)
         whole, view = _with_focal(view, whole, used, turning=True)
-    return _applied(estimate, normalised, used, whole, view), replace(whole, scales=whole.scales / scales)
+    return _applied(estimate, normalized, used, whole, view), replace(whole, scales=whole.scales / scales)
 
 
 def with_depth_map(estimate: CameraEstimate, covariance: ShapeCovariance) -> CameraEstimate:
@@ -119,13 +119,17 @@ def with_depth_map(estimate: CameraEstimate, covariance: ShapeCovariance) -> Cam
     return replace(estimate, perspective=replace(view, depth=depth))
 
 
-def _relearned(view: Perspective, found: Learned, used: NDArray[np.intp], support: Support) -> Learned:
+def _relearned(view: Perspective, found: Learned, used: NDArray[np.intp], model_order: ModelOrder) -> Learned:
     views = view.sample[used]
     depths = depths_of(depth_map(found.rotations, found.scales, found.covariance), views, view.curvature)
     rows = columns(centred(corrected(views, depths, view.curvature)))
-    pairs = found.rotations[:, :2] * found.scales[:, None, None]
+    projections = found.rotations[:, :2] * found.scales[:, None, None]
     covariance = annealed(
-        rows @ rows.T / rows.shape[1], pairs, most=support.most, noisy=support.noisy, iterations=LEARNING
+        rows @ rows.T / rows.shape[1],
+        projections,
+        max_modes=model_order.max_modes,
+        noisy_start=model_order.noisy_start,
+        iterations=LEARNING,
     )
     return replace(found, covariance=covariance)
 
@@ -141,17 +145,17 @@ def _with_focal(
 
 
 def _applied(
-    estimate: CameraEstimate, normalised: Normalised, used: NDArray[np.intp], found: Learned, view: Perspective
+    estimate: CameraEstimate, normalized: Normalized, used: NDArray[np.intp], found: Learned, view: Perspective
 ) -> CameraEstimate:
     """Return the estimate with the cameras found, and with Gram matrix, sample and translations of the corrected tracks."""
-    frames = len(normalised.points)
+    frames = len(normalized.points)
     before = np.asarray(estimate.rotations)
     turns = logarithm(found.rotations @ before[used].transpose(0, 2, 1))
     rotations = exponential(between(used, turns, frames)) @ before
     scales = np.exp(between(used, np.log(found.scales)[:, None], frames)[:, 0])
     covariance = found.covariance if len(used) == frames else found.covariance.stretched(used, frames)
     view = replace(view, depth=depth_map(rotations, scales, covariance))
-    gram, translations, sample = corrected_moments(view, normalised)
+    gram, translations, sample = corrected_moments(view, normalized)
     read_only(rotations)
     return replace(
         estimate, rotations=rotations, gram=gram, translations=translations, sample=sample, perspective=view

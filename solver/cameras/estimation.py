@@ -7,34 +7,44 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from pliant.solver.cameras.factorization import Upgrade, upgrade
-from pliant.solver.cameras.multistart import CANDIDATES, Candidate, carried, depth, frames_used, gram_of, held, race
+from pliant.solver.cameras.multistart import (
+    CANDIDATES,
+    Candidate,
+    carried,
+    depth,
+    frames_used,
+    gram_of,
+    run_multistart,
+    with_fixed_rotations,
+)
 from pliant.solver.cameras.perspective import Perspective
-from pliant.solver.cameras.planar_ambiguity import is_flat, on_its_sides
+from pliant.solver.cameras.planar_ambiguity import is_planar, resolve_pose_signs
 from pliant.solver.cameras.scale import rigid_evidence, rigid_scales
 from pliant.solver.model.so3 import angles_between, start_at_identity
 from pliant.solver.records import Floats, KnownCamera, Step, read_only
 from pliant.solver.settings import Settings
 from pliant.solver.tracks.completion import Completed, Filling, complete
-from pliant.solver.tracks.normalization import Normalised
+from pliant.solver.tracks.normalization import Normalized
 
-SHARE = 0.03
-"""Fraction reported at the end, beside what is counted by `should_stop` (`solver.monitor`)."""
+PROGRESS_SHARE = 0.03
+"""Fraction of progress reported at the end of this stage, besides the units counted by `should_stop`
+(`solver.monitor`)."""
 
-HARDLY = np.radians(10.0)
-"""Largest turn between any frame and the first below which the user is warned."""
+MIN_CAMERA_TURN = np.radians(10.0)
+"""Rotation between the first and any other frame, rad, below which the user is warned."""
 
-NEARLY = 0.05
-"""Energy, after the first heat, above the lowest up to which a factorization's own cameras are a start for the refinement with the
-shapes. Measured: the false one that flattens a shark is .10 above, one that bends a face .34; true ones up to .05."""
+MAX_HYPOTHESIS_GAP = 0.05
+"""Energy above the lowest after the first round up to which a factorization's own cameras stay a hypothesis for the
+refinement with shapes. True cameras are up to .05 above, false ones .10 and more."""
 
-TOO_DEEP = 4.0
-"""Mean squared depth of the closed form, normalised units, from which cameras are no start: they hardly turn. Measured: a horse seen
-from its short side 1.8, false cameras of ten faces 144."""
+MAX_START_DEPTH_VARIANCE = 4.0
+"""Mean squared depth of the closed form, normalized units, above which cameras are no start because they hardly
+rotate: 1.8 for a horse seen from its short side, 144 for false cameras of faces."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraEstimate:
-    """The cameras, and how they were found."""
+    """The cameras and how they were found."""
 
     rotations: Floats
     """Camera from world, shape `(F, 3, 3)`; the first is the identity."""
@@ -43,66 +53,67 @@ class CameraEstimate:
     """Shape `(F,)`, mean of the logarithm 0."""
 
     translations: Floats
-    """Correction to the centroid, normalised units, shape `(F, 2)`."""
+    """Correction to the centroid, normalized units, shape `(F, 2)`."""
 
     basis_size: int
     """K of the factorization; 0 for given cameras."""
 
     gram: Floats
-    """W Wᵀ / P of the completed tracks, shape `(2F, 2F)`, normalised units; empty where nothing asks for it."""
+    """W Wᵀ / P of the completed tracks, shape `(2F, 2F)`, normalized units; empty where it is not needed."""
 
     sample: Floats
-    """Some points of the completed tracks, centred, shape `(F, S, 2)`, normalised units; empty where nothing asks for it."""
+    """Some points of the completed tracks, centred, shape `(F, S, 2)`, normalized units; empty where it is not
+    needed."""
 
-    rivals: tuple[tuple[int, Floats], ...] = ()
-    """K and rotations `(F, 3, 3)`, not refined, of the factorizations that are about as probable."""
+    hypotheses: tuple[tuple[int, Floats], ...] = ()
+    """K and rotations `(F, 3, 3)`, not refined, of factorizations that are about as probable."""
 
     outliers: float = 0.0
-    """Share of the seen entries that completion replaced as gross outliers."""
+    """Share of the visible entries that completion replaced as gross outliers."""
 
     rank: int = 0
-    """Columns of the basis that filled the holes; 0 when nothing was filled."""
+    """Columns of the basis that filled hidden entries; 0 if nothing was filled."""
 
     filling: Filling | None = None
-    """How hidden entries and outliers were replaced; None: nothing was."""
+    """How hidden entries and outliers were replaced; None if nothing was."""
 
     perspective: Perspective | None = None
-    """What is known about perspective; None: it is not considered. With κ ≠ 0, `gram`, `sample` and `translations` are those of the
-    corrected tracks."""
+    """The perspective correction; None if perspective is not considered. With κ ≠ 0, `gram`, `sample` and
+    `translations` are those of the corrected tracks."""
 
     reasons: dict[str, str] = field(default_factory=dict)
     """One sentence for each choice."""
 
     warnings: tuple[str, ...] = ()
-    """What the user should know before trusting the result."""
+    """Reasons to distrust the result."""
 
 
 def estimate_cameras(
-    normalised: Normalised,
+    normalized: Normalized,
     settings: Settings,
     *,
     on_step: Callable[[Step], None] | None = None,
     should_stop: Callable[[], bool] | None = None,
     rank: int = 0,
 ) -> CameraEstimate:
-    """Return the cameras of the tracks, without anything known about the shapes.
+    """Return the cameras of the tracks, estimated without a model of the shapes.
 
     Parameters
     ----------
-    normalised : Normalised
+    normalized : Normalized
         Centred tracks; hidden entries and gross outliers are filled first.
     settings : Settings
         `camera`, `basis_size`, `refine_rotations`, `seed`.
     on_step : callable, optional
-        Told after completion and after every factorization; fractions run from 0 to `SHARE`.
+        Called after completion and after every factorization; fractions run from 0 to `PROGRESS_SHARE`.
     should_stop : callable, optional
-        Asked between units of work; once it says True, the best cameras so far are returned.
+        Called between units of work; once it returns True, the best cameras so far are returned.
     rank : int
         Of the completion, as an earlier estimate from these tracks had it; 0 chooses it.
     """
-    tell = on_step if on_step is not None else _silent
-    completed = complete(normalised, seed=settings.seed, rank=rank)
-    tell(Step("cameras", 0.4 * SHARE))
+    report = on_step if on_step is not None else _silent
+    completed = complete(normalized, seed=settings.seed, rank=rank)
+    report(Step("cameras", 0.4 * PROGRESS_SHARE))
     scales, scale_reason = rigid_evidence(completed.gram, settings)
     gram = completed.gram / np.outer(np.repeat(scales, 2), np.repeat(scales, 2))
     used = frames_used(len(scales))
@@ -114,35 +125,35 @@ def estimate_cameras(
             break
         upgrades.append(upgrade(gram, size))
         entries.append(
-            held(
+            with_fixed_rotations(
                 part, _thinned(upgrades[-1], used), np.ones(len(part) // 2), with_scales=False, should_stop=should_stop
             )
         )
-        tell(Step("cameras", (0.4 + 0.04 * len(entries)) * SHARE))
+        report(Step("cameras", (0.4 + 0.04 * len(entries)) * PROGRESS_SHARE))
     best, ran = min(entries, key=lambda candidate: candidate.energy), entries
     if settings.refine_rotations:
-        best, ran = race(part, entries, should_stop=should_stop)
+        best, ran = run_multistart(part, entries, should_stop=should_stop)
     own = next(each for each in upgrades if each.basis_size == best.basis_size)
-    tell(Step("cameras", 0.8 * SHARE))
+    report(Step("cameras", 0.8 * PROGRESS_SHARE))
     rotations, refined = _everywhere(own.rotations, best, used, settings)
-    rivals: tuple[tuple[int, Floats], ...] = ()
-    if settings.refine_rotations and is_flat(gram):
-        rotations, sheet = on_its_sides(gram, rotations, should_stop=should_stop)
+    hypotheses: tuple[tuple[int, Floats], ...] = ()
+    if settings.refine_rotations and is_planar(gram):
+        rotations, sheet = resolve_pose_signs(gram, rotations, should_stop=should_stop)
         refined = f"{refined} {sheet}"
     elif settings.refine_rotations:
-        rivals = _rivals(upgrades, ran, part, used)
+        hypotheses = _hypotheses(upgrades, ran, part, used)
     read_only(rotations)
     read_only(scales)
-    tell(Step("cameras", SHARE))
+    report(Step("cameras", PROGRESS_SHARE))
     reasons = {"basis_size": _why(ran, best, settings), "scales": scale_reason, "rotations": refined}
     return CameraEstimate(
         rotations, scales, completed.translations, best.basis_size, completed.gram, completed.sample,
-        rivals, completed.outliers, completed.rank, completed.filling, None, reasons, _warnings(rotations),
+        hypotheses, completed.outliers, completed.rank, completed.filling, None, reasons, _warnings(rotations),
     )  # fmt: skip
 
 
 def restarted(estimate: CameraEstimate, size: int, rotations: Floats) -> CameraEstimate:
-    """Return the estimate with the rotations of the factorization with K = `size`, as they came."""
+    """Return the estimate with the unrefined rotations of the factorization with K = `size`."""
     known = estimate.reasons.get("basis_size", "")
     why = f"{known} With the shapes, the rotations of K = {size} as they came lead to more probable motion."
     return replace(
@@ -154,19 +165,21 @@ def restarted(estimate: CameraEstimate, size: int, rotations: Floats) -> CameraE
     )
 
 
-def _rivals(upgrades: list[Upgrade], ran: list[Candidate], gram: Floats, used: slice) -> tuple[tuple[int, Floats], ...]:
-    """Return K and rotations of the factorizations that the first heat led to nearly the lowest energy, if not far too deep."""
+def _hypotheses(
+    upgrades: list[Upgrade], ran: list[Candidate], gram: Floats, used: slice
+) -> tuple[tuple[int, Floats], ...]:
+    """Return K and rotations of factorizations that reached nearly the lowest energy in the first round and are not too deep."""
     lowest = min(candidate.energy for candidate in ran)
-    near = {each.basis_size for each in ran if not each.steadied and each.energy <= lowest + NEARLY}
+    near = {each.basis_size for each in ran if not each.smooth_start and each.energy <= lowest + MAX_HYPOTHESIS_GAP}
     return tuple(
         (each.basis_size, each.rotations)
         for each in upgrades
-        if each.basis_size in near and depth(gram, each.rotations[used]) < TOO_DEEP
+        if each.basis_size in near and depth(gram, each.rotations[used]) < MAX_START_DEPTH_VARIANCE
     )
 
 
 def _everywhere(before: Floats, best: Candidate, used: slice, settings: Settings) -> tuple[Floats, str]:
-    """Return the rotations of all frames, given those of the frames that raced, and a sentence."""
+    """Return the rotations of all frames, given those of the frames in the multistart, and a sentence."""
     if not settings.refine_rotations:
         return before, "Rotations are those of the factorization."
     after = carried(before, best.cameras[0], used)
@@ -174,7 +187,7 @@ def _everywhere(before: Floats, best: Candidate, used: slice, settings: Settings
         return before, "A refinement was tried and refused: it left the finite numbers."
     after = start_at_identity(after)
     turn = float(np.degrees(angles_between(after, before).mean()))
-    how = ", from a steadied start" if best.steadied else ""
+    how = ", from a steadied start" if best.smooth_start else ""
     return after, f"Refined by variable projection{how}; rotations moved by {turn:.2f}° on average."
 
 
@@ -182,25 +195,24 @@ def _thinned(full: Upgrade, used: slice) -> Upgrade:
     return Upgrade(full.basis_size, full.rotations[used], full.scales[used], full.residual)
 
 
-def given_cameras(normalised: Normalised, known: KnownCamera, settings: Settings, *, rank: int = 0) -> CameraEstimate:
-    """Return given cameras as an estimate; scales that are not given are estimated if the camera model has them.
+def given_cameras(normalized: Normalized, known: KnownCamera, settings: Settings, *, rank: int = 0) -> CameraEstimate:
+    """Return given cameras as an estimate; missing scales are estimated if the camera model has them.
 
-    They are then those with which one rigid shape explains the tracks best: Σ_f ‖W_f − s_f R_f S‖². Shrinking them all gains
-    nothing, for S grows in return.
+    Estimated scales are those with which one rigid shape explains the tracks best: Σ_f ‖W_f − s_f R_f S‖² is least. A
+    common factor of all scales has no effect, because S compensates it.
 
-    Where scales are known, the prior does not ask for the tracks' Gram matrix, and translations are found with the shapes, the tracks
-    are not completed: that could take longer than the shapes. Measured with half of the points hidden: shapes the same to four digits.
-    `rank` is as for `estimate_cameras`.
+    Where scales are known, the prior does not need the tracks' Gram matrix and translations are estimated with the
+    shapes, completion is skipped, because it could take longer than the shapes. `rank` is as for `estimate_cameras`.
     """
     frames = len(known.rotations)
     exact = known.scales is not None or settings.camera == "orthographic"
     if exact and not settings.gaussian and settings.method != "pseudo_inverse":
         completed = Completed(np.zeros((0, 0)), np.zeros((frames, 0, 2)), np.zeros((frames, 2)), 0, 0.0)
     else:
-        completed = complete(normalised, seed=settings.seed, rank=rank)
+        completed = complete(normalized, seed=settings.seed, rank=rank)
     if known.scales is not None:
         scales, reason = np.array(known.scales), "Rotations and scales were given."
-    elif settings.zooming:
+    elif settings.estimates_scales:
         scales = rigid_scales(completed.gram, known.rotations)
         reason = "Rotations were given; scales were estimated."
     else:
@@ -230,14 +242,16 @@ def _why(ran: list[Candidate], best: Candidate, settings: Settings) -> str:
     size = best.basis_size
     if settings.basis_size is not None:
         return f"K = {size} as set."
-    tried = ", ".join(f"{each.basis_size}{' steadied' if each.steadied else ''}: {each.energy:.3f}" for each in ran)
+    tried = ", ".join(
+        f"{each.basis_size}{' smooth_start' if each.smooth_start else ''}: {each.energy:.3f}" for each in ran
+    )
     return (
         f"K = {size} leads to the most probable motion under the steadiest camera (negative log-likelihood: {tried})."
     )
 
 
 def _warnings(rotations: Floats) -> tuple[str, ...]:
-    if angles_between(rotations, rotations[:1]).max() >= HARDLY:
+    if angles_between(rotations, rotations[:1]).max() >= MIN_CAMERA_TURN:
         return ()
     return ("The camera hardly turns about the object: depth cannot be told from the tracks and is a guess.",)
 

@@ -25,7 +25,7 @@ Upper = tuple[NDArray[np.intp], NDArray[np.intp]]
 TRACE_WEIGHT = 1e-3
 """μ of ½‖A(Q) − b‖²/F + μ tr Q; small, for the constraints come first."""
 
-ROUNDS = 300
+TRACE_ITERATIONS = 300
 """Rounds of the alternating direction method; the factor's refinement makes more of them useless."""
 
 SOFTENING = 0.05
@@ -94,7 +94,7 @@ def least_trace_factor(factor: Floats, trace_weight: float = TRACE_WEIGHT) -> Fl
     inverse = np.linalg.inv(normal + penalty * np.eye(len(normal)))
     copy = np.zeros(len(normal))
     dual = np.zeros(len(normal))
-    for _ in range(ROUNDS):
+    for _ in range(TRACE_ITERATIONS):
         solved = inverse @ (right + penalty * (copy - dual))
         values, vectors = np.linalg.eigh(_unfold(solved + dual, upper, stretch, size))
         values = np.maximum(values - trace_weight / penalty, 0.0)

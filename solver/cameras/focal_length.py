@@ -30,8 +30,8 @@ from pliant.solver.cameras.perspective import (
     depth_map,
     depths_of,
 )
-from pliant.solver.model.marginal_likelihood import STEADINESS, UNLIKELY, Motion, energy_with_inverse
-from pliant.solver.model.model_order import Support
+from pliant.solver.model.marginal_likelihood import CAMERA_PRIOR_WEIGHT, UNLIKELY, Motion, energy_with_inverse
+from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.shape_covariance import ShapeCovariance, annealed
 from pliant.solver.records import Floats
 from scipy.optimize import minimize
@@ -79,7 +79,7 @@ def search(
     scales: Floats,
     view: Perspective,
     *,
-    support: Support,
+    model_order: ModelOrder,
     should_stop: Callable[[], bool] | None = None,
 ) -> tuple[Perspective, ShapeCovariance]:
     """Return what comparing values of κ shows, κ = 0 unless the tracks need perspective, and the covariance learned with it.
@@ -87,29 +87,29 @@ def search(
     Parameters
     ----------
     views : array, shape (F, S, 2)
-        Complete tracks of some points relative to the principal point, normalised units.
+        Complete tracks of some points relative to the principal point, normalized units.
     rotations, scales : arrays, shapes (F, 3, 3) and (F,)
         Cameras found under orthography.
     view : Perspective
         What is given; `curvature` of the result is negative if the depths of these cameras have to be mirrored.
-    support : Support
+    model_order : Support
         Modes at most, and the noise to begin with.
     should_stop : callable, optional
         Asked between values of κ; once it says True, the best so far counts.
     """
     count = max(min(SEARCH_FRAMES, len(views), views.shape[1] // 2), 3)
     used = np.unique(np.linspace(0, len(views) - 1, min(count, len(views))).round().astype(np.intp))
-    some, pairs = views[used], rotations[used, :2] * scales[used, None, None]
-    flat = _learn(some, np.zeros(some.shape[:2]), 0.0, pairs, support)
-    trials = {0.0: _Trial(0.0, flat.likelihood, np.zeros(some.shape[:2]), flat)}
+    some, projections = views[used], rotations[used, :2] * scales[used, None, None]
+    flat = _learn(some, np.zeros(some.shape[:2]), 0.0, projections, model_order)
+    trials = {0.0: _Trial(0.0, flat.nll, np.zeros(some.shape[:2]), flat)}
 
     def judge(curvature: float) -> None:
         trial = trials[0.0]
         for _ in range(UPDATES):
             depth = depth_map(rotations[used], scales[used], trial.covariance)
             depths = depths_of(depth, some, curvature, start=trial.depths)
-            covariance = _learn(some, depths, curvature, pairs, support)
-            trial = _Trial(curvature, covariance.likelihood + density(depths, curvature), depths, covariance)
+            covariance = _learn(some, depths, curvature, projections, model_order)
+            trial = _Trial(curvature, covariance.nll + density(depths, curvature), depths, covariance)
         trials[curvature] = trial
 
     def stopped() -> bool:
@@ -156,10 +156,12 @@ def _promising(view: Perspective, trials: dict[float, _Trial]) -> bool:
     return view.required or trials[_best(trials)].nll < trials[0.0].nll
 
 
-def _learn(views: Floats, depths: Floats, curvature: float, pairs: Floats, support: Support) -> ShapeCovariance:
+def _learn(
+    views: Floats, depths: Floats, curvature: float, projections: Floats, model_order: ModelOrder
+) -> ShapeCovariance:
     rows = columns(centred(corrected(views, depths, curvature)))
     return annealed(
-        rows @ rows.T / rows.shape[1], pairs, most=support.most, noisy=support.noisy, iterations=ROUNDS
+        rows @ rows.T / rows.shape[1], projections, max_modes=model_order.max_modes, noisy_start=model_order.noisy_start, iterations=ROUNDS
     )  # fmt: skip
 
 
@@ -202,7 +204,7 @@ def _between(trials: dict[float, _Trial]) -> float | None:
 def _decided(view: Perspective, trials: dict[float, _Trial], frames: int, points: int) -> Perspective:
     """Return κ by evidence, its standard deviation, and whether the sign of depth is settled.
 
-    The points of a surface move together; they count as 1/`STEADINESS` independent ones at most.
+    The points of a surface move together; they count as 1/`CAMERA_PRIOR_WEIGHT` independent ones at most.
     """
     candidates = tuple(Candidate(each, trials[each].nll) for each in sorted(trials))
     if view.given is not None:
@@ -221,7 +223,7 @@ def _decided(view: Perspective, trials: dict[float, _Trial], frames: int, points
     std, found = 0.0, _around(trials)
     if view.given is None and found is not None:
         bend = max(_parabola(*found)[1], 1e-12)
-        std = float(1 / np.sqrt(bend * frames * min(points, 1 / STEADINESS)))
+        std = float(1 / np.sqrt(bend * frames * min(points, 1 / CAMERA_PRIOR_WEIGHT)))
     return replace(view, curvature=best, curvature_std=std, candidates=candidates, settled=settled)
 
 
@@ -240,7 +242,7 @@ def refined_with_focal(
     Parameters
     ----------
     views : array, shape (F, S, 2)
-        Complete tracks relative to the principal point, normalised units.
+        Complete tracks relative to the principal point, normalized units.
     found : Learned
         Cameras and covariance to start from.
     curvature : float

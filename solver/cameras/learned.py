@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from pliant.solver.model.marginal_likelihood import Motion, Scene, cameras_of, covariances_of, root_of
-from pliant.solver.model.shape_covariance import FLATTEST, NOISE_FLOOR, ShapeCovariance
+from pliant.solver.model.shape_covariance import AXIS_VARIANCE_FLOOR, NOISE_VARIANCE_FLOOR, ShapeCovariance
 from pliant.solver.records import Floats
 
 STEADY = 0.01
@@ -35,8 +35,8 @@ class Learned:
 def scene_at(gram: Floats, rotations: Floats, *, with_scales: bool) -> Scene:
     """Return the scene whose cameras at zero turn are these."""
     return Scene(
-        gram, rotations, with_scales=with_scales, steadiness=STEADY,
-        noise_floor=NOISE_FLOOR**0.5, smoothness=0.0,
+        gram, rotations, with_scales=with_scales, prior_weight=STEADY,
+        noise_std_floor=NOISE_VARIANCE_FLOOR**0.5, smoothness=0.0,
     )  # fmt: skip
 
 
@@ -45,22 +45,22 @@ def motion_of(scene: Scene, found: Learned) -> Motion:
     covariance = found.covariance
     return Motion(
         np.zeros((len(found.rotations), 3)), np.log(found.scales), covariance.modes,
-        root_of(covariance.extent), root_of(covariance.play),
-        0.5 * np.log([max(covariance.noise - scene.noise_floor**2, LEAST_NOISE), covariance.drift]),
+        root_of(covariance.mean_covariance), root_of(covariance.axis_covariance),
+        0.5 * np.log([max(covariance.noise_variance - scene.noise_std_floor**2, LEAST_NOISE), covariance.walk_variance]),
     )  # fmt: skip
 
 
 def moved_to(scene: Scene, found: Learned, moved: Motion, energy: float) -> Learned:
     """Return what the parameters of the likelihood describe."""
-    extent, play, noise, drift = covariances_of(scene, moved)
-    play = play + FLATTEST * np.trace(play) / 3 * np.eye(3)
-    size = np.trace(play) / 3
+    mean_covariance, axis_covariance, noise, walk_variance = covariances_of(scene, moved)
+    axis_covariance = axis_covariance + AXIS_VARIANCE_FLOOR * np.trace(axis_covariance) / 3 * np.eye(3)
+    size = np.trace(axis_covariance) / 3
     better = replace(
         found.covariance,
-        extent=extent,
-        play=play / size,
+        mean_covariance=mean_covariance,
+        axis_covariance=axis_covariance / size,
         modes=moved.modes * np.sqrt(size),
-        drift=drift * size,
-        noise=noise,
+        walk_variance=walk_variance * size,
+        noise_variance=noise,
     )
     return Learned(*cameras_of(scene, moved), better, energy)

@@ -7,14 +7,14 @@ from pliant.solver.cameras.perspective import Perspective
 from pliant.solver.errors import InvalidInput
 from pliant.solver.records import KnownCamera, Tracks
 from pliant.solver.settings import Settings
-from pliant.solver.tracks.normalization import Normalised
+from pliant.solver.tracks.normalization import Normalized
 
 FARTHEST = 100.0
 """RMS radii from the tracks' centre within which a principal point must lie where the picture's size is unknown: a view of 1° or more."""
 
 
 def given_lens(
-    tracks: Tracks, normalised: Normalised, settings: Settings, cameras: KnownCamera | None = None
+    tracks: Tracks, normalized: Normalized, settings: Settings, cameras: KnownCamera | None = None
 ) -> Perspective | None:
     """Return what is given about perspective, or None where the camera model is orthographic.
 
@@ -47,8 +47,8 @@ def given_lens(
     elif settings.image_size is not None:
         point = np.array(settings.image_size, dtype=np.float64) / 2
     else:
-        point = normalised.centroid.mean(axis=0)
-    offsets = (normalised.centroid - point) / normalised.unit
+        point = normalized.centroid.mean(axis=0)
+    offsets = (normalized.centroid - point) / normalized.unit
     if not np.abs(offsets).max() < FARTHEST:
         raise InvalidInput(
             "principal_point_far", field="options.principal_point", expected=f"a point within {FARTHEST:.0f} RMS radii of the tracks",
@@ -58,7 +58,7 @@ def given_lens(
     return Perspective(
         offsets,
         point,
-        given=None if given is None else normalised.unit / given,
+        given=None if given is None else normalized.unit / given,
         signs=(first, -first) if cameras is None else (first,),
         required=settings.camera == "perspective",
     )

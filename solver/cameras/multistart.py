@@ -1,11 +1,12 @@
-"""Which cameras? Factorizations with several K, refined and judged by one number that needs no ground truth.
+"""Multistart over camera hypotheses: factorizations with several K, refined on one energy and ranked by it.
 
-No single K serves: dense surfaces that move little want K = 1, mocap 5 to 12, and a body that deforms as fast as it turns none of
-them. So every K gives a start, the two most probable ones also a second, steadied one, and all are refined on one energy
-(`model.marginal_likelihood` with `model.camera_motion_prior`): variable projection with a log-determinant against flattening, on
-the manifold. They race, the slower ones drop out early, and the lowest energy wins. From most starts it is the same minimum.
+No single K suits all data: dense surfaces with small motion need K = 1, motion capture 5 to 12, and a body that
+deforms as fast as it rotates none of them. Every K therefore gives a start, and the two most probable ones a second
+start with a smooth camera. All are refined on the manifold on the same energy (`model.marginal_likelihood` with
+`model.camera_motion_prior`), which needs no ground truth. The refinement runs in rounds; after each round the worst
+candidates are dropped, and the lowest energy is returned.
 
-Long sequences race on every n-th frame; what the race changed is carried to the frames between, so that the time hardly grows with F.
+Long sequences use every n-th frame; the correction found is interpolated to the frames in between (`carried`).
 """
 
 from __future__ import annotations
@@ -15,49 +16,51 @@ from dataclasses import dataclass
 
 import numpy as np
 from pliant.solver.cameras.factorization import Upgrade
-from pliant.solver.model.marginal_likelihood import STEADINESS, Motion, Scene, cameras_of, fit, start
+from pliant.solver.model.marginal_likelihood import CAMERA_PRIOR_WEIGHT, Motion, Scene, cameras_of, fit, start
 from pliant.solver.model.so3 import exponential, logarithm, nearest
 from pliant.solver.records import Floats
 from pliant.solver.tracks.noise import white_noise
 from scipy.linalg import solveh_banded
 
 CANDIDATES = (1, 2, 3, 5, 8, 12)
-"""K tried."""
+"""K of the factorizations."""
 
-RACE_FRAMES = 120
-"""Longer sequences race on every n-th frame."""
+MULTISTART_FRAMES = 120
+"""Maximum number of frames in the multistart; longer sequences use every n-th frame."""
 
-HELD_ITERATIONS = 60
-"""L-BFGS iterations with the rotations of the factorization."""
+FIXED_ROTATION_ITERATIONS = 60
+"""L-BFGS iterations with the rotations of the factorization fixed."""
 
-HEATS = ((60, 3), (140, 1))
-"""Iterations of every heat, and how many candidates are left after it."""
+MULTISTART_ROUNDS = ((60, 3), (140, 1))
+"""L-BFGS iterations of each round, and the number of candidates kept after it."""
 
-STEADIED = 2
-"""Candidates that also start steadied."""
+SMOOTH_STARTS = 2
+"""Number of candidates that get a second start with a smooth camera."""
 
-STEADIED_ITERATIONS, STEADIED_NOISE, STEADIED_WEIGHT = 100, 3e-2, 10.0
-"""A steadied start: so much noise and so heavy a camera that only what a steady camera explains is explained."""
+SMOOTH_START_ITERATIONS, SMOOTH_START_NOISE_STD, SMOOTH_START_PRIOR_WEIGHT = 100, 3e-2, 10.0
+"""A smooth-camera start: L-BFGS iterations, noise floor (standard deviation, normalized units) and weight of the
+camera-motion prior. Both are so high that deformation hardly counts."""
 
 
 CLOSED_FORM_WEIGHT = 1e-3
 """λ1 of the temporal closed form."""
 
-WHITE = 0.03
-"""White noise, normalised units, from which the number of points counts: a surface moves together and its points are worth few
-independent ones, but their noise is drawn for each of them. Measured: noise of .09 on an animated head, cameras off by 14° without."""
+WHITE_NOISE_STD = 0.03
+"""White noise, standard deviation in normalized units, at which the camera-motion prior has half its weight. Points
+of a surface move together, but their noise is independent: with noise of .09 on a head, cameras are off by 14° at
+full weight."""
 
-DEEPEST = 1.0
-"""Root mean square depth, normalised units, from which more depth counts against a candidate."""
+MAX_RMS_DEPTH = 1.0
+"""Root mean square depth, normalized units, above which depth is penalised in the ranking."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidate:
-    """Cameras and what is known about them."""
+    """Cameras with their energy and parameters."""
 
     basis_size: int
-    """K of the factorization that it came from."""
-    steadied: bool
+    """K of the factorization it started from."""
+    smooth_start: bool
     scene: Scene
     motion: Motion
     energy: float
@@ -69,8 +72,8 @@ class Candidate:
 
 
 def frames_used(count: int) -> slice:
-    """Return which frames race: all of a short sequence."""
-    return slice(None, None, -(-count // RACE_FRAMES))
+    """Return which frames the multistart uses: all of a short sequence."""
+    return slice(None, None, -(-count // MULTISTART_FRAMES))
 
 
 def gram_of(gram: Floats, used: slice) -> Floats:
@@ -80,7 +83,7 @@ def gram_of(gram: Floats, used: slice) -> Floats:
     return np.ascontiguousarray(blocks).reshape(2 * len(blocks), 2 * len(blocks))
 
 
-def held(
+def with_fixed_rotations(
     gram: Floats,
     upgrade: Upgrade,
     scales: Floats,
@@ -88,35 +91,35 @@ def held(
     with_scales: bool,
     should_stop: Callable[[], bool] | None = None,
 ) -> Candidate:
-    """Return a factorization's cameras with the energy they have unturned."""
+    """Return the cameras of a factorization, and their energy with the rotations fixed."""
     return _entered(
         gram, upgrade.rotations, scales, upgrade.basis_size,
-        with_scales=with_scales, steadied=False, should_stop=should_stop,
+        with_scales=with_scales, smooth_start=False, should_stop=should_stop,
     )  # fmt: skip
 
 
-def race(
+def run_multistart(
     gram: Floats, entries: list[Candidate], *, should_stop: Callable[[], bool] | None = None
 ) -> tuple[Candidate, list[Candidate]]:
-    """Return the winner, refined, and all that ran in the first heat, refined by that heat.
+    """Return the best candidate, refined, and all candidates after the first round.
 
     Parameters
     ----------
     gram : shape (2F, 2F)
-        W Wᵀ / P of the completed tracks, of the frames that race.
+        W Wᵀ / P of the completed tracks, of the frames used.
     entries : list of Candidate
-        From `held`, at least one.
+        From `with_fixed_rotations`; at least one.
     should_stop : callable, optional
-        Asked before every refinement; once it says True, the best so far wins.
+        Called before every refinement; once it returns True, the best so far is returned.
     """
 
     def rating(candidate: Candidate) -> float:
         return _rating(gram, candidate)
 
     ordered = sorted(entries, key=rating)
-    running = ordered + [steadied(gram, each, should_stop=should_stop) for each in ordered[:STEADIED]]
+    running = ordered + [smooth_start(gram, each, should_stop=should_stop) for each in ordered[:SMOOTH_STARTS]]
     first: list[Candidate] = []
-    for iterations, left in HEATS:
+    for iterations, left in MULTISTART_ROUNDS:
         finished: list[Candidate] = []
         for candidate in running:
             stopped = should_stop is not None and should_stop()
@@ -127,44 +130,52 @@ def race(
 
 
 def refined(candidate: Candidate, iterations: int, *, should_stop: Callable[[], bool] | None = None) -> Candidate:
-    """Return the candidate after that many iterations with the rotations free."""
+    """Return the candidate after `iterations` L-BFGS iterations with free rotations."""
     motion, energy = fit(
         candidate.scene, candidate.motion, iterations=iterations, turning=True, should_stop=should_stop
     )
-    return Candidate(candidate.basis_size, candidate.steadied, candidate.scene, motion, energy)
+    return Candidate(candidate.basis_size, candidate.smooth_start, candidate.scene, motion, energy)
 
 
-def steadied(gram: Floats, candidate: Candidate, *, should_stop: Callable[[], bool] | None = None) -> Candidate:
-    """Return the cameras nearest to the candidate's that turn as steadily as one can.
+def smooth_start(gram: Floats, candidate: Candidate, *, should_stop: Callable[[], bool] | None = None) -> Candidate:
+    """Return a candidate with the smoothest camera motion near the given one.
 
-    A factorization of a body that deforms as fast as it turns gives cameras that jitter with it, and a minimum of the energy near
-    every one of them. Fitted with noise so large that the deformation hardly counts, a heavy camera finds the turn in common.
+    The factorization of a body that deforms as fast as it rotates gives jittering cameras, each near a local minimum
+    of the energy. A fit with a high noise floor and a strong camera-motion prior finds the common rotation instead.
     """
     rotations, scales = candidate.cameras
     with_scales = candidate.scene.with_scales
-    calm = Scene.of(gram, rotations, with_scales=with_scales, steadiness=STEADIED_WEIGHT, noise_floor=STEADIED_NOISE)
-    motion, _ = fit(calm, start(calm, scales), iterations=STEADIED_ITERATIONS, turning=True, should_stop=should_stop)
+    calm = Scene.of(
+        gram,
+        rotations,
+        with_scales=with_scales,
+        prior_weight=SMOOTH_START_PRIOR_WEIGHT,
+        noise_std_floor=SMOOTH_START_NOISE_STD,
+    )
+    motion, _ = fit(
+        calm, start(calm, scales), iterations=SMOOTH_START_ITERATIONS, turning=True, should_stop=should_stop
+    )
     return _entered(
         gram, *cameras_of(calm, motion), candidate.basis_size,
-        with_scales=with_scales, steadied=True, should_stop=should_stop,
+        with_scales=with_scales, smooth_start=True, should_stop=should_stop,
     )  # fmt: skip
 
 
-def carried(rotations: Floats, winner: Floats, used: slice) -> Floats:
-    """Return rotations of all frames whose correction is the winner's at the frames used and blends in between.
+def carried(rotations: Floats, best: Floats, used: slice) -> Floats:
+    """Return rotations of all frames, with the correction found at the frames used interpolated in between.
 
-    Corrections are those of the world's axes, so that a world turned as a whole is none.
+    Corrections are rotations of the world axes, so a rotation of the whole world needs no interpolation.
 
     Parameters
     ----------
     rotations : shape (F, 3, 3)
         Cameras of all frames, from the factorization.
-    winner : shape (F', 3, 3)
+    best : shape (F', 3, 3)
         Cameras of the frames used, refined.
     used : slice
         Which frames they are.
     """
-    between = np.swapaxes(rotations[used], 1, 2) @ winner
+    between = np.swapaxes(rotations[used], 1, 2) @ best
     common = nearest(between.sum(axis=0))
     corrections = logarithm(between @ common.T)
     frames = np.arange(len(rotations))
@@ -179,48 +190,48 @@ def _entered(
     basis_size: int,
     *,
     with_scales: bool,
-    steadied: bool,
+    smooth_start: bool,
     should_stop: Callable[[], bool] | None,
 ) -> Candidate:
-    scene = Scene.of(gram, rotations, with_scales=with_scales, steadiness=binding(gram))
+    scene = Scene.of(gram, rotations, with_scales=with_scales, prior_weight=scaled_prior_weight(gram))
     motion, energy = fit(
-        scene, start(scene, scales), iterations=HELD_ITERATIONS, turning=False, should_stop=should_stop
+        scene, start(scene, scales), iterations=FIXED_ROTATION_ITERATIONS, turning=False, should_stop=should_stop
     )
-    return Candidate(basis_size, steadied, scene, motion, energy)
+    return Candidate(basis_size, smooth_start, scene, motion, energy)
 
 
-def binding(gram: Floats) -> float:
-    """Return the weight of the camera's unsteadiness: less where white noise is strong."""
-    return STEADINESS / (1 + white_noise(gram) / WHITE**2)
+def scaled_prior_weight(gram: Floats) -> float:
+    """Return the weight of the camera-motion prior, reduced where white noise is strong."""
+    return CAMERA_PRIOR_WEIGHT / (1 + white_noise(gram) / WHITE_NOISE_STD**2)
 
 
 def _rating(gram: Floats, candidate: Candidate) -> float:
-    """Return the energy, raised where the closed form comes out deeper than the image is wide: turns that are far too small."""
-    return candidate.energy + max(0.0, float(np.log(max(depth(gram, candidate.cameras[0]), 1e-12) / DEEPEST**2)))
+    """Return the energy plus a penalty where the closed form is deeper than the image is wide, a sign of rotations that are too small."""
+    return candidate.energy + max(0.0, float(np.log(max(depth(gram, candidate.cameras[0]), 1e-12) / MAX_RMS_DEPTH**2)))
 
 
 def depth(gram: Floats, rotations: Floats) -> float:
-    """Return the mean squared depth of the temporal closed form (Dai, Deng, He 2017, eq. 5), normalised units.
+    """Return the mean squared depth of the temporal closed form (Dai, Deng, He 2017, eq. 5), normalized units.
 
     S = (ΠᵀΠ + λ1 HᵀH)⁻¹ Πᵀ W, so that S Sᵀ / P follows from the Gram matrix; a block-tridiagonal solve, no shapes.
     """
     frames = len(rotations)
-    pairs = rotations[:, :2]
+    projections = rotations[:, :2]
     right = np.zeros((frames, 3, frames, 2))
     each = np.arange(frames)
-    right[each, :, each] = np.swapaxes(pairs, 1, 2)
-    solved = solveh_banded(_normal_bands(pairs), right.reshape(3 * frames, 2 * frames), lower=True)
+    right[each, :, each] = np.swapaxes(projections, 1, 2)
+    solved = solveh_banded(_normal_bands(projections), right.reshape(3 * frames, 2 * frames), lower=True)
     along = np.einsum("fi,fim->fm", rotations[:, 2], solved.reshape(frames, 3, -1))
     return float(((along @ gram) * along).sum()) / frames
 
 
-def _normal_bands(pairs: Floats) -> Floats:
+def _normal_bands(projections: Floats) -> Floats:
     """Return ΠᵀΠ + λ1 HᵀH in LAPACK's lower banded form, shape `(4, 3F)`."""
-    frames = len(pairs)
+    frames = len(projections)
     bands = np.zeros((4, 3 * frames))
     ends = np.full(frames, 2.0)
     ends[[0, -1]] = 1.0
-    blocks = np.einsum("fci,fcj->fij", pairs, pairs)
+    blocks = np.einsum("fci,fcj->fij", projections, projections)
     blocks += (CLOSED_FORM_WEIGHT * ends + 1e-9)[:, None, None] * np.eye(3)
     for below in range(3):
         for column in range(3 - below):

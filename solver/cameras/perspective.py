@@ -27,7 +27,7 @@ import numpy as np
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.records import Floats
 from pliant.solver.tracks.completion import Filling, spans
-from pliant.solver.tracks.normalization import Normalised
+from pliant.solver.tracks.normalization import Normalized
 from scipy import linalg
 
 STEPS = 8
@@ -44,7 +44,7 @@ class Candidate:
     """One value of κ that was compared."""
 
     curvature: float
-    """κ, inverse normalised units; negative: with all depths mirrored."""
+    """κ, inverse normalized units; negative: with all depths mirrored."""
 
     nll: float
     """Negative log likelihood of the tracks per point and frame, density of the correction included."""
@@ -55,13 +55,13 @@ class Perspective:
     """What the tracks say about perspective."""
 
     offsets: Floats
-    """Centroid of each frame relative to the principal point, normalised units, shape `(F, 2)`."""
+    """Centroid of each frame relative to the principal point, normalized units, shape `(F, 2)`."""
 
     principal_point: Floats
     """Shape `(2,)`, the tracks' unit."""
 
     curvature: float = 0.0
-    """κ = 1/φ, inverse normalised units; 0: orthography. It gets the sign of `signs[0]`: that of the third axis, away or towards."""
+    """κ = 1/φ, inverse normalized units; 0: orthography. It gets the sign of `signs[0]`: that of the third axis, away or towards."""
 
     curvature_std: float = 0.0
     """Its standard deviation; 0 where the focal length was given."""
@@ -88,7 +88,7 @@ class Perspective:
     """How hidden entries are completed; None: all are seen."""
 
     sample: Floats = field(default_factory=lambda: np.zeros((0, 0, 2)))
-    """Some complete tracks as they are, relative to the principal point, shape `(F, S, 2)`, normalised units."""
+    """Some complete tracks as they are, relative to the principal point, shape `(F, S, 2)`, normalized units."""
 
     depth: Floats = field(default_factory=lambda: np.zeros((0, 0)))
     """D of the cameras and the covariance found last, shape `(F, 2F)`."""
@@ -101,11 +101,11 @@ class Perspective:
 
 def depth_map(rotations: Floats, scales: Floats, covariance: ShapeCovariance) -> Floats:
     """Return D, shape `(F, 2F)`, for points whose centred image coordinates x1, y1, x2 … are one column."""
-    pairs = rotations[:, :2] * scales[:, None, None]
-    away, rows = rotations[:, 2] * scales[:, None], pairs.reshape(-1, 3)
+    projections = rotations[:, :2] * scales[:, None, None]
+    away, rows = rotations[:, 2] * scales[:, None], projections.reshape(-1, 3)
     wide = np.repeat(covariance.over_frames(), 2, axis=1)
-    cross = away @ covariance.extent @ rows.T + (away @ covariance.play @ rows.T) * wide
-    return np.asarray(linalg.solve(covariance.of_image(pairs), cross.T, assume_a="pos").T)
+    cross = away @ covariance.mean_covariance @ rows.T + (away @ covariance.axis_covariance @ rows.T) * wide
+    return np.asarray(linalg.solve(covariance.of_image(projections), cross.T, assume_a="pos").T)
 
 
 def columns(points: Floats) -> Floats:
@@ -126,7 +126,7 @@ def depths_of(depth: Floats, views: Floats, curvature: float, *, start: Floats |
     depth : array, shape (F, 2F)
         From `depth_map`.
     views : array, shape (F, P, 2)
-        Complete tracks relative to the principal point, normalised units.
+        Complete tracks relative to the principal point, normalized units.
     curvature : float
         κ.
     start : array, shape (F, P), optional
@@ -152,19 +152,21 @@ def density(depths: Floats, curvature: float) -> float:
 def mirrored(rotations: Floats, covariance: ShapeCovariance) -> tuple[Floats, ShapeCovariance]:
     """Return cameras and covariance with all depths reversed: the same under orthography."""
     turned = replace(
-        covariance, extent=MIRROR @ covariance.extent @ MIRROR, play=MIRROR @ covariance.play @ MIRROR
-    )  # fmt: skip
+        covariance,
+        mean_covariance=MIRROR @ covariance.mean_covariance @ MIRROR,
+        axis_covariance=MIRROR @ covariance.axis_covariance @ MIRROR,
+    )
     return MIRROR @ rotations @ MIRROR, turned
 
 
-def corrected_moments(view: Perspective, normalised: Normalised) -> tuple[Floats, Floats, Floats]:
+def corrected_moments(view: Perspective, normalized: Normalized) -> tuple[Floats, Floats, Floats]:
     """Return what completion returns of tracks, of the corrected ones: Gram matrix, translations and centred sample.
 
     Parameters
     ----------
     view : Perspective
         With κ, the sample and D.
-    normalised : Normalised
+    normalized : Normalized
         The tracks as they are.
 
     Returns
@@ -172,9 +174,9 @@ def corrected_moments(view: Perspective, normalised: Normalised) -> tuple[Floats
     gram (2F, 2F), translations (F, 2), sample (F, S, 2)
         Translations are relative to the centroids of the visible points.
     """
-    frames = len(normalised.points)
+    frames = len(normalized.points)
     gram, total, used = np.zeros((2 * frames, 2 * frames)), np.zeros((frames, 2)), 0
-    for _, points in spans(normalised, view.filling):
+    for _, points in spans(normalized, view.filling):
         changed = _corrected_by(view, points + view.offsets[:, None]) - view.offsets[:, None]
         stacked = columns(changed)
         gram += stacked @ stacked.T
@@ -189,27 +191,27 @@ def _corrected_by(view: Perspective, views: Floats) -> Floats:
     return corrected(views, depths_of(view.depth, views, view.curvature), view.curvature)
 
 
-def posterior_depths(view: Perspective, normalised: Normalised) -> Floats:
+def posterior_depths(view: Perspective, normalized: Normalized) -> Floats:
     """Return the depth of every point and frame, shape `(F, P)`; 0 for points that no frame shows."""
-    found = np.zeros(normalised.visible.shape)
-    for places, points in spans(normalised, view.filling):
+    found = np.zeros(normalized.visible.shape)
+    for places, points in spans(normalized, view.filling):
         views = points + view.offsets[:, None]
         found[:, places] = depths_of(view.depth, views, view.curvature)
     return found
 
 
-def orthographic(normalised: Normalised, view: Perspective | None) -> Normalised:
+def orthographic(normalized: Normalized, view: Perspective | None) -> Normalized:
     """Return the tracks corrected with posterior depths, still relative to the centroids of the tracks as they were.
 
     They are the same record where there is no perspective to correct.
     """
     if view is None or not view.bends:
-        return normalised
-    return corrected_tracks(normalised, view, posterior_depths(view, normalised))
+        return normalized
+    return corrected_tracks(normalized, view, posterior_depths(view, normalized))
 
 
-def corrected_tracks(normalised: Normalised, view: Perspective, depths: Floats) -> Normalised:
+def corrected_tracks(normalized: Normalized, view: Perspective, depths: Floats) -> Normalized:
     """Return the tracks corrected with depths `(F, P)`, relative to the centroids of the tracks as they were."""
-    views = normalised.points + view.offsets[:, None]
+    views = normalized.points + view.offsets[:, None]
     points = corrected(views, depths, view.curvature) - view.offsets[:, None]
-    return replace(normalised, points=np.where(normalised.visible[..., None] > 0, points, 0.0))
+    return replace(normalized, points=np.where(normalized.visible[..., None] > 0, points, 0.0))

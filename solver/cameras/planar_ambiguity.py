@@ -1,13 +1,15 @@
-"""Cameras of a sheet: paper, cloth, a flag, whose image leaves open to which side it is tilted.
+"""Cameras of a planar object (paper, cloth, a flag), whose image does not determine the sign of its tilt.
 
-A plane at rest and the same plane mirrored at the image plane look alike under orthography, so that every frame of a thin sheet has
-two poses, n̂ = (sin θ·u, cos θ) and (−sin θ·u, cos θ): Necker's reversal. A rigid factorization picks the sides that fit a constant
-relief, although what relief there is comes from bending and changes its sign; all further refinement then stays on the wrong sides,
-for between the two poses lies a steep ridge. The sides that let few modes of deformation explain the tracks are the right ones.
+A plane and its mirror image at the image plane look alike under orthography, so every frame of a thin sheet has two
+poses, n̂ = (sin θ·u, cos θ) and (−sin θ·u, cos θ): Necker reversal. A rigid factorization selects the pose signs that
+fit a constant relief, although the relief of a sheet is due to bending and changes its sign. Further refinement does
+not leave these signs, since a high ridge separates the two poses. The correct signs are those with which few modes of
+deformation explain the tracks.
 
-Therefore, for tracks that are nearly of rank two only: the poses of a plane, in closed form up to the sides; the sides
-of which the camera is steadiest, in three senses, as starts; and from the best of them frames and runs of frames are reversed as
-long as the likelihood with few modes rises. Scales stay free throughout, for the larger singular value of a plane's image is its scale.
+For tracks of nearly rank two, the poses of a plane are computed in closed form up to their signs. The starts are the
+given signs and those with the smoothest camera, of first and of second order. From the best start, frames and runs of
+frames are reversed while the likelihood with few modes improves. Scales stay free, because the larger singular value
+of a plane's image is its scale.
 """
 
 from __future__ import annotations
@@ -26,42 +28,44 @@ from pliant.solver.model.so3 import MIRROR, angles_between, from_rows, start_at_
 from pliant.solver.records import Floats
 from scipy.optimize import minimize
 
-Sides = NDArray[np.bool_]
+PoseSigns = NDArray[np.bool_]
 
-FLAT = 0.007
-"""Third eigenvalue of W Wᵀ over the second below which the tracks are those of a sheet. Measured: bending paper .004, a waving flag
-.005; faces that turn by 30° .01 to .08, bodies above .07."""
+MAX_PLANAR_RATIO = 0.007
+"""Ratio of the third to the second eigenvalue of W Wᵀ below which the object counts as planar: paper .004, a flag
+.005, faces that rotate by 30° .01 to .08, bodies above .07."""
 
-SHEET_FRAMES = 60
-"""Longer sequences are unfolded on every n-th frame."""
+PLANAR_FRAMES = 60
+"""Maximum number of frames for the search; longer sequences use every n-th frame."""
 
-MODES, NOISE, STEADY = 4, 1e-3, 0.03
-"""Modes, noise floor and weight of the camera's unsteadiness. With many modes every choice of sides is explained in the end."""
+PLANAR_MODES, PLANAR_NOISE_STD, PLANAR_PRIOR_WEIGHT = 4, 1e-3, 0.03
+"""Number of modes, noise floor (standard deviation, normalized units) and weight of the camera-motion prior. With
+many modes every choice of signs fits."""
 
-TINY = float(np.finfo(np.float64).tiny)
+SMALLEST_SCALE = float(np.finfo(np.float64).tiny)
 
 SMALL_TILT = 1e-3
-"""Weight of mean log 1/cos θ: of the planes that explain the singular values equally well, the least tilted."""
+"""Weight of mean log 1/cos θ: selects the least tilted of the planes that fit the singular values equally well."""
 
-DEEP, SHORT = 100, 40
-"""L-BFGS iterations of a start, and of each reversal that is tried."""
+FULL_ITERATIONS, TRIAL_ITERATIONS = 100, 40
+"""L-BFGS iterations of a full fit, and of each trial reversal."""
 
 PASSES = 8
-"""Reversals that are taken at most."""
+"""Maximum number of accepted reversals."""
 
-TRIED_DEEPLY = 3
-"""Reversals of one pass, the most promising first, that are fitted to the end before the pass gives up."""
+MAX_FULL_FITS = 3
+"""Number of trial reversals per pass, lowest energy first, that get a full fit."""
 
-EVERY = 24
-"""Up to so many frames, every frame may be where the sheet turns over; in longer ones only where it faces the camera most."""
+MAX_EXHAUSTIVE_FRAMES = 24
+"""Maximum number of frames for which a reversal may start at every frame; in longer sequences it starts only where
+the plane faces the camera most."""
 
-GAIN = 2e-3
-"""Energy that a reversal must gain."""
+MIN_REVERSAL_GAIN = 2e-3
+"""Minimum decrease of the energy per point and frame for a reversal to be accepted."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Unfolded:
-    """Cameras of a sheet."""
+class PlanarCameras:
+    """Cameras of a planar object."""
 
     rotations: Floats
     """Shape `(F, 3, 3)`."""
@@ -69,28 +73,28 @@ class Unfolded:
     scales: Floats
     """Shape `(F,)`, mean of the logarithm 0."""
 
-    sides: Sides
-    """Which frames show the reverse of the poses started from, shape `(F,)`."""
+    pose_signs: PoseSigns
+    """Frames whose pose is reversed relative to the start, shape `(F,)`."""
 
     motion: Motion
     energy: float
 
 
-def is_flat(gram: Floats) -> bool:
-    """Whether tracks with this Gram matrix are those of a thin sheet."""
+def is_planar(gram: Floats) -> bool:
+    """Whether tracks with this Gram matrix show a planar object."""
     values = np.linalg.eigvalsh(gram)[::-1]
-    return len(values) >= 6 and bool(values[2] < FLAT * values[1])
+    return len(values) >= 6 and bool(values[2] < MAX_PLANAR_RATIO * values[1])
 
 
-def frames_unfolded(count: int) -> slice:
-    """Return which frames are unfolded: all of a short sequence."""
-    return slice(None, None, -(-count // SHEET_FRAMES))
+def planar_frames(count: int) -> slice:
+    """Return which frames the search uses: all of a short sequence."""
+    return slice(None, None, -(-count // PLANAR_FRAMES))
 
 
-def on_its_sides(
+def resolve_pose_signs(
     gram: Floats, rotations: Floats, *, should_stop: Callable[[], bool] | None = None
 ) -> tuple[Floats, str]:
-    """Return the rotations of a sheet's cameras, and a sentence: the given ones, or more probable ones on other sides.
+    """Return the rotations of a planar object, given or with more probable pose signs, and a sentence.
 
     Parameters
     ----------
@@ -99,17 +103,17 @@ def on_its_sides(
     rotations : shape (F, 3, 3)
         The best that is known otherwise.
     should_stop : callable, optional
-        Asked between fits; once it says True, the best so far is returned.
+        Called between fits; once it returns True, the best so far is returned.
     """
-    used = frames_unfolded(len(rotations))
+    used = planar_frames(len(rotations))
     part, given = gram_of(gram, used), rotations[used]
     planes, scales = poses(gram)
-    rival = fitted(part, given, rigid_scales(part, given), np.zeros(len(given), dtype=bool), should_stop=should_stop)
-    found = unfold(part, planes[used], scales[used], should_stop=should_stop)
-    if found.energy >= rival.energy:
+    baseline = fitted(part, given, rigid_scales(part, given), np.zeros(len(given), dtype=bool), should_stop=should_stop)
+    found = search_pose_signs(part, planes[used], scales[used], should_stop=should_stop)
+    if found.energy >= baseline.energy:
         return rotations, "The tracks are those of a sheet; its sides are as they were."
-    sides = np.repeat(found.sides, used.step)[: len(rotations)]
-    after = start_at_identity(carried(reversed_at(planes, MIRROR, sides), found.rotations, used))
+    pose_signs = np.repeat(found.pose_signs, used.step)[: len(rotations)]
+    after = start_at_identity(carried(reversed_at(planes, MIRROR, pose_signs), found.rotations, used))
     turn = float(np.degrees(angles_between(after, rotations).mean()))
     return (
         after,
@@ -117,10 +121,10 @@ def on_its_sides(
     )
 
 
-def unfold(
+def search_pose_signs(
     gram: Floats, rotations: Floats, scales: Floats, *, should_stop: Callable[[], bool] | None = None
-) -> Unfolded:
-    """Return the cameras of the sheet on its most probable sides.
+) -> PlanarCameras:
+    """Return the cameras with the most probable pose signs.
 
     Parameters
     ----------
@@ -129,57 +133,57 @@ def unfold(
     rotations, scales
         From `poses`.
     should_stop : callable, optional
-        Asked before every fit; once it says True, the best so far is returned.
+        Called before every fit; once it returns True, the best so far is returned.
     """
-    best: Unfolded | None = None
-    for sides in _starts(rotations):
+    best: PlanarCameras | None = None
+    for pose_signs in _starts(rotations):
         if best is not None and should_stop is not None and should_stop():
             return best
-        found = fitted(gram, reversed_at(rotations, MIRROR, sides), scales, sides, should_stop=should_stop)
+        found = fitted(gram, reversed_at(rotations, MIRROR, pose_signs), scales, pose_signs, should_stop=should_stop)
         best = found if best is None or found.energy < best.energy else best
     assert best is not None
-    return _settled(gram, best, should_stop)
+    return _reverse_greedily(gram, best, should_stop)
 
 
 def fitted(
     gram: Floats,
     rotations: Floats,
     scales: Floats,
-    sides: Sides,
+    pose_signs: PoseSigns,
     *,
-    iterations: int = DEEP,
+    iterations: int = FULL_ITERATIONS,
     should_stop: Callable[[], bool] | None = None,
-) -> Unfolded:
+) -> PlanarCameras:
     """Return the cameras of highest likelihood near the given ones."""
     scene = Scene(
-        gram, rotations, with_scales=True, steadiness=STEADY, noise_floor=NOISE,
+        gram, rotations, with_scales=True, prior_weight=PLANAR_PRIOR_WEIGHT, noise_std_floor=PLANAR_NOISE_STD,
         smoothness=0.0,
     )  # fmt: skip
-    begun = replace(start(scene, scales, num_modes=MODES), logs=np.log([0.01, 0.05]))
+    begun = replace(start(scene, scales, num_modes=PLANAR_MODES), logs=np.log([0.01, 0.05]))
     motion, energy = fit(scene, begun, iterations=iterations, turning=True, should_stop=should_stop)
-    return Unfolded(*cameras_of(scene, motion), sides, motion, energy)
+    return PlanarCameras(*cameras_of(scene, motion), pose_signs, motion, energy)
 
 
 def poses(gram: Floats) -> tuple[Floats, Floats]:
-    """Return rotations and scales of a plane with this image, each frame on either side.
+    """Return rotations and scales of a plane with this image; the sign of each pose is arbitrary.
 
-    The rank-2 factor of W is, up to one 2×2 matrix T, s_f times the first two columns of R_f's rows, whose singular values are s_f
-    and s_f cos θ_f. T is the one with the most even scales; where several are equally even, as when the plane turns about one axis,
-    the one with the least tilt.
+    The rank-2 factor of W is, up to one 2×2 matrix T, s_f times the first two columns of R_f's rows, whose singular
+    values are s_f and s_f cos θ_f. T is chosen for the most even scales; among equally even ones, as for rotation
+    about one axis, for the least tilt.
     """
     factor = leading_factor(gram, 2)
 
-    def uneven(values: Floats) -> float:
+    def unevenness(values: Floats) -> float:
         large, small = np.moveaxis(np.linalg.svd(factor @ _lower(values), compute_uv=False), -1, 0)
-        large = np.maximum(large, 1e-9 * max(float(large.max()), TINY))
+        large = np.maximum(large, 1e-9 * max(float(large.max()), SMALLEST_SCALE))
         tilt = np.log(large / np.maximum(small, 1e-9 * large))
         return float(np.mean(np.log(large) ** 2) + SMALL_TILT * np.mean(tilt))
 
     begun = np.array([[0.0, 0, 0], [0.5, 0, -0.5], [-0.5, 0, 0.5], [0, 0.5, 0], [0, -0.5, 0]])
-    runs = [minimize(uneven, one, method="Nelder-Mead", options={"maxiter": 2000, "xatol": 1e-6}) for one in begun]
+    runs = [minimize(unevenness, one, method="Nelder-Mead", options={"maxiter": 2000, "xatol": 1e-6}) for one in begun]
     found = min(runs, key=lambda run: float(run.fun)).x
     left, values, right = np.linalg.svd(factor @ _lower(found))
-    values = np.maximum(values, 1e-9 * max(float(values.max()), TINY))
+    values = np.maximum(values, 1e-9 * max(float(values.max()), SMALLEST_SCALE))
     cosine = values[:, 1] / values[:, 0]
     across = np.sqrt(np.maximum(1 - cosine**2, 0.0))[:, None] * left[:, :, 1]
     flat = (left * np.stack([np.ones_like(cosine), cosine], axis=1)[:, None]) @ right
@@ -187,28 +191,33 @@ def poses(gram: Floats) -> tuple[Floats, Floats]:
     return from_rows(rows), np.exp(np.log(values[:, 0]) - np.log(values[:, 0]).mean())
 
 
-def reversed_at(rotations: Floats, plane: Floats, sides: Sides) -> Floats:
-    """Return the rotations with the sheet seen from the other side in some frames: D R H, H the mirror at the sheet's plane."""
-    return np.where(sides[:, None, None], MIRROR @ rotations @ plane, rotations)
+def reversed_at(rotations: Floats, plane: Floats, pose_signs: PoseSigns) -> Floats:
+    """Return the rotations with reversed pose in some frames: D R H, H the mirror at the object's plane."""
+    return np.where(pose_signs[:, None, None], MIRROR @ rotations @ plane, rotations)
 
 
 def _lower(values: Floats) -> Floats:
     return np.array([[np.exp(values[0]), 0.0], [values[1], np.exp(values[2])]])
 
 
-def _starts(rotations: Floats) -> list[Sides]:
-    """Return choices of sides: as they are, those that turn least, and those whose turn changes least; each once."""
-    kept: list[Sides] = []
-    for sides in (np.zeros(len(rotations), dtype=bool), steadiest(rotations, 1), steadiest(rotations, 2)):
-        if not any((sides == other).all() or (sides != other).all() for other in kept):
-            kept.append(sides)
+def _starts(rotations: Floats) -> list[PoseSigns]:
+    """Return choices of pose signs without duplicates: as given, least rotation, least change of rotation."""
+    kept: list[PoseSigns] = []
+    for pose_signs in (
+        np.zeros(len(rotations), dtype=bool),
+        smoothest_signs(rotations, 1),
+        smoothest_signs(rotations, 2),
+    ):
+        if not any((pose_signs == other).all() or (pose_signs != other).all() for other in kept):
+            kept.append(pose_signs)
     return kept
 
 
-def steadiest(rotations: Floats, order: int) -> Sides:
-    """Return the sides that minimise Σ ‖R_{f+1} − R_f‖² (order 1) or Σ ‖T_f − T_{f−1}‖², T_f = R_{f+1} R_fᵀ (order 2): Viterbi.
+def smoothest_signs(rotations: Floats, order: int) -> PoseSigns:
+    """Return the pose signs of the smoothest camera, by the Viterbi algorithm.
 
-    States are the sides of two successive frames.
+    Order 1 minimises Σ ‖R_{f+1} − R_f‖², order 2 Σ ‖T_f − T_{f−1}‖² with T_f = R_{f+1} R_fᵀ. States are the signs of
+    two successive frames.
     """
     both = np.stack([rotations, MIRROR @ rotations @ MIRROR], axis=1)
     turns = np.einsum("fjab,ficb->fijac", both[1:], both[:-1])
@@ -220,15 +229,15 @@ def steadiest(rotations: Floats, order: int) -> Sides:
         back.append(total.argmin(axis=0))
         cost = total.min(axis=0)
     before, here = np.unravel_index(int(cost.argmin()), (2, 2))
-    sides = [bool(here), bool(before)]
+    pose_signs = [bool(here), bool(before)]
     for choice in back[::-1]:
         before, here = choice[before, here], before
-        sides.append(bool(before))
-    return np.array(sides[::-1])
+        pose_signs.append(bool(before))
+    return np.array(pose_signs[::-1])
 
 
-def _settled(gram: Floats, found: Unfolded, should_stop: Callable[[], bool] | None) -> Unfolded:
-    """Return the cameras after all reversals, one after the other, that raise the likelihood."""
+def _reverse_greedily(gram: Floats, found: PlanarCameras, should_stop: Callable[[], bool] | None) -> PlanarCameras:
+    """Return the cameras after greedy reversals, as long as each improves the likelihood."""
     for _ in range(PASSES):
         plane, tried = _plane(found.motion), []
         for run in _runs(found.rotations @ plane[1]):
@@ -236,13 +245,20 @@ def _settled(gram: Floats, found: Unfolded, should_stop: Callable[[], bool] | No
                 return found
             turned = reversed_at(found.rotations, plane[0], run)
             tried.append(
-                fitted(gram, turned, found.scales, found.sides ^ run, iterations=SHORT, should_stop=should_stop)
+                fitted(
+                    gram,
+                    turned,
+                    found.scales,
+                    found.pose_signs ^ run,
+                    iterations=TRIAL_ITERATIONS,
+                    should_stop=should_stop,
+                )
             )
         tried.sort(key=lambda each: each.energy)
         better = None
-        for each in tried[:TRIED_DEEPLY]:
-            deep = fitted(gram, each.rotations, each.scales, each.sides, should_stop=should_stop)
-            if deep.energy < found.energy - GAIN:
+        for each in tried[:MAX_FULL_FITS]:
+            deep = fitted(gram, each.rotations, each.scales, each.pose_signs, should_stop=should_stop)
+            if deep.energy < found.energy - MIN_REVERSAL_GAIN:
                 better = deep
                 break
         if better is None:
@@ -252,23 +268,23 @@ def _settled(gram: Floats, found: Unfolded, should_stop: Callable[[], bool] | No
 
 
 def _plane(motion: Motion) -> tuple[Floats, Floats]:
-    """Return the mirror at the mean sheet's plane (3×3), and its normal (3,)."""
+    """Return the mirror at the plane of the mean shape (3×3), and its normal (3,)."""
     root = np.zeros((3, 3))
-    root[np.tril_indices(3)] = motion.extent
+    root[np.tril_indices(3)] = motion.mean_root
     normal = np.linalg.eigh(root @ root.T)[1][:, 0]
     return np.eye(3) - 2 * np.outer(normal, normal), normal
 
 
-def _runs(normals: Floats) -> list[Sides]:
-    """Return the runs of frames worth reversing, given the sheet's normal in each frame's camera, shape `(F, 3)`.
+def _runs(normals: Floats) -> list[PoseSigns]:
+    """Return the runs of frames to try to reverse, given the plane's normal in each camera, shape `(F, 3)`.
 
-    They lie between two neighbouring places where the sheet may turn over, or reach from such a place to the end.
+    They lie between two neighbouring candidate frames, or reach from one to the end.
     """
     frames = len(normals)
     facing = np.abs(normals[:, 2])
     every = range(1, frames)
     most = [f for f in range(1, frames - 1) if facing[f] >= facing[f - 1] and facing[f] > facing[f + 1]]
-    places = list(every) if frames <= EVERY else most
+    places = list(every) if frames <= MAX_EXHAUSTIVE_FRAMES else most
     edges = [0, *places, frames]
     spans = {(a, b) for a, b in pairwise(edges)} | {(a, frames) for a in places}
     index = np.arange(frames)

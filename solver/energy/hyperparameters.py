@@ -1,11 +1,12 @@
-"""λ1, λ2, λ3 and the robust scale: the paper's values, or chosen from the data.
+"""λ1, λ2, λ3 and the robust scale: the paper's values, or values chosen from the data.
 
-Near zero a robust loss is a parabola with curvature 1/ε, far steeper than a least-squares data term; away from zero its slope is
-1, so that a point follows an outlier wherever bending its path costs less than the residual does. With the paper's λ1 = 1e-3
-bending costs next to nothing and gross outliers win. A point is held back once λ1 ‖H S‖² of the jump outweighs the jump itself,
-which for jumps of one RMS radius means λ1 well above 1; what fits exactly stays fitted exactly, because the loss has slope 1 from
-the first residual on. λ2 must stay far below λ1: where the camera leaves depth open, the two alone decide it, and a strong λ2
-flattens the surface. Measured in `benchmarks/README.md`.
+Near zero a robust loss is a parabola with curvature 1/ε, much steeper than a least-squares data term; far from zero
+its slope is 1, so a point follows an outlier wherever bending its path costs less than the residual. At the paper's
+λ1 = 1e-3, bending is nearly free and gross outliers are fitted. An outlier is resisted once λ1 ‖H S‖² of the jump
+exceeds the jump itself, which for jumps of one RMS radius requires λ1 well above 1. Exact data are still fitted
+exactly, since the loss has slope 1 from the first residual on. λ2 must stay far below λ1: where the camera does not
+determine depth, the two priors decide it, and a large λ2 flattens the surface. See `benchmarks/README.md` for
+measurements.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.operators.mesh_laplacian import Laplacian
 from pliant.solver.settings import Settings
 from pliant.solver.tracks.noise import magnified
-from pliant.solver.tracks.normalization import Normalised
+from pliant.solver.tracks.normalization import Normalized
 
 PAPER = Weights(temporal=1e-3, spatial=1.0, low_rank=0.0, robust_scale=1e-3, order=1, rank_floor=1e-4)
 """Dai, Deng, He (2017), section 5: λ1 = 1e-3, λ2 = 1, first order, no low-rank prior; in units of the tracks' RMS radius."""
@@ -28,48 +29,48 @@ STIFFEST = 30.0
 """Largest λ1 of `auto` with a robust loss: no path bends to an outlier."""
 
 SOFTEST = 1.0
-"""Smallest λ1 of `auto` with a robust loss: few frames, far apart."""
+"""Smallest λ1 of `auto` with a robust loss, for rough tracks with few frames."""
 
 STIFFNESS = 0.1
-"""λ1 times the roughness: a point that moves by its own deformation must not look like an outlier."""
+"""λ1 times the roughness: below it, deformation does not look like an outlier."""
 
-FAR, FAR_AT_LEAST, JUMPS = 12.0, 0.05, 0.02
-"""A third difference above `FAR` times the typical one (and this many RMS radii) is a jump; above this share of them, the tracks
-have gross outliers."""
+JUMP_RATIO, MIN_JUMP, MAX_JUMP_SHARE = 12.0, 0.05, 0.02
+"""A third difference above `JUMP_RATIO` times the typical one and above `MIN_JUMP` RMS radii is a jump; above a share
+`MAX_JUMP_SHARE` of jumps the tracks contain gross outliers."""
 
 SPATIAL_SHARE = 3e-4
-"""λ2/λ1 of `auto`: neighbours help against outliers without flattening the depth."""
+"""λ2/λ1 of `auto`: smooths over neighbours against outliers without flattening the depth."""
 
 LEAST_SQUARES_SHARE = 1e-2
-"""λ2/λ1 of `auto` against outliers without a robust loss: worth some flattening."""
+"""λ2/λ1 of `auto` against outliers without a robust loss, where some flattening is acceptable."""
 
 LOW_RANK_SHARE = 3e-4
 """λ3/λ1 of `auto` with the low-rank prior."""
 
-FINEST = 1e-4
-"""Smallest noise that the Gaussian prior is weighed against, normalised units."""
+MIN_NOISE_STD = 1e-4
+"""Floor of the noise standard deviation used with the Gaussian prior, normalized units."""
 
 BENDING_SHARE, BENDING_MODES = 0.3, 2.0
-"""λ2/λ1 of `auto` with the Gaussian prior, times the mean square of AX: below 1, for the covariance has seen the bending, too; and less
-where so many times the modes are fewer than the frames, which then do not bend each in its own way. Measured against the first number
-alone, known cameras: 99 frames of faces .0114 → .0108, with noise .0536 → .0522, horse, dancer and 10 frames of faces equal."""
+"""λ2/λ1 of `auto` with the Gaussian prior, times the mean square of AX: below 1, because the covariance includes the
+bending; reduced where `BENDING_MODES` times the modes are fewer than the frames. Faces of 99 frames, known
+cameras: .0114 without the reduction, .0108 with it."""
 
-SCALES = (1e-3, 1e-2)
-"""Range of the robust scale that follows the noise."""
+ROBUST_SCALE_RANGE = (1e-3, 1e-2)
+"""Range of the robust scale that follows the noise, normalized units."""
 
-LARGEST_SCALE = 0.1
-"""Largest robust scale with the Gaussian prior, from whose fit gross outliers have been left out."""
+MAX_ROBUST_SCALE = 0.1
+"""Largest robust scale with the Gaussian prior, normalized units; its fit runs after outlier rejection."""
 
 
 def choose_weights(
-    normalised: Normalised,
+    normalized: Normalized,
     covariance: ShapeCovariance | None,
     laplacian: Laplacian | None,
     settings: Settings,
 ) -> tuple[Weights, float, dict[str, str]]:
-    """Return the weights, the noise they are for (standard deviation, normalised units) and one sentence for each choice."""
-    rough = roughness_of(normalised)
-    noise = rough.noise if covariance is None else noise_std(covariance)
+    """Return the weights, the noise they assume (standard deviation, normalized units) and one sentence for each choice."""
+    rough = roughness_of(normalized)
+    noise = rough.noise_std if covariance is None else noise_std(covariance)
     if settings.preset == "paper":
         chosen, reason = PAPER, "The paper's values."
     elif covariance is not None:
@@ -92,60 +93,59 @@ def choose_weights(
 
 
 def without_effect(settings: Settings) -> tuple[str, ...]:
-    """Return a sentence for each setting that was made and has no part in the solve."""
-    said = []
+    """Return a sentence for each setting that has no effect with the others."""
+    sentences = []
     if settings.low_rank_weight is not None and settings.prior != "smooth+low_rank":
-        said.append(f"low_rank_weight has no effect with prior {settings.prior}; set prior to smooth+low_rank.")
+        sentences.append(f"low_rank_weight has no effect with prior {settings.prior}; set prior to smooth+low_rank.")
     if settings.temporal_order is not None and settings.gaussian:
-        said.append("temporal_order has no effect with prior gaussian; set prior to smooth or smooth+low_rank.")
+        sentences.append("temporal_order has no effect with prior gaussian; set prior to smooth or smooth+low_rank.")
     if settings.precision == "float32" and settings.gaussian:
-        said.append("precision has no effect with prior gaussian, which needs float64.")
-    return tuple(said)
+        sentences.append("precision has no effect with prior gaussian, which needs float64.")
+    return tuple(sentences)
 
 
 @dataclass(frozen=True, slots=True)
 class Roughness:
-    """What third differences over frames say about the tracks."""
+    """Noise and jumps of the tracks from third differences over frames."""
 
-    noise: float
-    """Upper estimate of the noise's standard deviation, normalised units."""
+    noise_std: float
+    """Upper estimate of the noise's standard deviation, normalized units."""
 
     jumps: float
-    """Share of the third differences that are far larger than the typical one: what gross outliers leave."""
+    """Share of third differences that are far larger than the typical one, a sign of gross outliers."""
 
 
-def roughness_of(normalised: Normalised) -> Roughness:
+def roughness_of(normalized: Normalized) -> Roughness:
     """Return noise and jumps of the tracks.
 
-    The noise is the median absolute third difference of each coordinate over frames, as the standard deviation of white noise
-    that would leave it; smooth motion leaves little of it, and outliers do not move a median. Short sequences use lower
-    differences.
+    The noise is the standard deviation of white noise with the same median absolute third difference over frames.
+    Smooth motion contributes little to it, and a median is robust to outliers. Short sequences use lower differences.
     """
-    order = min(3, len(normalised.points) - 1)
-    differences = np.abs(np.diff(normalised.points, n=order, axis=0))
+    order = min(3, len(normalized.points) - 1)
+    differences = np.abs(np.diff(normalized.points, n=order, axis=0))
     whole = np.ones(differences.shape[:2], dtype=bool)
     for start in range(order + 1):
-        whole &= normalised.visible[start : start + len(differences)] > 0
+        whole &= normalized.visible[start : start + len(differences)] > 0
     if not whole.any():
         return Roughness(0.0, 0.0)
     seen = differences[whole]
     typical = 1.4826 * float(np.median(seen))
-    return Roughness(typical / magnified(order), float((seen.max(axis=1) > max(FAR * typical, FAR_AT_LEAST)).mean()))
+    return Roughness(typical / magnified(order), float((seen.max(axis=1) > max(JUMP_RATIO * typical, MIN_JUMP)).mean()))
 
 
 def noise_std(covariance: ShapeCovariance) -> float:
-    """Return the standard deviation of the noise that the Gaussian prior is weighed against, normalised units."""
-    return max(float(covariance.noise**0.5), FINEST)
+    """Return the standard deviation of the noise assumed with the Gaussian prior, normalized units."""
+    return max(float(covariance.noise_variance**0.5), MIN_NOISE_STD)
 
 
 def _from_covariance(covariance: ShapeCovariance, settings: Settings) -> tuple[Weights, str]:
-    """Return the weights with which the energy is the negative logarithm of a probability, times a constant.
+    """Return the weights with which the energy is proportional to a negative log posterior.
 
-    Residuals of Laplace's distribution with standard deviation σ have the density exp(−√2 |r| / σ), so that
-    |r| + (σ / 2√2) xᵀQx is what to minimise; Gaussian ones make it r² + σ² xᵀQx.
+    Laplace residuals with standard deviation σ have the density exp(−√2 |r| / σ), so |r| + (σ / 2√2) xᵀQx is
+    minimised; for Gaussian residuals it is r² + σ² xᵀQx.
     """
     sigma = noise_std(covariance)
-    scale = float(np.clip(sigma, SCALES[0], LARGEST_SCALE))
+    scale = float(np.clip(sigma, ROBUST_SCALE_RANGE[0], MAX_ROBUST_SCALE))
     strength = sigma / 8**0.5 if settings.loss == "l1" else sigma**2
     chosen = replace(PAPER, temporal=strength, spatial=0.0, robust_scale=scale)
     return chosen, (
@@ -164,16 +164,18 @@ def bending_weight(temporal: float, laplacian: Laplacian, shapes: NDArray[np.flo
 
 
 def _from_data(rough: Roughness, settings: Settings) -> tuple[Weights, str]:
-    spoiled = rough.jumps > JUMPS
+    spoiled = rough.jumps > MAX_JUMP_SHARE
     if settings.method != "robust" or settings.loss == "l2":
         return _least_squares(rough, spoiled=spoiled)
-    scale = float(np.clip(rough.noise, *SCALES))
-    stiff = STIFFEST if spoiled else float(np.clip(STIFFNESS / max(rough.noise, 1e-9), SOFTEST, STIFFEST))
+    scale = float(np.clip(rough.noise_std, *ROBUST_SCALE_RANGE))
+    stiff = STIFFEST if spoiled else float(np.clip(STIFFNESS / max(rough.noise_std, 1e-9), SOFTEST, STIFFEST))
     chosen = replace(
         PAPER, temporal=stiff, spatial=stiff * SPATIAL_SHARE, low_rank=stiff * LOW_RANK_SHARE, robust_scale=scale
     )
     why = (
-        "gross outliers have to be held back" if spoiled else f"frame-to-frame roughness is {rough.noise:.2g} RMS radii"
+        "gross outliers have to be held back"
+        if spoiled
+        else f"frame-to-frame roughness is {rough.noise_std:.2g} RMS radii"
     )
     return chosen, (
         f"λ1 = {stiff:.3g} because {why} ({rough.jumps:.1%} of the third differences are jumps); λ2 = {SPATIAL_SHARE:g} λ1 keeps "
@@ -184,8 +186,9 @@ def _from_data(rough: Roughness, settings: Settings) -> tuple[Weights, str]:
 def _least_squares(rough: Roughness, *, spoiled: bool) -> tuple[Weights, str]:
     """Return the weights without a robust loss.
 
-    At the published λ1 every frame is fitted all but exactly. An outlier is then in the shape in full, and the depth, which other
-    frames alone show, is made of their outliers: worse than no depth. Stiff paths and stiff neighbours are all the help there is.
+    At the published λ1 every frame is fitted almost exactly, so outliers enter the shape in full, and depth, which is
+    inferred from other frames, is inferred from their outliers. Strong smoothness in time and space is the only
+    protection.
     """
     stiff = STIFFEST if spoiled else PAPER.temporal
     share = LEAST_SQUARES_SHARE if spoiled else SPATIAL_SHARE

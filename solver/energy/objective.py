@@ -13,7 +13,7 @@ from pliant.solver.threads import SMALLEST, over_ranges
 
 
 def residuals(problem: Problem, shapes: Array, translations: Floats) -> Array:
-    """Return w − s R x − t, shape `(F, 2, P)`, normalised units; meaningless where hidden."""
+    """Return w − s R x − t, shape `(F, 2, P)`, normalized units; meaningless where hidden."""
     left = np.empty_like(problem.points, dtype=shapes.dtype)
 
     def work(start: int, stop: int) -> None:
@@ -58,7 +58,7 @@ def weights_of(problem: Problem, residual: Array, frame: int) -> Array:
 
 
 def prior(problem: Problem, shapes: Array) -> float:
-    """Return what of the energy the tracks have no part in."""
+    """Return the part of the energy that does not depend on the tracks."""
     weights = problem.weights
     return smoothness(problem, shapes) + rank_penalty(shapes, weights.low_rank, weights.rank_floor)
 

@@ -15,7 +15,7 @@ Array = NDArray[np.floating]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Weights:
-    """Every number of the energy, chosen; dimensionless, in normalised units."""
+    """Every number of the energy, chosen; dimensionless, in normalized units."""
 
     temporal: float
     """λ1."""
@@ -33,7 +33,7 @@ class Weights:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Problem:
-    """One energy to minimise, normalised units."""
+    """One energy to minimise, normalized units."""
 
     points: Array
     """Centred tracks, shape `(F, 2, P)`."""

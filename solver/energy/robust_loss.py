@@ -18,13 +18,13 @@ def loss_value(residual: Array, confidence: Array, *, loss: str, scale: float) -
     Parameters
     ----------
     residual : array, shape (F, 2, P)
-        r, normalised units; both coordinates.
+        r, normalized units; both coordinates.
     confidence : array, shape (F, P)
         v in [0, 1].
     loss : {"l1", "l2", "huber"}
         l1, on each coordinate as in the paper: √(r² + ε²) − ε. l2: r². huber, on the length of both: r² up to δ, then 2δr − δ².
     scale : float
-        ε or δ, normalised units.
+        ε or δ, normalized units.
     """
     if loss == "l2":
         return float(np.einsum("fcp,fcp,fp->", residual, residual, confidence, dtype=np.float64))

@@ -22,7 +22,7 @@ from pliant.solver.threads import over_ranges
 
 Array = NDArray[np.floating]
 
-MOST = 12
+MAX_FREE_MODES = 12
 """Modes of a coordinate at most: memory grows with the square."""
 
 HELD = 0.05
@@ -80,19 +80,19 @@ def build_coarse(operator: Operator) -> Coarse | None:
     prior = np.diag(np.concatenate(held))
 
     def work(start: int, stop: int) -> None:
-        for low in range(start, stop, BLOCK):
-            high = min(low + BLOCK, stop)
+        for low in range(start, stop, MODE_BLOCK):
+            high = min(low + MODE_BLOCK, stop)
             flat = operator.weights[:, :, low:high].reshape(-1, high - low).T @ products
             normal = np.zeros((high - low, size, size))
             normal[:, upper[0], upper[1]] = flat
             normal[:, upper[1], upper[0]] = flat
             inverses[low:high] = np.linalg.inv(normal + prior)
 
-    over_ranges(work, points, smallest=BLOCK)
+    over_ranges(work, points, smallest=MODE_BLOCK)
     return Coarse(modes, inverses)
 
 
-BLOCK = 256
+MODE_BLOCK = 256
 """Points worked on at once."""
 
 
@@ -100,7 +100,7 @@ def _free_modes(operator: Operator, limit: float) -> tuple[tuple[Floats, Floats,
     """Return for each coordinate the modes that the prior holds least, and how much it holds them."""
     assert operator.quadratic is not None
     modes, held = [], []
-    for directions, values in operator.quadratic.loosest(MOST):
+    for directions, values in operator.quadratic.loosest(MAX_FREE_MODES):
         free = values < limit
         modes.append(np.ascontiguousarray(directions[:, free]))
         held.append(np.maximum(values[free], 1e-9 * limit))

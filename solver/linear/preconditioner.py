@@ -23,7 +23,7 @@ from pliant.solver.threads import available_cores, over_ranges
 from scipy import fft, linalg
 
 Array = NDArray[np.floating]
-BLOCK = 1024
+POINTS_PER_BLOCK = 1024
 """Points a thread should have to work on, at least."""
 BENDS = 1.0
 """Coarser levels are taken where bending is this much beside the slowest smoothness in time."""
@@ -124,7 +124,7 @@ def _by_inverse(temporal: Floats, kind: np.dtype[np.floating]) -> Linear:
         def work(start: int, stop: int) -> None:
             into[:, start:stop] = symmetric @ flat[:, start:stop]
 
-        over_ranges(work, flat.shape[1], smallest=BLOCK)
+        over_ranges(work, flat.shape[1], smallest=POINTS_PER_BLOCK)
         return result
 
     return apply
@@ -141,7 +141,7 @@ def _by_point(r: Array, temporal: Diagonalised, shift: Floats) -> Array:
         inner /= (temporal.values[:, None] + shifts[start:stop]).astype(r.dtype)
         result[:, start:stop] = temporal.vectors @ inner
 
-    over_ranges(work, flat.shape[1], smallest=BLOCK)
+    over_ranges(work, flat.shape[1], smallest=POINTS_PER_BLOCK)
     return result.reshape(r.shape)
 
 

@@ -1,14 +1,15 @@
-"""How unsteady a camera is: what a real one does not do between two frames.
+"""Prior on camera motion: a penalty on changes of angular velocity and of scale between frames.
 
-The tracks of a thing that deforms strongly are explained almost equally well by many camera paths, for turning every frame a
-little is a cheap way to explain deformation. What tells them apart is that cameras and bodies have inertia. With T_f = R_{f+1} R_fᵀ
-the turn from frame f to the next, T_f − T_{f−1} is the change of angular velocity; its components are taken as Gaussian of
-unknown variance, and the negative log-likelihood with the variance at its most likely value is
+Many camera paths explain the tracks of a strongly deforming object almost equally well, because a small rotation of
+every frame absorbs deformation. Cameras and bodies have inertia, which separates these paths. With T_f = R_{f+1} R_fᵀ
+the rotation from frame f to the next, T_f − T_{f−1} is the change of angular velocity. Its components are Gaussian
+with unknown variance; at the most likely variance the negative log likelihood is
 
-    3/2 log(floor² + mean_f ½‖T_f − T_{f−1}‖_F²)      for each of the F − 2 changes, divided by F as the energy is,
+    3/2 log(floor² + mean_f ½‖T_f − T_{f−1}‖_F²)
 
-and ½ log(floor² + mean_f (log s_{f+1} − log s_f)²) for the scales. No strength has to be set: a camera with jumps has a large
-variance and is hardly bound, a steady one is held; the floors say from where on more steadiness is worth nothing.
+for each of the F − 2 changes, divided by F as the energy is. The term for the scales is ½ log(floor² + mean_f (log
+s_{f+1} − log s_f)²). The variance is estimated, so there is no strength to tune: the prior is weak for a jerky camera
+and strong for a smooth one. Below the floors, smoother motion is no longer rewarded.
 """
 
 from __future__ import annotations
@@ -17,14 +18,14 @@ import numpy as np
 from pliant.solver.records import Floats
 
 TURN_FLOOR = np.radians(0.2)
-"""Change of the turn from frame to frame, rad, that needs no reason."""
+"""Floor of the change of rotation between frames, rad: smaller changes are not rewarded."""
 
 SCALE_FLOOR = 0.002
-"""Change of log s from frame to frame that needs no reason."""
+"""Floor of the change of log s between frames: smaller changes are not rewarded."""
 
 
-def unsteadiness(rotations: Floats) -> tuple[float, Floats]:
-    """Return the term for the rotations, shape `(F, 3, 3)`, and its gradient in all nine entries of each."""
+def rotation_roughness(rotations: Floats) -> tuple[float, Floats]:
+    """Return the penalty on rotations of shape `(F, 3, 3)` and its gradient with respect to all nine entries of each."""
     turns = rotations[1:] @ np.swapaxes(rotations[:-1], 1, 2)
     changes = np.diff(turns, axis=0)
     count = max(len(changes), 1)
@@ -39,8 +40,8 @@ def unsteadiness(rotations: Floats) -> tuple[float, Floats]:
     return 1.5 * count / len(rotations) * float(np.log(variance)), gradient
 
 
-def unevenness(logs: Floats) -> tuple[float, Floats]:
-    """Return the term for the logarithms of the scales, shape `(F,)`, and its gradient."""
+def scale_roughness(logs: Floats) -> tuple[float, Floats]:
+    """Return the penalty on the logarithms of the scales, shape `(F,)`, and its gradient."""
     steps = np.diff(logs)
     variance = SCALE_FLOOR**2 + float((steps**2).mean())
     gradient = np.zeros_like(logs)

@@ -1,13 +1,12 @@
-"""When to stop learning the covariance: once points that were not learned from become less probable.
+"""Early stopping of the shape covariance: stop EM when held-out points become less probable.
 
-With fewer points than image coordinates, P < 2F, the Gram matrix of the tracks has no full rank, and the likelihood has no maximum: it
-grows as long as a covariance is the more certain that there is nothing but these points. Expectation maximisation finds first what they
-have in common, as all the tracks show it, and last what hangs on single points and on the depth of single frames. So three times
-two thirds of the points are learned from, the third is judged after every round, and all points are then learned from for as many
-rounds as were good for the others. Measured, all points seen: landmarks of a face .0204 → .0144, mocap of a dance .112 → .101, a
-dinosaur of 49 points .131 → .124; a walk .112 → .118.
+With fewer points than image coordinates, P < 2F, the Gram matrix of the tracks is rank deficient and the likelihood
+is unbounded: it keeps growing as the covariance concentrates on the given points. Expectation maximisation learns
+common structure first, and idiosyncrasies of single points and of the depth of single frames last. The points are
+therefore split into three folds. Each fold in turn is held out and scored after every round of EM on the other two;
+all points are then learned from for the number of rounds with the lowest held-out negative log likelihood.
 
-Where few modes are all there is (a shark of 91 points, 5 modes) the other points become more probable to the end, and nothing is stopped.
+Where the motion has few modes, the held-out likelihood improves to the end and nothing is stopped.
 """
 
 from __future__ import annotations
@@ -17,11 +16,11 @@ from dataclasses import replace
 from itertools import islice
 
 import numpy as np
-from pliant.solver.model.model_order import FEWEST, GAIN, Support, improbability
+from pliant.solver.model.model_order import MIN_JUDGED_POINTS, MIN_NLL_GAIN, ModelOrder, held_out_nll
 from pliant.solver.model.shape_covariance import (
-    DRIFT_FLOOR,
-    MOST_MODES,
-    WARM,
+    ANNEALING_START,
+    MAX_MODES,
+    WALK_VARIANCE_FLOOR,
     ShapeCovariance,
     learned,
     rounds,
@@ -31,90 +30,100 @@ from pliant.solver.records import Floats
 from pliant.solver.tracks.completion import SAMPLE
 
 FOLDS = 3
-"""Parts into which the points are dealt."""
+"""Folds of the cross-validation over points."""
 
-ROUNDS = 40
-"""Rounds judged at most. What still gains by the last of them is learned in full."""
+MAX_JUDGED_ROUNDS = 40
+"""Maximum number of EM rounds that are scored. If the last one is still the best, EM runs to its usual end."""
 
-ANNEALED, COLD = np.geomspace(WARM, DRIFT_FLOOR, ROUNDS), np.full(ROUNDS, DRIFT_FLOOR)
-"""The floors of τ of either way of learning."""
+ANNEALED_FLOORS, CONSTANT_FLOORS = (
+    np.geomspace(ANNEALING_START, WALK_VARIANCE_FLOOR, MAX_JUDGED_ROUNDS),
+    np.full(MAX_JUDGED_ROUNDS, WALK_VARIANCE_FLOOR),
+)
+"""Floors of τ per round, with annealing and without; variance per point in normalized units."""
 
-HOPELESS = 1.0
-"""Logarithms of the likelihood per point and frame by which the other points may become less probable before nobody looks further."""
+MAX_NLL_RISE = 1.0
+"""Rise of the held-out negative log likelihood above its minimum, per point and frame, that ends the scoring."""
 
 
-def learned_in_time(
+def learn_with_early_stopping(
     sample: Floats,
     gram: Floats,
-    pairs: Floats,
-    support: Support,
+    projections: Floats,
+    model_order: ModelOrder,
     *,
     seed: int = 0,
     should_stop: Callable[[], bool] | None = None,
 ) -> tuple[ShapeCovariance, str]:
-    """Return the covariance learned from scratch, for as many rounds as suit points that were not learned from, and the reason.
+    """Return the covariance learned from scratch for the number of rounds that suits held-out points, and a sentence.
 
     Parameters
     ----------
     sample : array, shape (F, S, 2)
-        Some points of centred, complete tracks, normalised units; judged only if they are all there are and fewer than 2F.
-    gram, pairs
+        Some points of centred, complete tracks, normalized units; held out only if they are all points and fewer than 2F.
+    gram, projections
         As for `pliant.solver.model.shape_covariance.learned`.
-    support : Support
-        Modes at most, and the noise to begin with.
+    model_order : Support
+        Maximum number of modes, and the starting noise.
     seed : int
-        Deals out the points.
+        Seed of the folds.
     should_stop : callable, optional
-        Asked between rounds; once it says True, no more of them are judged.
+        Called between rounds; once it returns True, scoring ends.
     """
     frames, count = sample.shape[:2]
-    if FEWEST <= count < min(2 * frames, SAMPLE):
+    if MIN_JUDGED_POINTS <= count < min(2 * frames, SAMPLE):
         points = sample.transpose(0, 2, 1).reshape(2 * frames, count)
-        ways = [(each, floors) for each in sorted({support.most, MOST_MODES}) for floors in (ANNEALED, COLD)]
+        ways = [
+            (each, floors)
+            for each in sorted({model_order.max_modes, MAX_MODES})
+            for floors in (ANNEALED_FLOORS, CONSTANT_FLOORS)
+        ]
         paths = [
-            _judged(points, pairs, replace(support, most=most), floors, seed, should_stop) for most, floors in ways
+            _judged(points, projections, replace(model_order, max_modes=max_modes), floors, seed, should_stop)
+            for max_modes, floors in ways
         ]
         best = min(paths, key=min)
-        if min(best) < min(path[-1] for path in paths) - GAIN:
-            most, floors = ways[paths.index(best)]
-            start = scratch(gram, pairs, most, noisy=support.noisy)
-            path = rounds(start, gram, pairs, floors=floors, most=most)
+        if min(best) < min(path[-1] for path in paths) - MIN_NLL_GAIN:
+            max_modes, floors = ways[paths.index(best)]
+            start = scratch(gram, projections, max_modes, noisy_start=model_order.noisy_start)
+            path = rounds(start, gram, projections, floors=floors, max_modes=max_modes)
             number = best.index(min(best)) + 1
-            told = f"learned in {number} rounds, for more would make points that are not learned from less probable."
+            reason = f"learned in {number} rounds, for more would make points that are not learned from less probable."
             covariance = next(islice(path, number - 1, None))
-            return covariance, described(covariance, told)
-    told = f"more than {support.most} modes, learned from some points, do not make the others more probable."
-    covariance = learned(gram, pairs, most=support.most, noisy=support.noisy, should_stop=should_stop)
-    return covariance, described(covariance, told if support.most < MOST_MODES else "")
+            return covariance, described(covariance, reason)
+    reason = f"more than {model_order.max_modes} modes, learned from some points, do not make the others more probable."
+    covariance = learned(
+        gram, projections, max_modes=model_order.max_modes, noisy_start=model_order.noisy_start, should_stop=should_stop
+    )
+    return covariance, described(covariance, reason if model_order.max_modes < MAX_MODES else "")
 
 
 def described(covariance: ShapeCovariance, more: str = "") -> str:
-    """Return a sentence about what was learned."""
-    found = f"{covariance.modes.shape[1]} modes of deformation, noise of {covariance.noise**0.5:.2g} RMS radii"
+    """Return a sentence that states the number of modes and the noise."""
+    found = f"{covariance.modes.shape[1]} modes of deformation, noise of {covariance.noise_variance**0.5:.2g} RMS radii"
     return f"{found}; {more}" if more else f"{found}."
 
 
 def _judged(
     points: Floats,
-    pairs: Floats,
-    support: Support,
+    projections: Floats,
+    model_order: ModelOrder,
     floors: Floats,
     seed: int,
     should_stop: Callable[[], bool] | None,
 ) -> list[float]:
-    """Return how improbable points that were not learned from are after every round, until it is hopeless."""
+    """Return the mean held-out negative log likelihood after every round, until it has risen by `MAX_NLL_RISE`."""
     part = np.random.default_rng(seed).permutation(points.shape[1]) % FOLDS
     paths, others = [], []
     for fold in range(FOLDS):
         own = points[:, part != fold]
         gram = own @ own.T / own.shape[1]
-        start = scratch(gram, pairs, support.most, noisy=support.noisy)
-        paths.append(rounds(start, gram, pairs, floors=floors, most=support.most))
+        start = scratch(gram, projections, model_order.max_modes, noisy_start=model_order.noisy_start)
+        paths.append(rounds(start, gram, projections, floors=floors, max_modes=model_order.max_modes))
         others.append(points[:, part == fold])
     found: list[float] = []
     for covariances in zip(*paths, strict=True):
-        energies = [improbability(each, pairs, other) for each, other in zip(covariances, others, strict=True)]
+        energies = [held_out_nll(each, projections, other) for each, other in zip(covariances, others, strict=True)]
         found.append(sum(energies) / FOLDS)
-        if found[-1] > min(found) + HOPELESS or (should_stop is not None and should_stop()):
+        if found[-1] > min(found) + MAX_NLL_RISE or (should_stop is not None and should_stop()):
             break
     return found

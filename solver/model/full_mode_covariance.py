@@ -1,20 +1,20 @@
-"""Cameras refined with a basis of shapes whose coefficients covary in full, for clean tracks.
+"""Camera refinement with full covariance between mode coefficients, for clean tracks.
 
-The shape covariance (`model.shape_covariance`) gives every mode the same covariance over axes, C ⊗ A₁. Real modes move along axes of
-their own: a jaw down, lips forward. Cameras that are wrong by a degree or two make them look alike, and with hardly any noise that is
-worth more than the error. So once the cameras are nearly right, the world positions of a point are taken as
+The shape covariance (`model.shape_covariance`) gives every mode the same covariance over axes, C ⊗ A₁. Real modes
+move along axes of their own: a jaw down, lips forward. Camera errors of one or two degrees make these axes look
+alike, and with little noise the separable model is then the larger error. Once the cameras are nearly right, the
+world positions of a point are therefore modelled as
 
     x_f = Σ_k c_fk b_k + random walk,    b = (b_1 … b_K) ~ N(0, Ω),    Ω = M Mᵀ of 3K × 3K,
 
-with the mean position among the b_k, the c_fk those of the modes and one column of ones; that is the basis of shapes of Bregler,
-Hertzmann, Biermann (2000), "Recovering non-rigid 3D shape from image streams", its coefficients integrated out as by Torresani,
-Hertzmann, Bregler (2008). The image of a point then covaries by V = B Ω Bᵀ + τ (T ⊗ A₁ seen) + σ²I, where row f of B is
-s_f R_f (c_f ⊗ I), and cameras, c, M, σ and τ minimise (log det V + tr V⁻¹G) / 2F together. From a separable start this is a long
-way: thousands of steps of L-BFGS, each in 2F dimensions.
+with the mean position among the b_k; the c_fk are the modes and one column of ones. This is the shape basis of
+Bregler, Hertzmann, Biermann (2000), "Recovering non-rigid 3D shape from image streams", with coefficients integrated
+out as in Torresani, Hertzmann, Bregler (2008). The image of a point has the covariance V = B Ω Bᵀ + τ (T ⊗ Π A₁ Πᵀ) +
+σ²I, where row f of B is s_f R_f (c_f ⊗ I). Cameras, c, M, σ and τ minimise (log det V + tr V⁻¹G) / 2F jointly, by
+L-BFGS from the separable model.
 
-Ω has so many entries that it needs many points and few modes, and where there is noise it learns the noise: `telling` says where
-it is of use. Measured with all points seen, estimated cameras: faces of 99 frames .0154 → .0081, horse .0125 → .0047; and with noise
-of .01 all the same faces .044 → .28, without the question.
+Ω has (3K)² entries, so it needs many points and few modes, and with noisy tracks it fits the noise. `is_identifiable`
+decides whether it is used.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from pliant.solver.model.camera_motion_prior import unevenness, unsteadiness
+from pliant.solver.model.camera_motion_prior import rotation_roughness, scale_roughness
 from pliant.solver.model.image_density import ImageModel, terms
 from pliant.solver.model.marginal_likelihood import UNLIKELY, Scene, cameras_of, root_matrix
 from pliant.solver.model.shape_covariance import ShapeCovariance
@@ -32,16 +32,18 @@ from pliant.solver.records import Floats
 from scipy.optimize import minimize
 
 POINTS_PER_COEFFICIENT = 4
-"""Points that each of the 3K coefficients needs."""
+"""Minimum number of points for each of the 3K coefficients."""
 
-QUIET = 1e-3
-"""Noise, normalised units, from which on the basis would learn the noise."""
+MAX_NOISE_STD = 1e-3
+"""Noise standard deviation, normalized units, above which the basis would fit noise and is not used: at .01 it raises
+the error of faces from .044 to .28."""
 
-STEPS, FRAME_STEPS, MOST_FRAMES = 2400, 240_000, 160
-"""L-BFGS iterations at most, their product with the frames, and the frames beyond which the way is too long."""
+MAX_STEPS, MAX_FRAME_STEPS, MAX_BASIS_FRAMES = 2400, 240_000, 160
+"""Maximum L-BFGS iterations, maximum product of iterations and frames, and maximum number of frames: bounds on the
+time."""
 
-FLAT = 1e-7
-"""Share of the energy that one iteration must gain, or the refinement is at its end."""
+ENERGY_TOLERANCE = 1e-7
+"""Relative decrease of the energy per iteration below which the refinement ends."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,10 +51,10 @@ class Basis:
     """Parameters of the density; a gradient has the same fields."""
 
     turns: Floats
-    """Rotation vectors that turn the scene's cameras, shape `(F, 3)`."""
+    """Rotation vectors relative to the scene's cameras, shape `(F, 3)`."""
 
     log_scales: Floats
-    """Shape `(F,)`; only their differences from the mean count."""
+    """Shape `(F,)`; only differences from the mean matter."""
 
     weights: Floats
     """c, shape `(F, K)`."""
@@ -78,68 +80,70 @@ class Basis:
         )
 
 
-def telling(covariance: ShapeCovariance, points: int) -> bool:
-    """Whether so many points tell how the coefficients of this covariance's modes covary."""
+def is_identifiable(covariance: ShapeCovariance, points: int) -> bool:
+    """Whether this number of points determines the covariance between the coefficients of the modes."""
     frames, count = covariance.modes.shape
     size = 3 * (count + 1)
     return (
-        frames <= MOST_FRAMES
-        and covariance.noise < QUIET**2
+        frames <= MAX_BASIS_FRAMES
+        and covariance.noise_variance < MAX_NOISE_STD**2
         and size < 2 * frames
         and POINTS_PER_COEFFICIENT * size <= points
     )
 
 
 def begin(scene: Scene, scales: Floats, covariance: ShapeCovariance) -> Basis:
-    """Return the covariance as a basis: its modes and the mean, which do not covary."""
+    """Return the separable covariance as a basis: its modes and the mean, uncorrelated."""
     frames = len(scene.rotations)
     weights = np.column_stack([covariance.modes, np.ones(frames)])
-    root = np.kron(np.eye(weights.shape[1]), np.linalg.cholesky(covariance.play))
-    root[-3:, -3:] = root_matrix(covariance.extent)
-    noise = max(covariance.noise - scene.noise_floor**2, scene.noise_floor**4)
-    return Basis(np.zeros((frames, 3)), np.log(scales), weights, root, 0.5 * np.log([noise, covariance.drift]))
+    root = np.kron(np.eye(weights.shape[1]), np.linalg.cholesky(covariance.axis_covariance))
+    root[-3:, -3:] = root_matrix(covariance.mean_covariance)
+    noise = max(covariance.noise_variance - scene.noise_std_floor**2, scene.noise_std_floor**4)
+    return Basis(np.zeros((frames, 3)), np.log(scales), weights, root, 0.5 * np.log([noise, covariance.walk_variance]))
 
 
 # A line search may try a step far too long: that energy is `UNLIKELY`.
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")
-def energy(scene: Scene, play: Floats, basis: Basis) -> tuple[float, Basis]:
-    """Return the energy with the terms for the camera's steadiness, and its gradient, analytic in every parameter.
+def energy(scene: Scene, axis_covariance: Floats, basis: Basis) -> tuple[float, Basis]:
+    """Return the energy with the camera-motion prior, and its gradient, analytic in every parameter.
 
     Parameters
     ----------
     scene : Scene
         Its smoothness does not count.
-    play : array, shape (3, 3)
+    axis_covariance : array, shape (3, 3)
         A₁ of the random walk.
     basis : Basis
         Where.
     """
     frames, size = basis.weights.shape
     rotations, scales = cameras_of(scene, basis)
-    pairs = rotations[:, :2] * scales[:, None, None]
-    root = root_matrix(play)
-    shapes = np.einsum("fk,fid->fikd", basis.weights, pairs).reshape(2 * frames, 3 * size)
-    noise, drift = np.exp(2 * basis.logs)
-    model = ImageModel(shapes @ basis.root, pairs @ root, float(noise) + scene.noise_floor**2, float(drift))
+    projections = rotations[:, :2] * scales[:, None, None]
+    root = root_matrix(axis_covariance)
+    shapes = np.einsum("fk,fid->fikd", basis.weights, projections).reshape(2 * frames, 3 * size)
+    noise, walk_variance = np.exp(2 * basis.logs)
+    model = ImageModel(
+        shapes @ basis.root, projections @ root, float(noise) + scene.noise_std_floor**2, float(walk_variance)
+    )
     try:
         found = terms(model, scene.factor)
     except np.linalg.LinAlgError:
         return UNLIKELY, Basis.unflat(np.zeros_like(basis.flat()), frames, size)
     by_shapes = (found.by_columns @ basis.root.T).reshape(frames, 2, size, 3)
-    by_pairs = np.einsum("fikd,fk->fid", by_shapes, basis.weights) + found.by_walk @ root.T
-    uneven, by_logs = unevenness(np.log(scales))
-    by_logs = scene.steadiness * by_logs + np.einsum("fij,fij->f", by_pairs, pairs)
-    unsteady, by_rotations = unsteadiness(rotations)
-    by_rotations *= scene.steadiness
-    by_rotations[:, :2] += by_pairs * scales[:, None, None]
+    by_projections = np.einsum("fikd,fk->fid", by_shapes, basis.weights) + found.by_walk @ root.T
+    rough_scales, by_logs = scale_roughness(np.log(scales))
+    by_logs = scene.prior_weight * by_logs + np.einsum("fij,fij->f", by_projections, projections)
+    rough_rotations, by_rotations = rotation_roughness(rotations)
+    by_rotations *= scene.prior_weight
+    by_rotations[:, :2] += by_projections * scales[:, None, None]
     gradient = Basis(
         np.einsum("fji,fj->fi", left_jacobian(basis.turns), vee(by_rotations @ np.swapaxes(rotations, 1, 2))),
         (by_logs - by_logs.mean()) * scene.with_scales,
-        np.einsum("fikd,fid->fk", by_shapes, pairs),
+        np.einsum("fikd,fid->fk", by_shapes, projections),
         shapes.T @ found.by_columns,
-        2 * np.array([found.by_noise * noise, found.by_drift * drift]),
+        2 * np.array([found.by_noise_variance * noise, found.by_walk_variance * walk_variance]),
     )
-    return found.value + scene.steadiness * (uneven + unsteady), gradient
+    return found.value + scene.prior_weight * (rough_scales + rough_rotations), gradient
 
 
 def refined(
@@ -149,21 +153,21 @@ def refined(
     *,
     should_stop: Callable[[], bool] | None = None,
 ) -> tuple[Floats, Floats]:
-    """Return rotations (F, 3, 3) and scales (F,) that minimise the energy from the scene's on."""
+    """Return rotations (F, 3, 3) and scales (F,) that minimise the energy, starting from the scene's cameras."""
     frames, size = len(scene.rotations), covariance.modes.shape[1] + 1
     start = begin(scene, scales, covariance)
 
     def objective(flat: Floats) -> tuple[float, Floats]:
-        value, gradient = energy(scene, covariance.play, Basis.unflat(flat, frames, size))
+        value, gradient = energy(scene, covariance.axis_covariance, Basis.unflat(flat, frames, size))
         return value, gradient.flat()
 
     def asked(xk: Floats) -> None:  # noqa: ARG001 - SciPy calls it by this name
         if should_stop is not None and should_stop():
             raise StopIteration
 
-    steps = min(STEPS, FRAME_STEPS // frames)
+    steps = min(MAX_STEPS, MAX_FRAME_STEPS // frames)
     found = minimize(
         objective, start.flat(), jac=True, method="L-BFGS-B", callback=asked,
-        options={"maxiter": steps, "maxfun": 2 * steps, "maxcor": 20, "ftol": FLAT},
+        options={"maxiter": steps, "maxfun": 2 * steps, "maxcor": 20, "ftol": ENERGY_TOLERANCE},
     )  # fmt: skip
     return cameras_of(scene, Basis.unflat(np.asarray(found.x), frames, size))

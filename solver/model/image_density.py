@@ -34,7 +34,7 @@ DENSE_ROWS = 210
 DENSE_SHARE = 0.55
 """Share of q and of the columns of F₀, together, in 2F above which factoring V is faster: measured for 2F = 240 … 714."""
 
-RANK = 2.0
+MIN_DENSE_RANK = 2.0
 """Pivots of G below this many roundings of its largest entry are rounding."""
 
 
@@ -74,17 +74,19 @@ class Terms:
     by_walk: Floats
     """∂E/∂B_f, shape `(F, 2, 3)`."""
 
-    by_noise: float
+    by_noise_variance: float
     """∂E/∂σ²."""
 
-    by_drift: float
+    by_walk_variance: float
     """∂E/∂τ."""
 
 
 def factor_of(gram: Floats) -> Floats:
     """Return F₀ with F₀F₀ᵀ = G to rounding, as many columns as G has rank: a pivoted Cholesky factor."""
     size, largest = len(gram), float(np.diag(gram).max(initial=0.0))
-    factor, pivots, rank, _ = lapack.dpstrf(gram, lower=1, tol=RANK * float(np.finfo(np.float64).eps) * largest)
+    factor, pivots, rank, _ = lapack.dpstrf(
+        gram, lower=1, tol=MIN_DENSE_RANK * float(np.finfo(np.float64).eps) * largest
+    )
     root = np.zeros((size, rank))
     root[pivots - 1] = np.tril(factor)[:, :rank]
     return root

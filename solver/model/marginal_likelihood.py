@@ -1,20 +1,20 @@
-"""How probable the tracks are under cameras, whatever the shapes: the energy with the shapes eliminated.
+"""Negative log likelihood of the tracks given cameras, with the shapes integrated out.
 
-A point's world positions over all frames are taken as Gaussian: a mean position with covariance A₀ (3×3, the object's extents)
-plus a deformation whose frames covary by C (F×F) and whose axes covary by A₁. Its image positions then have the covariance
+The world positions of a point over all frames are Gaussian: a mean position with covariance A₀ (3×3) plus a
+deformation with covariance C (F×F) over frames and A₁ over axes. The image positions then have the covariance
 
-    M = σ² I + Π (1 1ᵀ ⊗ A₀ + C ⊗ A₁) Πᵀ,    Π = blockdiag(s_f R_f),    C = L Lᵀ + τ² T,
+    M = σ² I + Π (1 1ᵀ ⊗ A₀ + C ⊗ A₁) Πᵀ,    Π = blockdiag(s_f R_f),    C = L Lᵀ + τ T,
 
-and with G = W Wᵀ / P the negative log-likelihood of one point and frame is
+and with G = W Wᵀ / P the negative log likelihood per point and frame is, up to a constant,
 
     E = (log det M + tr M⁻¹ G) / 2F.
 
-The trace is variable projection: tr M⁻¹ G is what min_S ‖W − Π S‖²/σ² + ‖S‖²_prior leaves. Alone it falls when depth is
-traded for rotation (a flat shape that turns faster moves the same in the image). The log-determinant is what a smoothness
-energy lacks: a prior that expects less depth explains less and must pay. T is the covariance of a random walk, the modes
-L (F×q) are the low-rank part, and κ‖H L‖²/2F keeps them smooth: without it every frame is turned to fit the mean shape best,
-and a talking face nods with its jaw. What binds the cameras is in
-`model.camera_motion_prior`. Everything lives in 2F dimensions; P does not matter.
+The trace is variable projection: tr M⁻¹ G is the minimum over S of ‖W − Π S‖²/σ² + ‖S‖²_prior. On its own it falls
+when depth is traded for rotation, because a flatter shape that turns further moves the same in the image. The
+log-determinant counteracts this: a prior with less depth explains less. T is the covariance of a random walk; the
+modes L (F×q) are the low-rank part. The penalty κ‖H L‖²/2F keeps them smooth, because otherwise every frame is
+rotated to fit the mean shape. `model.camera_motion_prior` adds the penalty on the cameras. All matrices are 2F×2F;
+the cost does not depend on P.
 """
 
 from __future__ import annotations
@@ -24,28 +24,28 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
-from pliant.solver.model.camera_motion_prior import unevenness, unsteadiness
+from pliant.solver.model.camera_motion_prior import rotation_roughness, scale_roughness
 from pliant.solver.model.image_density import ImageModel, factor_of, inverted, terms
 from pliant.solver.model.so3 import exponential, left_jacobian, vee
 from pliant.solver.records import Floats
 from scipy.optimize import minimize
 
-NOISE_FLOOR = 3e-3
-"""Normalised units. No tracks of real video are better, and a finer one spends the model's modes on what no camera explains:
-measured, 1e-4 leaves L-BFGS unconverged after 200 iterations, with 3e-3 different starts reach the same cameras."""
+NOISE_STD_FLOOR = 3e-3
+"""Floor of the noise standard deviation, normalized units: no tracks of real video are better. A smaller floor spends
+modes on model error and slows L-BFGS."""
 
-STEADINESS = 0.05
-"""Weight of `model.camera_motion_prior`, whose terms are those of one camera, against E, which is that of one point: the points
-of a surface move together and are worth about 1/0.05 independent ones."""
+CAMERA_PRIOR_WEIGHT = 0.05
+"""Weight of `model.camera_motion_prior`, a term per camera, against E, a term per point: points of a surface move
+together and count as about 1/0.05 independent ones."""
 
 SMOOTHNESS = 1000.0
-"""κ."""
+"""κ, weight of the penalty on differences of the modes between frames."""
 
 NUM_MODES = 16
-"""q."""
+"""q, number of modes."""
 
 UNLIKELY = 1e6
-"""Energy reported where M is not positive definite to rounding; the line search steps back from it."""
+"""Energy returned where M is not numerically positive definite; the line search steps back from it."""
 
 LOWER = np.tril_indices(3)
 
@@ -55,27 +55,27 @@ class Motion:
     """Parameters of the density; a gradient has the same fields."""
 
     turns: Floats
-    """Rotation vectors that turn the start's cameras: R_f = exp(turns_f) R_f⁰, shape `(F, 3)`."""
+    """Rotation vectors relative to the starting cameras: R_f = exp(turns_f) R_f⁰, shape `(F, 3)`."""
 
     log_scales: Floats
-    """Shape `(F,)`; only their differences from the mean count."""
+    """Shape `(F,)`; only differences from the mean matter."""
 
     modes: Floats
     """L, shape `(F, q)`."""
 
-    extent: Floats
+    mean_root: Floats
     """Lower triangle of a root of A₀, shape `(6,)`."""
 
-    play: Floats
+    axis_root: Floats
     """Lower triangle of a root of A₁, shape `(6,)`."""
 
     logs: Floats
-    """log σ and log τ, shape `(2,)`."""
+    """log σ and ½ log τ, shape `(2,)`."""
 
     def flat(self) -> Floats:
         """Return all parameters in one vector."""
         return np.concatenate(
-            [self.turns.ravel(), self.log_scales, self.modes.ravel(), self.extent, self.play, self.logs]
+            [self.turns.ravel(), self.log_scales, self.modes.ravel(), self.mean_root, self.axis_root, self.logs]
         )
 
     @classmethod
@@ -90,10 +90,10 @@ class Motion:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """What the likelihood is asked about."""
+    """The data and settings of the likelihood."""
 
     gram: Floats
-    """W Wᵀ / P of centred, complete tracks, normalised units, shape `(2F, 2F)`."""
+    """W Wᵀ / P of centred, complete tracks, normalized units, shape `(2F, 2F)`."""
 
     rotations: Floats
     """The cameras at zero turn, shape `(F, 3, 3)`."""
@@ -101,11 +101,11 @@ class Scene:
     with_scales: bool
     """False: every s_f is 1."""
 
-    steadiness: float
-    """Weight of the camera's unsteadiness."""
+    prior_weight: float
+    """Weight of the camera-motion prior."""
 
-    noise_floor: float
-    """Normalised units; added to σ in quadrature."""
+    noise_std_floor: float
+    """Normalized units; added to σ in quadrature."""
 
     smoothness: float = SMOOTHNESS
     """κ."""
@@ -124,28 +124,28 @@ class Scene:
         rotations: Floats,
         *,
         with_scales: bool,
-        steadiness: float = STEADINESS,
-        noise_floor: float = NOISE_FLOOR,
+        prior_weight: float = CAMERA_PRIOR_WEIGHT,
+        noise_std_floor: float = NOISE_STD_FLOOR,
     ) -> Scene:
         """Return the scene for a Gram matrix and starting cameras."""
-        return cls(gram, rotations, with_scales, steadiness, noise_floor)
+        return cls(gram, rotations, with_scales, prior_weight, noise_std_floor)
 
 
 def start(scene: Scene, scales: Floats, *, num_modes: int = NUM_MODES) -> Motion:
-    """Return a rigid explanation and, from what it leaves, the leading modes in time."""
+    """Return a rigid explanation and, from its residual, the leading modes in time."""
     frames = len(scene.rotations)
     rows = (scene.rotations[:, :2] * scales[:, None, None]).reshape(2 * frames, 3)
     inverse = np.linalg.pinv(rows)
-    extent = inverse @ scene.gram @ inverse.T
-    extent = extent + 1e-3 * np.trace(extent) / 3 * np.eye(3)
+    mean_covariance = inverse @ scene.gram @ inverse.T
+    mean_covariance = mean_covariance + 1e-3 * np.trace(mean_covariance) / 3 * np.eye(3)
     rest = np.eye(2 * frames) - rows @ inverse
     left = rest @ scene.gram @ rest.T
-    variance = max(float(np.trace(left)) / (2 * frames), scene.noise_floor**2)
+    variance = max(float(np.trace(left)) / (2 * frames), scene.noise_std_floor**2)
     values, vectors = np.linalg.eigh((left[0::2, 0::2] + left[1::2, 1::2]) / 2)
     count = min(num_modes, frames // 2)
     modes = vectors[:, ::-1][:, :count] * np.sqrt(np.maximum(values[::-1][:count], 1e-12))
     return Motion(
-        np.zeros((frames, 3)), np.log(scales), modes, root_of(extent), np.eye(3)[LOWER],
+        np.zeros((frames, 3)), np.log(scales), modes, root_of(mean_covariance), np.eye(3)[LOWER],
         0.5 * np.log(variance * np.array([0.05, 0.2])),
     )  # fmt: skip
 
@@ -170,21 +170,25 @@ def cameras_of(scene: Scene, motion: Moved) -> tuple[Floats, Floats]:
 
 
 def covariances_of(scene: Scene, motion: Motion) -> tuple[Floats, Floats, float, float]:
-    """Return A₀, A₁, σ², the scene's floor included, and τ."""
-    root0, root1 = _root(motion.extent), _root(motion.play)
-    noise, drift = np.exp(2 * motion.logs)
-    return root0 @ root0.T, root1 @ root1.T, float(noise) + scene.noise_floor**2, float(drift)
+    """Return A₀, A₁, σ² including the scene's floor, and τ."""
+    root0, root1 = _root(motion.mean_root), _root(motion.axis_root)
+    noise, walk_variance = np.exp(2 * motion.logs)
+    return root0 @ root0.T, root1 @ root1.T, float(noise) + scene.noise_std_floor**2, float(walk_variance)
 
 
 def image_of(scene: Scene, motion: Motion) -> ImageModel:
-    """Return the covariance of the images, by its parts."""
+    """Return the covariance of the images in factored form."""
     rotations, scales = cameras_of(scene, motion)
-    pairs = rotations[:, :2] * scales[:, None, None]
-    root0, root1 = _root(motion.extent), _root(motion.play)
-    noise, drift = np.exp(2 * motion.logs)
-    walk = pairs @ root1
-    columns = np.concatenate([(pairs @ root0)[:, :, None], motion.modes[:, None, :, None] * walk[:, :, None]], axis=2)
-    return ImageModel(columns.reshape(2 * len(pairs), -1), walk, float(noise) + scene.noise_floor**2, float(drift))
+    projections = rotations[:, :2] * scales[:, None, None]
+    root0, root1 = _root(motion.mean_root), _root(motion.axis_root)
+    noise, walk_variance = np.exp(2 * motion.logs)
+    walk = projections @ root1
+    columns = np.concatenate(
+        [(projections @ root0)[:, :, None], motion.modes[:, None, :, None] * walk[:, :, None]], axis=2
+    )
+    return ImageModel(
+        columns.reshape(2 * len(projections), -1), walk, float(noise) + scene.noise_std_floor**2, float(walk_variance)
+    )
 
 
 def energy_with_inverse(scene: Scene, motion: Motion) -> tuple[float, Motion, Floats | None]:
@@ -198,16 +202,17 @@ def energy_with_inverse(scene: Scene, motion: Motion) -> tuple[float, Motion, Fl
 # A line search may try a step far too long: that energy is `UNLIKELY`.
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")
 def energy(scene: Scene, motion: Motion) -> tuple[float, Motion]:
-    """Return E with the penalties on modes, turns and scales, and its gradient, analytic in every parameter.
+    """Return E with the penalties on modes, rotations and scales, and its gradient, analytic in every parameter.
 
-    With s_f R_f as Π_f and B_f = Π_f A₁^½, the columns of the image are Π_f A₀^½ and l_fk B_f (`model.image_density`). Turns move on
-    SO(3)^F by the exponential map, whose left Jacobian carries the gradient from the rotation to its vector.
+    With Π_f = s_f R_f and B_f = Π_f A₁^½, the columns of the image are Π_f A₀^½ and l_fk B_f (`model.image_density`).
+    Rotations move on SO(3)^F by the exponential map, whose left Jacobian maps the gradient from the rotation to its
+    vector.
     """
     frames = len(scene.rotations)
     rotations, scales = cameras_of(scene, motion)
-    pairs = rotations[:, :2] * scales[:, None, None]
-    root0, root1 = _root(motion.extent), _root(motion.play)
-    noise, drift = np.exp(2 * motion.logs)
+    projections = rotations[:, :2] * scales[:, None, None]
+    root0, root1 = _root(motion.mean_root), _root(motion.axis_root)
+    noise, walk_variance = np.exp(2 * motion.logs)
     try:
         model = image_of(scene, motion)
         found = terms(model, scene.factor)
@@ -215,32 +220,32 @@ def energy(scene: Scene, motion: Motion) -> tuple[float, Motion]:
         return UNLIKELY, Motion.unflat(np.zeros_like(motion.flat()), frames)
     by_columns = found.by_columns.reshape(frames, 2, -1, 3)
     by_walk = found.by_walk + np.einsum("fk,fikc->fic", motion.modes, by_columns[:, :, 1:])
-    by_pairs = by_columns[:, :, 0] @ root0.T + by_walk @ root1.T
+    by_projections = by_columns[:, :, 0] @ root0.T + by_walk @ root1.T
     rough, by_modes = _roughness(motion.modes, scene.smoothness / frames)
-    uneven, by_logs = unevenness(np.log(scales))
-    by_logs = scene.steadiness * by_logs + np.einsum("fij,fij->f", by_pairs, pairs)
-    unsteady, by_rotations = unsteadiness(rotations)
-    by_rotations *= scene.steadiness
-    by_rotations[:, :2] += by_pairs * scales[:, None, None]
+    rough_scales, by_logs = scale_roughness(np.log(scales))
+    by_logs = scene.prior_weight * by_logs + np.einsum("fij,fij->f", by_projections, projections)
+    rough_rotations, by_rotations = rotation_roughness(rotations)
+    by_rotations *= scene.prior_weight
+    by_rotations[:, :2] += by_projections * scales[:, None, None]
     turned = vee(by_rotations @ np.swapaxes(rotations, 1, 2))
     gradient = Motion(
         np.einsum("fji,fj->fi", left_jacobian(motion.turns), turned),
         (by_logs - by_logs.mean()) * scene.with_scales,
         by_modes + np.einsum("fikc,fic->fk", by_columns[:, :, 1:], model.walk),
-        np.einsum("fic,fid->cd", pairs, by_columns[:, :, 0])[LOWER],
-        np.einsum("fic,fid->cd", pairs, by_walk)[LOWER],
-        2 * np.array([found.by_noise * noise, found.by_drift * drift]),
+        np.einsum("fic,fid->cd", projections, by_columns[:, :, 0])[LOWER],
+        np.einsum("fic,fid->cd", projections, by_walk)[LOWER],
+        2 * np.array([found.by_noise_variance * noise, found.by_walk_variance * walk_variance]),
     )
-    return found.value + rough + scene.steadiness * (uneven + unsteady), gradient
+    return found.value + rough + scene.prior_weight * (rough_scales + rough_rotations), gradient
 
 
 def fit(
     scene: Scene, motion: Motion, *, iterations: int, turning: bool, should_stop: Callable[[], bool] | None = None
 ) -> tuple[Motion, float]:
-    """Return the parameters that minimise the energy from `motion` on, by L-BFGS, and the energy reached.
+    """Return the parameters that minimise the energy, by L-BFGS from `motion`, and the energy reached.
 
-    With `turning` False the rotations stay; everything else, scales included, is fitted. Once `should_stop`, called after every
-    iteration, returns True, the parameters reached are returned.
+    With `turning` False the rotations stay fixed; everything else, including scales, is fitted. `should_stop` is
+    called after every iteration; once it returns True, the parameters reached so far are returned.
     """
     frames = len(scene.rotations)
     held = 0 if turning else 3 * frames
@@ -262,12 +267,12 @@ def fit(
 
 
 def root_of(matrix: Floats) -> Floats:
-    """Return the lower triangle of a root of a covariance, shape `(6,)`; one without extent along an axis gets hardly any."""
+    """Return the lower triangle of a root of a covariance, shape `(6,)`; singular covariances are regularised."""
     return root_matrix(matrix)[LOWER]
 
 
 def root_matrix(matrix: Floats) -> Floats:
-    """Return the same as a lower triangular matrix, shape `(3, 3)`."""
+    """Return a lower triangular root of a covariance, shape `(3, 3)`; singular covariances are regularised."""
     try:
         return np.asarray(np.linalg.cholesky(matrix), dtype=np.float64)
     except np.linalg.LinAlgError:

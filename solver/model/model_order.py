@@ -1,12 +1,11 @@
-"""How many modes of deformation the points can tell, and how much noise to begin with: what suits points that were not learned from.
+"""Model order: the number of modes and the starting noise, chosen by held-out negative log likelihood.
 
-A covariance over F frames with many modes, learned from few points, explains those points and no others: it takes their noise for
-modes. And expectation maximisation moves the noise slowly: from a small one, strong noise ends as a random walk of every point; from
-a large one, fine deformation as noise. Where tracks are rougher than smooth motion is, one half of the points is therefore learned from and
-the other judged, then the other way round, with both starts and more and more modes. Measured with noise of .09 RMS radii on faces of
-99 frames: .003 from the small start, .074 from the large one.
+A covariance over F frames with many modes, learned from few points, fits those points only: it explains their noise
+by modes. In addition EM changes the noise slowly: from a low start, strong noise is absorbed by the random walk; from
+a high start, fine deformation counts as noise. Where the tracks are rougher than smooth motion, one half of the
+points is learned from and the other half scored, then vice versa, with both starts and a growing number of modes.
 
-Without noise more modes do no harm, and keep deformation out of the cameras: measured, mocap of 41 points .012 instead of .018.
+Without noise, additional modes do no harm and keep deformation out of the cameras, so nothing is limited.
 """
 
 from __future__ import annotations
@@ -16,106 +15,113 @@ from dataclasses import dataclass
 
 import numpy as np
 from pliant.solver.model.image_density import negative_log_likelihoods
-from pliant.solver.model.marginal_likelihood import NOISE_FLOOR
-from pliant.solver.model.shape_covariance import MOST_MODES, ShapeCovariance, annealed
+from pliant.solver.model.marginal_likelihood import NOISE_STD_FLOOR
+from pliant.solver.model.shape_covariance import MAX_MODES, ShapeCovariance, annealed
 from pliant.solver.records import Floats
 from pliant.solver.tracks.noise import typical_roughness
 
-COUNTS = (0, 2, 4, 8, 16, 32, MOST_MODES)
-"""Numbers of modes tried."""
+MODE_COUNTS = (0, 2, 4, 8, 16, 32, MAX_MODES)
+"""Numbers of modes that are compared."""
 
 JUDGED_FRAMES = 80
-"""Longer sequences are judged on this many of their frames, evenly spread."""
+"""Maximum number of frames used for the comparison, evenly spread over longer sequences."""
 
-ROUNDS = 40
-"""Rounds of expectation maximisation with each number, from scratch: what further rounds gain must not pass for what modes do."""
+JUDGED_ITERATIONS = 40
+"""EM rounds from scratch for each number of modes: enough that further rounds gain less than modes do."""
 
-GAIN = 0.01
-"""Logarithms of the likelihood of the other points, per point and frame, that differ by less are as good."""
+MIN_NLL_GAIN = 0.01
+"""Difference of the held-out negative log likelihood, per point and frame, below which two orders count as equal."""
 
-FEWEST = 8
-"""With fewer points nothing is judged."""
+MIN_JUDGED_POINTS = 8
+"""Minimum number of points for a comparison."""
 
 
 @dataclass(frozen=True, slots=True)
-class Support:
-    """What to learn the covariance with."""
+class ModelOrder:
+    """Limits with which the covariance is learned."""
 
-    most: int = MOST_MODES
-    """Modes at most."""
+    max_modes: int = MAX_MODES
+    """Maximum number of modes."""
 
-    noisy: bool = False
-    """Whether to begin with all that is rough in the tracks as noise."""
+    noisy_start: bool = False
+    """Whether EM starts with the roughness of the tracks as its noise, instead of a low noise."""
 
 
-def supported(
+def select_model_order(
     sample: Floats,
-    pairs: Floats,
+    projections: Floats,
     *,
     spoiled: bool = False,
     seed: int = 0,
     should_stop: Callable[[], bool] | None = None,
-) -> Support:
-    """Return what the sample supports: all modes where there is neither noise nor what is left of outliers to mistake for one.
+) -> ModelOrder:
+    """Return the order that the sample supports: no limit where there is neither noise nor remaining outliers.
 
     Parameters
     ----------
     sample : array, shape (F, S, 2)
-        Some points of centred, complete tracks, normalised units.
-    pairs : array, shape (F, 2, 3)
+        Some points of centred, complete tracks, normalized units.
+    projections : array, shape (F, 2, 3)
         s_f times the first two rows of R_f.
     spoiled : bool
-        Outliers were found: some that were not are still in the sample.
+        Whether outliers were found; undetected ones may remain in the sample.
     seed : int
-        Deals the points into halves.
+        Seed of the split into halves.
     should_stop : callable, optional
-        Asked after every round of learning; once it returns True, what was not judged counts as improbable.
+        Called after every round of EM; once it returns True, orders not yet scored count as improbable.
     """
     frames, count = sample.shape[:2]
-    if count < FEWEST or not (spoiled or typical_roughness(sample) >= NOISE_FLOOR):
-        return Support()
+    if count < MIN_JUDGED_POINTS or not (spoiled or typical_roughness(sample) >= NOISE_STD_FLOOR):
+        return ModelOrder()
     used = np.unique(np.linspace(0, frames - 1, min(frames, JUDGED_FRAMES)).round().astype(np.intp))
     rows = sample[used].transpose(0, 2, 1).reshape(2 * len(used), count)
     order = np.random.default_rng(seed).permutation(count)
     one, other = rows[:, order[0::2]], rows[:, order[1::2]]
-    quiet, noisy = (
+    quiet_start, noisy_start = (
         (
-            _judged(one, other, pairs[used], noisy=each, should_stop=should_stop)
-            + _judged(other, one, pairs[used], noisy=each, should_stop=should_stop)
+            _judged(one, other, projections[used], noisy_start=each, should_stop=should_stop)
+            + _judged(other, one, projections[used], noisy_start=each, should_stop=should_stop)
         )
         / 2
         for each in (False, True)
     )
-    enough = min(float(quiet.min()), float(noisy.min())) + GAIN
-    better = noisy if noisy.min() <= enough else quiet
-    return Support(_counts(len(used))[int(np.flatnonzero(better <= enough)[-1])], better is noisy)
+    enough = min(float(quiet_start.min()), float(noisy_start.min())) + MIN_NLL_GAIN
+    better = noisy_start if noisy_start.min() <= enough else quiet_start
+    return ModelOrder(_counts(len(used))[int(np.flatnonzero(better <= enough)[-1])], better is noisy_start)
 
 
 def _counts(frames: int) -> list[int]:
-    """Return those of `COUNTS` that differ, for there are fewer modes than frames."""
-    return [count for count in COUNTS[:-1] if count < frames - 1] + [MOST_MODES]
+    """Return those of `MODE_COUNTS` that differ for this number of frames; there are fewer modes than frames."""
+    return [count for count in MODE_COUNTS[:-1] if count < frames - 1] + [MAX_MODES]
 
 
 def _judged(
-    points: Floats, other: Floats, pairs: Floats, *, noisy: bool, should_stop: Callable[[], bool] | None
+    points: Floats, other: Floats, projections: Floats, *, noisy_start: bool, should_stop: Callable[[], bool] | None
 ) -> Floats:
-    """Return how improbable other points are for each count of modes."""
-    frames = len(pairs)
+    """Return the held-out negative log likelihood for each number of modes."""
+    frames = len(projections)
     gram = points @ points.T / points.shape[1]
     counts = _counts(frames)
     energies = np.full(len(counts), np.inf)
-    for index, most in enumerate(counts):
+    for index, max_modes in enumerate(counts):
         if index and should_stop is not None and should_stop():
             break
-        found = annealed(gram, pairs, most=most, noisy=noisy, iterations=ROUNDS, should_stop=should_stop)
-        energies[index] = improbability(found, pairs, other)
+        found = annealed(
+            gram,
+            projections,
+            max_modes=max_modes,
+            noisy_start=noisy_start,
+            iterations=JUDGED_ITERATIONS,
+            should_stop=should_stop,
+        )
+        energies[index] = held_out_nll(found, projections, other)
     return energies
 
 
-def improbability(covariance: ShapeCovariance, pairs: Floats, other: Floats) -> float:
+def held_out_nll(covariance: ShapeCovariance, projections: Floats, other: Floats) -> float:
     """Return the negative logarithm of the likelihood of points that were not learned from, per point and frame.
 
     The tenth of them that is least probable does not count: what completion left of gross outliers.
     """
-    each = np.sort(negative_log_likelihoods(covariance.image_model(pairs), other))
+    each = np.sort(negative_log_likelihoods(covariance.image_model(projections), other))
     return float(each[: -(-9 * len(each) // 10)].mean())

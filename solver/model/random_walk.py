@@ -20,7 +20,7 @@ from pliant.solver.operators.finite_differences import difference_bands
 from pliant.solver.records import Floats, read_only
 from scipy.linalg import lapack
 
-BLOCK = 8
+FRAMES_PER_BLOCK = 8
 """Frames eliminated together, as one dense block: of 4, 8 and 12 the fastest for 120 to 1,000 frames and 90 to 350 columns."""
 
 LEVEL = 10.0
@@ -108,7 +108,8 @@ class WalkPosterior:
     """Λ, eliminated."""
 
     inverses: Floats
-    """Inverses of the pivot blocks of `BLOCK` frames each, shape `(N, 3·BLOCK, 3·BLOCK)`; the last is padded with the identity."""
+    """Inverses of the pivot blocks, shape `(N, 3b, 3b)`, b = `FRAMES_PER_BLOCK`; the
+    last is padded with the identity."""
 
     coupling: float
     """What couples neighbouring frames in −Λ, per axis."""
@@ -143,9 +144,9 @@ class WalkPosterior:
         """Return Λ⁻¹ times columns of shape `(F, 3, r)`, in the same shape."""
         frames, _, count = columns.shape
         blocks = len(self.inverses)
-        padded = np.zeros((blocks * BLOCK, 3, count))
+        padded = np.zeros((blocks * FRAMES_PER_BLOCK, 3, count))
         padded[:frames] = columns
-        result = self.inverses @ padded.reshape(blocks, 3 * BLOCK, count)
+        result = self.inverses @ padded.reshape(blocks, 3 * FRAMES_PER_BLOCK, count)
         before = np.zeros((blocks, 3, count))
         corner = self.coupling * self.inverses[:, -3:, :3]
         for index in range(1, blocks):
@@ -178,17 +179,21 @@ def _block_pivots(blocks: Floats, coupling: float) -> tuple[Floats, float]:
 
 
 def _gathered(blocks: Floats, pivots: Floats, coupling: float) -> Floats:
-    """Return the inverses of the pivots of `BLOCK` frames, `(N, 3·BLOCK, 3·BLOCK)`."""
+    """Return the inverses of the pivots of `FRAMES_PER_BLOCK` frames, `(N, 3·FRAMES_PER_BLOCK, 3·FRAMES_PER_BLOCK)`."""
     frames = len(blocks)
-    count = -(-frames // BLOCK)
-    padded = np.broadcast_to(np.eye(3), (count * BLOCK, 3, 3)).copy()
+    count = -(-frames // FRAMES_PER_BLOCK)
+    padded = np.broadcast_to(np.eye(3), (count * FRAMES_PER_BLOCK, 3, 3)).copy()
     padded[:frames] = blocks
-    padded[:frames:BLOCK] = pivots[::BLOCK]
-    gathered = np.zeros((count, BLOCK, 3, BLOCK, 3))
-    each = np.arange(BLOCK)
-    gathered[:, each, :, each, :] = padded.reshape(count, BLOCK, 3, 3).transpose(1, 0, 2, 3)
-    coupled = np.where(np.arange(count * BLOCK).reshape(count, BLOCK) + 1 < frames, -coupling, 0.0)[:, :-1]
+    padded[:frames:FRAMES_PER_BLOCK] = pivots[::FRAMES_PER_BLOCK]
+    gathered = np.zeros((count, FRAMES_PER_BLOCK, 3, FRAMES_PER_BLOCK, 3))
+    each = np.arange(FRAMES_PER_BLOCK)
+    gathered[:, each, :, each, :] = padded.reshape(count, FRAMES_PER_BLOCK, 3, 3).transpose(1, 0, 2, 3)
+    coupled = np.where(
+        np.arange(count * FRAMES_PER_BLOCK).reshape(count, FRAMES_PER_BLOCK) + 1 < frames, -coupling, 0.0
+    )[:, :-1]
     for axis in range(3):
         gathered[:, each[:-1], axis, each[1:], axis] = coupled
         gathered[:, each[1:], axis, each[:-1], axis] = coupled
-    return np.asarray(np.linalg.inv(gathered.reshape(count, 3 * BLOCK, 3 * BLOCK)), dtype=np.float64)
+    return np.asarray(
+        np.linalg.inv(gathered.reshape(count, 3 * FRAMES_PER_BLOCK, 3 * FRAMES_PER_BLOCK)), dtype=np.float64
+    )

@@ -1,16 +1,19 @@
-"""The Gaussian shape prior: how the positions of a point covary over frames and axes, learned from the tracks themselves.
+"""Gaussian shape prior: covariance of point positions over frames and axes, learned from the tracks.
 
-A point's world positions over all frames, x ∈ R^{3F}, are taken as draws from one zero-mean Gaussian with covariance
+A point's world positions over all frames, x ∈ R^{3F}, are draws from one zero-mean Gaussian with covariance
 
     Σ = 1 1ᵀ ⊗ A₀  +  C ⊗ A₁,    C = L Lᵀ + τ T,
 
-a mean position with extents A₀ (3×3), deformation whose frames covary by C (F×F: modes L, and a random walk T for what they
-leave) and whose axes covary by A₁ (3×3, trace 3). The tracks show two of three coordinates a frame, W = Π X + noise σ² with
-Π = blockdiag(s_f R_f); the unseen third is integrated out, not guessed, so that depth is not counted as flat where it is merely
-unknown. That is the difference to a penalty on the shapes found (`pliant.solver.energy.low_rank`), which shrinks depth. Expectation
-maximisation, as for probabilistic principal components with missing data: Torresani, Hertzmann, Bregler (2008), "Nonrigid
-structure-from-motion: estimating shape and motion with hierarchical priors", with frames instead of points as the variables, which
-makes everything a matter of the 2F×2F Gram matrix W Wᵀ / P and independent of P.
+that is, a mean position with covariance A₀ (3×3) and a deformation with covariance C over frames (F×F: modes L, and a
+random walk T for the remainder) and A₁ over axes (3×3, trace 3). The tracks observe two of three coordinates per
+frame, W = Π X + noise of variance σ² with Π = blockdiag(s_f R_f). The unobserved coordinate is integrated out, so
+unknown depth is not counted as flat; a penalty on the estimated shapes (`pliant.solver.energy.low_rank`) shrinks
+depth instead.
+
+The parameters are learned by expectation maximisation, as in probabilistic PCA with missing data: Torresani,
+Hertzmann, Bregler (2008), "Nonrigid structure-from-motion: estimating shape and motion with hierarchical priors".
+Here frames instead of points are the variables, so that all statistics are in the 2F×2F Gram matrix W Wᵀ / P and the
+cost does not depend on P.
 """
 
 from __future__ import annotations
@@ -35,107 +38,108 @@ from pliant.solver.records import Floats
 from pliant.solver.tracks.noise import roughness
 from scipy import linalg
 
-ITERATIONS, FEWEST, FRAMES = 150, 60, 18_000
-"""Rounds of expectation maximisation from scratch: so many, fewer where their product with the frames is above the last number, for a
-round costs F³. The likelihood still creeps up. Measured with 60, known cameras, horse of 48 frames: .020 instead of .013; 400 gain
-no more."""
+MAX_ITERATIONS, MIN_ITERATIONS, ITERATION_FRAMES = 150, 60, 18_000
+"""EM rounds from scratch: min(MAX_ITERATIONS, max(MIN_ITERATIONS, ITERATION_FRAMES // F)), since a round costs F³.
+Horse of 48 frames, known cameras: error .020 after 60 rounds, .013 after 150, no lower after 400."""
 
-MOST_MODES = 64
-"""Columns of L at most."""
+MAX_MODES = 64
+"""Maximum number of columns of L."""
 
-BEGUN_WEIGHT = 1e-3
-"""Weight of HᵀH against the data in the shapes to start from, normalised units."""
+START_SMOOTHNESS = 1e-3
+"""Weight of HᵀH against the data in the starting shapes, normalized units."""
 
-ABOVE = 2.0
-"""A mode counts if its variance is this many times what the random walk explains of it."""
+MODE_VARIANCE_RATIO = 2.0
+"""Minimum ratio of a mode's variance to the variance of the random walk along it; weaker modes are dropped."""
 
-DRIFT_FLOOR = 1e-6
-"""Smallest τ, variance per point in normalised units."""
+WALK_VARIANCE_FLOOR = 1e-6
+"""Floor of τ, variance per point in normalized units."""
 
-WARM = 1e-2
-"""The floor of τ at the first round from scratch, whence it falls to `DRIFT_FLOOR`: annealing. A mode that was given up too early
-comes back only slowly. Measured: known cameras, horse .069 → .024, talking face .074 → .022, speaking head .017 → .0002."""
+ANNEALING_START = 1e-2
+"""Floor of τ in the first annealed round, variance in normalized units; it falls to `WALK_VARIANCE_FLOOR`. A mode
+dropped early recovers only slowly, so early rounds keep a high floor: horse, known cameras, error .069 without,
+.024 with."""
 
-FREED = 0.3
-"""Standard deviation, normalised units, that mean positions get as a mode."""
+MEAN_MODE_STD = 0.3
+"""Standard deviation, normalized units, of the mode that `freed` adds for the mean positions."""
 
-FLATTEST = 1e-3
-"""Least variance of deformation along an axis, beside a mean of 1: keeps A₁ invertible."""
+AXIS_VARIANCE_FLOOR = 1e-3
+"""Floor of the deformation variance along an axis, relative to a mean of 1: keeps A₁ invertible."""
 
-NOISE_FLOOR = 1e-8
-"""Smallest σ²."""
+NOISE_VARIANCE_FLOOR = 1e-8
+"""Floor of σ², normalized units squared."""
 
-QUIET = 1e-5
-"""σ² to start from: less than any tracker's."""
+START_NOISE_VARIANCE = 1e-5
+"""σ² at the start, normalized units squared: below that of any tracker."""
 
 
-DENSE_FRAMES = 160
-"""Frames up to which a round of expectation maximisation works on 2F×2F matrices, which is then faster."""
+MAX_DENSE_FRAMES = 160
+"""Maximum number of frames for which an EM round works on dense 2F×2F matrices, which is then the faster form."""
 
-GUARD = 8
-"""Eigenvectors beyond the modes that are followed from round to round, in which new modes appear."""
+GUARD_VECTORS = 8
+"""Eigenvectors beyond the modes that are carried from round to round, in which new modes appear."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShapeCovariance:
-    """Σ and the noise, normalised units."""
+    """Prior covariance Σ of a point's path and the noise, normalized units."""
 
-    extent: Floats
-    """A₀, shape `(3, 3)`."""
+    mean_covariance: Floats
+    """A₀, covariance of the mean position, shape `(3, 3)`."""
 
-    play: Floats
-    """A₁, shape `(3, 3)`, trace 3."""
+    axis_covariance: Floats
+    """A₁, covariance of the deformation over axes, shape `(3, 3)`, trace 3."""
 
     modes: Floats
     """L, shape `(F, k)`."""
 
-    drift: float
-    """τ."""
+    walk_variance: float
+    """τ, variance of the random walk."""
 
-    noise: float
+    noise_variance: float
     """σ², variance of an image coordinate."""
 
-    likelihood: float
-    """Negative logarithm, per point and frame, of the covariance this one was improved from; ∞ for the start."""
+    nll: float
+    """Negative log likelihood per point and frame of the covariance that EM improved to this one; ∞ at the start."""
 
     def over_frames(self) -> Floats:
         """Return C, shape `(F, F)`."""
-        covariance: Floats = self.modes @ self.modes.T + self.drift * random_walk(len(self.modes))
+        covariance: Floats = self.modes @ self.modes.T + self.walk_variance * random_walk(len(self.modes))
         return covariance
 
-    def of_image(self, pairs: Floats) -> Floats:
-        """Return V = ΠΣΠᵀ + σ²I, shape `(2F, 2F)`, for `pairs` (F, 2, 3) of s_f times the first two rows of R_f."""
-        rows = pairs.reshape(-1, 3)
+    def of_image(self, projections: Floats) -> Floats:
+        """Return V = ΠΣΠᵀ + σ²I, shape `(2F, 2F)`; `projections` (F, 2, 3) are s_f times the first two rows of R_f."""
+        rows = projections.reshape(-1, 3)
         wide = np.repeat(np.repeat(self.over_frames(), 2, axis=0), 2, axis=1)
-        image: Floats = rows @ self.extent @ rows.T + (rows @ self.play @ rows.T) * wide
-        image[np.diag_indices(len(rows))] += self.noise
+        image: Floats = rows @ self.mean_covariance @ rows.T + (rows @ self.axis_covariance @ rows.T) * wide
+        image[np.diag_indices(len(rows))] += self.noise_variance
         return image
 
-    def image_model(self, pairs: Floats) -> ImageModel:
-        """Return the same by its parts."""
-        frames, walk = len(pairs), pairs @ root_matrix(self.play)
-        middle = (pairs @ root_matrix(self.extent))[:, :, None]
+    def image_model(self, projections: Floats) -> ImageModel:
+        """Return V in factored form."""
+        frames, walk = len(projections), projections @ root_matrix(self.axis_covariance)
+        middle = (projections @ root_matrix(self.mean_covariance))[:, :, None]
         columns = np.concatenate([middle, self.modes[:, None, :, None] * walk[:, :, None]], axis=2)
-        return ImageModel(columns.reshape(2 * frames, -1), walk, self.noise, self.drift)
+        return ImageModel(columns.reshape(2 * frames, -1), walk, self.noise_variance, self.walk_variance)
 
     def axes(self) -> tuple[Floats, Floats]:
-        """Return B (3×3) and a (3,) with A₁ = B Bᵀ and A₀ = B diag(a) Bᵀ: in axes x = B y the coordinates are independent."""
-        values, vectors = linalg.eigh(self.extent, self.play)
+        """Return B (3×3) and a (3,) with A₁ = B Bᵀ and A₀ = B diag(a) Bᵀ: the coordinates of y, x = B y, are independent."""
+        values, vectors = linalg.eigh(self.mean_covariance, self.axis_covariance)
         return np.asarray(np.linalg.inv(vectors).T, dtype=np.float64), np.maximum(values, 0.0)
 
     def precisions(self) -> tuple[Floats, PathPrior]:
         """Return B (3×3) and the inverse covariance over frames of each coordinate of y = B⁻¹x."""
-        basis, extents = self.axes()
+        basis, mean_moments = self.axes()
         chain, norm = walk_bands(len(self.modes))
         first, second, third = (
-            np.column_stack([self.modes, np.full(len(self.modes), extent**0.5)]) for extent in extents
+            np.column_stack([self.modes, np.full(len(self.modes), mean_covariance**0.5)])
+            for mean_covariance in mean_moments
         )
-        return basis, PathPrior.of(chain * (norm / self.drift), (first, second, third))
+        return basis, PathPrior.of(chain * (norm / self.walk_variance), (first, second, third))
 
     def stretched(self, used: NDArray[np.intp], num_frames: int) -> ShapeCovariance:
-        """Return the covariance for all of `num_frames` frames when this one belongs to the frames `used`.
+        """Return the covariance of all `num_frames` frames when this one covers the frames `used`.
 
-        Between two of them the modes run straight, which is what a random walk expects.
+        Modes are interpolated linearly between them, the conditional mean of a random walk.
         """
         every = np.arange(num_frames)
         modes = [np.interp(every, used, mode) for mode in self.modes.T]
@@ -144,110 +148,129 @@ class ShapeCovariance:
 
 def learned(
     gram: Floats,
-    pairs: Floats,
+    projections: Floats,
     *,
-    most: int = MOST_MODES,
-    noisy: bool = False,
+    max_modes: int = MAX_MODES,
+    noisy_start: bool = False,
     should_stop: Callable[[], bool] | None = None,
 ) -> ShapeCovariance:
-    """Return the most probable of the covariances that expectation maximisation finds from scratch in two ways.
+    """Return the more probable of two covariances learned by EM from scratch.
 
-    Annealed, and then once more without, from a start whose mean positions may also be a mode: annealing that has taken the turn
-    of an object for deformation does not find back otherwise. Or never annealed. Neither is best for all: measured, known cameras,
-    99 frames of faces seen in one sweep of 60°, error .192 annealed, .030 not; a horse of 48 frames .009 and .314. The likelihood tells.
+    The first run is annealed, then continued without annealing with the mean position added as a mode, which undoes a
+    rotation that annealing took for deformation. The second run is never annealed. Neither is better on all data, so
+    the likelihood decides.
 
     Parameters
     ----------
-    gram, pairs
+    gram, projections
         As for `begin`.
-    most : int
-        Columns of L at most.
-    noisy : bool
-        Begin with all that is rough in the tracks as noise, not with hardly any.
+    max_modes : int
+        Maximum number of columns of L.
+    noisy_start : bool
+        Start with the roughness of the tracks as noise instead of a low noise.
     should_stop : callable, optional
-        Asked after every round; once it returns True, the best so far is returned.
+        Called after every round; once it returns True, the best so far is returned.
     """
-    count = min(ITERATIONS, max(FEWEST, FRAMES // len(pairs)))
-    warm = freed(annealed(gram, pairs, most=most, noisy=noisy, iterations=count, should_stop=should_stop))
+    count = min(MAX_ITERATIONS, max(MIN_ITERATIONS, ITERATION_FRAMES // len(projections)))
+    warm = freed(
+        annealed(
+            gram, projections, max_modes=max_modes, noisy_start=noisy_start, iterations=count, should_stop=should_stop
+        )
+    )
     runs = (
-        improve(warm, gram, pairs, iterations=count // 2, most=most, should_stop=should_stop),
+        improve(warm, gram, projections, iterations=count // 2, max_modes=max_modes, should_stop=should_stop),
         improve(
-            scratch(gram, pairs, most, noisy=noisy), gram, pairs,
-            iterations=count, most=most, should_stop=should_stop,
+            scratch(gram, projections, max_modes, noisy_start=noisy_start), gram, projections,
+            iterations=count, max_modes=max_modes, should_stop=should_stop,
         ),
     )  # fmt: skip
-    return min(runs, key=lambda run: run.likelihood)
+    return min(runs, key=lambda run: run.nll)
 
 
 def annealed(
     gram: Floats,
-    pairs: Floats,
+    projections: Floats,
     *,
-    most: int = MOST_MODES,
-    noisy: bool = False,
+    max_modes: int = MAX_MODES,
+    noisy_start: bool = False,
     iterations: int,
     should_stop: Callable[[], bool] | None = None,
 ) -> ShapeCovariance:
-    """Return the covariance that so many annealed rounds find from scratch."""
-    start = scratch(gram, pairs, most, noisy=noisy)
-    return improve(start, gram, pairs, iterations=iterations, warm=WARM, most=most, should_stop=should_stop)
+    """Return the covariance after `iterations` annealed rounds from scratch."""
+    start = scratch(gram, projections, max_modes, noisy_start=noisy_start)
+    return improve(
+        start,
+        gram,
+        projections,
+        iterations=iterations,
+        warm=ANNEALING_START,
+        max_modes=max_modes,
+        should_stop=should_stop,
+    )
 
 
 def freed(covariance: ShapeCovariance) -> ShapeCovariance:
-    """Return the same with one more mode, that of mean positions: how much of them is deformation is open anew."""
-    constant = np.full((len(covariance.modes), 1), FREED)
+    """Return the covariance with the mean position added as a mode, for EM to reassign."""
+    constant = np.full((len(covariance.modes), 1), MEAN_MODE_STD)
     return replace(covariance, modes=np.hstack([covariance.modes, constant]))
 
 
-def scratch(gram: Floats, pairs: Floats, most: int, *, noisy: bool) -> ShapeCovariance:
-    """Return a covariance to start from (`begin`), with the noise that `learned` says."""
-    return begin(gram, pairs, noise=max(roughness(gram), QUIET) if noisy else QUIET, most=most)
+def scratch(gram: Floats, projections: Floats, max_modes: int, *, noisy_start: bool) -> ShapeCovariance:
+    """Return a starting covariance (`begin`) with the low or, with `noisy_start`, the high starting noise."""
+    return begin(
+        gram,
+        projections,
+        noise_variance=max(roughness(gram), START_NOISE_VARIANCE) if noisy_start else START_NOISE_VARIANCE,
+        max_modes=max_modes,
+    )
 
 
-def begin(gram: Floats, pairs: Floats, *, noise: float = QUIET, most: int = MOST_MODES) -> ShapeCovariance:
-    """Return a covariance to start from: that of the shapes of least acceleration in the least-squares sense.
+def begin(
+    gram: Floats, projections: Floats, *, noise_variance: float = START_NOISE_VARIANCE, max_modes: int = MAX_MODES
+) -> ShapeCovariance:
+    """Return a starting covariance: that of the least-squares shapes with least acceleration.
 
     Parameters
     ----------
     gram : array, shape (2F, 2F)
-        W Wᵀ / P of centred, complete tracks, normalised units.
-    pairs : array, shape (F, 2, 3)
+        W Wᵀ / P of centred, complete tracks, normalized units.
+    projections : array, shape (F, 2, 3)
         s_f times the first two rows of R_f.
-    noise : float
+    noise_variance : float
         σ² to start from.
-    most : int
-        Columns of L at most.
+    max_modes : int
+        Maximum number of columns of L.
     """
-    frames, factor = len(pairs), factor_of(gram)
-    seen = pairs.transpose(0, 2, 1) @ factor.reshape(frames, 2, -1)
-    walk = WalkPosterior.of(pairs, noise_variance=1.0, walk_variance=walk_bands(frames)[1] / BEGUN_WEIGHT)
+    frames, factor = len(projections), factor_of(gram)
+    seen = projections.transpose(0, 2, 1) @ factor.reshape(frames, 2, -1)
+    walk = WalkPosterior.of(projections, noise_variance=1.0, walk_variance=walk_bands(frames)[1] / START_SMOOTHNESS)
     shapes = walk.solve(seen)
     mean = shapes.mean(axis=0)
-    extent = mean @ mean.T + 1e-6 * np.eye(3)
+    mean_covariance = mean @ mean.T + 1e-6 * np.eye(3)
     flat = shapes.reshape(frames, -1)
     whole = flat @ flat.T / 3
     middle = whole.mean(axis=0)
     deformed = whole - middle - middle[:, None] + middle.mean()
-    modes, drift = _split(deformed, WARM, most)
-    return ShapeCovariance(extent, np.eye(3), modes, drift, noise, np.inf)
+    modes, walk_variance = _split(deformed, ANNEALING_START, max_modes)
+    return ShapeCovariance(mean_covariance, np.eye(3), modes, walk_variance, noise_variance, np.inf)
 
 
 def improve(
     covariance: ShapeCovariance,
     gram: Floats,
-    pairs: Floats,
+    projections: Floats,
     *,
     iterations: int,
-    warm: float = DRIFT_FLOOR,
-    most: int = MOST_MODES,
+    warm: float = WALK_VARIANCE_FLOOR,
+    max_modes: int = MAX_MODES,
     should_stop: Callable[[], bool] | None = None,
 ) -> ShapeCovariance:
-    """Return the covariance after rounds of expectation maximisation, with a floor of τ that falls from `warm` to `DRIFT_FLOOR`.
+    """Return the covariance after rounds of EM with a floor of τ that falls from `warm` to `WALK_VARIANCE_FLOOR`.
 
-    At a constant floor no round makes the tracks less probable.
+    At a constant floor the likelihood never decreases.
     """
-    floors = np.geomspace(warm, DRIFT_FLOOR, iterations)
-    for better in rounds(covariance, gram, pairs, floors=floors, most=most):
+    floors = np.geomspace(warm, WALK_VARIANCE_FLOOR, iterations)
+    for better in rounds(covariance, gram, projections, floors=floors, max_modes=max_modes):
         covariance = better
         if should_stop is not None and should_stop():
             break
@@ -255,35 +278,38 @@ def improve(
 
 
 def rounds(
-    covariance: ShapeCovariance, gram: Floats, pairs: Floats, *, floors: Floats, most: int = MOST_MODES
+    covariance: ShapeCovariance, gram: Floats, projections: Floats, *, floors: Floats, max_modes: int = MAX_MODES
 ) -> Iterator[ShapeCovariance]:
-    """Yield the covariance after every round of expectation maximisation, each with its floor of τ.
+    """Yield the covariance after every round of EM, each with its floor of τ.
 
-    With V = ΠΣΠᵀ + σ²I and K = V⁻¹(G − V)V⁻¹ every second moment of the posterior is a contraction of K: for a component with
-    covariance D and image ΠD, E[xxᵀ] = D + (ΠD)ᵀ K (ΠD). Modes and drift are then the probabilistic principal components
-    (Tipping, Bishop 1999) of C seen relative to the random walk. `DENSE_FRAMES` says in which form K is.
+    With V = ΠΣΠᵀ + σ²I and K = V⁻¹(G − V)V⁻¹ every second moment of the posterior is a contraction of K: for a
+    component with covariance D and image ΠD, E[xxᵀ] = D + (ΠD)ᵀ K (ΠD). Modes and walk variance are the probabilistic
+    principal components (Tipping, Bishop 1999) of C relative to the random walk. `MAX_DENSE_FRAMES` selects the dense
+    or the factored form of K.
     """
     factor, subspace = factor_of(gram), None
     for number, floor in enumerate(floors):
-        if len(pairs) <= DENSE_FRAMES:
-            covariance = _round(covariance, factor, pairs, floor, most)
+        if len(projections) <= MAX_DENSE_FRAMES:
+            covariance = _round(covariance, factor, projections, floor, max_modes)
         else:
-            covariance, subspace = _linear_round(covariance, factor, pairs, floor, most, subspace)
-            subspace = np.hstack([subspace, _cosines(len(pairs), GUARD, first=number * GUARD)])
+            covariance, subspace = _linear_round(covariance, factor, projections, floor, max_modes, subspace)
+            subspace = np.hstack([subspace, _cosines(len(projections), GUARD_VECTORS, first=number * GUARD_VECTORS)])
         yield covariance
 
 
-def _round(covariance: ShapeCovariance, factor: Floats, pairs: Floats, floor: float, most: int) -> ShapeCovariance:
-    """Return the covariance after one round, K dense."""
-    frames = len(pairs)
-    rows = pairs.reshape(2 * frames, 3)
+def _round(
+    covariance: ShapeCovariance, factor: Floats, projections: Floats, floor: float, max_modes: int
+) -> ShapeCovariance:
+    """Return the covariance after one round with dense K."""
+    frames = len(projections)
+    rows = projections.reshape(2 * frames, 3)
     over_frames = covariance.over_frames()
     wide = np.repeat(np.repeat(over_frames, 2, axis=0), 2, axis=1)
-    by_extent, by_play = rows @ covariance.extent, rows @ covariance.play
-    deform = by_play @ rows.T
+    by_mean, by_axes = rows @ covariance.mean_covariance, rows @ covariance.axis_covariance
+    deform = by_axes @ rows.T
     image = deform * wide
-    image += by_extent @ rows.T
-    image[np.diag_indices(2 * frames)] += covariance.noise
+    image += by_mean @ rows.T
+    image[np.diag_indices(2 * frames)] += covariance.noise_variance
     inverse, log_det = inverted(image)
     explained = inverse @ factor
     surplus = explained @ explained.T
@@ -291,40 +317,45 @@ def _round(covariance: ShapeCovariance, factor: Floats, pairs: Floats, floor: fl
     wide *= surplus
     deform *= surplus
     moved = deform[0::2, 0::2] + deform[0::2, 1::2] + deform[1::2, 0::2] + deform[1::2, 1::2]
-    modes, drift = _split(over_frames + over_frames @ moved @ over_frames / 3, floor, most)
+    modes, walk_variance = _split(over_frames + over_frames @ moved @ over_frames / 3, floor, max_modes)
     return _improved(
-        covariance, modes, drift,
-        extent=covariance.extent + by_extent.T @ surplus @ by_extent,
-        play=covariance.play + by_play.T @ wide @ by_play / frames,
+        covariance, modes, walk_variance,
+        mean_covariance=covariance.mean_covariance + by_mean.T @ surplus @ by_mean,
+        axis_covariance=covariance.axis_covariance + by_axes.T @ wide @ by_axes / frames,
         surplus=float(np.trace(surplus)) / (2 * frames),
         nll=0.5 * (log_det + float((explained * factor).sum())) / frames,
     )  # fmt: skip
 
 
 def _linear_round(
-    covariance: ShapeCovariance, factor: Floats, pairs: Floats, floor: float, most: int, subspace: Floats | None
+    covariance: ShapeCovariance,
+    factor: Floats,
+    projections: Floats,
+    floor: float,
+    max_modes: int,
+    subspace: Floats | None,
 ) -> tuple[ShapeCovariance, Floats]:
-    """Return the covariance after one round in time linear in the frames, and the subspace to begin the next one with.
+    """Return the covariance after one round in time linear in the frames, and the subspace for the next round.
 
-    All contractions but the modes are derivatives of `image_density` already. With root rootᵀ = T⁻¹ and C̃ = rootᵀ C root the modes are the
-    leading eigenvectors of C̃ + C̃ m C̃/3, of which only products and the trace are needed: one step of Nyström's method a round, from the
-    eigenvectors of the round before and `GUARD` more.
+    All contractions except those for the modes are derivatives of `image_density`. With root rootᵀ = T⁻¹ and C̃ =
+    rootᵀ C root, the modes are the leading eigenvectors of C̃ + C̃ m C̃/3, of which only products and the trace are
+    needed: one Nyström step a round, from the eigenvectors of the previous round and `GUARD_VECTORS` more.
     """
     frames, count = covariance.modes.shape
-    root0, root1 = root_matrix(covariance.extent), root_matrix(covariance.play)
-    model = covariance.image_model(pairs)
+    root0, root1 = root_matrix(covariance.mean_covariance), root_matrix(covariance.axis_covariance)
+    model = covariance.image_model(projections)
     walk, columns = model.walk, model.columns.reshape(frames, 2, count + 1, 3)
     seen = Explained.of(model, factor)
     found = seen.terms()
     by_columns = -frames * found.by_columns.reshape(columns.shape)
     by_walk = -frames * found.by_walk  # [K B (τT ⊗ I)]_ff
-    extents = np.einsum("fic,fid->cd", columns[:, :, 0], by_columns[:, :, 0])
+    mean_moments = np.einsum("fic,fid->cd", columns[:, :, 0], by_columns[:, :, 0])
     own, by_own = (each[:, :, 1:].transpose(2, 0, 1, 3).reshape(count, -1) for each in (columns, by_columns))
-    plays = own.reshape(-1, 3).T @ by_own.reshape(-1, 3) + np.einsum("fic,fid->cd", walk, by_walk)
+    axis_moments = own.reshape(-1, 3).T @ by_own.reshape(-1, 3) + np.einsum("fic,fid->cd", walk, by_walk)
     along = whitened(covariance.modes)
 
     def spread(vectors: Floats) -> Floats:  # C̃ times them
-        result: Floats = along @ (along.T @ vectors) + covariance.drift * vectors
+        result: Floats = along @ (along.T @ vectors) + covariance.walk_variance * vectors
         return result
 
     def product(vectors: Floats) -> Floats:
@@ -334,31 +365,33 @@ def _linear_round(
         return wide + spread(coloured((walk.reshape(frames, 1, 6) @ moved)[:, 0], transposed=True)) / 3
 
     inner = own @ by_own.T
-    square = along.T @ along + 2 * covariance.drift * np.eye(count)
-    total = float((along**2).sum()) + frames * covariance.drift
-    total += (float((square * inner).sum()) + covariance.drift * float((walk * by_walk).sum())) / 3
-    values, vectors = _nystrom(product, np.hstack([along, _cosines(frames, most)]) if subspace is None else subspace)
-    modes, drift = _kept(values, vectors, total, floor, min(most, frames - 1))
+    square = along.T @ along + 2 * covariance.walk_variance * np.eye(count)
+    total = float((along**2).sum()) + frames * covariance.walk_variance
+    total += (float((square * inner).sum()) + covariance.walk_variance * float((walk * by_walk).sum())) / 3
+    values, vectors = _nystrom(
+        product, np.hstack([along, _cosines(frames, max_modes)]) if subspace is None else subspace
+    )
+    modes, walk_variance = _kept(values, vectors, total, floor, min(max_modes, frames - 1))
     better = _improved(
-        covariance, coloured(modes), drift,
-        extent=root0 @ (np.eye(3) + extents) @ root0.T,
-        play=root1 @ (np.eye(3) + plays / frames) @ root1.T,
-        surplus=-found.by_noise,
+        covariance, coloured(modes), walk_variance,
+        mean_covariance=root0 @ (np.eye(3) + mean_moments) @ root0.T,
+        axis_covariance=root1 @ (np.eye(3) + axis_moments / frames) @ root1.T,
+        surplus=-found.by_noise_variance,
         nll=found.value,
     )  # fmt: skip
-    return better, vectors[:, : modes.shape[1] + GUARD]
+    return better, vectors[:, : modes.shape[1] + GUARD_VECTORS]
 
 
 def _cosines(frames: int, count: int, *, first: int = 0) -> Floats:
-    """Return `count` cosines of rising frequency, orthonormal but for the constant, shape `(F, count)`; after the last comes the first."""
+    """Return `count` cosines of rising frequency, orthonormal except for the constant, shape `(F, count)`; frequencies wrap around."""
     frequencies = (first + np.arange(min(count, frames))) % frames
     return np.asarray(np.cos(np.pi * np.outer(np.arange(frames) + 0.5, frequencies) / frames) * (2 / frames) ** 0.5)
 
 
 def _nystrom(product: Callable[[Floats], Floats], begun: Floats) -> tuple[Floats, Floats]:
-    """Return leading eigenvalues, falling, and eigenvectors of a positive semidefinite matrix, given its product with a basis.
+    """Return leading eigenvalues, descending, and eigenvectors of a positive semidefinite matrix, given its product with a basis.
 
-    Williams and Seeger (2001), "Using the Nyström method to speed up kernel machines", for a basis of any columns.
+    Williams and Seeger (2001), "Using the Nyström method to speed up kernel machines", for an arbitrary basis.
     """
     basis, _ = np.linalg.qr(begun)
     image = product(basis)
@@ -370,48 +403,49 @@ def _nystrom(product: Callable[[Floats], Floats], begun: Floats) -> tuple[Floats
     return values, vectors / np.linalg.norm(vectors, axis=0)
 
 
-def _kept(values: Floats, vectors: Floats, total: float, floor: float, most: int) -> tuple[Floats, float]:
-    """Return L in white coordinates and τ as `_split` does, from leading eigenvalues, eigenvectors, and the sum of all."""
-    frames, most = len(vectors), min(most, len(values))
-    drift = max((total - float(values[:most].sum())) / (frames - most), floor)
-    count = min(most, int((values > ABOVE * drift).sum()))
-    drift = max((total - float(values[:count].sum())) / (frames - count), floor)
-    return vectors[:, :count] * np.sqrt(np.maximum(values[:count] - drift, 0.0)), drift
+def _kept(values: Floats, vectors: Floats, total: float, floor: float, max_modes: int) -> tuple[Floats, float]:
+    """Return L in white coordinates and τ as `_split` does, from leading eigenvalues, eigenvectors, and the trace."""
+    frames, max_modes = len(vectors), min(max_modes, len(values))
+    walk_variance = max((total - float(values[:max_modes].sum())) / (frames - max_modes), floor)
+    count = min(max_modes, int((values > MODE_VARIANCE_RATIO * walk_variance).sum()))
+    walk_variance = max((total - float(values[:count].sum())) / (frames - count), floor)
+    return vectors[:, :count] * np.sqrt(np.maximum(values[:count] - walk_variance, 0.0)), walk_variance
 
 
 def _improved(
     covariance: ShapeCovariance,
     modes: Floats,
-    drift: float,
+    walk_variance: float,
     *,
-    extent: Floats,
-    play: Floats,
+    mean_covariance: Floats,
+    axis_covariance: Floats,
     surplus: float,
     nll: float,
 ) -> ShapeCovariance:
-    """Return the covariance with new moments; `surplus`: mean of K's diagonal, `nll`: of the covariance before."""
+    """Return the covariance with new moments; `surplus` is the mean of K's diagonal, `nll` that of the previous covariance."""
     return ShapeCovariance(
-        extent=_symmetric(extent),
-        play=_symmetric(play * (3 / np.trace(play)) + FLATTEST * np.eye(3)) / (1 + FLATTEST),
+        mean_covariance=_symmetric(mean_covariance),
+        axis_covariance=_symmetric(axis_covariance * (3 / np.trace(axis_covariance)) + AXIS_VARIANCE_FLOOR * np.eye(3))
+        / (1 + AXIS_VARIANCE_FLOOR),
         modes=modes,
-        drift=drift,
-        noise=max(covariance.noise * (1 + covariance.noise * surplus), NOISE_FLOOR),
-        likelihood=nll,
+        walk_variance=walk_variance,
+        noise_variance=max(covariance.noise_variance * (1 + covariance.noise_variance * surplus), NOISE_VARIANCE_FLOOR),
+        nll=nll,
     )
 
 
-def _split(over_frames: Floats, floor: float, most: int) -> tuple[Floats, float]:
+def _split(over_frames: Floats, floor: float, max_modes: int) -> tuple[Floats, float]:
     """Return L and τ with C ≈ L Lᵀ + τ T: principal components in coordinates in which the random walk is white."""
     frames = len(over_frames)
     root = whitener(frames)
     values, vectors = np.linalg.eigh(_symmetric(root.T @ over_frames @ root))
     values, vectors = values[::-1], vectors[:, ::-1]
-    most = min(most, frames - 1)
-    drift = max(float(values[most:].mean()), floor)
-    count = min(most, int((values > ABOVE * drift).sum()))
-    drift = max(float(values[count:].mean()), floor)
-    scaled = vectors[:, :count] * np.sqrt(np.maximum(values[:count] - drift, 0.0))
-    return linalg.solve_triangular(root, scaled, lower=True, trans="T"), drift
+    max_modes = min(max_modes, frames - 1)
+    walk_variance = max(float(values[max_modes:].mean()), floor)
+    count = min(max_modes, int((values > MODE_VARIANCE_RATIO * walk_variance).sum()))
+    walk_variance = max(float(values[count:].mean()), floor)
+    scaled = vectors[:, :count] * np.sqrt(np.maximum(values[:count] - walk_variance, 0.0))
+    return linalg.solve_triangular(root, scaled, lower=True, trans="T"), walk_variance
 
 
 def _symmetric(matrix: Floats) -> Floats:

@@ -21,7 +21,7 @@ from scipy import linalg
 
 Array = NDArray[np.floating]
 
-BLOCK = 1024
+POINT_BLOCK = 1024
 """Points worked on at a time."""
 
 
@@ -72,7 +72,7 @@ class PathPrior:
 
     def value(self, shapes: Array) -> float:
         """Return Σ_c tr X_cᵀ Q_c X_c, in double precision: for smooth paths it is a small difference of large numbers."""
-        parts = np.zeros(-(-shapes.shape[2] // BLOCK))
+        parts = np.zeros(-(-shapes.shape[2] // POINT_BLOCK))
         diagonal, beside = self.bands[0], self.bands[1, :-1]
         modes = [each.astype(np.float64) for each in self.modes]
 
@@ -84,7 +84,7 @@ class PathPrior:
                 total += float(np.einsum("f,fp,fp->", diagonal, paths, paths))
                 total += 2 * float(np.einsum("f,fp,fp->", beside, paths[:-1], paths[1:]))
                 total -= float(np.einsum("kp,kp->", seen, seen))
-            parts[span.start // BLOCK] = total
+            parts[span.start // POINT_BLOCK] = total
 
         over_blocks(work, shapes.shape[2], rows=3 * len(shapes))
         return float(parts.sum())
@@ -110,10 +110,10 @@ def over_blocks(work: Callable[[slice], None], points: int, *, rows: int) -> Non
     """Call `work` on blocks of points, the same whatever the number of threads that share them."""
 
     def blocks(start: int, stop: int) -> None:
-        for first in range(start * BLOCK, min(stop * BLOCK, points), BLOCK):
-            work(slice(first, min(first + BLOCK, points)))
+        for first in range(start * POINT_BLOCK, min(stop * POINT_BLOCK, points), POINT_BLOCK):
+            work(slice(first, min(first + POINT_BLOCK, points)))
 
-    over_ranges(blocks, -(-points // BLOCK), smallest=max(1, SMALLEST // (rows * BLOCK)))
+    over_ranges(blocks, -(-points // POINT_BLOCK), smallest=max(1, SMALLEST // (rows * POINT_BLOCK)))
 
 
 def _chained(bands: Floats, columns: Floats) -> Floats:

@@ -14,7 +14,7 @@ EXACT, ROUGH, MOST = 1e-4, 0.1, 200
 """Reduction of the residual where least squares are the answer, where they are but a start, and iterations at most."""
 
 DOUBT = 0.1
-"""Standard deviation of an image coordinate, normalised units, that the start assumes with a Gaussian prior."""
+"""Standard deviation of an image coordinate, normalized units, that the start assumes with a Gaussian prior."""
 
 
 def pseudo_inverse(problem: Problem, translations: Floats) -> Array:

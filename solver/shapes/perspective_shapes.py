@@ -11,24 +11,24 @@ from pliant.solver.cameras.perspective import Perspective, corrected_tracks
 from pliant.solver.energy.problem import Problem
 from pliant.solver.records import Camera, Floats, Solution, Tracks, read_only
 from pliant.solver.shapes.state import State
-from pliant.solver.tracks.normalization import Normalised
+from pliant.solver.tracks.normalization import Normalized
 
 
 def corrected_again(
     problem: Problem,
     state: State,
-    normalised: Normalised,
-    flat: Normalised,
+    normalized: Normalized,
+    flat: Normalized,
     estimate: CameraEstimate,
     kept: NDArray[np.intp] | None,
-) -> tuple[Problem, Normalised, float]:
+) -> tuple[Problem, Normalized, float]:
     """Return problem and tracks corrected with the depths of the state, and the RMS change of the corrected tracks.
 
     Parameters
     ----------
     problem, state
         Of the points `kept`, all of them for None.
-    normalised, flat : Normalised
+    normalized, flat : Normalized
         The tracks as they are, and as they were corrected so far.
     estimate : CameraEstimate
         With κ and the cameras.
@@ -37,10 +37,10 @@ def corrected_again(
     """
     view = estimate.perspective
     assert view is not None
-    places = np.arange(normalised.points.shape[1]) if kept is None else kept
+    places = np.arange(normalized.points.shape[1]) if kept is None else kept
     rows = np.asarray(estimate.scales)[:, None] * np.asarray(estimate.rotations)[:, 2] @ problem.axes
     depths = np.einsum("fi,fip->fp", rows, state.shapes.astype(np.float64))
-    part = replace(normalised, points=normalised.points[:, places], visible=normalised.visible[:, places])
+    part = replace(normalized, points=normalized.points[:, places], visible=normalized.visible[:, places])
     points = corrected_tracks(part, view, depths).points
     seen = problem.confidence > 0
     squared = np.square(points - flat.points[:, places]).sum(axis=2)

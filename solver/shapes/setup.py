@@ -1,4 +1,4 @@
-"""From normalised tracks, cameras, mesh and settings to the one energy that is minimised."""
+"""From normalized tracks, cameras, mesh and settings to the one energy that is minimised."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from pliant.solver.records import Choices, Mesh
 from pliant.solver.settings import Settings
 from pliant.solver.shapes.irls import init
 from pliant.solver.shapes.state import State
-from pliant.solver.tracks.normalization import Normalised
+from pliant.solver.tracks.normalization import Normalized
 
 
 def build_problem(
-    normalised: Normalised,
+    normalized: Normalized,
     estimate: CameraEstimate,
     mesh: Mesh | None,
     settings: Settings,
@@ -28,9 +28,9 @@ def build_problem(
     """Choose what the settings leave open, and put the energy together; a covariance makes the prior Gaussian."""
     # The Gaussian prior is a small difference of large numbers: single precision loses it where a fit is stiff.
     kind = np.dtype(settings.precision if covariance is None else "float64")
-    laplacian = _laplacian(normalised, mesh, settings)
-    weights, noise, reasons = choose_weights(normalised, covariance, laplacian, settings)
-    frames = len(normalised.points)
+    laplacian = _laplacian(normalized, mesh, settings)
+    weights, noise, reasons = choose_weights(normalized, covariance, laplacian, settings)
+    frames = len(normalized.points)
     bands = weights.temporal * difference_bands(frames, weights.order)
     axes, quadratic = np.eye(3), None
     if covariance is not None:
@@ -38,8 +38,8 @@ def build_problem(
         bands, quadratic = np.zeros_like(bands), precisions.scaled(weights.temporal)
     projections = np.asarray(estimate.scales)[:, None, None] * np.asarray(estimate.rotations)[:, :2] @ axes
     problem = Problem(
-        points=np.ascontiguousarray(normalised.points.transpose(0, 2, 1), dtype=kind),
-        confidence=normalised.visible.astype(kind),
+        points=np.ascontiguousarray(normalized.points.transpose(0, 2, 1), dtype=kind),
+        confidence=normalized.visible.astype(kind),
         projections=np.ascontiguousarray(projections, dtype=kind),
         loss=settings.loss if settings.method == "robust" else "l2",
         weights=weights,
@@ -56,8 +56,8 @@ def build_problem(
         temporal_order=weights.order,
         low_rank_weight=weights.low_rank,
         laplacian=laplacian.name if laplacian is not None else "none",
-        unit=normalised.unit,
-        noise=noise * normalised.unit,
+        unit=normalized.unit,
+        noise=noise * normalized.unit,
         reasons={**estimate.reasons, **reasons},
         warnings=(*estimate.warnings, *without_effect(settings)),
     )
@@ -78,14 +78,14 @@ def with_bending(
     return problem, choices, init(problem, state.shapes, state.translations)
 
 
-def _laplacian(normalised: Normalised, mesh: Mesh | None, settings: Settings) -> Laplacian | None:
+def _laplacian(normalized: Normalized, mesh: Mesh | None, settings: Settings) -> Laplacian | None:
     if settings.method in ("pseudo_inverse", "temporal"):
         return None
-    return build_laplacian(mesh, settings.laplacian, _reference(normalised))
+    return build_laplacian(mesh, settings.laplacian, _reference(normalized))
 
 
-def _reference(normalised: Normalised) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+def _reference(normalized: Normalized) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
     """Return each point's mean image position with depth 0, shape `(P, 3)`: geometry enough for cotangents."""
-    total = np.maximum(normalised.visible.sum(axis=0), np.finfo(float).tiny)
-    mean = np.einsum("fp,fpc->pc", normalised.visible, normalised.points) / total[:, None]
+    total = np.maximum(normalized.visible.sum(axis=0), np.finfo(float).tiny)
+    mean = np.einsum("fp,fpc->pc", normalized.visible, normalized.points) / total[:, None]
     return np.concatenate([mean, np.zeros((len(mean), 1))], axis=1)

@@ -1,19 +1,20 @@
-"""Points that are seldom or never seen: left out of the minimisation, then drawn along the surface and moved to what was seen of them.
+"""Sparsely observed points: excluded from the minimisation, placed on the surface, moved to their observations.
 
-Hardly anything holds such a point but its prior, which says that it is somewhere about the middle, and its neighbours. In the
-minimisation it would go where those want it at the pace of diffusion, and wherever a patch of such points lies the prior would win:
-it takes every point by itself. Therefore in two steps, from the shapes of the points that are seen often enough:
+A sparsely observed point is held by its neighbours and by its prior alone, whose mean is the centre of the body. In
+the minimisation it would approach its neighbours at the pace of diffusion, and in a patch of such points the prior,
+which acts on every point separately, would win. The points are therefore placed in two steps, given the shapes of the
+well-observed points:
 
-- the surface is closed: among all positions of the others, those of least ‖A X‖² + μ Σ ‖x_i − x_j‖², the second sum over edges: a thin
-  plate through their neighbours, under a little tension, for a plate alone that hangs on an edge goes on at its slope without end;
-- what was seen of a point, if anything, moves it off the plate. About its mean position its path has the learned covariance; the mean is
-  near the plate and not just anywhere in the body. With Σ for both, and K = ΠΣΠᵀ + diag(λ1/ω) over its observations r, it is moved by
-  the conditional mean Σ Πᵀ K⁻¹ r: kriging, the plate for its trend (Cressie, Statistics for Spatial Data, 1993, section 3.4). It meets
-  what was seen and follows the modes of the body elsewhere.
+    1. Close the surface: the unknown positions minimise ‖A X‖² + μ Σ ‖x_i − x_j‖², the second sum over edges. This is a thin plate
+       under tension; without tension, a plate that hangs on an edge continues at its slope without bound.
+    2. Move each point to its observations by simple kriging with the plate as trend (Cressie, Statistics for Spatial Data, 1993,
+       section 3.4). Its path about its mean has the learned covariance; the variance of the mean is reduced to stay near the plate.
+       With Σ for both, and K = ΠΣΠᵀ + diag(λ1/ω) over its observations r, the correction is the conditional mean Σ Πᵀ K⁻¹ r.
 
-Where the tracks have gross outliers, those of such a point are found first, one after the other: the observation that is the least
-probable given the others of its point, from the closed form of leaving one out (Dubrule, "Cross validation of kriging in a unique
-neighborhood", 1983). Of four observations one that is an outlier bends any fit to all of them; it does not bend the one without it.
+Where the tracks have gross outliers, they are rejected one by one: the observation that is least probable given the
+others of its point, by the closed form of leave-one-out (Dubrule, "Cross validation of kriging in a unique
+neighborhood", 1983). A single outlier among four observations bends any fit to all of them, but not the leave-one-out
+prediction.
 """
 
 from __future__ import annotations
@@ -28,82 +29,83 @@ from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.operators.mesh_laplacian import Matrix
 from pliant.solver.records import MIN_POINTS, Floats, Mesh
 from pliant.solver.shapes.irls import init
-from pliant.solver.shapes.outlier_rejection import GROSS
+from pliant.solver.shapes.outlier_rejection import MIN_OUTLIER_DISTANCE
 from pliant.solver.shapes.state import State
 from pliant.solver.threads import over_ranges
-from pliant.solver.tracks.normalization import Normalised
+from pliant.solver.tracks.normalization import Normalized
 from scipy import linalg, sparse
 from scipy.sparse.linalg import splu
 
-SELDOM = 0.25
-"""A point is seldom seen below this share of the frames. Measured on turning bodies: .15 to .35 alike."""
+WELL_OBSERVED_SHARE = 0.25
+"""Minimum share of the frames in which a well-observed point is visible. On rotating bodies .15 to .35 give about the
+same error."""
 
-MOST = 0.5
-"""Where more of the points are seldom seen, tracks come and go, and all of them are needed together."""
+MAX_SPARSE_SHARE = 0.5
+"""Share of sparsely observed points above which all points are fitted together, since tracks then start and end
+throughout."""
 
 TENSION = 1.0
-"""μ: felt beyond some three rings of neighbours. Measured on four bodies: 1 to 10 alike; at .01 patches hung on an edge fly off."""
+"""μ, weight of the differences along edges; it acts beyond about three rings of neighbours. On four bodies 1 to 10
+give about the same error; at .01 patches that hang on an edge fly off."""
 
-LOOSE = 1e-6
-"""Ridge beside AᵀA, whose diagonal is about 150: points that hang on nothing stay in the middle."""
+SURFACE_RIDGE = 1e-6
+"""Ridge on AᵀA, whose diagonal is about 150: keeps unconnected points at the centre."""
 
-ROUNDING = 1e-10
+PATH_RIDGE = 1e-10
 """Share added to the diagonal of K, against rounding."""
 
-TINY = float(np.finfo(np.float64).tiny)
+SMALLEST_WEIGHT = float(np.finfo(np.float64).tiny)
 
-ROUNDS = 3
-"""Reweightings of the deviations."""
+PATH_REWEIGHTINGS = 3
+"""Reweightings of the deviations of a path."""
 
-DOUBT = 5.0
-"""Standard deviations beyond which an observation does not belong to the others of its point, if it is further than `GROSS` from where
-they expect it. Measured, 6 % outliers, known cameras, three draws: animated head .103, .095, .103 with a fit to all of them, .068, .057,
-.056 without those in doubt; galloping horse .248, .273, .350, and .058, .061, .058. At 6 head .059, .057, .056, horse .058, .064, .065."""
+MAX_DEVIATION = 5.0
+"""Standard deviations from its leave-one-out prediction beyond which an observation is rejected, if it is also
+further away than `MIN_OUTLIER_DISTANCE`. With 6 % outliers on a galloping horse .25 to .35 without, .06 with
+rejection."""
 
-NEAR = 0.1
-"""Share of the variance of the body's mean positions that a point's has off the plate. With all of it the little that was seen of a
-point may put its depth anywhere, as far as noise carries it. Measured, all against this share: noise of .01, known cameras, galloping
-horse .104 → .072, animated head .0741 → .0655, speaking head .0313 → .0282, dancer .152 → .150; clean, estimated cameras, .0562 → .0537,
-.0519 → .0524, .0221 → .0222, .124 → .122. With .3 noise costs horse .083 and head .067, with .03 .072 and .072. What the modes hold of the
-mean counts as such: estimated cameras leave much of it to them."""
+MEAN_VARIANCE_SHARE = 0.1
+"""Share of the variance of the body's mean positions that a point may deviate from the surface. With all of it, few
+noisy observations leave the depth open: with noise of .01 on a galloping horse .104 at share 1, .072 at .1; .03 to
+.1 are alike."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class OftenSeen:
-    """The points that are seen often enough, as a sequence of their own."""
+class WellObserved:
+    """The well-observed points as a sequence of their own."""
 
-    normalised: Normalised
+    normalized: Normalized
     mesh: Mesh
-    """Faces, or cells of the grid, whose corners are all among them."""
+    """Faces, or cells of the grid, all of whose corners are well observed."""
 
     kept: NDArray[np.intp]
-    """Which points they are, ascending."""
+    """Indices of the points, ascending."""
 
     pull: Matrix
     """√μ times the differences along the edges of the whole surface, shape `(E, P)`."""
 
 
-def often_seen(normalised: Normalised, mesh: Mesh | None) -> OftenSeen | None:
-    """Return the points that are seen often enough; None if that is all, hardly any, or if there is no surface to draw the rest on."""
+def well_observed(normalized: Normalized, mesh: Mesh | None) -> WellObserved | None:
+    """Return the well-observed points; None if these are all points or too few, or if there is no mesh."""
     if mesh is None or (len(mesh.faces) == 0 and mesh.grid is None):
         return None
-    count = normalised.visible.shape[1]
-    kept = np.flatnonzero((normalised.visible > 0).mean(axis=0) >= SELDOM)
-    if len(kept) == count or len(kept) < max(MIN_POINTS, (1 - MOST) * count):
+    count = normalized.visible.shape[1]
+    kept = np.flatnonzero((normalized.visible > 0).mean(axis=0) >= WELL_OBSERVED_SHARE)
+    if len(kept) == count or len(kept) < max(MIN_POINTS, (1 - MAX_SPARSE_SHARE) * count):
         return None
-    part = Normalised(normalised.points[:, kept], normalised.visible[:, kept], normalised.centroid, normalised.unit)
-    return OftenSeen(part, _mesh_of(mesh, kept), kept, TENSION**0.5 * _differences(mesh))
+    part = Normalized(normalized.points[:, kept], normalized.visible[:, kept], normalized.centroid, normalized.unit)
+    return WellObserved(part, _mesh_of(mesh, kept), kept, TENSION**0.5 * _differences(mesh))
 
 
-def draw_the_rest(
-    part: OftenSeen, problem: Problem, covariance: ShapeCovariance, state: State, *, spoiled: bool = False
+def place_the_rest(
+    part: WellObserved, problem: Problem, covariance: ShapeCovariance, state: State, *, spoiled: bool = False
 ) -> tuple[Problem, State]:
-    """Return the problem without gross outliers and the state of all points, its energy and counts those of the points of the part.
+    """Return the problem without gross outliers and the state of all points; energy and counts are those of the part.
 
     Parameters
     ----------
-    part : OftenSeen
-        Which points have been found.
+    part : WellObserved
+        The well-observed points.
     problem : Problem
         Of all points, with the Gaussian prior of `covariance`.
     covariance : ShapeCovariance
@@ -111,7 +113,7 @@ def draw_the_rest(
     state : State
         Of the points of the part.
     spoiled : bool
-        Whether there are gross outliers to leave out.
+        Whether to reject gross outliers.
     """
     shapes = np.zeros((len(problem.points), 3, problem.points.shape[2]))
     shapes[:, :, part.kept] = state.shapes
@@ -120,7 +122,7 @@ def draw_the_rest(
     close_surface(shapes, part.kept, energy)
     confidence = problem.confidence.astype(np.float64)
     kriging = Kriging.of(problem, covariance, state.translations)
-    _meet_what_was_seen(kriging, shapes, confidence, np.setdiff1d(seen, part.kept), spoiled=spoiled)
+    _fit_observations(kriging, shapes, confidence, np.setdiff1d(seen, part.kept), spoiled=spoiled)
     problem = replace(problem, confidence=confidence)
     if len(seen) < problem.points.shape[2]:
         close_surface(shapes, seen, energy)
@@ -131,7 +133,7 @@ def draw_the_rest(
 
 
 def close_surface(shapes: Floats, known: NDArray[np.intp], energy: Matrix) -> None:
-    """Put all other points where ‖E X‖² is least.
+    """Place the other points so that ‖E X‖² is least, in place.
 
     Parameters
     ----------
@@ -145,7 +147,7 @@ def close_surface(shapes: Floats, known: NDArray[np.intp], energy: Matrix) -> No
     unknown = np.setdiff1d(np.arange(shapes.shape[2]), known)
     matrix = sparse.csc_array(energy, dtype=np.float64)
     there, elsewhere = matrix[:, unknown], matrix[:, known]
-    normal = sparse.csc_array(there.T @ there + LOOSE * sparse.eye_array(len(unknown)))
+    normal = sparse.csc_array(there.T @ there + SURFACE_RIDGE * sparse.eye_array(len(unknown)))
     flat = shapes.reshape(-1, shapes.shape[2])
     drawn = splu(normal).solve(np.asarray(-(there.T @ (elsewhere @ flat[:, known].T))))
     shapes[:, :, unknown] = drawn.T.reshape(shapes.shape[0], 3, len(unknown))
@@ -153,31 +155,31 @@ def close_surface(shapes: Floats, known: NDArray[np.intp], energy: Matrix) -> No
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Kriging:
-    """The conditional mean of one point's path, given what was seen of it and a trend."""
+    """The conditional mean of a point's path, given its observations and a trend (simple kriging)."""
 
     problem: Problem
     translations: Floats
 
     reach: Floats
-    """Σ Πᵀ: what an observation, frame and image axis, says of the path, shape `(3F, 2F)`."""
+    """Σ Πᵀ, covariance of the path with the observations, shape `(3F, 2F)`."""
 
     image: Floats
     """Π Σ Πᵀ, shape `(2F, 2F)`."""
 
     scatter: float
-    """Variance of what belongs where it is expected: of noise, and of what is not gross."""
+    """Variance of an inlier about its prediction."""
 
     @classmethod
     def of(cls, problem: Problem, covariance: ShapeCovariance, translations: Floats) -> Kriging:
-        """Multiply the covariances out, once for all points."""
+        """Compute the covariances once for all points."""
         frames, rows = len(problem.points), problem.projections.astype(np.float64)
         moving = covariance.over_frames()
-        near = NEAR * (moving.mean() + covariance.axes()[1])
+        near = MEAN_VARIANCE_SHARE * (moving.mean() + covariance.axes()[1])
         moving = moving - moving.mean(axis=0) - moving.mean(axis=1)[:, None] + moving.mean()  # about a path's mean
         each = moving + near[:, None, None]
         reach = np.einsum("gic,cfg->fcgi", rows, each).reshape(3 * frames, 2 * frames)
         image = np.einsum("fic,fcm->fim", rows, reach.reshape(frames, 3, -1)).reshape(2 * frames, 2 * frames)
-        return cls(problem, translations, reach, image, max(covariance.noise, (GROSS / 3) ** 2))
+        return cls(problem, translations, reach, image, max(covariance.noise_variance, (MIN_OUTLIER_DISTANCE / 3) ** 2))
 
     def left(self, point: int, path: Floats) -> Floats:
         """Return the residuals of a path `(F, 3, 1)`, shape `(F, 2, 1)`."""
@@ -185,27 +187,27 @@ class Kriging:
         return np.asarray(self.problem.points[:, :, point : point + 1] - image, dtype=np.float64)
 
     def moved(self, point: int, confidence: Floats, trend: Floats) -> Floats:
-        """Return the path, `(F, 3, 1)`, of the trend and the observations of some confidence `(F, 1)`."""
+        """Return the path, `(F, 3, 1)`, given a trend and observations with confidence `(F, 1)`."""
         weights = self.problem.weights
         there = np.repeat(confidence[:, 0] > 0, 2)
         if not there.any():
             return trend
         off, path = self.left(point, trend).reshape(-1)[there], trend
-        for _ in range(ROUNDS):
+        for _ in range(PATH_REWEIGHTINGS):
             omega = loss_weights(
                 self.left(point, path), confidence, loss=self.problem.loss, scale=weights.robust_scale
             ).reshape(-1)[there]
             matrix = self.image[np.ix_(there, there)]
-            matrix[np.diag_indices_from(matrix)] *= 1 + ROUNDING
-            matrix[np.diag_indices_from(matrix)] += weights.temporal / np.maximum(omega, TINY)
+            matrix[np.diag_indices_from(matrix)] *= 1 + PATH_RIDGE
+            matrix[np.diag_indices_from(matrix)] += weights.temporal / np.maximum(omega, SMALLEST_WEIGHT)
             path = trend + (self.reach[:, there] @ linalg.solve(matrix, off, assume_a="pos")).reshape(trend.shape)
         return path
 
-    def doubtful(self, point: int, confidence: Floats, trend: Floats) -> NDArray[np.intp]:
-        """Return the frames whose observations do not belong to the others of the point.
+    def inconsistent(self, point: int, confidence: Floats, trend: Floats) -> NDArray[np.intp]:
+        """Return the frames whose observations are inconsistent with the point's other observations.
 
-        With K = ΠΣΠᵀ + scatter, y = K⁻¹ r and Bᵢ the 2×2 block of K⁻¹ at observation i, the others expect it Bᵢ⁻¹ yᵢ from
-        where it is, and the square of the standard deviations between is yᵢᵀ Bᵢ⁻¹ yᵢ.
+        With K = ΠΣΠᵀ + scatter, y = K⁻¹ r and Bᵢ the 2×2 block of K⁻¹ at observation i, the leave-one-out residual is
+        Bᵢ⁻¹ yᵢ, and its squared Mahalanobis length is yᵢᵀ Bᵢ⁻¹ yᵢ (Dubrule 1983).
         """
         off, there = self.left(point, trend)[:, :, 0], np.flatnonzero(confidence[:, 0] > 0)
         while len(there):
@@ -215,25 +217,25 @@ class Kriging:
             blocks = inverse.reshape(len(there), 2, len(there), 2)[each, :, each]
             weighed = (inverse @ off[there].reshape(-1)).reshape(-1, 2)
             apart = np.linalg.solve(blocks, weighed[:, :, None])[:, :, 0]
-            doubt = np.where(np.hypot(*apart.T) > GROSS, (apart * weighed).sum(axis=1), 0.0)
-            worst = int(doubt.argmax())
-            if doubt[worst] <= DOUBT**2:
+            deviation = np.where(np.hypot(*apart.T) > MIN_OUTLIER_DISTANCE, (apart * weighed).sum(axis=1), 0.0)
+            worst = int(deviation.argmax())
+            if deviation[worst] <= MAX_DEVIATION**2:
                 break
             there = np.delete(there, worst)
         return np.setdiff1d(np.flatnonzero(confidence[:, 0] > 0), there)
 
 
-def _meet_what_was_seen(
+def _fit_observations(
     kriging: Kriging, shapes: Floats, confidence: Floats, points: NDArray[np.intp], *, spoiled: bool
 ) -> None:
-    """Move some points of the shapes to their observations, in place; gross outliers lose their confidence, in place, too."""
+    """Move points to their observations, in place; the confidence of gross outliers is set to 0, in place."""
 
     def work(start: int, stop: int) -> None:
         for point in points[start:stop]:
             one = slice(point, point + 1)
             trend = shapes[:, :, one].copy()
             if spoiled:
-                confidence[kriging.doubtful(point, confidence[:, one], trend), point] = 0
+                confidence[kriging.inconsistent(point, confidence[:, one], trend), point] = 0
             shapes[:, :, one] = kriging.moved(point, confidence[:, one], trend)
 
     over_ranges(work, len(points), smallest=64)
@@ -248,7 +250,7 @@ def _differences(mesh: Mesh) -> Matrix:
 
 
 def _mesh_of(mesh: Mesh, kept: NDArray[np.intp]) -> Mesh:
-    """Return the mesh of the kept points, numbered anew: a grid with more holes, or the faces that are left."""
+    """Return the mesh of the kept points, renumbered: a grid with more holes, or the remaining faces."""
     number = np.full(mesh.num_points + 1, -1, dtype=np.int32)  # the last entry stands for −1, a hole
     number[kept] = np.arange(len(kept))
     if mesh.grid is not None:

@@ -1,4 +1,4 @@
-"""Where a minimisation stands after some reweightings."""
+"""State of a minimisation after some reweightings."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pliant.solver.records import Floats
 
 @dataclass(frozen=True, slots=True, eq=False)
 class State:
-    """Where the minimisation stands after some reweightings."""
+    """State of the minimisation after some reweightings."""
 
     shapes: Array
     """X, shape `(F, 3, P)`, centred per frame."""
@@ -24,7 +24,7 @@ class State:
     """Majoriser of the low-rank prior at the current shapes."""
     objective: float
     residual: float
-    """Median visible reprojection residual, normalised units."""
+    """Median visible reprojection residual, normalized units."""
     reweighting: int
     iterations: int
     """Conjugate-gradient iterations of the last step."""

@@ -21,21 +21,22 @@ from pliant.solver.records import Floats
 from scipy import linalg
 from scipy.spatial import cKDTree
 
-MOST_FRAMES = 300
-"""Frames evaluated at most, evenly spread; fewer observations make the numbers larger, never smaller. The cost is cubic in frames."""
+MAX_FRAMES = 300
+"""Maximum number of frames evaluated, evenly spread, because the cost is cubic in frames. Fewer observations make the
+numbers larger, never smaller."""
 
-WORK = 2e10
-"""Floating-point operations spent on patterns of visibility at most: a few seconds on one core."""
+MAX_OPERATIONS = 2e10
+"""Maximum floating-point operations spent on patterns of visibility: a few seconds on one core."""
 
-MOST_PATTERNS = 128
-"""Patterns evaluated at most."""
+MAX_PATTERNS = 128
+"""Maximum number of patterns evaluated."""
 
 GAPS = (0, 1, 2, 4, 8, 16, 32, np.inf)
-"""Classes of a position, by the number of frames to the nearest frame that shows the point."""
+"""Bounds of the classes of positions, in frames to the nearest frame in which the point is visible."""
 
 
-OFTEN = 0.25
-"""Share of the frames from which a point counts as observed often, as in `shapes.sparsely_observed`."""
+WELL_OBSERVED_SHARE = 0.25
+"""Minimum share of the frames in which a well-observed point is visible, as in `shapes.sparsely_observed`."""
 
 
 def position_std(
@@ -62,7 +63,7 @@ def position_std(
         In the unit of the covariance.
     """
     frames = len(projections)
-    used = np.unique(np.linspace(0, frames - 1, min(frames, MOST_FRAMES)).round().astype(int))
+    used = np.unique(np.linspace(0, frames - 1, min(frames, MAX_FRAMES)).round().astype(int))
     prior, crossed, image = _moments(covariance, projections, used)
     noise = noise_std**2
     weights = confidence[used]
@@ -90,7 +91,7 @@ def bounded_by_neighbours(std: Floats, shapes: Floats, visible: Floats) -> Float
     std, shapes, visible
         Shapes `(F, P)`, `(F, P, 3)` and `(F, P)`.
     """
-    often = np.flatnonzero((visible > 0).mean(axis=0) >= OFTEN)
+    often = np.flatnonzero((visible > 0).mean(axis=0) >= WELL_OBSERVED_SHARE)
     rarely = np.setdiff1d(np.arange(shapes.shape[1]), often)
     if len(often) == 0 or len(rarely) == 0:
         return std
@@ -106,12 +107,12 @@ def _moments(covariance: ShapeCovariance, projections: Floats, used: NDArray[np.
     """Return tr Σ_ff (F,), Σ Πᵀ of shape (3F, 2F) and Π Σ Πᵀ (2F, 2F) for the frames used."""
     rows = projections[used].reshape(-1, 3)
     over_frames = covariance.over_frames()[np.ix_(used, used)]
-    mean = rows @ covariance.extent
-    path = rows @ covariance.play
+    mean = rows @ covariance.mean_covariance
+    path = rows @ covariance.axis_covariance
     wide = np.repeat(over_frames, 2, axis=1)
     crossed = (mean.T[None, :, :] + path.T[None, :, :] * wide[:, None, :]).reshape(3 * len(used), -1)
     image = mean @ rows.T + (path @ rows.T) * np.repeat(wide, 2, axis=0)
-    prior = np.trace(covariance.extent) + np.diag(over_frames) * np.trace(covariance.play)
+    prior = np.trace(covariance.mean_covariance) + np.diag(over_frames) * np.trace(covariance.axis_covariance)
     return np.asarray(prior), crossed, np.asarray(image)
 
 
@@ -130,7 +131,7 @@ def _variance(prior: Floats, crossed: Floats, image: Floats, weights: Floats, no
 def _sample(weights: Floats, seed: int) -> NDArray[np.intp]:
     """Return the points whose patterns are evaluated exactly."""
     frames, points = weights.shape
-    count = int(np.clip(WORK / (16 * frames**3), 8, MOST_PATTERNS))
+    count = int(np.clip(MAX_OPERATIONS / (16 * frames**3), 8, MAX_PATTERNS))
     if points <= count:
         return np.arange(points)
     return np.sort(np.random.default_rng(seed).choice(points, count, replace=False))

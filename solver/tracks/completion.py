@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.errors import InvalidInput
 from pliant.solver.records import MIN_POINTS, Floats
-from pliant.solver.tracks.normalization import Normalised
+from pliant.solver.tracks.normalization import Normalized
 
 SAMPLE = 600
 """Points that the basis is fitted to."""
@@ -28,20 +28,20 @@ RANKS = (4, 7, 10, 16, 25, 40)
 SWEEPS = 8
 """Alternations at each rank."""
 
-HELD_OUT = 0.05
+HELD_OUT_SHARE = 0.05
 """Share of the seen entries of the sample that is hidden to choose the rank by predicting it."""
 
-GROSS = 0.15
-"""Normalised units below which a residual is never called an outlier, however well the others fit."""
+MIN_OUTLIER_RESIDUAL = 0.15
+"""Normalized units below which a residual is never called an outlier, however well the others fit."""
 
-OUTLIER = 6.0
+OUTLIER_SIGMAS = 6.0
 """Residuals beyond this many robust standard deviations are outliers."""
 
 CHUNK = 4096
 """Points carried onto the basis at once; bounds the memory at CHUNK·(6F + r²) numbers."""
 
-FINE = 0.01
-"""Normalised units: smallest residual scale of the weights, so that clean tracks are fitted by plain least squares, and of the
+MIN_RESIDUAL_SCALE = 0.01
+"""Normalized units: smallest residual scale of the weights, so that clean tracks are fitted by plain least squares, and of the
 prior on coefficients: measured on turning bodies, of which no point is always seen, a finer one extrapolates, a coarser one blurs."""
 
 DAMPING = 1e-2
@@ -62,7 +62,7 @@ class Filling:
     """Covariance of the coefficients, shape `(r − 1, r − 1)`."""
 
     scale: float
-    """Standard deviation of the residuals, normalised units."""
+    """Standard deviation of the residuals, normalized units."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,7 +73,7 @@ class Completed:
     """W Wᵀ / P over all points, shape `(2F, 2F)`."""
 
     sample: Floats
-    """Some of the points, shape `(F, S, 2)`, normalised units."""
+    """Some of the points, shape `(F, S, 2)`, normalized units."""
 
     translations: Floats
     """Mean of the completed points of each frame, shape `(F, 2)`: what the centroid of the visible ones missed."""
@@ -88,13 +88,13 @@ class Completed:
     """How hidden entries and outliers were replaced; None: nothing was."""
 
 
-def complete(normalised: Normalised, *, seed: int = 0, rank: int = 0) -> Completed:
+def complete(normalized: Normalized, *, seed: int = 0, rank: int = 0) -> Completed:
     """Fill hidden entries, replace gross outliers, and return the Gram matrix of the result.
 
     Parameters
     ----------
-    normalised : Normalised
-        Points (F, P, 2) in normalised units with their visibility.
+    normalized : Normalized
+        Points (F, P, 2) in normalized units with their visibility.
     seed : int
         Of the sample of points and of the held-out entries.
     rank : int
@@ -105,23 +105,23 @@ def complete(normalised: Normalised, *, seed: int = 0, rank: int = 0) -> Complet
     InvalidInput
         Hardly any point is seen in two frames.
     """
-    most = float(normalised.visible.max())
+    most = float(normalized.visible.max())
     if 0 < most < 1:  # only the ratios of confidences count
-        normalised = replace(normalised, visible=normalised.visible / most)
+        normalized = replace(normalized, visible=normalized.visible / most)
     random = np.random.default_rng(seed)
-    chosen = choose_points(normalised.visible, random)
-    again = seen_again(normalised.visible)
+    chosen = choose_points(normalized.visible, random)
+    again = seen_again(normalized.visible)
     if again < MIN_POINTS:
         raise InvalidInput(
             "too_little_seen", field="visibility", expected=f"at least {MIN_POINTS} points that are seen in two frames or more",
             got=f"{again}", hint="Check that the visibility is not inverted, and that a point keeps its place from frame to frame.",
         )  # fmt: skip
-    points, weight = normalised.points[:, chosen], normalised.visible[:, chosen]
+    points, weight = normalized.points[:, chosen], normalized.visible[:, chosen]
     basis, spread, scale = fit_basis(points, weight, random, rank)
     outliers = fill(points, weight, basis, spread, scale)[1]
-    clean = outliers == 0.0 and bool((normalised.visible == 1).all())
+    clean = outliers == 0.0 and bool((normalized.visible == 1).all())
     filling = None if clean else Filling(basis, spread, scale)
-    gram, translations, sample = _carry(normalised, filling, chosen)
+    gram, translations, sample = _carry(normalized, filling, chosen)
     return Completed(gram, sample, translations, 0 if clean else basis.shape[2], outliers, filling)
 
 
@@ -150,7 +150,7 @@ def fit_basis(
     The rank is the one that is given, or that predicts held-out entries best; a larger one must do so by more than 2 %.
     """
     frames, count = weight.shape
-    held = (random.random(weight.shape) < HELD_OUT) & (weight > 0)
+    held = (random.random(weight.shape) < HELD_OUT_SHARE) & (weight > 0)
     kept = np.where(held, 0.0, weight)
     start = _interpolated(points, weight)
     hidden = bool((weight == 0).any())
@@ -181,10 +181,10 @@ def alternate(points: Floats, weight: Floats, basis: Floats, *, sweeps: int) -> 
     Weights are those of the Cauchy loss, whose scale follows three times the median residual.
     """
     coefficients, spread = coefficients_of(points, weight, basis, None, 1.0, sweeps=3)
-    scale = FINE
+    scale = MIN_RESIDUAL_SCALE
     for _ in range(sweeps):
         lengths = _lengths(points - predict(basis, coefficients))
-        scale = max(_typical(lengths, weight > 0), FINE)
+        scale = max(_typical(lengths, weight > 0), MIN_RESIDUAL_SCALE)
         robust = weight / (1 + (lengths / (3 * scale)) ** 2)
         extended = np.concatenate([coefficients, np.ones((len(coefficients), 1))], axis=1)
         normal = np.einsum("fp,pi,pj->fij", robust, extended, extended, optimize=True)
@@ -220,7 +220,7 @@ def coefficients_of(
             moment = moment + scale**2 * inverse.mean(axis=0)
         if sweep + 1 < sweeps:
             lengths = _lengths(points - predict(basis, coefficients))
-            typical = max(_typical(lengths, weight > 0), FINE)
+            typical = max(_typical(lengths, weight > 0), MIN_RESIDUAL_SCALE)
             robust = weight / (1 + (lengths / (3 * typical)) ** 2)
     return coefficients, moment
 
@@ -246,15 +246,15 @@ def fill(points: Floats, weight: Floats, basis: Floats, spread: Floats, scale: f
 
 def gross(points: Floats, weight: Floats, predicted: Floats, scale: float) -> NDArray[np.bool_]:
     """Return which seen entries lie too far from their prediction to be believed, shape `(F, S)`."""
-    return np.asarray((weight > 0) & (_lengths(points - predicted) > max(OUTLIER * scale, GROSS)))
+    return np.asarray((weight > 0) & (_lengths(points - predicted) > max(OUTLIER_SIGMAS * scale, MIN_OUTLIER_RESIDUAL)))
 
 
-def spans(normalised: Normalised, filling: Filling | None) -> Iterator[tuple[NDArray[np.intp], Floats]]:
+def spans(normalized: Normalized, filling: Filling | None) -> Iterator[tuple[NDArray[np.intp], Floats]]:
     """Yield the points that are seen at all, completed, a chunk at a time: their indices, and positions `(F, n, 2)`."""
-    count = normalised.visible.shape[1]
+    count = normalized.visible.shape[1]
     for start in range(0, count, CHUNK):
         span = slice(start, min(start + CHUNK, count))
-        points, weight = normalised.points[:, span], normalised.visible[:, span]
+        points, weight = normalized.points[:, span], normalized.visible[:, span]
         shown = (weight > 0).any(axis=0)
         points, weight = points[:, shown], weight[:, shown]
         if filling is not None:
@@ -262,13 +262,13 @@ def spans(normalised: Normalised, filling: Filling | None) -> Iterator[tuple[NDA
         yield np.flatnonzero(shown) + span.start, points
 
 
-def _carry(normalised: Normalised, filling: Filling | None, chosen: NDArray[np.intp]) -> tuple[Floats, Floats, Floats]:
+def _carry(normalized: Normalized, filling: Filling | None, chosen: NDArray[np.intp]) -> tuple[Floats, Floats, Floats]:
     """Return Gram matrix, translations and centred sample, filling all points chunk by chunk."""
-    frames = len(normalised.points)
+    frames = len(normalized.points)
     gram, total = np.zeros((2 * frames, 2 * frames)), np.zeros((frames, 2))
     sample = np.zeros((frames, len(chosen), 2))
     used = 0
-    for places, points in spans(normalised, filling):
+    for places, points in spans(normalized, filling):
         stacked = points.transpose(0, 2, 1).reshape(2 * frames, -1)
         gram += stacked @ stacked.T
         total += points.sum(axis=1)
@@ -300,7 +300,7 @@ def _widen(basis: Floats, points: Floats, weight: Floats, start: Floats, rank: i
     else:
         coefficients, _ = coefficients_of(points, weight, basis, None, 1.0, sweeps=2)
         left = points - predict(basis, coefficients)
-        scale = max(_typical(_lengths(left), weight > 0), FINE)
+        scale = max(_typical(_lengths(left), weight > 0), MIN_RESIDUAL_SCALE)
         left *= (weight / (1 + (_lengths(left) / (3 * scale)) ** 2))[..., None]
         old, shift = basis[:, :, :-1], basis[:, :, -1]
     stacked = (left - left.mean(axis=1, keepdims=True)).transpose(0, 2, 1).reshape(2 * frames, -1)

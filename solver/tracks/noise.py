@@ -1,4 +1,4 @@
-"""How strong white noise is, from the tracks alone: before there are cameras or shapes."""
+"""White-noise estimates from the tracks alone, without cameras or shapes."""
 
 from __future__ import annotations
 
@@ -7,22 +7,22 @@ from math import comb
 import numpy as np
 from pliant.solver.records import Floats
 
-RANK = 1e-9
-"""Median eigenvalue over the largest from which there are more points than rows of W."""
+MIN_EIGENVALUE_RATIO = 1e-9
+"""Ratio of the median to the largest eigenvalue above which there are more points than rows of W."""
 
-SPOILED = 0.005
-"""Share of gross outliers in the completion of the tracks from which they are rejected."""
+OUTLIER_SHARE = 0.005
+"""Share of gross outliers in the completion of the tracks above which outliers are rejected."""
 
 
 def magnified(order: int) -> float:
-    """Return by how much differences of that order over frames magnify the standard deviation of white noise."""
+    """Return the factor by which differences of that order over frames amplify the standard deviation of white noise."""
     return float(np.sqrt(comb(2 * order, order)))
 
 
 def roughness(gram: Floats) -> float:
-    """Return the median over frames of the tracks' mean squared third difference, as the variance of white noise that would leave it.
+    """Return the variance of white noise that would explain the median over frames of the mean squared third difference.
 
-    An upper estimate: what moves unsteadily counts as noise. Short sequences use lower differences.
+    It is an upper estimate, since jerky motion counts as noise. Short sequences use lower differences.
     """
     frames = len(gram) // 2
     order = min(3, frames - 1)
@@ -34,9 +34,9 @@ def roughness(gram: Floats) -> float:
 
 
 def typical_roughness(points: Floats) -> float:
-    """Return the standard deviation of white noise that would leave the median third difference of complete tracks `(F, P, 2)`.
+    """Return the standard deviation of white noise that would explain the median third difference of complete tracks `(F, P, 2)`.
 
-    Unlike `roughness` it does not mind a few wrong points.
+    Unlike `roughness` it is robust to a few wrong points.
     """
     order = min(3, len(points) - 1)
     size = np.abs(np.diff(points, n=order, axis=0))
@@ -44,10 +44,10 @@ def typical_roughness(points: Floats) -> float:
 
 
 def white_noise(gram: Floats) -> float:
-    """Return σ² from the median eigenvalue of W Wᵀ / P `(2F, 2F)`, which no motion of low rank raises, but noise does.
+    """Return σ² from the median eigenvalue of W Wᵀ / P `(2F, 2F)`, which noise raises and low-rank motion does not.
 
-    Too few points leave it 0 whatever the noise; then it is the roughness, if there is a sequence of frames to tell it from.
+    With too few points it is 0 for any noise; the roughness is returned instead.
     """
     values = np.linalg.eigvalsh(gram)
     median = float(values[len(values) // 2])
-    return median if median > RANK * float(values[-1]) else roughness(gram)
+    return median if median > MIN_EIGENVALUE_RATIO * float(values[-1]) else roughness(gram)

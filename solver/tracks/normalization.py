@@ -1,4 +1,4 @@
-"""Units: every frame's centroid removed, then divided by the RMS radius, so that every weight is dimensionless."""
+"""Normalization: every frame's centroid removed, then divided by the RMS radius; all weights are dimensionless."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 from pliant.solver.errors import InvalidInput
 from pliant.solver.records import Floats, Tracks, read_only
 
-FAR = 10.0
-"""An observation further than this many median radii from its frame's median says nothing about centre or size."""
+MAX_MEDIAN_RADII = 10.0
+"""Distance from the frame's median, in median radii, beyond which an observation is ignored for centre and size."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Normalised:
+class Normalized:
     """Tracks without position and unit: `tracks.points = unit · points + centroid` wherever visible."""
 
     points: Floats
@@ -27,15 +27,15 @@ class Normalised:
     """Mean of each frame's visible points, shape `(F, 2)`, the tracks' unit; interpolated in frames that show nothing."""
 
     unit: float
-    """One normalised unit: RMS radius of the centred tracks, the tracks' unit."""
+    """One normalized unit: RMS radius of the centred tracks, the tracks' unit."""
 
 
-def normalise(tracks: Tracks) -> Normalised:
-    """Remove each frame's centroid and divide by the RMS radius of what is left.
+def normalize(tracks: Tracks) -> Normalized:
+    """Remove the centroid of each frame and divide by the RMS radius of the centred points.
 
-    Both are confidence-weighted means. Observations absurdly far away (beyond `FAR` median radii of their frame's
-    median) are left out of the means, for a single one could otherwise shrink the object to a dot; they stay in the
-    tracks, where the robust loss meets them. On tracks without such observations the means are the plain ones.
+    Both are confidence-weighted means. Observations further than `MAX_MEDIAN_RADII` median radii from their frame's
+    median are excluded from the means, because a single one could shrink the object to a dot; they stay in the
+    tracks, where the robust loss handles them.
 
     Raises
     ------
@@ -60,16 +60,16 @@ def normalise(tracks: Tracks) -> Normalised:
     points /= unit
     read_only(points)
     read_only(centroid)
-    return Normalised(points, tracks.visible, centroid, unit)
+    return Normalized(points, tracks.visible, centroid, unit)
 
 
 def _near(tracks: Tracks, seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return which visible observations lie within `FAR` median radii of their frame's median, shape `(F, P)`."""
+    """Return which visible observations lie within `MAX_MEDIAN_RADII` median radii of their frame's median, shape `(F, P)`."""
     near = seen.copy()
     radius = np.zeros(seen.shape)
     for frame, mask in enumerate(seen):
         if mask.any():
             middle = np.median(tracks.points[frame, mask], axis=0)
             radius[frame] = np.hypot(*(tracks.points[frame] - middle).T)
-    near &= radius <= FAR * np.median(radius[seen])
+    near &= radius <= MAX_MEDIAN_RADII * np.median(radius[seen])
     return near if near.any() else seen

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from pliant.solver import KnownCamera, Mesh, Settings, solve
 from pliant.solver.gallery import corrupt, face, sphere
-from pliant.solver.tracks.normalization import normalise
+from pliant.solver.tracks.normalization import normalize
 
 ROOT = Path(__file__).parent.parent.parent
 
@@ -181,7 +181,7 @@ def test_every_baseline_reaches_the_solver_s_energy(bench, small_problem, name):
     made, cameras, settings, solution = small_problem
     baselines, side = bench("baselines"), bench("side_by_side")
     problem, start = side.prepare(made.tracks, made.mesh, cameras, settings)
-    centred = normalise(made.tracks)
+    centred = normalize(made.tracks)
     translations = (solution.camera.translations - centred.centroid) / centred.unit
     best = solution.trace.objective[-1]
     finished = getattr(baselines, name)(problem, start, translations, target=1.01 * best, cap=30.0)

@@ -9,7 +9,7 @@ from pliant.solver import KnownCamera, Mesh, Settings, Tracks
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.energy.problem import Problem
 from pliant.solver.shapes.setup import build_problem
-from pliant.solver.tracks.normalization import normalise
+from pliant.solver.tracks.normalization import normalize
 
 
 def turning(num_frames: int, degrees: float) -> np.ndarray:
@@ -55,11 +55,11 @@ def small_problem(
     points = project(shapes, rotations) + 0.02 * random.standard_normal((frames, shapes.shape[1], 2))
     visible = np.where(random.random(points.shape[:2]) < hidden, 0.0, random.uniform(0.5, 1, points.shape[:2]))
     options = {"temporal_weight": 0.05, "spatial_weight": 0.02, "robust_scale": 0.03, **settings}
-    normalised = normalise(Tracks.from_arrays(points, visible))
+    normalized = normalize(Tracks.from_arrays(points, visible))
     estimate = CameraEstimate(
         rotations, np.ones(frames), np.zeros((frames, 2)), 1, np.zeros((0, 0)), np.zeros((frames, 0, 2))
     )
-    return build_problem(normalised, estimate, mesh, Settings(**options))[0]
+    return build_problem(normalized, estimate, mesh, Settings(**options))[0]
 
 
 def cameras_of(rotations: np.ndarray) -> KnownCamera:

@@ -9,7 +9,7 @@ from pliant.solver import KnownCamera, Settings, Tracks, gallery
 from pliant.solver.cameras.estimation import estimate_cameras, given_cameras
 from pliant.solver.cameras.factorization import upgrade
 from pliant.solver.cameras.multistart import carried
-from pliant.solver.model.camera_motion_prior import SCALE_FLOOR, TURN_FLOOR, unevenness, unsteadiness
+from pliant.solver.model.camera_motion_prior import SCALE_FLOOR, TURN_FLOOR, rotation_roughness, scale_roughness
 from pliant.solver.model.marginal_likelihood import Motion, Scene, energy, start
 from pliant.solver.model.so3 import (
     exponential,
@@ -18,7 +18,7 @@ from pliant.solver.model.so3 import (
     start_at_identity,
 )
 from pliant.solver.tracks.completion import RANKS, complete
-from pliant.solver.tracks.normalization import normalise
+from pliant.solver.tracks.normalization import normalize
 
 
 def turning(frames: int, degrees: float) -> np.ndarray:
@@ -39,7 +39,7 @@ CAMERA = turning(20, 40)
 
 
 def test_a_rigid_scene_is_exact() -> None:
-    found = estimate_cameras(normalise(Tracks.from_arrays(view(RIGID, CAMERA) * 7 + 3)), Settings())
+    found = estimate_cameras(normalize(Tracks.from_arrays(view(RIGID, CAMERA) * 7 + 3)), Settings())
     assert degrees_apart(found.rotations, CAMERA) < 0.1
     np.testing.assert_allclose(found.rotations[0], np.eye(3), atol=1e-12)
     np.testing.assert_allclose(found.scales, 1.0, atol=1e-3)
@@ -62,13 +62,13 @@ def test_a_low_rank_scene_needs_its_own_k() -> None:
 def test_scales_are_found_where_the_camera_has_them() -> None:
     scales = np.exp(0.1 * np.sin(np.linspace(0, 3, 20)))
     scales /= np.exp(np.log(scales).mean())
-    normalised = normalise(Tracks.from_arrays(view(RIGID, CAMERA) * scales[:, None, None]))
-    found = estimate_cameras(normalised, Settings())
+    normalized = normalize(Tracks.from_arrays(view(RIGID, CAMERA) * scales[:, None, None]))
+    found = estimate_cameras(normalized, Settings())
     np.testing.assert_allclose(found.scales, scales, rtol=5e-3)
     assert np.log(found.scales).mean() == pytest.approx(0, abs=1e-12)
-    given = given_cameras(normalised, KnownCamera.from_arrays(CAMERA), Settings())
+    given = given_cameras(normalized, KnownCamera.from_arrays(CAMERA), Settings())
     np.testing.assert_allclose(given.scales, scales, rtol=5e-3)
-    plain = estimate_cameras(normalised, Settings(camera="orthographic"))
+    plain = estimate_cameras(normalized, Settings(camera="orthographic"))
     assert (plain.scales == 1).all()
 
 
@@ -77,32 +77,32 @@ def test_outliers_and_hidden_points_hardly_matter() -> None:
     points = view(RIGID, CAMERA)
     points[random.random(points.shape[:2]) < 0.1] = random.uniform(-2, 2, 2)
     visible = random.random(points.shape[:2]) > 0.3
-    found = estimate_cameras(normalise(Tracks.from_arrays(points, visible)), Settings())
+    found = estimate_cameras(normalize(Tracks.from_arrays(points, visible)), Settings())
     assert np.isfinite(found.rotations).all()
     assert degrees_apart(found.rotations, CAMERA) < 3
 
 
 def test_a_still_camera_is_said() -> None:
     still = np.broadcast_to(np.eye(3), (8, 3, 3))
-    found = estimate_cameras(normalise(Tracks.from_arrays(view(RIGID, still))), Settings())
+    found = estimate_cameras(normalize(Tracks.from_arrays(view(RIGID, still))), Settings())
     assert any("hardly turns" in sentence for sentence in found.warnings)
 
 
 @pytest.mark.parametrize(("frames", "points"), [(3, 4), (3, 60), (20, 4)])
 def test_the_smallest_inputs_give_rotations(frames: int, points: int) -> None:
-    found = estimate_cameras(normalise(Tracks.from_arrays(view(RIGID[:points], turning(frames, 40)))), Settings())
+    found = estimate_cameras(normalize(Tracks.from_arrays(view(RIGID[:points], turning(frames, 40)))), Settings())
     square = found.rotations @ found.rotations.transpose(0, 2, 1)
     np.testing.assert_allclose(square, np.broadcast_to(np.eye(3), (frames, 3, 3)), atol=1e-9)
 
 
 def test_the_same_seed_gives_the_same_bits_and_stopping_returns() -> None:
-    normalised = normalise(Tracks.from_arrays(view(RIGID, CAMERA)))
-    first, second = estimate_cameras(normalised, Settings()), estimate_cameras(normalised, Settings())
+    normalized = normalize(Tracks.from_arrays(view(RIGID, CAMERA)))
+    first, second = estimate_cameras(normalized, Settings()), estimate_cameras(normalized, Settings())
     assert (first.rotations == second.rotations).all()
     steps: list[float] = []
-    estimate_cameras(normalised, Settings(), on_step=lambda step: steps.append(step.fraction), should_stop=lambda: True)
+    estimate_cameras(normalized, Settings(), on_step=lambda step: steps.append(step.fraction), should_stop=lambda: True)
     assert steps == sorted(steps)
-    assert estimate_cameras(normalised, Settings(basis_size=2)).basis_size == 2
+    assert estimate_cameras(normalized, Settings(basis_size=2)).basis_size == 2
 
 
 @pytest.mark.parametrize("with_scales", [True, False])
@@ -141,13 +141,13 @@ def test_logarithms_are_those_of_the_exponentials() -> None:
 def test_steadiness_pays_for_changes_of_speed_alone() -> None:
     spin = exponential(np.arange(30)[:, None] * np.array([0.0, 0.05, 0.0]))
     random = np.random.default_rng(0)
-    floor, slope = unsteadiness(spin)
+    floor, slope = rotation_roughness(spin)
     assert floor == pytest.approx(3 * 28 / 30 * np.log(TURN_FLOOR), abs=1e-9)
     np.testing.assert_allclose(slope, 0, atol=1e-6)
-    jitter = unsteadiness(exponential(random.normal(0, 0.01, (30, 3))) @ spin)[0]
-    jolts = unsteadiness(exponential(random.normal(0, 0.1, (30, 3))) @ spin)[0]
+    jitter = rotation_roughness(exponential(random.normal(0, 0.01, (30, 3))) @ spin)[0]
+    jolts = rotation_roughness(exponential(random.normal(0, 0.1, (30, 3))) @ spin)[0]
     assert floor + 2 < jitter < jolts - 5
-    assert unevenness(np.linspace(0, 0, 9))[0] == pytest.approx(np.log(SCALE_FLOOR))
+    assert scale_roughness(np.linspace(0, 0, 9))[0] == pytest.approx(np.log(SCALE_FLOOR))
 
 
 def test_corrections_are_carried_to_the_frames_between() -> None:
@@ -168,11 +168,11 @@ def test_a_dancer_does_not_make_the_camera_dance() -> None:
     body = random.normal(size=(80, 3)) * [0.5, 1.0, 0.4]
     swings = [np.sin(2 * np.pi * (rate * time + phase)) for rate, phase in random.uniform(0.5, 2.5, (8, 2))]
     shapes = body + sum(0.12 * swing[:, None, None] * random.normal(size=body.shape) for swing in swings)
-    normalised = normalise(Tracks.from_arrays(view(shapes, camera)))
-    rough = estimate_cameras(normalised, Settings(refine_rotations=False)).rotations
-    refined = estimate_cameras(normalised, Settings())
+    normalized = normalize(Tracks.from_arrays(view(shapes, camera)))
+    rough = estimate_cameras(normalized, Settings(refine_rotations=False)).rotations
+    refined = estimate_cameras(normalized, Settings())
     assert degrees_apart(refined.rotations, camera) < 0.5 * degrees_apart(rough, camera)
-    assert unsteadiness(refined.rotations)[0] < unsteadiness(rough)[0]
+    assert rotation_roughness(refined.rotations)[0] < rotation_roughness(rough)[0]
     assert refined.reasons["rotations"].startswith("Refined by variable projection")
 
 
@@ -180,15 +180,15 @@ def test_a_dancer_does_not_make_the_camera_dance() -> None:
 def test_a_body_that_hides_its_back_is_completed(frames: int, points: int, most: float) -> None:
     # no point is always seen: without a prior on the coefficients, points seen seldom fly off (.105 and .123)
     body = gallery.sphere(frames, points)
-    normalised = normalise(body.tracks)
-    whole = view(body.shapes, body.rotations) * body.scales[:, None, None] / normalised.unit
+    normalized = normalize(body.tracks)
+    whole = view(body.shapes, body.rotations) * body.scales[:, None, None] / normalized.unit
     rows = (whole - whole.mean(axis=1, keepdims=True)).transpose(0, 2, 1).reshape(2 * frames, -1)
     truth = rows @ rows.T / points
-    found = complete(normalised)
+    found = complete(normalized)
     missed = np.linalg.norm(found.gram - truth) / np.linalg.norm(truth)
     assert 0.01 < missed < most
     np.testing.assert_array_equal(
-        complete(normalised, rank=found.rank).gram, found.gram
+        complete(normalized, rank=found.rank).gram, found.gram
     )  # the rank that was chosen is kept
-    smaller = complete(normalised, rank=RANKS[0])
+    smaller = complete(normalized, rank=RANKS[0])
     assert smaller.rank == RANKS[0] < found.rank

@@ -6,36 +6,36 @@ import numpy as np
 import pytest
 from pliant.solver import Settings, gallery
 from pliant.solver.cameras import joint_refinement
-from pliant.solver.cameras.estimation import TOO_DEEP, CameraEstimate, estimate_cameras, restarted
+from pliant.solver.cameras.estimation import MAX_START_DEPTH_VARIANCE, CameraEstimate, estimate_cameras, restarted
 from pliant.solver.cameras.joint_refinement import learn
 from pliant.solver.cameras.multistart import depth
-from pliant.solver.model.model_order import Support
-from pliant.solver.model.shape_covariance import MOST_MODES
+from pliant.solver.model.model_order import ModelOrder
+from pliant.solver.model.shape_covariance import MAX_MODES
 from pliant.solver.model.so3 import angles_between, exponential, nearest
-from pliant.solver.tracks.normalization import normalise
+from pliant.solver.tracks.normalization import normalize
 
 FRAMES = 16
 
 
 def test_rivals_are_cameras_of_their_own_and_not_far_too_deep() -> None:
     face = gallery.face(24, 200)
-    found = estimate_cameras(normalise(face.tracks), Settings())
-    assert found.rivals
-    assert len({size for size, _ in found.rivals}) == len(found.rivals)
-    for _, rotations in found.rivals:
+    found = estimate_cameras(normalize(face.tracks), Settings())
+    assert found.hypotheses
+    assert len({size for size, _ in found.hypotheses}) == len(found.hypotheses)
+    for _, rotations in found.hypotheses:
         assert rotations.shape == (24, 3, 3)
-        assert depth(found.gram, rotations) < TOO_DEEP
-    assert not estimate_cameras(normalise(face.tracks), Settings(refine_rotations=False)).rivals
+        assert depth(found.gram, rotations) < MAX_START_DEPTH_VARIANCE
+    assert not estimate_cameras(normalize(face.tracks), Settings(refine_rotations=False)).hypotheses
 
 
 def test_a_sheet_has_no_rivals_for_its_sides_are_chosen() -> None:
-    assert not estimate_cameras(normalise(gallery.flag(24, 400).tracks), Settings()).rivals
+    assert not estimate_cameras(normalize(gallery.flag(24, 400).tracks), Settings()).hypotheses
 
 
 def test_cameras_far_too_deep_are_no_rivals(monkeypatch: pytest.MonkeyPatch) -> None:
     face = gallery.face(24, 200)
-    monkeypatch.setattr("pliant.solver.cameras.estimation.TOO_DEEP", 0.0)
-    assert not estimate_cameras(normalise(face.tracks), Settings()).rivals
+    monkeypatch.setattr("pliant.solver.cameras.estimation.MAX_START_DEPTH_VARIANCE", 0.0)
+    assert not estimate_cameras(normalize(face.tracks), Settings()).hypotheses
 
 
 @pytest.mark.parametrize("better", ["own", "rival"])
@@ -52,9 +52,9 @@ def test_it_starts_from_the_cameras_that_lead_to_more_probable_ones(
     tracks = np.einsum("fij,fjp->fpi", true[:, :2], shapes)
     rows = tracks.transpose(0, 2, 1).reshape(2 * FRAMES, -1)
     wrong = exponential(0.2 * np.stack([np.sin(5 * time + 1), np.cos(3 * time), np.sin(2 * time)], axis=1)) @ true
-    own, rival = (true, wrong) if better == "own" else (wrong, true)
+    own, hypothesis = (true, wrong) if better == "own" else (wrong, true)
     estimate = CameraEstimate(
-        own, np.ones(FRAMES), np.zeros((FRAMES, 2)), 1, rows @ rows.T / 300, tracks, rivals=((7, rival),)
+        own, np.ones(FRAMES), np.zeros((FRAMES, 2)), 1, rows @ rows.T / 300, tracks, hypotheses=((7, hypothesis),)
     )
     found, _ = learn(estimate, np.ones(FRAMES, dtype=bool), turning=True)
     common = nearest(np.einsum("fij,fik->jk", found.rotations, true))
@@ -81,13 +81,13 @@ def test_where_outliers_were_found_cameras_keep_all_modes_and_shapes_those_confi
     asked: list[int] = []
     refined = joint_refinement.refined
 
-    def spied(*given: object, support: Support, **more: object) -> object:
-        asked.append(support.most)
-        return refined(*given, support=support, **more)  # type: ignore[arg-type]
+    def spied(*given: object, model_order: ModelOrder, **more: object) -> object:
+        asked.append(model_order.max_modes)
+        return refined(*given, model_order=model_order, **more)  # type: ignore[arg-type]
 
     monkeypatch.setattr("pliant.solver.cameras.joint_refinement.refined", spied)
     _, covariance = learn(estimate, np.ones(FRAMES, dtype=bool), turning=True)
-    assert set(asked) == {MOST_MODES}
+    assert set(asked) == {MAX_MODES}
     assert (covariance.modes.shape[1] <= 4) == (outliers > 0)
 
 

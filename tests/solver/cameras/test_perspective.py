@@ -15,7 +15,7 @@ from pliant.solver.evaluation.metrics import e3d_frame_scaled, focal_error, repr
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import exponential
 from pliant.solver.shapes import perspective_shapes
-from pliant.solver.tracks.normalization import normalise
+from pliant.solver.tracks.normalization import normalize
 
 PICTURE = (1280.0, 720.0)
 CENTRE = np.array(PICTURE) / 2
@@ -84,14 +84,16 @@ def a_covariance(frames: int = 6) -> tuple[np.ndarray, ShapeCovariance]:
     random = np.random.default_rng(4)
     rotations = exponential(np.linspace(-0.6, 0.6, frames)[:, None] * np.array([[0.3, 1.0, 0.1]]))
     root = random.normal(size=(3, 3))
-    play = root @ root.T + np.eye(3)
+    axis_covariance = root @ root.T + np.eye(3)
     modes = 0.1 * random.normal(size=(frames, 2))
-    return rotations, ShapeCovariance(np.diag([1.0, 0.8, 0.5]), 3 * play / np.trace(play), modes, 1e-4, 1e-6, np.inf)
+    return rotations, ShapeCovariance(
+        np.diag([1.0, 0.8, 0.5]), 3 * axis_covariance / np.trace(axis_covariance), modes, 1e-4, 1e-6, np.inf
+    )
 
 
 def test_depths_are_those_of_the_shapes_where_noise_is_small() -> None:
     rotations, covariance = a_covariance(20)
-    covariance = replace(covariance, modes=0 * covariance.modes, drift=1e-9)
+    covariance = replace(covariance, modes=0 * covariance.modes, walk_variance=1e-9)
     shape = np.random.default_rng(5).normal(size=(40, 3)) * [1.0, 0.8, 0.6]
     seen = in_camera(np.broadcast_to(shape, (20, 40, 3)), rotations) / 200
     views = seen[..., :2] / (1 + 0.2 * seen[..., 2:]) + 0.1
@@ -106,7 +108,7 @@ def test_the_gradient_of_the_focal_length_is_that_of_finite_differences() -> Non
     rotations, covariance = a_covariance()
     random = np.random.default_rng(6)
     views, depths = random.normal(size=(6, 30, 2)), 0.5 * random.normal(size=(6, 30))
-    found = Learned(rotations, np.ones(6), replace(covariance, noise=0.5), np.inf)
+    found = Learned(rotations, np.ones(6), replace(covariance, noise_variance=0.5), np.inf)
     energy = corrected_energy(views, depths, found, with_scales=False)
     flat = np.append(motion_of(energy.scene, found).flat(), 0.15)
     _, gradient = energy(flat)
@@ -244,7 +246,7 @@ def test_a_picture_beside_the_tracks_is_refused() -> None:
 def test_a_principal_point_absurdly_far_away_is_refused() -> None:
     tracks = pinhole(SEEN, FOCAL)
     with pytest.raises(InvalidInput) as refused:
-        given_lens(tracks, normalise(tracks), Settings(principal_point=(1e7, 0.0)))
+        given_lens(tracks, normalize(tracks), Settings(principal_point=(1e7, 0.0)))
     assert refused.value.code == "principal_point_far"
 
 
@@ -264,8 +266,8 @@ def test_given_cameras_with_an_impossible_lens_are_refused(wrong: dict[str, obje
 def test_shapes_centred_on_more_points_keep_their_image() -> None:
     """Where depths were relative to the mean of some points, scales and translations are changed so that pixels stay."""
     tracks = pinhole(SEEN, FOCAL)
-    normalised = normalise(tracks)
-    view = given_lens(tracks, normalised, Settings(focal=FOCAL, image_size=PICTURE))
+    normalized = normalize(tracks)
+    view = given_lens(tracks, normalized, Settings(focal=FOCAL, image_size=PICTURE))
     assert view is not None
     kept = np.arange(20)
     middle = SEEN[:, kept].mean(axis=1)
@@ -277,6 +279,6 @@ def test_shapes_centred_on_more_points_keep_their_image() -> None:
     flat = np.zeros(SEEN.shape[:2])
     given = Solution(about - whole[:, None], camera, flat, flat, None, None, None, {})  # type: ignore[arg-type]
     found = perspective_shapes.seen_in_perspective(
-        given, image, replace(view, curvature=normalised.unit / FOCAL), normalised.unit, kept
+        given, image, replace(view, curvature=normalized.unit / FOCAL), normalized.unit, kept
     )
     assert found.residuals.max() < 1e-6

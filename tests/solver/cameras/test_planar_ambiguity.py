@@ -6,11 +6,19 @@ import numpy as np
 import pytest
 from camera_errors import degrees_apart
 from pliant.solver import Settings, gallery, solve
-from pliant.solver.cameras.planar_ambiguity import fitted, is_flat, on_its_sides, poses, reversed_at, steadiest, unfold
+from pliant.solver.cameras.planar_ambiguity import (
+    fitted,
+    is_planar,
+    poses,
+    resolve_pose_signs,
+    reversed_at,
+    search_pose_signs,
+    smoothest_signs,
+)
 from pliant.solver.evaluation import metrics
 from pliant.solver.model.so3 import MIRROR, angles_between, exponential
 from pliant.solver.tracks.completion import complete
-from pliant.solver.tracks.normalization import normalise
+from pliant.solver.tracks.normalization import normalize
 
 PLANE = np.random.default_rng(4).uniform(-1, 1, (80, 3)) * [1.0, 0.7, 0.0]
 
@@ -28,13 +36,13 @@ def gram_of_view(shapes: np.ndarray, rotations: np.ndarray) -> np.ndarray:
 
 
 def test_a_reversed_plane_looks_the_same() -> None:
-    rotations, sides = swaying(12), np.arange(12) % 3 == 0
-    turned = reversed_at(rotations, MIRROR, sides)
+    rotations, pose_signs = swaying(12), np.arange(12) % 3 == 0
+    turned = reversed_at(rotations, MIRROR, pose_signs)
     np.testing.assert_allclose(turned @ turned.transpose(0, 2, 1), np.broadcast_to(np.eye(3), (12, 3, 3)), atol=1e-12)
     assert np.linalg.det(turned) == pytest.approx(1.0)
     np.testing.assert_allclose(gram_of_view(PLANE, turned), gram_of_view(PLANE, rotations), atol=1e-12)
-    assert np.degrees(angles_between(turned, rotations))[sides].min() > 5
-    assert (turned[~sides] == rotations[~sides]).all()
+    assert np.degrees(angles_between(turned, rotations))[pose_signs].min() > 5
+    assert (turned[~pose_signs] == rotations[~pose_signs]).all()
 
 
 def test_the_poses_of_a_plane_are_exact_up_to_its_sides() -> None:
@@ -43,25 +51,25 @@ def test_the_poses_of_a_plane_are_exact_up_to_its_sides() -> None:
     np.testing.assert_allclose(scales, 1.0, atol=5e-3)
     tilt, truth = np.degrees(np.arccos(np.abs(found[:, 2, 2]))), np.degrees(np.arccos(np.abs(camera[:, 2, 2])))
     assert np.abs(tilt - truth).max() < 3
-    assert degrees_apart(reversed_at(found, MIRROR, steadiest(found, 2)), camera) < 2
-    mixed = reversed_at(found, MIRROR, steadiest(found, 2) ^ (np.arange(40) > 20))
+    assert degrees_apart(reversed_at(found, MIRROR, smoothest_signs(found, 2)), camera) < 2
+    mixed = reversed_at(found, MIRROR, smoothest_signs(found, 2) ^ (np.arange(40) > 20))
     assert degrees_apart(mixed, camera) > 8
 
 
 def test_the_steadiest_sides_are_those_of_a_steady_camera() -> None:
     spin = exponential(np.linspace(-0.6, 0.6, 30)[:, None] * np.array([0.1, 1.0, 0.0]))
     wrong = np.random.default_rng(0).random(30) < 0.4
-    assert len({*(steadiest(reversed_at(spin, MIRROR, wrong), 2) ^ wrong)}) == 1
+    assert len({*(smoothest_signs(reversed_at(spin, MIRROR, wrong), 2) ^ wrong)}) == 1
     # where the plane faces the camera, turning on and turning back are as far: order 1 leaves that open
-    least = reversed_at(spin, MIRROR, steadiest(reversed_at(spin, MIRROR, wrong), 1) ^ wrong)
+    least = reversed_at(spin, MIRROR, smoothest_signs(reversed_at(spin, MIRROR, wrong), 1) ^ wrong)
     assert angles_between(least[1:], least[:-1]).max() < 1.01 * angles_between(spin[1:], spin[:-1]).max()
 
 
 def test_only_sheets_are_flat() -> None:
     flat, solid = gallery.flag(12, 150), gallery.face(12, 150)
-    assert is_flat(complete(normalise(flat.tracks)).gram)
-    assert not is_flat(complete(normalise(solid.tracks)).gram)
-    assert not is_flat(complete(normalise(gallery.sphere(12, 150).tracks)).gram)
+    assert is_planar(complete(normalize(flat.tracks)).gram)
+    assert not is_planar(complete(normalize(solid.tracks)).gram)
+    assert not is_planar(complete(normalize(gallery.sphere(12, 150).tracks)).gram)
 
 
 @pytest.fixture(scope="module")
@@ -78,28 +86,28 @@ def test_a_flag_is_seen_from_its_sides(flag: gallery.Sequence) -> None:
 
 
 def test_sides_that_are_right_stay(flag: gallery.Sequence) -> None:
-    gram, truth = complete(normalise(flag.tracks)).gram, np.asarray(flag.rotations)
+    gram, truth = complete(normalize(flag.tracks)).gram, np.asarray(flag.rotations)
     best = fitted(gram, truth, np.ones(24), np.zeros(24, dtype=bool), iterations=400)
-    kept, sentence = on_its_sides(gram, best.rotations, should_stop=lambda: True)
+    kept, sentence = resolve_pose_signs(gram, best.rotations, should_stop=lambda: True)
     assert ("as they were" in sentence) == (kept is best.rotations)
 
 
 def test_a_long_film_is_unfolded_on_some_of_its_frames(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pliant.solver.cameras.planar_ambiguity.SHEET_FRAMES", 20)
+    monkeypatch.setattr("pliant.solver.cameras.planar_ambiguity.PLANAR_FRAMES", 20)
     long = gallery.flag(50, 200, degrees=40)
-    gram = complete(normalise(long.tracks)).gram
-    found, _ = on_its_sides(gram, np.broadcast_to(np.eye(3), (50, 3, 3)))
+    gram = complete(normalize(long.tracks)).gram
+    found, _ = resolve_pose_signs(gram, np.broadcast_to(np.eye(3), (50, 3, 3)))
     assert found.shape == (50, 3, 3)
     steps = np.degrees(angles_between(found[1:], found[:-1]))
     assert steps.max() < 20
 
 
 def test_a_stop_returns_the_best_so_far(flag: gallery.Sequence) -> None:
-    gram = complete(normalise(flag.tracks)).gram
+    gram = complete(normalize(flag.tracks)).gram
     rotations, scales = poses(gram)
-    stopped = unfold(gram, rotations, scales, should_stop=lambda: True)
-    assert not stopped.sides.any()
-    assert unfold(gram, rotations, scales).energy < stopped.energy
+    stopped = search_pose_signs(gram, rotations, scales, should_stop=lambda: True)
+    assert not stopped.pose_signs.any()
+    assert search_pose_signs(gram, rotations, scales).energy < stopped.energy
 
 
 def test_orthography_as_set_keeps_the_scales(flag: gallery.Sequence) -> None:

@@ -7,7 +7,7 @@ import pytest
 from pliant.solver import KnownCamera, Settings, Tracks, gallery, solve
 from pliant.solver.energy.hyperparameters import PAPER, Roughness, roughness_of
 from pliant.solver.evaluation import metrics
-from pliant.solver.tracks.normalization import normalise
+from pliant.solver.tracks.normalization import normalize
 
 
 @pytest.fixture(scope="module")
@@ -87,18 +87,18 @@ def test_noise_is_measured_where_nothing_moves(frames: int) -> None:
     rng = np.random.default_rng(5)
     still = rng.standard_normal((1, 500, 2)) * 100
     tracks = Tracks.from_arrays(still + rng.standard_normal((frames, 500, 2)) * 0.5)
-    normalised = normalise(tracks)
-    assert roughness_of(normalised).noise * normalised.unit == pytest.approx(0.5, rel=0.1)
+    normalized = normalize(tracks)
+    assert roughness_of(normalized).noise_std * normalized.unit == pytest.approx(0.5, rel=0.1)
 
 
 def test_points_never_seen_in_a_row_say_nothing() -> None:
     visible = np.zeros((8, 6))
     visible[::3] = 1
     tracks = Tracks.from_arrays(np.random.default_rng(0).standard_normal((8, 6, 2)), visible)
-    assert roughness_of(normalise(tracks)) == Roughness(0.0, 0.0)
+    assert roughness_of(normalize(tracks)) == Roughness(0.0, 0.0)
 
 
 def test_jumps_are_told_from_motion(face: gallery.Sequence) -> None:
-    assert roughness_of(normalise(face.tracks)).jumps < 0.01
+    assert roughness_of(normalize(face.tracks)).jumps < 0.01
     spoiled = gallery.corrupt(face, outliers=0.05, seed=3).tracks
-    assert 0.1 < roughness_of(normalise(spoiled)).jumps < 0.3
+    assert 0.1 < roughness_of(normalize(spoiled)).jumps < 0.3

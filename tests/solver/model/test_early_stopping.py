@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 from pliant.solver.model import early_stopping
-from pliant.solver.model.early_stopping import learned_in_time
-from pliant.solver.model.model_order import FEWEST, Support, improbability
+from pliant.solver.model.early_stopping import learn_with_early_stopping
+from pliant.solver.model.model_order import MIN_JUDGED_POINTS, ModelOrder, held_out_nll
 from pliant.solver.model.random_walk import random_walk
 from pliant.solver.model.shape_covariance import ShapeCovariance, learned
 from pliant.solver.model.so3 import exponential
@@ -39,20 +39,20 @@ def gram_of(images: np.ndarray) -> np.ndarray:
 
 def both(images: np.ndarray) -> tuple[ShapeCovariance, ShapeCovariance, str]:
     """What is learned in time, what is learned in full, and the reason."""
-    found, why = learned_in_time(images, gram_of(images), PAIRS, Support())
+    found, why = learn_with_early_stopping(images, gram_of(images), PAIRS, ModelOrder())
     return found, learned(gram_of(images), PAIRS), why
 
 
 def test_what_only_these_points_have_is_not_learned() -> None:
     found, whole, why = both(drawn(30, modes=12, drift=0.03))
     other = rows(drawn(1000, modes=12, drift=0.03, seed=1))
-    assert improbability(found, PAIRS, other) < improbability(whole, PAIRS, other) - 0.5
+    assert held_out_nll(found, PAIRS, other) < held_out_nll(whole, PAIRS, other) - 0.5
     assert "would make points that are not learned from less probable" in why
 
 
 @pytest.mark.parametrize(
     ("points", "modes", "drift"),
-    [(30, 2, 1e-6), (2 * FRAMES, 12, 0.03), (FEWEST - 1, 12, 0.03)],
+    [(30, 2, 1e-6), (2 * FRAMES, 12, 0.03), (MIN_JUDGED_POINTS - 1, 12, 0.03)],
     ids=["few modes are all there is", "as many points as image coordinates", "too few to deal out"],
 )
 def test_else_nothing_is_stopped(points: int, modes: int, drift: float) -> None:
@@ -69,7 +69,7 @@ def test_a_sample_of_more_points_is_not_judged(monkeypatch: pytest.MonkeyPatch) 
 
 def test_fewer_modes_are_said() -> None:
     images = drawn(200, modes=2, drift=1e-6)
-    _, why = learned_in_time(images, gram_of(images), PAIRS, Support(most=4))
+    _, why = learn_with_early_stopping(images, gram_of(images), PAIRS, ModelOrder(max_modes=4))
     assert why.endswith("more than 4 modes, learned from some points, do not make the others more probable.")
 
 
@@ -78,9 +78,9 @@ def test_a_stop_ends_the_judging(monkeypatch: pytest.MonkeyPatch) -> None:
     judged: list[float] = []
 
     def counted(*given: Any) -> float:
-        judged.append(improbability(*given))
+        judged.append(held_out_nll(*given))
         return judged[-1]
 
-    monkeypatch.setattr(early_stopping, "improbability", counted)
-    learned_in_time(images, gram_of(images), PAIRS, Support(), should_stop=lambda: True)
+    monkeypatch.setattr(early_stopping, "held_out_nll", counted)
+    learn_with_early_stopping(images, gram_of(images), PAIRS, ModelOrder(), should_stop=lambda: True)
     assert len(judged) == 2 * early_stopping.FOLDS, "one round of either way"

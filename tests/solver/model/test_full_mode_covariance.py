@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 from pliant.solver.cameras import joint_refinement
 from pliant.solver.model.full_mode_covariance import (
-    MOST_FRAMES,
+    MAX_BASIS_FRAMES,
+    MAX_NOISE_STD,
     POINTS_PER_COEFFICIENT,
-    QUIET,
     Basis,
     begin,
     energy,
+    is_identifiable,
     refined,
-    telling,
 )
 from pliant.solver.model.marginal_likelihood import Scene, cameras_of
-from pliant.solver.model.model_order import Support
+from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.random_walk import random_walk
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import angles_between, exponential, nearest
@@ -32,57 +32,58 @@ def covariance(frames: int = FRAMES, modes: int = 2, noise: float = 1e-6) -> Sha
     return ShapeCovariance(np.diag([0.5, 0.4, 0.3]), np.diag([0.5, 1.0, 1.5]), along, 1e-5, noise, np.inf)
 
 
-def scene(gram: np.ndarray, rotations: np.ndarray, *, with_scales: bool, steadiness: float) -> Scene:
-    return Scene(gram, rotations, with_scales, steadiness, noise_floor=1e-4, smoothness=0.0)
+def scene(gram: np.ndarray, rotations: np.ndarray, *, with_scales: bool, prior_weight: float) -> Scene:
+    return Scene(gram, rotations, with_scales, prior_weight, noise_std_floor=1e-4, smoothness=0.0)
 
 
-def a_scene(*, with_scales: bool, steadiness: float = 0.01) -> tuple[Scene, Basis]:
+def a_scene(*, with_scales: bool, prior_weight: float = 0.01) -> tuple[Scene, Basis]:
     """Random tracks, and a basis near nothing in particular."""
     random = np.random.default_rng(3)
     tracks = random.normal(size=(2 * FRAMES, 60))
     rotations = exponential(random.normal(0, 0.4, (FRAMES, 3)))
-    place = scene(tracks @ tracks.T / 60, rotations, with_scales=with_scales, steadiness=steadiness)
+    place = scene(tracks @ tracks.T / 60, rotations, with_scales=with_scales, prior_weight=prior_weight)
     flat = begin(place, np.ones(FRAMES), covariance(noise=0.01)).flat()
     return place, Basis.unflat(flat + random.normal(0, 0.1, flat.size), FRAMES, 3)
 
 
-def image_of(basis: Basis, pairs: np.ndarray, play: np.ndarray, noise: float) -> np.ndarray:
+def image_of(basis: Basis, projections: np.ndarray, axis_covariance: np.ndarray, noise: float) -> np.ndarray:
     """The covariance of the image, by way of the world's, dense."""
     seen = np.zeros((2 * FRAMES, 3 * FRAMES))
     for frame in range(FRAMES):
-        seen[2 * frame : 2 * frame + 2, 3 * frame : 3 * frame + 3] = pairs[frame]
+        seen[2 * frame : 2 * frame + 2, 3 * frame : 3 * frame + 3] = projections[frame]
     shapes = np.kron(basis.weights, np.eye(3)) @ basis.root
-    world = shapes @ shapes.T + np.exp(2 * basis.logs[1]) * np.kron(random_walk(FRAMES), play)
+    world = shapes @ shapes.T + np.exp(2 * basis.logs[1]) * np.kron(random_walk(FRAMES), axis_covariance)
     return np.asarray(seen @ world @ seen.T + noise * np.eye(2 * FRAMES))
 
 
 def test_the_energy_is_the_likelihood_of_the_dense_covariance() -> None:
-    place, basis = a_scene(with_scales=True, steadiness=0.0)
+    place, basis = a_scene(with_scales=True, prior_weight=0.0)
     rotations, scales = cameras_of(place, basis)
     image = image_of(
-        basis, rotations[:, :2] * scales[:, None, None], covariance().play, np.exp(2 * basis.logs[0]) + 1e-8
+        basis, rotations[:, :2] * scales[:, None, None], covariance().axis_covariance, np.exp(2 * basis.logs[0]) + 1e-8
     )
     expected = (np.linalg.slogdet(image)[1] + np.trace(np.linalg.solve(image, place.gram))) / (2 * FRAMES)
-    assert energy(place, covariance().play, basis)[0] == pytest.approx(expected, rel=1e-10)
+    assert energy(place, covariance().axis_covariance, basis)[0] == pytest.approx(expected, rel=1e-10)
 
 
 def test_it_begins_as_the_shape_covariance() -> None:
     place, _ = a_scene(with_scales=False)
     start = covariance(noise=0.01)
-    pairs = place.rotations[:, :2]
-    begun = image_of(begin(place, np.ones(FRAMES), start), pairs, start.play, 0.01)
-    np.testing.assert_allclose(begun, start.of_image(pairs), atol=1e-9)
+    projections = place.rotations[:, :2]
+    begun = image_of(begin(place, np.ones(FRAMES), start), projections, start.axis_covariance, 0.01)
+    np.testing.assert_allclose(begun, start.of_image(projections), atol=1e-9)
 
 
 @pytest.mark.parametrize("with_scales", [True, False])
 def test_the_gradient_is_that_of_the_energy(with_scales: bool) -> None:
     place, basis = a_scene(with_scales=with_scales)
-    flat, gradient = basis.flat(), energy(place, covariance().play, basis)[1].flat()
+    flat, gradient = basis.flat(), energy(place, covariance().axis_covariance, basis)[1].flat()
     random, step = np.random.default_rng(0), 1e-6
     for _ in range(12):
         way = random.standard_normal(flat.size)
         ahead, behind = (
-            energy(place, covariance().play, Basis.unflat(flat + sign * step * way, FRAMES, 3))[0] for sign in (1, -1)
+            energy(place, covariance().axis_covariance, Basis.unflat(flat + sign * step * way, FRAMES, 3))[0]
+            for sign in (1, -1)
         )
         assert gradient @ way == pytest.approx((ahead - behind) / (2 * step), rel=1e-5, abs=1e-6)
 
@@ -90,11 +91,13 @@ def test_the_gradient_is_that_of_the_energy(with_scales: bool) -> None:
 def test_it_is_of_use_for_many_points_few_modes_no_noise_and_films_that_are_not_long() -> None:
     quiet = covariance(noise=1e-8)
     least = POINTS_PER_COEFFICIENT * 3 * 3
-    assert telling(quiet, least)
-    assert not telling(quiet, least - 1)
-    assert not telling(replace(quiet, noise=QUIET**2), least)
-    assert not telling(covariance(frames=5, modes=3, noise=1e-8), 10_000)  # twelve coefficients, ten numbers a point
-    assert not telling(covariance(frames=MOST_FRAMES + 1, noise=1e-8), 10_000)
+    assert is_identifiable(quiet, least)
+    assert not is_identifiable(quiet, least - 1)
+    assert not is_identifiable(replace(quiet, noise_variance=MAX_NOISE_STD**2), least)
+    assert not is_identifiable(
+        covariance(frames=5, modes=3, noise=1e-8), 10_000
+    )  # twelve coefficients, ten numbers a point
+    assert not is_identifiable(covariance(frames=MAX_BASIS_FRAMES + 1, noise=1e-8), 10_000)
 
 
 def test_modes_with_axes_of_their_own_tell_the_cameras_exactly() -> None:
@@ -109,8 +112,8 @@ def test_modes_with_axes_of_their_own_tell_the_cameras_exactly() -> None:
     gram = tracks @ tracks.T / 600
     wander = 0.05 * np.stack([np.sin(5 * time + 1), np.cos(3 * time), np.sin(2 * time)], axis=1)
     wrong = exponential(wander) @ rotations
-    before = joint_refinement.refined(gram, wrong, np.ones(FRAMES), with_scales=False, rounds=2, support=Support())
-    place = scene(gram, before.rotations, with_scales=False, steadiness=0.01)
+    before = joint_refinement.refined(gram, wrong, np.ones(FRAMES), with_scales=False, rounds=2, model_order=ModelOrder())
+    place = scene(gram, before.rotations, with_scales=False, prior_weight=0.01)
     found, scales = refined(place, np.ones(FRAMES), before.covariance)
 
     def off(cameras: np.ndarray) -> float:

@@ -18,7 +18,7 @@ from pliant.solver.model.image_density import (
 from pliant.solver.model.random_walk import WalkPosterior, random_walk
 from pliant.solver.model.so3 import exponential
 
-GRADIENTS = ("by_columns", "by_walk", "by_noise", "by_drift")
+GRADIENTS = ("by_columns", "by_walk", "by_noise_variance", "by_walk_variance")
 
 
 def drawn(
@@ -26,14 +26,14 @@ def drawn(
 ) -> tuple[ImageModel, np.ndarray]:
     """A model, and tracks that it nearly explains."""
     random = np.random.default_rng(frames)
-    pairs = exponential(np.cumsum(random.normal(0, 0.1, (frames, 3)), axis=0))[:, :2] * random.uniform(
+    projections = exponential(np.cumsum(random.normal(0, 0.1, (frames, 3)), axis=0))[:, :2] * random.uniform(
         0.8, 1.2, (frames, 1, 1)
     )
     along = np.cumsum(random.normal(0, 1 / frames**0.5, (frames, modes)), axis=0)
-    columns = np.concatenate([pairs, *(pairs * each[:, None, None] for each in along.T)], axis=2).reshape(
+    columns = np.concatenate([projections, *(projections * each[:, None, None] for each in along.T)], axis=2).reshape(
         2 * frames, -1
     )
-    walk = pairs @ np.linalg.cholesky(np.diag([1.4, 1.0, 0.6]))
+    walk = projections @ np.linalg.cholesky(np.diag([1.4, 1.0, 0.6]))
     model = ImageModel(columns, walk, noise**2, drift)
     tracks = columns @ random.normal(size=(columns.shape[1], points)) + noise * random.normal(size=(2 * frames, points))
     return model, tracks / points**0.5
@@ -73,7 +73,7 @@ def test_the_gradient_is_that_of_the_value() -> None:
 
     slope = (moved(step) - moved(-step)) / (2 * step)
     expected = (found.by_columns * columns).sum() + (found.by_walk * walk).sum()
-    expected += found.by_noise * model.noise_variance + 2 * found.by_drift * model.walk_variance
+    expected += found.by_noise_variance * model.noise_variance + 2 * found.by_walk_variance * model.walk_variance
     assert slope == pytest.approx(expected, rel=1e-6)
 
 

@@ -15,17 +15,17 @@ def test_the_covariances_reported_are_those_of_the_energy(floor: float) -> None:
     tracks = random.normal(size=(2 * frames, 40))
     gram = tracks @ tracks.T / 40
     rotations = exponential(random.normal(0, 0.4, (frames, 3)))
-    scene = Scene.of(gram, rotations, with_scales=True, steadiness=0.0, noise_floor=floor)
+    scene = Scene.of(gram, rotations, with_scales=True, prior_weight=0.0, noise_std_floor=floor)
     scene = Scene(gram, rotations, True, 0.0, floor, smoothness=0.0)
     flat = start(scene, np.exp(random.normal(0, 0.1, frames))).flat()
     motion = Motion.unflat(flat + random.normal(0, 0.1, flat.size), frames)
-    extent, play, noise, drift = covariances_of(scene, motion)
+    mean_covariance, axis_covariance, noise, walk_variance = covariances_of(scene, motion)
     turned, scales = cameras_of(scene, motion)
     seen = np.zeros((2 * frames, 3 * frames))
     for frame in range(frames):
         seen[2 * frame : 2 * frame + 2, 3 * frame : 3 * frame + 3] = scales[frame] * turned[frame, :2]
-    over_frames = motion.modes @ motion.modes.T + drift * random_walk(frames)
-    world = np.kron(np.ones((frames, frames)), extent) + np.kron(over_frames, play)
+    over_frames = motion.modes @ motion.modes.T + walk_variance * random_walk(frames)
+    world = np.kron(np.ones((frames, frames)), mean_covariance) + np.kron(over_frames, axis_covariance)
     image = seen @ world @ seen.T + noise * np.eye(2 * frames)
     expected = (np.linalg.slogdet(image)[1] + np.trace(np.linalg.solve(image, gram))) / (2 * frames)
     assert energy(scene, motion)[0] == pytest.approx(expected, rel=1e-10)

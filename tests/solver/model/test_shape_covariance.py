@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from pliant.solver import KnownCamera, Settings, gallery, solve
 from pliant.solver.cameras.estimation import CameraEstimate
-from pliant.solver.cameras.joint_refinement import learn, telling_frames
+from pliant.solver.cameras.joint_refinement import informative_frames, learn
 from pliant.solver.evaluation import metrics
 from pliant.solver.model.random_walk import random_walk
 from pliant.solver.model.shape_covariance import (
-    DRIFT_FLOOR,
-    FREED,
-    ITERATIONS,
+    MAX_ITERATIONS,
+    MEAN_MODE_STD,
+    WALK_VARIANCE_FLOOR,
     ShapeCovariance,
     annealed,
     begin,
@@ -32,73 +32,83 @@ def drawn(points: int = 4000, noise: float = 1e-4) -> tuple[ShapeCovariance, np.
     random = np.random.default_rng(5)
     time = np.linspace(0, 1, FRAMES)
     modes = np.stack([0.2 * np.sin(2 * np.pi * time), 0.1 * np.cos(5 * time)], axis=1)
-    play = np.diag([0.5, 1.0, 1.5])
-    truth = ShapeCovariance(np.diag([0.2, 0.4, 0.6]), play, modes, 1e-4, noise, np.inf)
+    axis_covariance = np.diag([0.5, 1.0, 1.5])
+    truth = ShapeCovariance(np.diag([0.2, 0.4, 0.6]), axis_covariance, modes, 1e-4, noise, np.inf)
     angles = np.stack([0.3 * np.sin(7 * time), 1.2 * np.sin(4 * time), 0.2 * time], axis=1)
-    pairs = exponential(angles)[:, :2]
+    projections = exponential(angles)[:, :2]
     frames = np.linalg.cholesky(truth.over_frames())
-    middle = random.standard_normal((points, 3)) @ np.sqrt(truth.extent)
-    deform = np.einsum("fg,pgc->fpc", frames, random.standard_normal((points, FRAMES, 3))) @ np.sqrt(play)
-    image = np.einsum("fic,fpc->fip", pairs, middle + deform) + noise**0.5 * random.standard_normal((FRAMES, 2, points))
+    middle = random.standard_normal((points, 3)) @ np.sqrt(truth.mean_covariance)
+    deform = np.einsum("fg,pgc->fpc", frames, random.standard_normal((points, FRAMES, 3))) @ np.sqrt(axis_covariance)
+    image = np.einsum("fic,fpc->fip", projections, middle + deform) + noise**0.5 * random.standard_normal(
+        (FRAMES, 2, points)
+    )
     rows = image.reshape(2 * FRAMES, points)
-    return truth, pairs, rows @ rows.T / points
+    return truth, projections, rows @ rows.T / points
 
 
 def test_no_round_makes_the_tracks_less_probable() -> None:
-    _, pairs, gram = drawn(300)
-    covariance = begin(gram, pairs)
+    _, projections, gram = drawn(300)
+    covariance = begin(gram, projections)
     likelihoods = []
     for _ in range(12):
-        covariance = improve(covariance, gram, pairs, iterations=1)
-        likelihoods.append(covariance.likelihood)
+        covariance = improve(covariance, gram, projections, iterations=1)
+        likelihoods.append(covariance.nll)
     assert (np.diff(likelihoods) < 1e-9).all()
     assert likelihoods[0] - likelihoods[-1] > 0.01
 
 
 def test_what_the_points_were_drawn_from_is_found() -> None:
-    truth, pairs, gram = drawn()
-    found = improve(begin(gram, pairs), gram, pairs, iterations=300, warm=1e-2)
+    truth, projections, gram = drawn()
+    found = improve(begin(gram, projections), gram, projections, iterations=300, warm=1e-2)
     for mine, known in (
         (found.over_frames(), truth.over_frames()),
-        (found.play, truth.play),
-        (found.extent, truth.extent),
+        (found.axis_covariance, truth.axis_covariance),
+        (found.mean_covariance, truth.mean_covariance),
     ):
         assert np.linalg.norm(mine - known) < 0.2 * np.linalg.norm(known)
     assert np.linalg.norm(found.over_frames()) > 0.8 * np.linalg.norm(truth.over_frames())
 
 
-@pytest.mark.parametrize("most", [2, 64])
-def test_learned_is_the_more_probable_of_two_ways(most: int) -> None:
-    _, pairs, gram = drawn(300)
-    found = learned(gram, pairs, most=most)
-    cold = improve(begin(gram, pairs, most=most), gram, pairs, iterations=ITERATIONS, most=most)
-    warm = improve(
-        freed(annealed(gram, pairs, most=most, iterations=ITERATIONS)),
-        gram,
-        pairs,
-        iterations=ITERATIONS // 2,
-        most=most,
+@pytest.mark.parametrize("max_modes", [2, 64])
+def test_learned_is_the_more_probable_of_two_ways(max_modes: int) -> None:
+    _, projections, gram = drawn(300)
+    found = learned(gram, projections, max_modes=max_modes)
+    cold = improve(
+        begin(gram, projections, max_modes=max_modes), gram, projections, iterations=MAX_ITERATIONS, max_modes=max_modes
     )
-    assert found.likelihood == min(cold.likelihood, warm.likelihood)
-    assert cold.likelihood != warm.likelihood
-    assert found.modes.shape[1] <= most
+    warm = improve(
+        freed(annealed(gram, projections, max_modes=max_modes, iterations=MAX_ITERATIONS)),
+        gram,
+        projections,
+        iterations=MAX_ITERATIONS // 2,
+        max_modes=max_modes,
+    )
+    assert found.nll == min(cold.nll, warm.nll)
+    assert cold.nll != warm.nll
+    assert found.modes.shape[1] <= max_modes
 
 
 def test_mean_positions_freed_are_one_more_mode_and_nothing_else() -> None:
     truth, _, _ = drawn(10)
     free = freed(truth)
     np.testing.assert_array_equal(free.modes[:, :-1], truth.modes)
-    np.testing.assert_allclose(free.over_frames() - truth.over_frames(), FREED**2)
-    assert free.extent is truth.extent
-    assert (free.drift, free.noise) == (truth.drift, truth.noise)
+    np.testing.assert_allclose(free.over_frames() - truth.over_frames(), MEAN_MODE_STD**2)
+    assert free.mean_covariance is truth.mean_covariance
+    assert (free.walk_variance, free.noise_variance) == (truth.walk_variance, truth.noise_variance)
 
 
 def test_precisions_are_the_inverse_of_the_covariance() -> None:
     truth, _, _ = drawn(10)
     turn = exponential(np.array([0.3, -0.5, 0.8]))
-    turned = replace(truth, extent=turn @ truth.extent @ turn.T, play=np.asarray(truth.play + 0.2))
+    turned = replace(
+        truth,
+        mean_covariance=turn @ truth.mean_covariance @ turn.T,
+        axis_covariance=np.asarray(truth.axis_covariance + 0.2),
+    )
     basis, precisions = turned.precisions()
-    whole = np.kron(np.ones((FRAMES, FRAMES)), turned.extent) + np.kron(turned.over_frames(), turned.play)
+    whole = np.kron(np.ones((FRAMES, FRAMES)), turned.mean_covariance) + np.kron(
+        turned.over_frames(), turned.axis_covariance
+    )
     inverse = np.zeros((FRAMES, 3, FRAMES, 3))
     for axis in range(3):
         inverse[:, axis, :, axis] = precisions.matrices()[axis]
@@ -117,8 +127,8 @@ def test_between_the_frames_used_modes_run_straight() -> None:
 
 
 def test_the_drift_never_falls_below_its_floor() -> None:
-    _, pairs, gram = drawn(300, noise=0.0)
-    assert improve(begin(gram, pairs), gram, pairs, iterations=40).drift >= DRIFT_FLOOR
+    _, projections, gram = drawn(300, noise=0.0)
+    assert improve(begin(gram, projections), gram, projections, iterations=40).walk_variance >= WALK_VARIANCE_FLOOR
 
 
 @pytest.fixture(scope="module")
@@ -165,12 +175,12 @@ def test_frames_that_show_little_are_not_learned_from() -> None:
     visible = np.ones((10, 50))
     visible[3] = 0
     visible[4, 4:] = 0
-    assert telling_frames(visible).tolist() == [True] * 3 + [False] * 2 + [True] * 5
-    assert telling_frames(np.eye(10)).all()
+    assert informative_frames(visible).tolist() == [True] * 3 + [False] * 2 + [True] * 5
+    assert informative_frames(np.eye(10)).all()
 
 
 def test_a_stop_leaves_the_rotations_of_the_start(face: gallery.Sequence) -> None:
-    pairs = np.asarray(face.rotations)[:, :2]
+    projections = np.asarray(face.rotations)[:, :2]
     points = face.tracks.points - face.tracks.points.mean(axis=1, keepdims=True)
     rows = points.transpose(0, 2, 1).reshape(48, -1) / points.std()
     estimate = CameraEstimate(
@@ -183,11 +193,13 @@ def test_a_stop_leaves_the_rotations_of_the_start(face: gallery.Sequence) -> Non
     )
     shown = np.ones(24, dtype=bool)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pliant.solver.cameras.joint_refinement.learned_in_time", None)  # a stop learns nothing more
+        patch.setattr(
+            "pliant.solver.cameras.joint_refinement.learn_with_early_stopping", None
+        )  # a stop learns nothing more
         stopped, _ = learn(estimate, shown, turning=True, should_stop=lambda: True)
     np.testing.assert_allclose(
         stopped.rotations, np.asarray(face.rotations) @ np.asarray(face.rotations)[0].T, atol=1e-12
     )
     moved, covariance = learn(estimate, shown, turning=True)
     assert np.abs(moved.rotations - stopped.rotations).max() > 1e-5
-    assert covariance.likelihood < improve(begin(estimate.gram, pairs), estimate.gram, pairs, iterations=5).likelihood
+    assert covariance.nll < improve(begin(estimate.gram, projections), estimate.gram, projections, iterations=5).nll

@@ -99,7 +99,7 @@ def both(given: Operator) -> list[tuple[Operator, type]]:
 
 
 def test_blocks_of_points_are_the_same_for_all_threads(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gauss_markov, "BLOCK", 4)
+    monkeypatch.setattr(gauss_markov, "POINT_BLOCK", 4)
     monkeypatch.setattr(gauss_markov, "SMALLEST", 1)
     given, r = operator(a_frame_s(300.0)), np.random.default_rng(4).standard_normal((FRAMES, 3, POINTS))
     modes, found = MeanModes.of(given), []

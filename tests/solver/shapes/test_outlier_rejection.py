@@ -11,16 +11,16 @@ from pliant.solver.evaluation import metrics
 
 MADE = gallery.face(24, 300, degrees=60)
 CAMERAS = KnownCamera.from_arrays(MADE.rotations, MADE.scales)
-SPOILED = gallery.corrupt(MADE, outliers=0.1, seed=4).tracks
-WRONG = np.abs(np.asarray(SPOILED.points) - np.asarray(MADE.tracks.points)).max(axis=2) > 0
+OUTLIER_SHARE = gallery.corrupt(MADE, outliers=0.1, seed=4).tracks
+WRONG = np.abs(np.asarray(OUTLIER_SHARE.points) - np.asarray(MADE.tracks.points)).max(axis=2) > 0
 
 
 @pytest.mark.parametrize("cameras", [CAMERAS, None], ids=["known", "estimated"])
 def test_what_is_left_out_is_what_was_spoiled(cameras: KnownCamera | None) -> None:
-    found = solve(SPOILED, cameras=cameras)
+    found = solve(OUTLIER_SHARE, cameras=cameras)
     left_out = found.weights == 0
     size = np.abs(np.asarray(MADE.tracks.points)).max()
-    gross = np.linalg.norm(np.asarray(SPOILED.points) - np.asarray(MADE.tracks.points), axis=2) > 0.3 * size
+    gross = np.linalg.norm(np.asarray(OUTLIER_SHARE.points) - np.asarray(MADE.tracks.points), axis=2) > 0.3 * size
     assert left_out[gross].mean() > 0.97
     assert left_out[~WRONG].mean() < 0.03
     said = re.match(r"([\d.]+)% of what was seen", found.choices.reasons["outliers"])
@@ -30,16 +30,16 @@ def test_what_is_left_out_is_what_was_spoiled(cameras: KnownCamera | None) -> No
 
 @pytest.mark.parametrize("cameras", [CAMERAS, None], ids=["known", "estimated"])
 def test_it_is_as_if_somebody_had_hidden_them(cameras: KnownCamera | None, monkeypatch: pytest.MonkeyPatch) -> None:
-    found = solve(SPOILED, cameras=cameras)
-    hidden = solve(Tracks.from_arrays(SPOILED.points, found.weights > 0), cameras=cameras)
+    found = solve(OUTLIER_SHARE, cameras=cameras)
+    hidden = solve(Tracks.from_arrays(OUTLIER_SHARE.points, found.weights > 0), cameras=cameras)
     error, least = (metrics.e3d_frame(each.shapes, MADE.shapes) for each in (found, hidden))
     assert error < 1.1 * least + 1e-3
     assert "outliers" not in hidden.choices.reasons
-    far = np.linalg.norm(np.asarray(SPOILED.points) - np.asarray(MADE.tracks.points), axis=2) > found.choices.unit
+    far = np.linalg.norm(np.asarray(OUTLIER_SHARE.points) - np.asarray(MADE.tracks.points), axis=2) > found.choices.unit
     assert (found.residuals[far] > 0.5 * found.choices.unit).all(), "they are reported all the same"
     with monkeypatch.context() as patch:
         patch.setattr("pliant.solver.reconstruct.MIN_POINTS", 10_000)  # too little would be left to begin anew from
-        once = solve(SPOILED, cameras=cameras)
+        once = solve(OUTLIER_SHARE, cameras=cameras)
     assert (once.weights == 0).mean() == pytest.approx(0.1, abs=0.03)
     assert metrics.e3d_frame(once.shapes, MADE.shapes) > error - 1e-3
 
@@ -48,7 +48,7 @@ def test_clean_tracks_and_the_published_prior_keep_everything() -> None:
     clean = solve(MADE.tracks, cameras=CAMERAS)
     assert "outliers" not in clean.choices.reasons
     assert (clean.weights > 0).all()
-    published = solve(SPOILED, cameras=CAMERAS, settings=Settings(prior="smooth"))
+    published = solve(OUTLIER_SHARE, cameras=CAMERAS, settings=Settings(prior="smooth"))
     assert "outliers" not in published.choices.reasons
     assert (published.weights > 0).all()
 
@@ -68,7 +68,7 @@ def test_the_stiff_fit_descends_though_the_learned_paths_hardly_move() -> None:
 
 
 def test_a_prior_of_no_weight_is_minimised_as_told() -> None:
-    found = solve(SPOILED, cameras=CAMERAS, settings=Settings(temporal_weight=0))
+    found = solve(OUTLIER_SHARE, cameras=CAMERAS, settings=Settings(temporal_weight=0))
     assert np.isfinite(found.shapes).all()
     assert found.choices.temporal_weight == 0
     assert np.median(found.residuals) < 1e-6 * found.choices.unit, "every track can be followed"
@@ -77,6 +77,6 @@ def test_a_prior_of_no_weight_is_minimised_as_told() -> None:
 
 
 def test_stopped_before_the_stiff_fit_it_leaves_nothing_out() -> None:
-    found = solve(SPOILED, cameras=CAMERAS, should_stop=lambda: True)
+    found = solve(OUTLIER_SHARE, cameras=CAMERAS, should_stop=lambda: True)
     assert found.outcome is Outcome.STOPPED
     assert (found.weights > 0).all()

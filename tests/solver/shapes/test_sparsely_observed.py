@@ -11,9 +11,16 @@ from hypothesis import strategies as st
 from pliant.solver import KnownCamera, Mesh, Settings, Tracks, gallery, solve
 from pliant.solver.evaluation import metrics
 from pliant.solver.model.shape_covariance import ShapeCovariance
-from pliant.solver.shapes.outlier_rejection import GROSS
-from pliant.solver.shapes.sparsely_observed import DOUBT, LOOSE, SELDOM, Kriging, close_surface, often_seen
-from pliant.solver.tracks.normalization import normalise
+from pliant.solver.shapes.outlier_rejection import MIN_OUTLIER_DISTANCE
+from pliant.solver.shapes.sparsely_observed import (
+    MAX_DEVIATION,
+    SURFACE_RIDGE,
+    WELL_OBSERVED_SHARE,
+    Kriging,
+    close_surface,
+    well_observed,
+)
+from pliant.solver.tracks.normalization import normalize
 from scipy import sparse
 
 MADE = gallery.face(16, 400, degrees=60, mesh="triangles")
@@ -52,8 +59,8 @@ def test_a_hole_in_the_face_is_closed(cameras: KnownCamera | None) -> None:
     centred, expected = (each[:, sides] - each[:, sides].mean(axis=1, keepdims=True) for each in (found.shapes, whole))
     assert metrics.e3d_frame(centred, expected) < 0.1
     assert (
-        "3.2% of the points" in found.choices.reasons["seldom_seen"]
-        or "of the points" in found.choices.reasons["seldom_seen"]
+        "3.2% of the points" in found.choices.reasons["sparsely_observed"]
+        or "of the points" in found.choices.reasons["sparsely_observed"]
     )
 
 
@@ -92,13 +99,13 @@ def test_a_mode_that_never_changes_says_what_a_wider_extent_says(seed: int) -> N
     random = np.random.default_rng(seed)
     frames, share = int(random.integers(3, 12)), random.uniform(0.2, 2)
     root, modes = random.normal(size=(3, 3)), random.normal(size=(frames, 2))
-    play = root @ root.T + 0.1 * np.eye(3)
-    extent = np.diag(random.uniform(0.1, 1, 3))
+    axis_covariance = root @ root.T + 0.1 * np.eye(3)
+    mean_covariance = np.diag(random.uniform(0.1, 1, 3))
     mode = np.full((frames, 1), share**0.5)
     problem = SimpleNamespace(points=np.zeros((frames, 2, 1)), projections=random.normal(size=(frames, 2, 3)))
     one, other = (
-        Kriging.of(problem, ShapeCovariance(a, play, m, 1e-3, 1e-4, 0.0), np.zeros((frames, 2)))  # type: ignore[arg-type]
-        for a, m in ((extent, np.hstack([modes, mode])), (extent + share * play, modes))
+        Kriging.of(problem, ShapeCovariance(a, axis_covariance, m, 1e-3, 1e-4, 0.0), np.zeros((frames, 2)))  # type: ignore[arg-type]
+        for a, m in ((mean_covariance, np.hstack([modes, mode])), (mean_covariance + share * axis_covariance, modes))
     )
     for name in ("reach", "image"):
         expected = getattr(one, name)
@@ -140,19 +147,19 @@ def test_the_worst_of_the_observations_goes_first_and_the_rest_is_judged_without
     kriging = Kriging(problem, np.zeros((frames, 2)), np.zeros((18, 12)), image, scatter)  # type: ignore[arg-type]
     left = np.flatnonzero(confidence[:, 0] > 0).tolist()
     while left:
-        doubt = []
+        deviation = []
         for one in left:
             others = [2 * f + axis for f in left if f != one for axis in (0, 1)]
             mine = [2 * one, 2 * one + 1]
             gain = expected[np.ix_(mine, others)] @ np.linalg.inv(expected[np.ix_(others, others)])
             apart = off[one] - gain @ off.ravel()[others]
             spread = expected[np.ix_(mine, mine)] - gain @ expected[np.ix_(others, mine)]
-            doubt.append(apart @ np.linalg.solve(spread, apart) if np.hypot(*apart) > GROSS else 0.0)
-        if max(doubt) <= DOUBT**2:
+            deviation.append(apart @ np.linalg.solve(spread, apart) if np.hypot(*apart) > MIN_OUTLIER_DISTANCE else 0.0)
+        if max(deviation) <= MAX_DEVIATION**2:
             break
-        left.pop(int(np.argmax(doubt)))
+        left.pop(int(np.argmax(deviation)))
     gone = np.setdiff1d(np.flatnonzero(confidence[:, 0] > 0), left)
-    np.testing.assert_array_equal(kriging.doubtful(0, confidence, path), gone)
+    np.testing.assert_array_equal(kriging.inconsistent(0, confidence, path), gone)
 
 
 def test_a_patch_that_hangs_on_an_edge_does_not_fly_off() -> None:
@@ -176,7 +183,7 @@ def test_a_grid_keeps_its_cells_and_gets_a_hole() -> None:
     visible = np.ones(made.tracks.points.shape[:2])
     visible[:, hole] = 0
     tracks = Tracks.from_arrays(made.tracks.points, visible)
-    part = often_seen(normalise(tracks), made.mesh)
+    part = well_observed(normalize(tracks), made.mesh)
     assert part is not None
     assert part.mesh.grid is not None
     assert part.mesh.grid.shape == made.mesh.grid.shape
@@ -194,12 +201,12 @@ def test_a_grid_keeps_its_cells_and_gets_a_hole() -> None:
         (seen_but([7]), None),
         (seen_but([7]), Mesh.from_faces(np.zeros((0, 3), dtype=int), 400)),
         (seen_but(list(range(250))), MADE.mesh),
-        (seen_but([7], shown=tuple(range(int(SELDOM * 16)))), MADE.mesh),
+        (seen_but([7], shown=tuple(range(int(WELL_OBSERVED_SHARE * 16)))), MADE.mesh),
     ],
     ids=["all seen", "no mesh", "no faces", "most are seldom seen", "seen just often enough"],
 )
 def test_everything_is_found_together_where(tracks: Tracks, mesh: Mesh | None) -> None:
-    assert often_seen(normalise(tracks), mesh) is None
+    assert well_observed(normalize(tracks), mesh) is None
 
 
 def test_the_surface_is_closed_where_its_energy_is_least_and_the_rest_stays() -> None:
@@ -209,11 +216,11 @@ def test_the_surface_is_closed_where_its_energy_is_least_and_the_rest_stays() ->
     before = shapes.copy()
     close_surface(shapes, known, energy)
     np.testing.assert_array_equal(shapes[:, :, known], before[:, :, known])
-    pull = shapes @ (energy.T @ energy).toarray() + LOOSE * shapes
+    pull = shapes @ (energy.T @ energy).toarray() + SURFACE_RIDGE * shapes
     np.testing.assert_allclose(pull[:, :, [2, 5, 11]], 0, atol=1e-10)
 
 
 @pytest.mark.parametrize("settings", [{"prior": "smooth"}, {"temporal_weight": 0.0}], ids=str)
 def test_the_published_prior_and_one_of_no_weight_find_every_point_by_their_energy(settings: dict[str, object]) -> None:
     found = solve(seen_but(HOLE), MADE.mesh, cameras=CAMERAS, settings=Settings(**settings))  # type: ignore[arg-type]
-    assert "seldom_seen" not in found.choices.reasons
+    assert "sparsely_observed" not in found.choices.reasons

@@ -16,9 +16,11 @@ NOISE = 0.02
 def covariance(seed: int = 0, frames: int = FRAMES) -> ShapeCovariance:
     rng = np.random.default_rng(seed)
     spread = rng.normal(size=(3, 3))
-    play = spread @ spread.T + np.eye(3)
+    axis_covariance = spread @ spread.T + np.eye(3)
     modes = 0.2 * np.cumsum(rng.normal(size=(frames, 2)), axis=0) / np.sqrt(frames)
-    return ShapeCovariance(np.diag([1.0, 0.8, 0.4]), play * 3 / np.trace(play), modes, 1e-3, NOISE**2, np.inf)
+    return ShapeCovariance(
+        np.diag([1.0, 0.8, 0.4]), axis_covariance * 3 / np.trace(axis_covariance), modes, 1e-3, NOISE**2, np.inf
+    )
 
 
 def projections(frames: int = FRAMES, degrees: float = 40) -> np.ndarray:
@@ -28,7 +30,7 @@ def projections(frames: int = FRAMES, degrees: float = 40) -> np.ndarray:
 
 def dense(given: ShapeCovariance) -> np.ndarray:
     ones = np.ones((len(given.modes), len(given.modes)))
-    return np.kron(ones, given.extent) + np.kron(given.over_frames(), given.play)
+    return np.kron(ones, given.mean_covariance) + np.kron(given.over_frames(), given.axis_covariance)
 
 
 def projection_matrix(pairs: np.ndarray) -> np.ndarray:
@@ -92,9 +94,9 @@ def test_what_is_predicted_from_a_sample_is_near_what_is_exact(monkeypatch: pyte
     rng = np.random.default_rng(4)
     centre, width = rng.uniform(0, frames, points), rng.uniform(2, 8, points)
     confidence = (np.abs(np.arange(frames)[:, None] - centre) > width).astype(float)
-    monkeypatch.setattr(uncertainty, "MOST_PATTERNS", points)
+    monkeypatch.setattr(uncertainty, "MAX_PATTERNS", points)
     exact = position_std(given, pairs, confidence, noise_std=NOISE)
-    monkeypatch.setattr(uncertainty, "MOST_PATTERNS", 40)
+    monkeypatch.setattr(uncertainty, "MAX_PATTERNS", 40)
     predicted = position_std(given, pairs, confidence, noise_std=NOISE)
     assert np.array_equal(predicted, position_std(given, pairs, confidence, noise_std=NOISE)), "it is deterministic"
     assert not np.array_equal(predicted, exact)
@@ -107,7 +109,7 @@ def test_long_films_are_evaluated_at_some_of_their_frames_and_never_too_confiden
     frames = 30
     given, pairs, seen = covariance(5, frames), projections(frames), np.ones((frames, 2))
     exact = position_std(given, pairs, seen, noise_std=NOISE)
-    monkeypatch.setattr(uncertainty, "MOST_FRAMES", 10)
+    monkeypatch.setattr(uncertainty, "MAX_FRAMES", 10)
     fewer = position_std(given, pairs, seen, noise_std=NOISE)
     assert fewer.shape == exact.shape
     assert (fewer > 0.99 * exact).mean() > 0.95

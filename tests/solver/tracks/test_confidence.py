@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 from pliant.solver import Tracks, gallery
 from pliant.solver.tracks.completion import complete
-from pliant.solver.tracks.normalization import normalise
+from pliant.solver.tracks.normalization import normalize
 
 
 def gram(points: np.ndarray, confidence: np.ndarray | None = None) -> np.ndarray:
     """The Gram matrix in the tracks' unit, so that those of differently weighted tracks compare."""
-    normalised = normalise(Tracks.from_arrays(points, confidence))
-    return np.asarray(complete(normalised).gram * normalised.unit**2)
+    normalized = normalize(Tracks.from_arrays(points, confidence))
+    return np.asarray(complete(normalized).gram * normalized.unit**2)
 
 
 def noisy() -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from pliant.solver import KnownCamera, Settings, gallery, solve
-from pliant.solver.cameras.multistart import binding
+from pliant.solver.cameras.multistart import scaled_prior_weight
 from pliant.solver.evaluation import metrics
-from pliant.solver.model.marginal_likelihood import STEADINESS
-from pliant.solver.model.model_order import FEWEST, Support, supported
-from pliant.solver.model.shape_covariance import QUIET, WARM, begin, improve, learned
+from pliant.solver.model.marginal_likelihood import CAMERA_PRIOR_WEIGHT
+from pliant.solver.model.model_order import MIN_JUDGED_POINTS, ModelOrder, select_model_order
+from pliant.solver.model.shape_covariance import ANNEALING_START, START_NOISE_VARIANCE, begin, improve, learned
 from pliant.solver.model.so3 import exponential
 from pliant.solver.tracks.noise import roughness, typical_roughness, white_noise
 
@@ -74,46 +74,48 @@ def test_short_sequences_use_lower_differences(frames: int) -> None:
 
 
 def test_the_camera_is_bound_less_where_noise_is_strong() -> None:
-    weights = [binding(gram_of(tracks(500, modes=2, sigma=sigma))) for sigma in (0.0, 0.03, 0.1)]
-    assert weights[0] == pytest.approx(STEADINESS, rel=1e-3)
-    assert weights[1] == pytest.approx(STEADINESS / 2, rel=0.1)
-    assert weights[2] < STEADINESS / 9
+    weights = [scaled_prior_weight(gram_of(tracks(500, modes=2, sigma=sigma))) for sigma in (0.0, 0.03, 0.1)]
+    assert weights[0] == pytest.approx(CAMERA_PRIOR_WEIGHT, rel=1e-3)
+    assert weights[1] == pytest.approx(CAMERA_PRIOR_WEIGHT / 2, rel=0.1)
+    assert weights[2] < CAMERA_PRIOR_WEIGHT / 9
 
 
 def test_strong_noise_is_learned_though_a_small_start_misses_it() -> None:
     gram = gram_of(tracks(500, modes=2, sigma=SIGMA))
-    small = improve(begin(gram, PAIRS, noise=QUIET), gram, PAIRS, iterations=60, warm=WARM)
-    assert small.noise**0.5 < SIGMA / 3
-    assert learned(gram, PAIRS, most=8, noisy=True).noise ** 0.5 == pytest.approx(SIGMA, rel=0.15)
+    small = improve(
+        begin(gram, PAIRS, noise_variance=START_NOISE_VARIANCE), gram, PAIRS, iterations=60, warm=ANNEALING_START
+    )
+    assert small.noise_variance**0.5 < SIGMA / 3
+    assert learned(gram, PAIRS, max_modes=8, noisy_start=True).noise_variance ** 0.5 == pytest.approx(SIGMA, rel=0.15)
 
 
 def test_fine_deformation_is_not_learned_as_noise() -> None:
-    assert learned(gram_of(tracks(500, modes=6, sigma=0.0)), PAIRS).noise ** 0.5 < 1e-3
+    assert learned(gram_of(tracks(500, modes=6, sigma=0.0)), PAIRS).noise_variance ** 0.5 < 1e-3
 
 
 def test_as_many_modes_are_taken_as_other_points_confirm() -> None:
-    few = [supported(tracks(40, modes=modes, sigma=SIGMA), PAIRS) for modes in (0, 2)]
-    assert [each.most for each in few] == [0, 2]
-    assert all(each.noisy for each in few)
-    assert supported(tracks(40, modes=8, sigma=0.02), PAIRS).most == 8
+    few = [select_model_order(tracks(40, modes=modes, sigma=SIGMA), PAIRS) for modes in (0, 2)]
+    assert [each.max_modes for each in few] == [0, 2]
+    assert all(each.noisy_start for each in few)
+    assert select_model_order(tracks(40, modes=8, sigma=0.02), PAIRS).max_modes == 8
 
 
 def test_many_points_confirm_at_least_the_modes_there_are() -> None:
-    assert supported(tracks(400, modes=2, sigma=SIGMA), PAIRS).most >= 2
-    assert supported(tracks(400, modes=8, sigma=0.02), PAIRS).most >= 8
+    assert select_model_order(tracks(400, modes=2, sigma=SIGMA), PAIRS).max_modes >= 2
+    assert select_model_order(tracks(400, modes=8, sigma=0.02), PAIRS).max_modes >= 8
 
 
 def test_without_noise_or_with_hardly_a_point_nothing_is_judged() -> None:
-    assert supported(tracks(40, modes=2, sigma=0.0), PAIRS) == Support()
-    assert supported(tracks(FEWEST - 1, modes=2, sigma=SIGMA), PAIRS) == Support()
+    assert select_model_order(tracks(40, modes=2, sigma=0.0), PAIRS) == ModelOrder()
+    assert select_model_order(tracks(MIN_JUDGED_POINTS - 1, modes=2, sigma=SIGMA), PAIRS) == ModelOrder()
 
 
 def test_where_outliers_were_found_what_is_left_of_them_is_not_learned_as_modes() -> None:
     random, sample = np.random.default_rng(0), tracks(40, modes=2, sigma=0.0).copy()
     wrong = random.random(sample.shape[:2]) < 0.02
     sample[wrong] += random.normal(0, 0.1, (wrong.sum(), 2))
-    assert supported(sample, PAIRS) == Support()
-    assert supported(sample, PAIRS, spoiled=True) == Support(2, noisy=True)
+    assert select_model_order(sample, PAIRS) == ModelOrder()
+    assert select_model_order(sample, PAIRS, spoiled=True) == ModelOrder(2, noisy_start=True)
 
 
 @pytest.mark.parametrize("points", [40, 400])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from pliant.solver import InvalidInput, Tracks
-from pliant.solver.tracks.normalization import normalise
+from pliant.solver.tracks.normalization import normalize
 
 
 def some_tracks(seed: int = 0) -> np.ndarray:
@@ -15,7 +15,7 @@ def some_tracks(seed: int = 0) -> np.ndarray:
 
 def test_centroid_zero_radius_one_and_back() -> None:
     points = some_tracks()
-    found = normalise(Tracks.from_arrays(points))
+    found = normalize(Tracks.from_arrays(points))
     np.testing.assert_allclose(found.points.mean(axis=1), 0, atol=1e-12)
     np.testing.assert_allclose((found.points**2).sum(axis=2).mean(), 1)
     np.testing.assert_allclose(found.unit * found.points + found.centroid[:, None], points)
@@ -23,7 +23,7 @@ def test_centroid_zero_radius_one_and_back() -> None:
 
 def test_scale_and_position_of_the_input_do_not_matter() -> None:
     points = some_tracks()
-    one, two = (normalise(Tracks.from_arrays(p)) for p in (points, 7.5 * points + [100.0, -3.0]))
+    one, two = (normalize(Tracks.from_arrays(p)) for p in (points, 7.5 * points + [100.0, -3.0]))
     np.testing.assert_allclose(one.points, two.points, atol=1e-12)
     np.testing.assert_allclose(two.unit, 7.5 * one.unit)
 
@@ -33,7 +33,7 @@ def test_hidden_observations_count_for_nothing_and_stay_zero() -> None:
     visible = np.random.default_rng(1).random((6, 30)) > 0.3
     visible[2] = False
     points[~visible] = 1e6
-    found = normalise(Tracks.from_arrays(points, visible))
+    found = normalize(Tracks.from_arrays(points, visible))
     assert (found.points[~visible] == 0).all()
     shown = [0, 1, 3, 4, 5]
     np.testing.assert_allclose(found.points[shown].sum(axis=1), 0, atol=1e-12)
@@ -42,14 +42,14 @@ def test_hidden_observations_count_for_nothing_and_stay_zero() -> None:
 
 def test_one_absurd_observation_does_not_shrink_the_object() -> None:
     points = some_tracks()
-    clean = normalise(Tracks.from_arrays(points))
+    clean = normalize(Tracks.from_arrays(points))
     points[3, 4] = 1e9
-    found = normalise(Tracks.from_arrays(points))
+    found = normalize(Tracks.from_arrays(points))
     assert 0.9 < found.unit / clean.unit < 1.1
     assert np.abs(found.points[3, 4]).min() > 1e5
 
 
 def test_one_position_for_all_points_is_refused() -> None:
     with pytest.raises(InvalidInput, match="points that differ") as caught:
-        normalise(Tracks.from_arrays(np.full((3, 5, 2), 7.0)))
+        normalize(Tracks.from_arrays(np.full((3, 5, 2), 7.0)))
     assert caught.value.code == "no_extent"
