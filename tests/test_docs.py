@@ -120,6 +120,7 @@ def test_every_block_says_what_it_is(block: Block) -> None:
 
 
 @pytest.mark.parametrize("document", pages("python"))
+@pytest.mark.slow
 def test_python_runs(document: Path, service_url: str, folder: Path) -> None:
     blocks = [block for block in BLOCKS if block.document == document and block.language == "python" and not block.note]
     assert blocks
@@ -143,6 +144,7 @@ def test_the_readmes_first_program_is_five_lines() -> None:
 
 
 @pytest.mark.parametrize("document", pages("bash"))
+@pytest.mark.slow
 def test_shell_runs(document: Path, service_url: str, folder: Path) -> None:
     (folder / "examples").symlink_to(ROOT / "examples")
     for block in BLOCKS:

@@ -90,6 +90,7 @@ def resident(pid: int) -> int:
 
 
 @pytest.mark.parametrize("attack", ATTACKS, ids=str)
+@pytest.mark.slow
 def test_a_crafted_file_is_refused_and_costs_nothing(house: House, attack: Attack) -> None:
     jobs = len(house.http.get("/v1/jobs").json()["jobs"])
     outcome = send(house, attack)

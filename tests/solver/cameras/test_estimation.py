@@ -59,6 +59,7 @@ def test_a_low_rank_scene_needs_its_own_k() -> None:
     assert rigid > 1.5 * own
 
 
+@pytest.mark.slow
 def test_scales_are_found_where_the_camera_has_them() -> None:
     scales = np.exp(0.1 * np.sin(np.linspace(0, 3, 20)))
     scales /= np.exp(np.log(scales).mean())
@@ -72,6 +73,7 @@ def test_scales_are_found_where_the_camera_has_them() -> None:
     assert (plain.scales == 1).all()
 
 
+@pytest.mark.slow
 def test_outliers_and_hidden_points_hardly_matter() -> None:
     random = np.random.default_rng(1)
     points = view(RIGID, CAMERA)
@@ -89,12 +91,14 @@ def test_a_still_camera_is_said() -> None:
 
 
 @pytest.mark.parametrize(("frames", "points"), [(3, 4), (3, 60), (20, 4)])
+@pytest.mark.slow
 def test_the_smallest_inputs_give_rotations(frames: int, points: int) -> None:
     found = estimate_cameras(normalize(Tracks.from_arrays(view(RIGID[:points], turning(frames, 40)))), Settings())
     square = found.rotations @ found.rotations.transpose(0, 2, 1)
     np.testing.assert_allclose(square, np.broadcast_to(np.eye(3), (frames, 3, 3)), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_bits_and_stopping_returns() -> None:
     normalized = normalize(Tracks.from_arrays(view(RIGID, CAMERA)))
     first, second = estimate_cameras(normalized, Settings()), estimate_cameras(normalized, Settings())
@@ -160,6 +164,7 @@ def test_corrections_are_carried_to_the_frames_between() -> None:
     assert degrees_apart(truth @ exponential(-drift), truth) > 3
 
 
+@pytest.mark.slow
 def test_a_dancer_does_not_make_the_camera_dance() -> None:
     # limbs that swing as fast as the camera turns: every K gives cameras that jitter with them
     random = np.random.default_rng(2)
@@ -177,6 +182,7 @@ def test_a_dancer_does_not_make_the_camera_dance() -> None:
 
 
 @pytest.mark.parametrize(("frames", "points", "most"), [(40, 300, 0.09), (60, 400, 0.11)])
+@pytest.mark.slow
 def test_a_body_that_hides_its_back_is_completed(frames: int, points: int, most: float) -> None:
     # no point is always seen: without a prior on the coefficients, points seen seldom fly off (.105 and .123)
     body = gallery.sphere(frames, points)

@@ -17,6 +17,7 @@ from pliant.solver.tracks.normalization import normalize
 FRAMES = 16
 
 
+@pytest.mark.slow
 def test_rivals_are_cameras_of_their_own_and_not_far_too_deep() -> None:
     face = gallery.face(24, 200)
     found = estimate_cameras(normalize(face.tracks), Settings())
@@ -28,10 +29,12 @@ def test_rivals_are_cameras_of_their_own_and_not_far_too_deep() -> None:
     assert not estimate_cameras(normalize(face.tracks), Settings(refine_rotations=False)).hypotheses
 
 
+@pytest.mark.slow
 def test_a_sheet_has_no_rivals_for_its_sides_are_chosen() -> None:
     assert not estimate_cameras(normalize(gallery.flag(24, 400).tracks), Settings()).hypotheses
 
 
+@pytest.mark.slow
 def test_cameras_far_too_deep_are_no_rivals(monkeypatch: pytest.MonkeyPatch) -> None:
     face = gallery.face(24, 200)
     monkeypatch.setattr("pliant.solver.cameras.estimation.MAX_START_DEPTH_VARIANCE", 0.0)
@@ -39,6 +42,7 @@ def test_cameras_far_too_deep_are_no_rivals(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @pytest.mark.parametrize("better", ["own", "rival"])
+@pytest.mark.slow
 def test_it_starts_from_the_cameras_that_lead_to_more_probable_ones(
     better: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -77,6 +77,7 @@ def flag() -> gallery.Sequence:
     return gallery.flag(24, 300)
 
 
+@pytest.mark.slow
 def test_a_flag_is_seen_from_its_sides(flag: gallery.Sequence) -> None:
     # without the sheet's own search the cameras are 23° off, and the shapes .34
     found = solve(flag.tracks)
@@ -92,6 +93,7 @@ def test_sides_that_are_right_stay(flag: gallery.Sequence) -> None:
     assert ("as they were" in sentence) == (kept is best.rotations)
 
 
+@pytest.mark.slow
 def test_a_long_film_is_unfolded_on_some_of_its_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pliant.solver.cameras.planar_ambiguity.PLANAR_FRAMES", 20)
     long = gallery.flag(50, 200, degrees=40)
@@ -102,6 +104,7 @@ def test_a_long_film_is_unfolded_on_some_of_its_frames(monkeypatch: pytest.Monke
     assert steps.max() < 20
 
 
+@pytest.mark.slow
 def test_a_stop_returns_the_best_so_far(flag: gallery.Sequence) -> None:
     gram = complete(normalize(flag.tracks)).gram
     rotations, scales = poses(gram)
@@ -110,10 +113,12 @@ def test_a_stop_returns_the_best_so_far(flag: gallery.Sequence) -> None:
     assert search_pose_signs(gram, rotations, scales).energy < stopped.energy
 
 
+@pytest.mark.slow
 def test_orthography_as_set_keeps_the_scales(flag: gallery.Sequence) -> None:
     assert (solve(flag.tracks, settings=Settings(camera="orthographic")).camera.scales == 1).all()
 
 
+@pytest.mark.slow
 def test_a_spoiled_sheet_keeps_the_sides_that_were_found_for_it() -> None:
     """What stands in for outliers is enough to turn a sheet over: its cameras are not refined with the shapes."""
     film = gallery.flag(24, 300)

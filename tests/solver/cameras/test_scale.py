@@ -15,6 +15,7 @@ def missed(found: np.ndarray, truth: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize(("frames", "points"), [(24, 400), (60, 300)])
+@pytest.mark.slow
 def test_a_zooming_camera_is_recovered(frames: int, points: int) -> None:
     film = gallery.face(frames, points, scale_change=0.1)
     found = solve(film.tracks)
@@ -27,6 +28,7 @@ def test_a_zooming_camera_is_recovered(frames: int, points: int) -> None:
 
 
 @pytest.mark.parametrize("name", ["face", "flag"])
+@pytest.mark.slow
 def test_a_camera_that_does_not_zoom_has_scales_of_one(name: str) -> None:
     film = {"face": gallery.face, "flag": gallery.flag}[name](30, 300)
     found = solve(film.tracks)

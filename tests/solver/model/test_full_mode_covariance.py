@@ -112,7 +112,9 @@ def test_modes_with_axes_of_their_own_tell_the_cameras_exactly() -> None:
     gram = tracks @ tracks.T / 600
     wander = 0.05 * np.stack([np.sin(5 * time + 1), np.cos(3 * time), np.sin(2 * time)], axis=1)
     wrong = exponential(wander) @ rotations
-    before = joint_refinement.refined(gram, wrong, np.ones(FRAMES), with_scales=False, rounds=2, model_order=ModelOrder())
+    before = joint_refinement.refined(
+        gram, wrong, np.ones(FRAMES), with_scales=False, rounds=2, model_order=ModelOrder()
+    )
     place = scene(gram, before.rotations, with_scales=False, prior_weight=0.01)
     found, scales = refined(place, np.ones(FRAMES), before.covariance)
 

@@ -143,12 +143,14 @@ def error(face: gallery.Sequence, *, known: bool, settings: Settings, spoiled: g
 
 
 @pytest.mark.parametrize("known", [True, False])
+@pytest.mark.slow
 def test_it_brings_a_face_far_nearer_to_the_truth(face: gallery.Sequence, known: bool) -> None:
     smooth = error(face, known=known, settings=Settings(prior="smooth"))
     gaussian = error(face, known=known, settings=Settings())
     assert 1e-4 < gaussian < 0.6 * smooth
 
 
+@pytest.mark.slow
 def test_gross_outliers_are_left_out_and_said(face: gallery.Sequence) -> None:
     spoiled = gallery.corrupt(face, outliers=0.1, seed=1)
     assert error(face, known=True, settings=Settings(), spoiled=spoiled) < 0.03
@@ -161,6 +163,7 @@ def test_gross_outliers_are_left_out_and_said(face: gallery.Sequence) -> None:
     assert np.median(found.residuals[gross]) > 0.2 * found.choices.unit  # they are reported, not hidden
 
 
+@pytest.mark.slow
 def test_a_long_film_is_learned_from_some_of_its_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     long = gallery.face(40, 150)
     whole = metrics.e3d_frame(solve(long.tracks).shapes, long.shapes)
@@ -179,6 +182,7 @@ def test_frames_that_show_little_are_not_learned_from() -> None:
     assert informative_frames(np.eye(10)).all()
 
 
+@pytest.mark.slow
 def test_a_stop_leaves_the_rotations_of_the_start(face: gallery.Sequence) -> None:
     projections = np.asarray(face.rotations)[:, :2]
     points = face.tracks.points - face.tracks.points.mean(axis=1, keepdims=True)

@@ -16,6 +16,7 @@ WRONG = np.abs(np.asarray(OUTLIER_SHARE.points) - np.asarray(MADE.tracks.points)
 
 
 @pytest.mark.parametrize("cameras", [CAMERAS, None], ids=["known", "estimated"])
+@pytest.mark.slow
 def test_what_is_left_out_is_what_was_spoiled(cameras: KnownCamera | None) -> None:
     found = solve(OUTLIER_SHARE, cameras=cameras)
     left_out = found.weights == 0
@@ -29,6 +30,7 @@ def test_what_is_left_out_is_what_was_spoiled(cameras: KnownCamera | None) -> No
 
 
 @pytest.mark.parametrize("cameras", [CAMERAS, None], ids=["known", "estimated"])
+@pytest.mark.slow
 def test_it_is_as_if_somebody_had_hidden_them(cameras: KnownCamera | None, monkeypatch: pytest.MonkeyPatch) -> None:
     found = solve(OUTLIER_SHARE, cameras=cameras)
     hidden = solve(Tracks.from_arrays(OUTLIER_SHARE.points, found.weights > 0), cameras=cameras)
@@ -53,6 +55,7 @@ def test_clean_tracks_and_the_published_prior_keep_everything() -> None:
     assert (published.weights > 0).all()
 
 
+@pytest.mark.slow
 def test_the_stiff_fit_descends_though_the_learned_paths_hardly_move() -> None:
     """A nearly rigid body: the prior's precision spans ten magnitudes, and 300 times that in the stiff fit."""
     rigid = gallery.face(40, 200, degrees=60)

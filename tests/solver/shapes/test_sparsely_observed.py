@@ -47,6 +47,7 @@ ROWS = np.ix_(SHOWN, HOLE)
 
 
 @pytest.mark.parametrize("cameras", [CAMERAS, None], ids=["known", "estimated"])
+@pytest.mark.slow
 def test_a_hole_in_the_face_is_closed(cameras: KnownCamera | None) -> None:
     assert len(HOLE) > 12
     found = solve(seen_but(HOLE), MADE.mesh, cameras=cameras)
@@ -113,6 +114,7 @@ def test_a_mode_that_never_changes_says_what_a_wider_extent_says(seed: int) -> N
 
 
 @pytest.mark.parametrize("seed", [5, 6])
+@pytest.mark.slow
 def test_outliers_of_seldom_seen_points_cost_hardly_more_than_not_seeing_them(seed: int) -> None:
     """Of three observations of a point one or two may be outliers: a fit to all of them would lose the good ones."""
     tracks = seen_but(HOLE, shown=(0, 5, 10))

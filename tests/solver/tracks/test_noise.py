@@ -120,6 +120,7 @@ def test_where_outliers_were_found_what_is_left_of_them_is_not_learned_as_modes(
 
 @pytest.mark.parametrize("points", [40, 400])
 @pytest.mark.parametrize("known", [True, False])
+@pytest.mark.slow
 def test_the_default_stands_strong_noise_better_than_the_papers_prior(known: bool, points: int) -> None:
     face = gallery.face(60, points)
     cameras = KnownCamera.from_arrays(face.rotations, face.scales) if known else None
@@ -131,6 +132,7 @@ def test_the_default_stands_strong_noise_better_than_the_papers_prior(known: boo
     assert error(Settings()) < 0.8 * error(Settings(prior="smooth"))
 
 
+@pytest.mark.slow
 def test_the_report_says_how_many_modes_and_why() -> None:
     face = gallery.face(30, 60)
     noisy = gallery.corrupt(face, noise=0.03, seed=1).tracks
