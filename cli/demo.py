@@ -92,7 +92,7 @@ def report(job: Job, paths: Mapping[str, Path], *, good: bool, url: str | None, 
     from rich.table import Table
     from rich.text import Text
 
-    table = Table(title=job.sentence, title_justify="left")
+    table = Table(title=job.trust_sentence or job.sentence, title_justify="left")
     for heading in ("metric", "value", "good below"):
         table.add_column(heading, justify="left" if heading == "metric" else "right")
     for name, value in metrics.items():

@@ -13,10 +13,13 @@ from rich.text import Text
 if TYPE_CHECKING:
     from pliant.cli.exits import Exit
     from pliant.schemas.job import Interpretation, Job
+    from pliant.worker.execution.pipeline import Finished
 
 COLOURS = {
     "queued": "cyan", "running": "blue", "cancelling": "yellow", "succeeded": "green", "failed": "red", "cancelled": "yellow",
 }  # fmt: skip
+
+VERDICTS = {"good": ("Good", "green"), "with_care": ("Use with care", "yellow"), "do_not_use": ("Do not use", "red")}
 
 
 def out() -> Console:
@@ -84,7 +87,7 @@ def show_job(job: Job, *, as_json: bool) -> None:
         table.add_row(Text("kept until", "dim"), f"{job.expires_at:%Y-%m-%d %H:%M} UTC")
     if job.error is not None:
         table.add_row(Text("error", "red"), f"{job.error.detail} [{job.error.code}]")
-    elif job.sentence is not None:
+    elif job.sentence is not None and job.verdict is None:
         table.add_row(Text("outcome", "dim"), job.sentence)
     for warning in job.warnings:
         table.add_row(Text("warning", "yellow"), warning)
@@ -93,6 +96,19 @@ def show_job(job: Job, *, as_json: bool) -> None:
         screen.print(metrics_table(job.metrics))
     for artifact in job.artifacts:
         screen.print(f"  {artifact.name}  {artifact.bytes / 1e6:.2f} MB  {artifact.description}", markup=False)
+    for line in verdict_lines(job):
+        screen.print(line)
+
+
+def verdict_lines(result: Job | Finished) -> list[Text]:
+    """Return the verdict with its reasons as the last lines of an output; none where a job was not judged."""
+    if result.verdict is None:
+        return []
+    words, colour = VERDICTS.get(result.verdict, (result.verdict, "yellow"))
+    sentences = " ".join(sentence for sentence in (result.trust_sentence, result.sentence) if sentence is not None)
+    return [Text.assemble((words, f"bold {colour}"), f"  {sentences}")] + [
+        Text(f"  {reason}") for reason in result.verdict_reasons
+    ]
 
 
 def understood(interpretation: Interpretation) -> list[tuple[str, str]]:
@@ -128,13 +144,14 @@ def show_jobs(jobs: Iterable[Job], *, as_json: bool) -> None:
         print_json([job.model_dump(mode="json") for job in jobs])
         return
     table = Table(box=None, pad_edge=False)
-    for heading in ("id", "status", "progress", "created", "frames × points", "name"):
+    for heading in ("id", "status", "verdict", "progress", "created", "frames × points", "name"):
         table.add_column(heading)
     for job in jobs:
         progress = "" if job.progress is None or job.status.final else f"{job.progress.fraction:.0%}"
         size = f"{job.interpretation.num_frames} × {job.interpretation.num_points}"
         created = f"{job.created_at.astimezone():%Y-%m-%d %H:%M:%S}"
-        table.add_row(job.id, Text(job.status, COLOURS[job.status]), progress, created, size, Text(job.name))
+        verdict = Text(*VERDICTS.get(job.verdict or "", ("", "")))
+        table.add_row(job.id, Text(job.status, COLOURS[job.status]), verdict, progress, created, size, Text(job.name))
     out().print(table)
 
 

@@ -21,7 +21,7 @@ from pliant.cli.session import (
     Tracks,
     parse_options,
 )
-from pliant.cli.show import err, metrics_table, out, print_json, understood
+from pliant.cli.show import err, metrics_table, out, print_json, understood, verdict_lines
 
 if TYPE_CHECKING:
     from pliant.schemas.job import Interpretation
@@ -127,18 +127,22 @@ def show_finished(done: Finished, output: Path, *, as_json: bool) -> None:
     if as_json:
         print_json(
             {
+                "verdict": done.verdict, "verdict_reasons": list(done.verdict_reasons), "trust_sentence": done.trust_sentence,
                 "outcome": done.outcome, "sentence": done.sentence, "metrics": done.metrics, "warnings": list(done.warnings),
                 "files": {artifact.name: str(output / artifact.name) for artifact in done.artifacts},
             }
         )  # fmt: skip
         return
+    from rich.text import Text
+
     screen = out()
     for warning in done.warnings:
         err().print(f"[yellow]warning[/yellow] {warning}")
-    screen.print(done.sentence, markup=False)
     screen.print(metrics_table(done.metrics))
     for artifact in done.artifacts:
         screen.print(f"{output / artifact.name}  {artifact.bytes / 1e6:.2f} MB", markup=False)
+    for line in verdict_lines(done) or [Text(done.sentence)]:
+        screen.print(line)
 
 
 def file_or_word(mesh: str | None) -> Path | str | None:

@@ -61,6 +61,16 @@ class Reconstruction:
         return self.arrays["rotations"]
 
     @property
+    def shapes_std(self) -> NDArray[np.float32] | None:
+        """Standard deviation of every position, shape (F, P), the tracks' unit; None where the prior has no posterior."""
+        return self.arrays.get("shapes_std")
+
+    @property
+    def verdict(self) -> str | None:
+        """Whether the result can be used: `good`, `with_care` or `do_not_use`; None where it was not judged."""
+        return self.job.verdict
+
+    @property
     def faces(self) -> NDArray[np.int32]:
         """Triangles (T, 3) or quads (T, 4): indices into the points."""
         return self.arrays["faces"]

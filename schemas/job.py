@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from datetime import datetime
 from enum import StrEnum
-from typing import Any
+from typing import Any, Literal
 
 from pliant.schemas.options import Options
 from pliant.schemas.problems import type_of
@@ -148,6 +148,14 @@ class Job(Record):
     )
     outcome: str | None = Field(None, description="How the solver ended: `converged`, `max_reweightings`.")
     sentence: str | None = Field(None, description="The outcome in words.")
+    verdict: Literal["good", "with_care", "do_not_use"] | None = Field(
+        None, description="Whether the result can be used, judged without ground truth; null: not judged."
+    )
+    verdict_reasons: list[str] = Field(
+        default_factory=list,
+        description="A sentence with a figure for each sign against the result, the gravest first.",
+    )
+    trust_sentence: str | None = Field(None, description="The expected error and what depth rests on, in words.")
     warnings: list[str] = Field(default_factory=list, description="What the user should read about this result.")
     artifacts: list[Artifact] = Field(default_factory=list)
     error: Problem | None = None

@@ -138,10 +138,11 @@ class Options(BaseModel):
         description="static: those of the first shape, in shapes.glb alone. animated: they move with the shape, and are in every "
         "frame of PLY, OBJ and USD, too. none: viewers make their own.",
     )
-    colours: Literal["none", "error"] = Field(
+    colours: Literal["none", "error", "expected_error"] = Field(
         "none",
         description="none: no colours. error: points are coloured by their distance from the ground truth, or by their reprojection "
-        "residual where there is none: in every frame in PLY, OBJ and USD, by the mean over frames in shapes.glb.",
+        "residual where there is none. expected_error: by the error that the solver expects, in percent of the object's size; only "
+        "prior gaussian estimates it. PLY, OBJ and USD are coloured in every frame, shapes.glb by the mean over frames.",
     )
     glb_quantized: bool = Field(
         False,

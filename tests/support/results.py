@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from pliant.schemas.job import Interpretation
 from pliant.schemas.options import Options
 from pliant.solver import Camera, Choices, Mesh, Outcome, Solution, Trace, Tracks
+from pliant.solver.evaluation.trust import assess
 from pliant.worker.formats import GroundTruth, Inputs
+from scipy.spatial.transform import Rotation
 
 
 def moving_sheet(frames: int, rows: int, columns: int) -> np.ndarray:
@@ -29,12 +32,13 @@ def make_result(
     y_axis: str = "down",
     truth: bool = False,
     hidden: bool = False,
+    std: bool = True,
     **options: Any,
 ) -> tuple[Inputs, Solution, Options]:
     """Inputs and the solution that belongs to them.
 
     `mesh` is grid, triangles or none; with `truth` the result is off by a smooth error; with `hidden` a third of the observations and
-    the whole of point 3 and frame 2 are hidden.
+    the whole of point 3 and frame 2 are hidden; without `std` the solver has estimated no deviations.
     """
     shapes = moving_sheet(frames, rows, columns)
     points = rows * columns
@@ -64,6 +68,10 @@ def make_result(
         ),
         seconds={"cameras": 0.5},
     )  # fmt: skip
+    spread = np.linspace(0.5, 2.0, frames * points).reshape(frames, points) if std else None
+    turned = Rotation.from_rotvec(np.linspace(0, 0.8, frames)[:, None] * [0, 1, 0]).as_matrix()
+    trust = assess(shapes, turned, solution.residuals, visible, scales=np.ones(frames), shapes_std=spread)
+    solution = replace(solution, shapes_std=spread, trust=trust)
     return inputs, solution, Options(**options)
 
 

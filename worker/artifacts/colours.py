@@ -15,7 +15,7 @@ SCALE = ("2b2f77", "28608f", "1f8f8a", "58b96d", "b5d44a", "fbe94b")
 STOPS = np.array([[int(text[i : i + 2], 16) / 255 for i in (0, 2, 4)] for text in SCALE])
 TOP_SHARE = 0.99
 UNKNOWN = 0.5
-"""Grey of what was not seen, where the colour is the reprojection residual."""
+"""Grey of positions that were not seen, except where the colour is the distance from the truth."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -26,20 +26,30 @@ class Painting:
     """What they are, in words."""
 
     values: Floats
-    """Shape `(F, P)`, not negative, the tracks' unit."""
+    """Shape `(F, P)`, not negative, in `unit`."""
 
     known: NDArray[np.bool_] | None
     """Shape `(F, P)`: where there is a value; None if everywhere."""
+
+    unit: str
+    """Unit of the values."""
 
     top: float
     """The value that gets the brightest colour: the 99th percentile, so that a few outliers do not make all else dark."""
 
     @classmethod
-    def of(cls, quantity: str, values: Floats, known: NDArray[np.bool_] | None = None) -> Painting:
+    def of(
+        cls,
+        quantity: str,
+        values: Floats,
+        known: NDArray[np.bool_] | None = None,
+        *,
+        unit: str = "the tracks' unit",
+    ) -> Painting:
         """Choose the scale for values `(F, P)`."""
         counted = values.ravel() if known is None else values[known]
         top = float(np.quantile(counted, TOP_SHARE)) if counted.size else 0.0
-        return cls(quantity, values, known, top if top > 0 else 1.0)
+        return cls(quantity, values, known, unit, top if top > 0 else 1.0)
 
     def frame(self, index: int) -> Floats:
         """Colours `(P, 3)` of one frame, sRGB in [0, 1]."""
@@ -60,7 +70,8 @@ class Painting:
 
     def said(self) -> dict[str, Any]:
         """Say for the report and the files what the colours mean."""
-        return {"colours": {"quantity": self.quantity, "top": self.top, "scale": ["#" + text for text in SCALE]}}
+        scale = ["#" + text for text in SCALE]
+        return {"colours": {"quantity": self.quantity, "unit": self.unit, "top": self.top, "scale": scale}}
 
 
 def shade(share: Floats) -> Floats:

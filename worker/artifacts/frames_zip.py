@@ -76,7 +76,8 @@ def _said(result: Result) -> list[str]:
     depth = "away from" if result.y_axis == "down" else "towards"
     said = [f"x right, y {result.y_axis}, z {depth} the first camera; unit of the tracks"]
     if result.painting is not None:
-        said.append(f"colour: {result.painting.quantity}, dark at 0, bright at {result.painting.top:.6g} and above")
+        painting = result.painting
+        said.append(f"colour: {painting.quantity}, dark at 0, bright at {painting.top:.6g} ({painting.unit}) and above")
     return said
 
 

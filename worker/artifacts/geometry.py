@@ -37,6 +37,12 @@ def vertex_normals(points: Floats | Singles, triangles: Ints) -> Singles:
     return total.astype(np.float32)
 
 
+def size_of(shapes: Floats) -> float:
+    """Root mean square distance of the points from the centre of their frame: the size that errors are shares of."""
+    centred = shapes - shapes.mean(axis=1, keepdims=True)
+    return max(float(np.sqrt(np.square(centred).sum(axis=2).mean())), float(np.finfo(float).tiny))
+
+
 def viewer_scale(shapes: Floats) -> float:
     """Power of ten that brings the bounding box's diagonal between 1 and 10, for viewers that take units for metres."""
     low, high = shapes.min(axis=(0, 1)), shapes.max(axis=(0, 1))

@@ -69,6 +69,7 @@ def _npz(result: Result, file: IO[bytes], on_progress: OnProgress) -> dict[str, 
     solution, camera = result.solution, result.solution.camera
     chosen = result.inputs.selection
     sources = {} if chosen is None else {"source_frames": chosen.frames, "source_points": chosen.points}
+    spread = {} if solution.shapes_std is None else {"shapes_std": solution.shapes_std.astype(np.float32)}
     np.savez(
         file,
         allow_pickle=False,
@@ -83,6 +84,7 @@ def _npz(result: Result, file: IO[bytes], on_progress: OnProgress) -> dict[str, 
         faces=result.faces,
         residuals=solution.residuals.astype(np.float32),
         weights=solution.weights.astype(np.float32),
+        **spread,
         trace_objective=solution.trace.objective,
         trace_residual=solution.trace.residual,
         trace_iterations=solution.trace.iterations,
@@ -139,7 +141,7 @@ def _preview(result: Result, file: IO[bytes]) -> None:
 
 
 KINDS = (
-    Kind("shapes.npz", None, "application/zip", "All arrays: shapes (F, P, 3), cameras, faces, residuals, weights, trace.", 2, _npz),
+    Kind("shapes.npz", None, "application/zip", "All arrays: shapes (F, P, 3), deviations, cameras, faces, residuals, weights.", 2, _npz),
     Kind("shapes.glb", "glb", "model/gltf-binary", "The moving mesh as animated glTF, y up.", 2, _glb),
     Kind("shapes_ply.zip", "ply", "application/zip", "One binary PLY for each frame.", 6, _painted(write_ply_zip)),
     Kind("shapes_obj.zip", "obj", "application/zip", "One OBJ for each frame.", 30, _painted(write_obj_zip)),

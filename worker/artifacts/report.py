@@ -13,6 +13,7 @@ from typing import Any
 
 from pliant.schemas.options import Options
 from pliant.solver import Solution
+from pliant.solver.evaluation.trust import Trust
 from pliant.worker.formats import Inputs
 
 REPORT_VERSION = 1
@@ -43,6 +44,7 @@ def build_report(
         del choices[name]  # in the section `camera`
     report = {
         "report_version": REPORT_VERSION,
+        **_trust(solution.trust),
         "outcome": solution.outcome.value,
         "sentence": solution.outcome.sentence,
         "warnings": list(warnings),
@@ -79,6 +81,20 @@ def _camera(solution: Solution) -> dict[str, Any]:
         "depth_sign": choices.depth_sign,
         "candidates": [asdict(each) for each in choices.focal_candidates],
         "reason": choices.reasons.get("camera_model"),
+    }
+
+
+def _trust(trust: Trust | None) -> dict[str, Any]:
+    """Describe how far the result can be trusted; nulls where the solver did not judge it."""
+    if trust is None:
+        trust_fields = ("verdict", "expected_error", "expected_error_interval", "trust_sentence")
+        return {**dict.fromkeys(trust_fields), "verdict_reasons": []}
+    return {
+        "verdict": trust.verdict.value,
+        "verdict_reasons": list(trust.reasons),
+        "expected_error": trust.expected_error,
+        "expected_error_interval": None if trust.interval is None else list(trust.interval),
+        "trust_sentence": trust.sentence,
     }
 
 

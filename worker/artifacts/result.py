@@ -10,7 +10,7 @@ from pliant.schemas.options import Options
 from pliant.solver import Solution
 from pliant.solver.evaluation.metrics import point_errors
 from pliant.worker.artifacts.colours import Painting
-from pliant.worker.artifacts.geometry import Floats, Ints, upright
+from pliant.worker.artifacts.geometry import Floats, Ints, size_of, upright
 from pliant.worker.formats import Inputs
 
 
@@ -40,12 +40,20 @@ class Result:
 
     @cached_property
     def painting(self) -> Painting | None:
-        """Colours by error, if they are wanted: of the distance from the truth where there is one, else of the residual."""
+        """Colours, if the options request them: the distance from the truth (the residual without truth), or the expected error.
+
+        None, too, for the expected error of a prior that has no posterior.
+        """
         if self.options.colours == "none":
             return None
+        seen = self.inputs.tracks.visible > 0
+        if self.options.colours == "expected_error":
+            if self.solution.shapes_std is None:
+                return None
+            share = 100 * self.solution.shapes_std / size_of(self.solution.shapes)
+            return Painting.of("expected error", share, seen, unit="percent of the object's size")
         if self.distances is not None:
             return Painting.of("distance from the truth", self.distances)
-        seen = self.inputs.tracks.visible > 0
         return Painting.of("reprojection residual", self.solution.residuals, seen)
 
     def standing(self, frame: int) -> Floats:

@@ -137,6 +137,7 @@ class Attempt:
                 held, attempt_id=self.attempt_id, prefix=self.prefix, artifacts=end.artifacts, metrics=end.metrics,
                 outcome=end.outcome, sentence=end.sentence, warnings=end.warnings, now=now, retention=settings.retention,
                 interpretation=end.interpretation,
+                verdict=end.verdict, verdict_reasons=end.verdict_reasons, trust_sentence=end.trust_sentence,
             )  # fmt: skip
 
         with contextlib.suppress(StoreUnavailable):
@@ -221,7 +222,8 @@ def work(
         if problem.code in ("internal_error", "storage_failed", "store_unavailable", "out_of_memory"):
             attempt.log("".join(traceback.format_exception(error)))
         return problem
-    attempt.log(f"{finished.sentence} {_listed([each.name for each in finished.artifacts])}")
+    ended = " ".join(sentence for sentence in (finished.trust_sentence, finished.sentence) if sentence is not None)
+    attempt.log(f"{ended} {_listed([each.name for each in finished.artifacts])}")
     return finished
 
 

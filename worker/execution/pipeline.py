@@ -40,6 +40,15 @@ class Finished:
     interpretation: Interpretation | None = None
     """How the inputs were read, where that was not known before the job ran: the tracks of a film."""
 
+    verdict: str | None = None
+    """`good`, `with_care` or `do_not_use`; None where the solver did not judge the result."""
+
+    verdict_reasons: tuple[str, ...] = ()
+    """A sentence for each sign against the result, the gravest first."""
+
+    trust_sentence: str | None = None
+    """The expected error and what depth rests on, in words."""
+
 
 def solver_settings(options: Options, *, y_up: bool = False) -> Settings:
     """Return the solver's part of a job's options; `y_up` as the tracks were read."""
@@ -148,10 +157,14 @@ def solve_and_write(
 
     artifacts = write_artifacts(inputs, solution, options, report, directory, on_progress=exported)
     exported(1.0)
+    trust = solution.trust
     return Finished(
         metrics=metrics,
         outcome=solution.outcome.value,
         sentence=solution.outcome.sentence,
+        verdict=None if trust is None else trust.verdict.value,
+        verdict_reasons=() if trust is None else trust.reasons,
+        trust_sentence=None if trust is None else trust.sentence,
         warnings=tuple(solution.choices.warnings),
         artifacts=tuple(artifacts),
     )

@@ -64,6 +64,9 @@ def succeed(
     now: datetime,
     retention: float,
     interpretation: Interpretation | None = None,
+    verdict: str | None = None,
+    verdict_reasons: Sequence[str] = (),
+    trust_sentence: str | None = None,
 ) -> Stored:
     """Publish the result, and the interpretation where the job found it out.
 
@@ -81,6 +84,9 @@ def succeed(
         "metrics": dict(metrics),
         "outcome": outcome,
         "sentence": sentence,
+        "verdict": verdict,
+        "verdict_reasons": list(verdict_reasons),
+        "trust_sentence": trust_sentence,
         "warnings": list(warnings),
         "artifacts": list(artifacts),
         **({} if interpretation is None else {"interpretation": interpretation}),

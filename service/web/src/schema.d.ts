@@ -323,6 +323,21 @@ export interface components {
              */
             sentence: string | null;
             /**
+             * Verdict
+             * @description Whether the result can be used, judged without ground truth; null: not judged.
+             */
+            verdict: ("good" | "with_care" | "do_not_use") | null;
+            /**
+             * Verdict Reasons
+             * @description A sentence with a figure for each sign against the result, the gravest first.
+             */
+            verdict_reasons: string[];
+            /**
+             * Trust Sentence
+             * @description The expected error and what depth rests on, in words.
+             */
+            trust_sentence: string | null;
+            /**
              * Warnings
              * @description What the user should read about this result.
              */
@@ -489,11 +504,11 @@ export interface components {
             normals: "static" | "animated" | "none";
             /**
              * Colours
-             * @description none: no colours. error: points are coloured by their distance from the ground truth, or by their reprojection residual where there is none: in every frame in PLY, OBJ and USD, by the mean over frames in shapes.glb.
+             * @description none: no colours. error: points are coloured by their distance from the ground truth, or by their reprojection residual where there is none. expected_error: by the error that the solver expects, in percent of the object's size; only prior gaussian estimates it. PLY, OBJ and USD are coloured in every frame, shapes.glb by the mean over frames.
              * @default none
              * @enum {string}
              */
-            colours: "none" | "error";
+            colours: "none" | "error" | "expected_error";
             /**
              * Glb Quantized
              * @description Write shapes.glb with 16-bit positions (KHR_mesh_quantization): two thirds of the size, and rounded to about a 65,000th of the largest extent.

@@ -225,6 +225,25 @@ def test_obj_colours_are_read_by_others(tmp_path: Path) -> None:
     assert told(files, "shapes_obj.zip")["colours"]["quantity"] == "reprojection residual"
 
 
+def test_expected_error_is_painted_in_percent_and_hidden_positions_grey(tmp_path: Path) -> None:
+    made = make_result(outputs="ply,glb", colours="expected_error", hidden=True, truth=True)
+    inputs, solution, _ = made
+    files = write(tmp_path, made)
+    seen = inputs.tracks.visible > 0
+    share = 100 * solution.shapes_std / np.sqrt(np.square(solution.shapes).sum(axis=2).mean())
+    top = np.quantile(share[seen], 0.99)
+    for name in ("shapes_ply.zip", "shapes.glb"):
+        described = told(files, name)["colours"]
+        assert (described["quantity"], described["unit"]) == ("expected error", "percent of the object's size")
+        assert described["top"] == pytest.approx(top)
+    for frame, content in enumerate(members(files["shapes_ply.zip"])):
+        vertex = plyfile.PlyData.read(io.BytesIO(content))["vertex"]
+        colours = np.column_stack([vertex[a] for a in ("red", "green", "blue")])
+        expected = np.where(seen[frame, :, None], shade(share[frame] / top), 0.5)
+        np.testing.assert_array_equal(colours, np.rint(255 * expected))
+    assert b"(percent of the object's size) and above" in members(files["shapes_ply.zip"])[0]
+
+
 def test_colours_mean_over_what_was_seen() -> None:
     values = np.array([[1.0, 2.0, 9.0], [3.0, 9.0, 9.0]])
     known = np.array([[True, True, False], [True, False, False]])

@@ -95,6 +95,9 @@ def test_npz_holds_the_solution_bit_for_bit(tmp_path: Path) -> None:
         np.testing.assert_array_equal(got["faces"], inputs.mesh.faces)
         np.testing.assert_allclose(got["residuals"], solution.residuals, rtol=1e-6)
         np.testing.assert_array_equal(got["weights"], solution.weights)
+        assert solution.shapes_std is not None
+        np.testing.assert_array_equal(got["shapes_std"], solution.shapes_std.astype(np.float32))
+        assert got["shapes_std"].dtype == np.float32
         np.testing.assert_array_equal(got["trace_objective"], solution.trace.objective)
         np.testing.assert_array_equal(got["trace_residual"], solution.trace.residual)
         np.testing.assert_array_equal(got["trace_iterations"], solution.trace.iterations)
@@ -266,6 +269,35 @@ def test_the_report_says_how_it_came_to_be(tmp_path: Path) -> None:
     assert report["seconds"]["exporting"] > 0
     assert report["peak_memory_bytes"] > 10_000_000
     assert set(report["versions"]) == {"pliant", "numpy", "scipy", "python", "system"}
+
+
+def test_the_report_states_how_far_to_trust_the_result(tmp_path: Path) -> None:
+    made = make_result(hidden=True)
+    report = json.loads(write(tmp_path, made)["report.json"].read_text())
+    trust = made[1].trust
+    assert trust is not None
+    assert trust.interval is not None
+    assert report["verdict"] == trust.verdict.value
+    assert report["verdict_reasons"] == list(trust.reasons)
+    assert report["expected_error"] == trust.expected_error
+    assert report["expected_error_interval"] == list(trust.interval)
+    assert report["trust_sentence"] == trust.sentence
+    inputs, solution, options = made
+    silent = build_report(inputs, replace(solution, trust=None), options, metrics={})
+    assert [silent[name] for name in ("verdict", "expected_error", "expected_error_interval", "trust_sentence")] == [
+        None
+    ] * 4
+    assert silent["verdict_reasons"] == []
+
+
+def test_a_result_without_deviations_has_no_array_of_them(tmp_path: Path) -> None:
+    files = write(tmp_path, make_result(std=False, outputs="glb", colours="expected_error"))
+    with np.load(files["shapes.npz"]) as arrays:
+        assert "shapes_std" not in arrays
+    report = json.loads(files["report.json"].read_text())
+    assert report["expected_error"] is None
+    assert report["trust_sentence"].startswith("The error is not estimated")
+    assert "colours" not in report["artifacts"]["shapes.glb"], "nothing is painted where nothing is known"
 
 
 def test_a_failed_write_leaves_the_old_file_and_no_half(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

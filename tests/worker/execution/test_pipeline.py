@@ -32,6 +32,9 @@ def test_the_files_hold_what_the_call_returns(inputs: Inputs, tmp_path: Path) ->
     assert (report["outcome"], report["sentence"]) == (finished.outcome, finished.sentence)
     assert report["metrics"] == pytest.approx(finished.metrics)
     assert {"e3d_sequence", "reprojection_median"} <= set(finished.metrics)
+    assert finished.verdict in ("good", "with_care", "do_not_use")
+    assert [report[name] for name in ("verdict", "trust_sentence")] == [finished.verdict, finished.trust_sentence]
+    assert report["verdict_reasons"] == list(finished.verdict_reasons)
     for artifact in finished.artifacts:
         assert (tmp_path / "new" / artifact.name).stat().st_size == artifact.bytes
     with np.load(tmp_path / "new" / "shapes.npz") as arrays:

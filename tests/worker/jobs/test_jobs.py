@@ -45,6 +45,7 @@ def finish(jobs: Jobs, id: str, file: Path) -> Stored:
         lambda stored: lifecycle.succeed(
             stored, attempt_id=attempt_id, prefix=prefix, artifacts=[artifact], metrics={"reprojection_median": 0.5},
             outcome="converged", sentence="Converged.", warnings=[], now=NOW, retention=60,
+            verdict="with_care", verdict_reasons=["The camera turned by 9° only."], trust_sentence="Expected error about 4 %.",
         ),
     )  # fmt: skip
 
@@ -232,6 +233,8 @@ def test_a_result_is_published_and_read_in_ranges(jobs: Jobs, submit, inputs_fil
     assert stored.bytes == jobs.records.used() == 6_000_000
     job = jobs.get(id)
     assert (job.status, job.outcome, job.metrics) == (Status.SUCCEEDED, "converged", {"reprojection_median": 0.5})
+    assert (job.verdict, job.trust_sentence) == ("with_care", "Expected error about 4 %.")
+    assert job.verdict_reasons == ["The camera turned by 9° only."]
     artifact, blob = jobs.artifact(id, "report.json")
     assert artifact.bytes == blob.size == 3_000_000
     assert sum(len(chunk) for chunk in blob.read(10, 2_500_000)) == 2_499_990

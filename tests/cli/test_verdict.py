@@ -1,0 +1,71 @@
+"""The verdict is what the commands end with; "Converged" never stands alone."""
+
+from __future__ import annotations
+
+import json
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+from pliant.cli.show import show_job, show_jobs, verdict_lines
+from pliant.cli.solve import show_finished
+from pliant.schemas.job import Interpretation, Job, Status
+from pliant.schemas.options import Options
+from pliant.worker.execution.pipeline import Finished
+
+REASON = "The camera turned by 9° only; depth needs 20° or more."
+TRUST = "Expected error about 4 % of the object's size; depth rests on 9° of turn."
+LAST = ["Use with care  " + TRUST + " Converged.", "  " + REASON]
+
+
+def finished(**changed: object) -> Finished:
+    given = {
+        "metrics": {"reprojection_median": 0.5}, "outcome": "converged", "sentence": "Converged.", "warnings": (), "artifacts": (),
+        "verdict": "with_care", "verdict_reasons": (REASON,), "trust_sentence": TRUST,
+    }  # fmt: skip
+    return Finished(**(given | changed))  # type: ignore[arg-type]
+
+
+def job(**changed: object) -> Job:
+    interpretation = Interpretation(
+        num_frames=3, num_points=4, num_faces=0, hidden_fraction=0, mesh_source="none", has_ground_truth=False,
+        has_rotations=False, layout="",
+    )  # fmt: skip
+    given = {
+        "id": "job", "status": Status.SUCCEEDED, "created_at": datetime.now(UTC), "options": Options(), "outcome": "converged",
+        "interpretation": interpretation, "sentence": "Converged.",
+    }  # fmt: skip
+    return Job.model_validate(given | changed)
+
+
+@pytest.fixture(autouse=True)
+def _wide(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+
+
+def test_solve_ends_with_the_verdict(capsys: pytest.CaptureFixture[str]) -> None:
+    show_finished(finished(), Path("out"), as_json=False)
+    assert capsys.readouterr().out.splitlines()[-2:] == LAST
+    show_finished(finished(), Path("out"), as_json=True)
+    printed = json.loads(capsys.readouterr().out)
+    assert (printed["verdict"], printed["verdict_reasons"], printed["trust_sentence"]) == ("with_care", [REASON], TRUST)
+
+
+def test_a_job_ends_with_the_verdict_and_an_old_one_with_its_outcome(capsys: pytest.CaptureFixture[str]) -> None:
+    show_job(job(verdict="with_care", verdict_reasons=[REASON], trust_sentence=TRUST), as_json=False)
+    shown = capsys.readouterr().out
+    assert shown.splitlines()[-2:] == LAST
+    assert shown.count("Converged") == 1
+    show_job(job(), as_json=False)
+    shown = capsys.readouterr().out
+    assert "Converged." in shown
+    assert "Good" not in shown
+    assert verdict_lines(job()) == []
+
+
+def test_the_list_of_jobs_has_the_verdict(capsys: pytest.CaptureFixture[str]) -> None:
+    show_jobs([job(verdict="do_not_use"), job()], as_json=False)
+    heading, bad, old = capsys.readouterr().out.splitlines()
+    assert "verdict" in heading
+    assert "Do not use" in bad
+    assert old.split()[:2] == ["job", "succeeded"]

@@ -1,0 +1,31 @@
+"""What a result states about its own accuracy, as an SDK user reads it."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+from pliant.client.result import Reconstruction
+from pliant.schemas.job import Interpretation, Job, Status
+from pliant.schemas.options import Options
+
+
+def test_deviations_and_verdict_come_from_the_files_and_the_record(tmp_path: Path) -> None:
+    interpretation = Interpretation(
+        num_frames=2, num_points=3, num_faces=0, hidden_fraction=0, mesh_source="none", has_ground_truth=False,
+        has_rotations=False, layout="",
+    )  # fmt: skip
+    job = Job(
+        id="job", status=Status.SUCCEEDED, created_at=datetime.now(UTC), options=Options(), interpretation=interpretation,
+        verdict="good",
+    )  # fmt: skip
+    deviations = np.arange(6, dtype=np.float32).reshape(2, 3)
+    for name, arrays in (("new", {"shapes_std": deviations}), ("old", {})):
+        (tmp_path / name).mkdir()
+        np.savez(tmp_path / name / "shapes.npz", shapes=np.zeros((2, 3, 3)), **arrays)
+    new, old = Reconstruction(job, tmp_path / "new"), Reconstruction(job, tmp_path / "old")
+    assert new.shapes_std is not None
+    np.testing.assert_array_equal(new.shapes_std, deviations)
+    assert old.shapes_std is None
+    assert new.verdict == "good"
