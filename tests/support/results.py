@@ -10,7 +10,7 @@ from pliant.schemas.job import Interpretation
 from pliant.schemas.options import Options
 from pliant.solver import Camera, Choices, Mesh, Outcome, Solution, Trace, Tracks
 from pliant.solver.evaluation.trust import assess
-from pliant.worker.formats import GroundTruth, Inputs
+from pliant.worker.formats import GroundTruth, Inputs, Texture
 from scipy.spatial.transform import Rotation
 
 
@@ -33,6 +33,7 @@ def make_result(
     truth: bool = False,
     hidden: bool = False,
     std: bool = True,
+    texture: bool = False,
     **options: Any,
 ) -> tuple[Inputs, Solution, Options]:
     """Inputs and the solution that belongs to them.
@@ -72,7 +73,18 @@ def make_result(
     turned = Rotation.from_rotvec(np.linspace(0, 0.8, frames)[:, None] * [0, 1, 0]).as_matrix()
     trust = assess(shapes, turned, solution.residuals, visible, scales=np.ones(frames), shapes_std=spread)
     solution = replace(solution, shapes_std=spread, trust=trust)
+    if texture:
+        inputs = replace(inputs, texture=make_texture(rows, columns))
     return inputs, solution, Options(**options)
+
+
+def make_texture(rows: int, columns: int) -> Texture:
+    """A smooth picture, red from left to right and green from top to bottom, with a place for each point of a sheet's grid."""
+    y, x = np.mgrid[0:96, 0:128]
+    picture = np.stack([255 * x / 127, 255 * y / 95, 0 * x + 128.0], axis=-1)
+    down, right = np.mgrid[0:rows, 0:columns].reshape(2, -1)
+    uv = np.column_stack([0.1 + 0.8 * right / columns, 0.2 + 0.7 * down / rows])
+    return Texture.from_tracked(np.rint(picture).astype(np.uint8), uv)
 
 
 def _off(frames: int, points: int) -> np.ndarray:

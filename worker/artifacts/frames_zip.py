@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import IO
 
 import numpy as np
@@ -11,6 +11,9 @@ from pliant.worker.artifacts.geometry import Floats, triangles_of, vertex_normal
 from pliant.worker.artifacts.result import Result
 
 FIRST_DAY = (1980, 1, 1, 0, 0, 0)
+
+MATERIAL_HEAD = "mtllib shapes.mtl\nusemtl film\n"
+MATERIAL = "newmtl film\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd texture.jpg\n"
 
 OnProgress = Callable[[float], None]
 
@@ -47,21 +50,34 @@ def write_ply_zip(result: Result, file: IO[bytes], on_progress: OnProgress) -> N
 def write_obj_zip(result: Result, file: IO[bytes], on_progress: OnProgress) -> None:
     """Wavefront OBJ of every frame, `frame_00000.obj` …; nine digits, which is single precision, axes and unit of the tracks.
 
-    Colours, if there are any, stand behind the coordinates, as MeshLab, Blender and Open3D read them.
+    Colours, if there are any, stand behind the coordinates, as MeshLab, Blender and Open3D read them. With a texture, the archive also
+    holds `shapes.mtl` and `texture.jpg`; v of `vt` points up.
     """
-    head = "".join(f"# {line}\n" for line in _said(result))
+    texture = result.texture
+    head = "".join(f"# {line}\n" for line in _said(result)) + (MATERIAL_HEAD if texture is not None else "")
     moving = result.options.normals == "animated" and len(result.faces) > 0
-    corner = "{0}//{0}" if moving else "{0}"
+    places = "" if texture is None else _lines("vt", np.column_stack([texture.uv[:, 0], 1 - texture.uv[:, 1]]), "%.6f")
+    corner = _corner(textured=texture is not None, moving=moving)
     tail = "".join("f " + " ".join(corner.format(index + 1) for index in face) + "\n" for face in result.faces.tolist())
     if len(result.faces) == 0:
         tail = "".join(f"p {index + 1}\n" for index in range(result.solution.shapes.shape[1]))
 
     def content(frame: int) -> bytes:
         points, normals, colours = _frame(result, frame)
+        if texture is not None:
+            colours = None
         vertices = _lines("v", points, "%.9g") if colours is None else _lines("v", np.hstack([points, colours]), "%.9g")
-        return (head + vertices + ("" if normals is None else _lines("vn", normals, "%.6g")) + tail).encode()
+        return (head + vertices + places + ("" if normals is None else _lines("vn", normals, "%.6g")) + tail).encode()
 
-    _write_members(file, content, len(result.solution.shapes), "obj", on_progress)
+    beside = {} if texture is None else {"shapes.mtl": MATERIAL.encode(), "texture.jpg": texture.jpeg}
+    _write_members(file, content, len(result.solution.shapes), "obj", on_progress, beside=beside)
+
+
+def _corner(*, textured: bool, moving: bool) -> str:
+    """How a face names vertex, texture coordinate and normal of one number."""
+    if textured:
+        return "{0}/{0}/{0}" if moving else "{0}/{0}"
+    return "{0}//{0}" if moving else "{0}"
 
 
 def _frame(result: Result, frame: int) -> tuple[Floats, Floats | None, Floats | None]:
@@ -69,7 +85,7 @@ def _frame(result: Result, frame: int) -> tuple[Floats, Floats | None, Floats | 
     points = result.solution.shapes[frame].astype(np.float32).astype(np.float64)
     moving = result.options.normals == "animated" and len(result.faces) > 0
     normals = vertex_normals(points, triangles_of(result.faces)).astype(np.float64) if moving else None
-    return points, normals, None if result.painting is None else result.painting.frame(frame)
+    return points, normals, result.picture_colours if result.painting is None else result.painting.frame(frame)
 
 
 def _said(result: Result) -> list[str]:
@@ -78,6 +94,8 @@ def _said(result: Result) -> list[str]:
     if result.painting is not None:
         painting = result.painting
         said.append(f"colour: {painting.quantity}, dark at 0, bright at {painting.top:.6g} ({painting.unit}) and above")
+    elif result.picture_colours is not None:
+        said.append("colour: the film's template frame")
     return said
 
 
@@ -88,9 +106,12 @@ def _lines(word: str, rows: Floats, number: str) -> str:
 
 
 def _write_members(
-    file: IO[bytes], content: Callable[[int], bytes], count: int, suffix: str, on_progress: OnProgress
-) -> None:
+    file: IO[bytes], content: Callable[[int], bytes], count: int, suffix: str, on_progress: OnProgress,
+    *, beside: Mapping[str, bytes] | None = None,
+) -> None:  # fmt: skip
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for name, whole in (beside or {}).items():
+            archive.writestr(zipfile.ZipInfo(name, FIRST_DAY), whole, zipfile.ZIP_STORED)
         for index in range(count):
             # A fixed date, so that equal results are equal files.
             archive.writestr(

@@ -16,11 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.worker.artifacts.animation import Animation
 from pliant.worker.artifacts.geometry import Ints, Singles, vertex_normals
+from pliant.worker.formats import Texture
 
 COMPONENTS = {"int8": 5120, "uint8": 5121, "int16": 5122, "uint16": 5123, "uint32": 5125, "float32": 5126}
-TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 VERTICES, INDICES = 34962, 34963
 POINTS, TRIANGLES = 0, 4
+LINEAR, MIPMAPS, CLAMPED = 9729, 9987, 33071
 CLAY = [0.74, 0.62, 0.55, 1.0]
 
 
@@ -73,6 +75,13 @@ class Buffer:
         self.bytes += -(-count * stride // 4) * 4
         return len(self.accessors) - 1
 
+    def attach(self, content: bytes) -> int:
+        """Append a file as a view of its own; returns the view's index."""
+        self.views.append({"buffer": 0, "byteOffset": self.bytes, "byteLength": len(content)})
+        self.parts.append((lambda: np.frombuffer(content, dtype=np.uint8), 1))
+        self.bytes += -(-len(content) // 4) * 4
+        return len(self.views) - 1
+
     def chunks(self) -> Iterator[bytes]:
         """Yield the bytes of one array after the other, little-endian, each padded to a multiple of four."""
         for make, stride in self.parts:
@@ -85,7 +94,8 @@ class Buffer:
 
 def write_glb(
     file: IO[bytes], animation: Animation, triangles: Ints, *, fps: float, node: dict[str, Any], normals: str = "static",
-    quantized: bool = False, colours: NDArray[np.uint16] | None = None, on_progress: Callable[[float], None] | None = None,
+    quantized: bool = False, colours: NDArray[np.uint16] | None = None, texture: Texture | None = None,
+    on_progress: Callable[[float], None] | None = None,
 ) -> None:  # fmt: skip
     """Write the animation.
 
@@ -107,8 +117,10 @@ def write_glb(
         16-bit positions by KHR_mesh_quantization.
     colours : array of uint16, shape (P, 4), optional
         RGBA of every point, linear light, 65535 for 1.
+    texture : Texture, optional
+        Base colour; embedded as JPEG.
     on_progress : callable, optional
-        Told the share of bytes written.
+        Called with the share of bytes written.
     """
     buffer = Buffer()
     placed = dict(node)
@@ -123,6 +135,8 @@ def write_glb(
         attributes["NORMAL"] = buffer.add(base_normals, target=VERTICES)
     if colours is not None:
         attributes["COLOR_0"] = buffer.add(colours, target=VERTICES, normalised=True)
+    if texture is not None:
+        attributes["TEXCOORD_0"] = buffer.add(texture.uv, target=VERTICES)
     primitive: dict[str, Any] = {
         "attributes": attributes,
         "material": 0,
@@ -141,7 +155,7 @@ def write_glb(
         "output": buffer.add(animation.weights.reshape(-1)),
         "interpolation": "LINEAR",
     }
-    document = {
+    document: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": f"Pliant {version('pliant')}"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
@@ -154,12 +168,17 @@ def write_glb(
                 "extras": {"targetNames": animation.names, "pliant": animation.extras},
             }
         ],
-        "materials": [_material(colours is not None)],
+        "materials": [_material(coloured=colours is not None, textured=texture is not None)],
         "animations": [{"name": "motion", "samplers": [sampler], "channels": [{"sampler": 0, "target": {"node": 0, "path": "weights"}}]}],
         "buffers": [{"byteLength": buffer.bytes}],
         "bufferViews": buffer.views,
         "accessors": buffer.accessors,
     }  # fmt: skip
+    if texture is not None:
+        document["images"] = [{"name": "film", "mimeType": "image/jpeg", "bufferView": buffer.attach(texture.jpeg)}]
+        document["samplers"] = [{"magFilter": LINEAR, "minFilter": MIPMAPS, "wrapS": CLAMPED, "wrapT": CLAMPED}]
+        document["textures"] = [{"source": 0, "sampler": 0}]
+        document["buffers"] = [{"byteLength": buffer.bytes}]
     if quantized:
         document["extensionsUsed"] = document["extensionsRequired"] = ["KHR_mesh_quantization"]
     _write(file, document, buffer, on_progress)
@@ -204,7 +223,13 @@ def _quantize(animation: Animation, node: dict[str, Any]) -> tuple[Array, Callab
     return positions, target, placed
 
 
-def _material(coloured: bool) -> dict[str, Any]:
+def _material(*, coloured: bool, textured: bool) -> dict[str, Any]:
+    if textured:
+        # The film has its light in the picture, so the surface adds no highlights of its own.
+        return {
+            "name": "film", "doubleSided": True,
+            "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "metallicFactor": 0.0, "roughnessFactor": 1.0},
+        }  # fmt: skip
     base = [1.0, 1.0, 1.0, 1.0] if coloured else CLAY
     return {
         "name": "clay", "doubleSided": True,

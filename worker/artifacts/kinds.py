@@ -7,14 +7,16 @@ from dataclasses import dataclass
 from typing import IO, Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pliant.schemas.options import Options, Output
 from pliant.solver import InvalidInput
 from pliant.worker.artifacts import matlab, preview, usd
 from pliant.worker.artifacts.animation import animate
 from pliant.worker.artifacts.colours import linear
 from pliant.worker.artifacts.frames_zip import OnProgress, write_obj_zip, write_ply_zip
-from pliant.worker.artifacts.geometry import triangles_of, viewer_scale
+from pliant.worker.artifacts.geometry import Floats, triangles_of, viewer_scale
 from pliant.worker.artifacts.glb import write_glb
+from pliant.worker.artifacts.mdd import write_mdd
 from pliant.worker.artifacts.result import Result
 from pliant.worker.artifacts.tables import write_frames_csv, write_points_csv
 
@@ -99,15 +101,22 @@ def _glb(result: Result, file: IO[bytes], on_progress: OnProgress) -> dict[str, 
     colours = None
     if painted is not None:
         animation.extras.update(painted.said())
-        shares = np.hstack([linear(painted.mean()), np.ones((shapes.shape[1], 1))])
-        colours = np.rint(shares * 65535).astype(np.uint16)
+        colours = _rgba(painted.mean())
+    elif result.texture is None and result.picture_colours is not None:
+        colours = _rgba(result.picture_colours)
     on_progress(0.4)
     write_glb(
         file, animation, triangles_of(result.faces), fps=options.fps, node={"scale": [viewer_scale(shapes)] * 3},
         normals=options.normals, quantized=options.glb_quantized, colours=colours,
-        on_progress=lambda part: on_progress(0.4 + 0.6 * part),
+        texture=result.texture, on_progress=lambda part: on_progress(0.4 + 0.6 * part),
     )  # fmt: skip
     return animation.extras
+
+
+def _rgba(colours: Floats) -> NDArray[np.uint16]:
+    """Return colours `(P, 3)`, sRGB, as glTF stores them: linear light and opaque, 65535 for 1."""
+    shares = np.hstack([linear(colours), np.ones((len(colours), 1))])
+    return np.asarray(np.rint(shares * 65535).astype(np.uint16))
 
 
 def _painted(write: Callable[[Result, IO[bytes], OnProgress], None]) -> Callable[..., dict[str, Any]]:
@@ -147,6 +156,7 @@ KINDS = (
     Kind("shapes_obj.zip", "obj", "application/zip", "One OBJ for each frame.", 30, _painted(write_obj_zip)),
     Kind("shapes.usdc", "usd", "application/octet-stream", "The moving mesh as USD, y up.", 3, _painted(usd.write_usd)),
     Kind("shapes.mat", "mat", "application/x-matlab-data", "The same arrays for MATLAB; faces from 1.", 2, _at_once(matlab.write_mat)),
+    Kind("shapes.mdd", "mdd", "application/octet-stream", "Point cache for Blender, Maya and Houdini, y up.", 2, _painted(write_mdd)),
     Kind("metrics_frames.csv", "csv", "text/csv", "Metrics of every frame.", 2, _at_once(write_frames_csv)),
     Kind("metrics_points.csv", "csv", "text/csv", "Metrics of every point.", 2, _at_once(write_points_csv)),
     Kind(preview.NAME, None, preview.MEDIA_TYPE, preview.DESCRIPTION, 1, _at_once(_preview)),

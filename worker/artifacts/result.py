@@ -11,7 +11,7 @@ from pliant.solver import Solution
 from pliant.solver.evaluation.metrics import point_errors
 from pliant.worker.artifacts.colours import Painting
 from pliant.worker.artifacts.geometry import Floats, Ints, size_of, upright
-from pliant.worker.formats import Inputs
+from pliant.worker.formats import Inputs, Texture
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +55,16 @@ class Result:
         if self.distances is not None:
             return Painting.of("distance from the truth", self.distances)
         return Painting.of("reprojection residual", self.solution.residuals, seen)
+
+    @property
+    def texture(self) -> Texture | None:
+        """The picture to put on the surface; None without one, without a surface, and where colours mean something else."""
+        return self.inputs.texture if self.painting is None and len(self.faces) else None
+
+    @cached_property
+    def picture_colours(self) -> Floats | None:
+        """Colours `(P, 3)` of the points in the picture, sRGB in [0, 1]; None without one or where colours mean something else."""
+        return None if self.inputs.texture is None or self.painting is not None else self.inputs.texture.colours()
 
     def standing(self, frame: int) -> Floats:
         """Points `(P, 3)` of a frame, y up, right-handed."""

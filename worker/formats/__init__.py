@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from pliant.worker.formats.isolated_reader import store_inputs
     from pliant.worker.formats.read import read_inputs
     from pliant.worker.formats.records import GroundTruth, Inputs, Limits
+    from pliant.worker.formats.texture import Texture
 
 _HOME_OF = {
     "AmbiguousInput": "pliant.worker.formats.errors",
@@ -20,6 +21,7 @@ _HOME_OF = {
     "Inputs": "pliant.worker.formats.records",
     "InvalidInput": "pliant.solver.errors",
     "Limits": "pliant.worker.formats.records",
+    "Texture": "pliant.worker.formats.texture",
     "load_inputs": "pliant.worker.formats.canonical",
     "read_inputs": "pliant.worker.formats.read",
     "save_inputs": "pliant.worker.formats.canonical",
@@ -32,6 +34,7 @@ __all__ = [
     "Inputs",
     "InvalidInput",
     "Limits",
+    "Texture",
     "load_inputs",
     "read_inputs",
     "save_inputs",

@@ -12,6 +12,7 @@ from pliant.solver import KnownCamera, Mesh, Tracks
 from pliant.worker.formats.errors import damaged
 from pliant.worker.formats.reading.arrays import read_file
 from pliant.worker.formats.records import Arrays, GroundTruth, Inputs, Limits, Selection
+from pliant.worker.formats.texture import Texture
 
 VERSION = 1
 _OURS = Limits(max_bytes=1 << 36)
@@ -40,6 +41,10 @@ def save_inputs(inputs: Inputs, path: Path) -> None:
     if inputs.selection is not None:
         arrays["source_frames"], arrays["source_points"] = inputs.selection.frames, inputs.selection.points
         arrays["source_whole"] = np.array(inputs.selection.whole)
+    if inputs.texture is not None:
+        arrays["texture"] = np.frombuffer(inputs.texture.jpeg, dtype=np.uint8)
+        arrays["texture_size"] = np.array([inputs.texture.width, inputs.texture.height])
+        arrays["uv"] = inputs.texture.uv
     with path.open("wb") as file:
         np.savez(file, allow_pickle=False, **arrays)
 
@@ -75,7 +80,16 @@ def load_inputs(path: Path) -> Inputs:
         frames, kept = (arrays[name].astype(np.intp) for name in ("source_frames", "source_points"))
         selection = Selection(frames, kept, (int(arrays["source_whole"][0]), int(arrays["source_whole"][1])))
     told = Interpretation.model_validate(json.loads(arrays["interpretation"].tobytes()))
-    return Inputs(Tracks(points, _wide(arrays["visible"])), mesh, truth, cameras, told, selection)
+    return Inputs(Tracks(points, _wide(arrays["visible"])), mesh, truth, cameras, told, selection, _texture(arrays))
+
+
+def _texture(arrays: Arrays) -> Texture | None:
+    if "texture" not in arrays:
+        return None
+    width, height = arrays["texture_size"].tolist()
+    uv = np.ascontiguousarray(arrays["uv"], dtype=np.float32)
+    uv.flags.writeable = False
+    return Texture(arrays["texture"].tobytes(), width, height, uv)
 
 
 def _narrow(values: NDArray[np.float64]) -> NDArray[np.generic]:

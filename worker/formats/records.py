@@ -12,6 +12,7 @@ from pliant.worker.formats.errors import refusal
 
 if TYPE_CHECKING:  # a contained child needs none of it
     from pliant.schemas.job import Interpretation
+    from pliant.worker.formats.texture import Texture
 
 Arrays = dict[str, NDArray[np.generic]]
 """Named arrays as a file holds them, not yet interpreted; members of nested structures have dotted names."""
@@ -155,3 +156,6 @@ class Inputs:
 
     selection: Selection | None = None
     """Which frames and points of the files these are; None: all of them."""
+
+    texture: Texture | None = None
+    """The picture on the surface, with a place for each of the P points; None: there is none."""

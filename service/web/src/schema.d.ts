@@ -487,14 +487,14 @@ export interface components {
             fps: number;
             /**
              * Outputs
-             * @description Files to write besides shapes.npz, report.json and preview.bin. glb: animated glTF. ply, obj: one mesh a frame, in a zip. usd: USD with time samples. mat: MATLAB. csv: metrics of every frame and of every point.
+             * @description Files to write besides shapes.npz, report.json and preview.bin. glb: animated glTF. ply, obj: one mesh a frame, in a zip. usd: USD with time samples. mdd: point cache for Blender, Maya and Houdini. mat: MATLAB. csv: metrics of every frame and of every point.
              * @default [
              *       "glb",
              *       "ply",
              *       "csv"
              *     ]
              */
-            outputs: ("glb" | "ply" | "obj" | "usd" | "mat" | "csv")[];
+            outputs: ("glb" | "ply" | "obj" | "usd" | "mdd" | "mat" | "csv")[];
             /**
              * Normals
              * @description static: those of the first shape, in shapes.glb alone. animated: they move with the shape, and are in every frame of PLY, OBJ and USD, too. none: viewers make their own.
