@@ -37,8 +37,11 @@ class Kind:
     write: Callable[[Result, IO[bytes], OnProgress], dict[str, Any]]
     """Writes the file; returns what the report should say of it."""
 
+    textured: bool | None = None
+    """Whether it is written only with, or only without, a picture on the surface; None: either way."""
 
-def kinds_for(options: Options, *, size: tuple[int, int] = (0, 0)) -> list[Kind]:
+
+def kinds_for(options: Options, *, size: tuple[int, int] = (0, 0), textured: bool = False) -> list[Kind]:
     """Return what a job's options ask for, in the order of writing.
 
     Parameters
@@ -47,6 +50,8 @@ def kinds_for(options: Options, *, size: tuple[int, int] = (0, 0)) -> list[Kind]
         Of the job.
     size : tuple of int
         Frames and points, as far as they are known.
+    textured : bool
+        There is a picture to put on the surface.
 
     Raises
     ------
@@ -64,7 +69,8 @@ def kinds_for(options: Options, *, size: tuple[int, int] = (0, 0)) -> list[Kind]
             "output_unavailable", field="options.outputs", expected="less than 2 GiB of shapes for mat",
             got=f"{size[0]} frames of {size[1]} points", hint="Leave mat out; shapes.npz holds the same arrays.",
         )  # fmt: skip
-    return [kind for kind in KINDS if kind.output is None or kind.output in options.outputs]
+    wanted = [kind for kind in KINDS if kind.output is None or kind.output in options.outputs]
+    return [kind for kind in wanted if kind.textured in (None, textured)]
 
 
 def _npz(result: Result, file: IO[bytes], on_progress: OnProgress) -> dict[str, Any]:
@@ -154,7 +160,8 @@ KINDS = (
     Kind("shapes.glb", "glb", "model/gltf-binary", "The moving mesh as animated glTF, y up.", 2, _glb),
     Kind("shapes_ply.zip", "ply", "application/zip", "One binary PLY for each frame.", 6, _painted(write_ply_zip)),
     Kind("shapes_obj.zip", "obj", "application/zip", "One OBJ for each frame.", 30, _painted(write_obj_zip)),
-    Kind("shapes.usdc", "usd", "application/octet-stream", "The moving mesh as USD, y up.", 3, _painted(usd.write_usd)),
+    Kind("shapes.usdc", "usd", "application/octet-stream", "The moving mesh as USD, y up.", 3, _painted(usd.write_usd), textured=False),
+    Kind("shapes.usdz", "usd", "model/vnd.usdz+zip", "USD, y up, with its picture.", 3, _painted(usd.write_usdz), textured=True),
     Kind("shapes.mat", "mat", "application/x-matlab-data", "The same arrays for MATLAB; faces from 1.", 2, _at_once(matlab.write_mat)),
     Kind("shapes.mdd", "mdd", "application/octet-stream", "Point cache for Blender, Maya and Houdini, y up.", 2, _painted(write_mdd)),
     Kind("metrics_frames.csv", "csv", "text/csv", "Metrics of every frame.", 2, _at_once(write_frames_csv)),

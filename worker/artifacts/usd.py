@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import shutil
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
@@ -12,6 +13,10 @@ import numpy as np
 from pliant.worker.artifacts.colours import linear
 from pliant.worker.artifacts.geometry import triangles_of, vertex_normals, viewer_scale
 from pliant.worker.artifacts.result import Result
+from pliant.worker.formats import Texture
+
+PICTURE = "texture.jpg"
+"""Name of the picture in the package."""
 
 
 def available() -> bool:
@@ -32,6 +37,21 @@ def write_usd(result: Result, file: IO[bytes], on_progress: Callable[[float], No
             shutil.copyfileobj(made, file)
     finally:
         path.unlink(missing_ok=True)
+
+
+def write_usdz(result: Result, file: IO[bytes], on_progress: Callable[[float], None]) -> None:
+    """Write what `write_usd` does, in a package together with the picture on the surface."""
+    from pxr import UsdUtils
+
+    with tempfile.TemporaryDirectory(dir=Path(file.name).parent, prefix=".usdz-") as folder:
+        stage, package = Path(folder) / "shapes.usdc", Path(folder) / "shapes.usdz"
+        assert result.texture is not None
+        (Path(folder) / PICTURE).write_bytes(result.texture.jpeg)
+        _build(stage, result, on_progress)
+        if not UsdUtils.CreateNewUsdzPackage(str(stage), str(package)):
+            raise OSError(f"USD could not write the package {package}.")
+        with package.open("rb") as made:
+            shutil.copyfileobj(made, file)
 
 
 def _build(path: Path, result: Result, on_progress: Callable[[float], None]) -> None:
@@ -92,4 +112,35 @@ def _define(stage: Any, result: Result) -> Any:
     # Subdivision would move the surface away from the points.
     shape.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     shape.CreateDoubleSidedAttr(True)
+    if result.texture is not None:
+        _put_picture(stage, shape, result.texture)
     return shape
+
+
+def _put_picture(stage: Any, shape: Any, texture: Texture) -> None:
+    """Bind a material that shows the picture: a UsdPreviewSurface with texture coordinates `st`, whose t points up."""
+    from pxr import Sdf, UsdGeom, UsdShade, Vt
+
+    places = np.column_stack([texture.uv[:, 0], 1 - texture.uv[:, 1]]).astype(np.float32)
+    kinds = Sdf.ValueTypeNames
+    coordinates = UsdGeom.PrimvarsAPI(shape).CreatePrimvar("st", kinds.TexCoord2fArray, UsdGeom.Tokens.vertex)
+    coordinates.Set(Vt.Vec2fArray.FromNumpy(places))
+    material = UsdShade.Material.Define(stage, "/shape/film")
+    surface, picture, reader = (
+        UsdShade.Shader.Define(stage, f"/shape/film/{name}") for name in ("surface", "picture", "coordinates")
+    )
+    reader.CreateIdAttr("UsdPrimvarReader_float2")
+    reader.CreateInput("varname", kinds.String).Set("st")
+    picture.CreateIdAttr("UsdUVTexture")
+    picture.CreateInput("file", kinds.Asset).Set(f"./{PICTURE}")
+    picture.CreateInput("sourceColorSpace", kinds.Token).Set("sRGB")
+    for name in ("wrapS", "wrapT"):
+        picture.CreateInput(name, kinds.Token).Set("clamp")
+    found = reader.CreateOutput("result", kinds.Float2)
+    picture.CreateInput("st", kinds.Float2).ConnectToSource(found)
+    surface.CreateIdAttr("UsdPreviewSurface")
+    colour = picture.CreateOutput("rgb", kinds.Float3)
+    surface.CreateInput("diffuseColor", kinds.Color3f).ConnectToSource(colour)
+    surface.CreateInput("roughness", kinds.Float).Set(1.0)
+    material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", kinds.Token))
+    UsdShade.MaterialBindingAPI.Apply(shape.GetPrim()).Bind(material)

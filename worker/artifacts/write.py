@@ -52,7 +52,7 @@ def write_artifacts(
     tell: OnProgress = on_progress or (lambda _: None)
     written: list[Artifact] = []
     told: dict[str, Any] = {}
-    kinds = kinds_for(options)
+    kinds = kinds_for(options, textured=result.texture is not None)
     done, total = 0.0, sum(kind.share for kind in kinds)
     for kind in kinds:
         start, share = done / total, kind.share / total

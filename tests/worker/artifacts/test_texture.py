@@ -117,6 +117,54 @@ def test_ply_has_the_colours_of_the_picture(tmp_path: Path) -> None:
     assert b"colour: the film's template frame" in contents[0]
 
 
+def test_usd_is_a_package_with_material_and_picture(tmp_path: Path) -> None:
+    from pxr import Usd, UsdGeom, UsdShade, UsdValidation
+
+    made = make_result(texture=True, outputs="usd", normals="animated")
+    texture = made[0].texture
+    files = write(tmp_path, made)
+    assert "shapes.usdc" not in files
+    assert {path.name for path in tmp_path.iterdir()} == set(files)
+    with zipfile.ZipFile(files["shapes.usdz"]) as archive:
+        assert archive.namelist() == ["shapes.usdc", "texture.jpg"]
+        assert archive.read("texture.jpg") == texture.jpeg
+    stage = Usd.Stage.Open(str(files["shapes.usdz"]))
+    shape = stage.GetDefaultPrim()
+    np.testing.assert_array_equal(
+        shape.GetAttribute("points").Get(4), upright(made[1].shapes[4], "down").astype(np.float32)
+    )
+    places = UsdGeom.PrimvarsAPI(shape).GetPrimvar("st").Get()
+    np.testing.assert_allclose(places, np.column_stack([texture.uv[:, 0], 1 - texture.uv[:, 1]]), atol=1e-6)
+    material, _ = UsdShade.MaterialBindingAPI(shape).ComputeBoundMaterial()
+    surface, _, _ = material.ComputeSurfaceSource()
+    source = surface.GetInput("diffuseColor").GetConnectedSources()[0][0].source
+    picture = UsdShade.Shader(source.GetPrim()).GetInput("file").Get()
+    assert picture.path == "./texture.jpg"
+    assert picture.resolvedPath.endswith("shapes.usdz[texture.jpg]")
+    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    found = UsdValidation.ValidationContext(validators).Validate(stage)
+    assert [error.GetMessage() for error in found] == []
+
+
+def test_a_package_that_usd_cannot_write_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from pxr import UsdUtils
+
+    monkeypatch.setattr(UsdUtils, "CreateNewUsdzPackage", lambda *_: False)
+    with pytest.raises(OSError, match="could not write the package"):
+        write(tmp_path, make_result(texture=True, outputs="usd"))
+    assert {path.name for path in tmp_path.iterdir()} == {"shapes.npz"}
+
+
+def test_equal_textured_results_are_equal_files(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+    first, second = (
+        write(tmp_path / name, make_result(texture=True, outputs="glb,obj,usd,mdd")) for name in ("a", "b")
+    )
+    for name in set(first) - {"report.json"}:
+        assert first[name].read_bytes() == second[name].read_bytes(), name
+
+
 @pytest.mark.parametrize("y_axis", ["down", "up"])
 def test_mdd_holds_every_frame(tmp_path: Path, y_axis: str) -> None:
     made = make_result(y_axis=y_axis, outputs="mdd", fps=12.5)
