@@ -373,11 +373,36 @@ export interface components {
             method: "pseudo_inverse" | "temporal" | "spatio_temporal" | "robust";
             /**
              * Camera
-             * @description scaled_orthographic estimates one scale per frame (real video); orthographic has none.
-             * @default scaled_orthographic
+             * @description perspective: a pinhole camera. scaled_orthographic: no perspective, one scale per frame. orthographic: no scales. auto: perspective where the tracks are clearly more probable with it, else scaled_orthographic.
+             * @default auto
              * @enum {string}
              */
-            camera: "scaled_orthographic" | "orthographic";
+            camera: "auto" | "perspective" | "scaled_orthographic" | "orthographic";
+            /**
+             * Focal
+             * @description Focal length in pixels of the tracks; null: estimated where the camera is perspective.
+             * @default null
+             */
+            focal: number | null;
+            /**
+             * Field Of View
+             * @description Horizontal angle of view in degrees, instead of focal: focal = width / (2 tan(angle / 2)). Needs image_size.
+             * @default null
+             */
+            field_of_view: number | null;
+            /**
+             * Principal Point
+             * @description Principal point X,Y in pixels, e.g. 319.5,239.5; null: the centre of image_size, or of the tracks without it.
+             * @default null
+             */
+            principal_point: string | null;
+            /**
+             * Surface
+             * @description isometric: a sheet that bends without stretching, such as paper or cloth, seen in perspective. free: no such assumption. auto: isometric where the tracks are those of a sheet and its edge lengths single out a focal length; needs image_size or focal.
+             * @default auto
+             * @enum {string}
+             */
+            surface: "auto" | "isometric" | "free";
             /**
              * Basis Size
              * @description Number K of basis shapes in the factorization that gives the rotations; null: chosen from the data.
@@ -545,7 +570,7 @@ export interface components {
             coordinates: "auto" | "pixels" | "unit" | "signed";
             /**
              * Image Size
-             * @description WIDTHxHEIGHT of the picture in pixels, e.g. 640x480; needed where coordinates are fractions of it.
+             * @description WIDTHxHEIGHT of the picture in pixels, e.g. 640x480; needed where coordinates are fractions of it. Its centre is the principal point of a perspective camera.
              * @default null
              */
             image_size: string | null;
