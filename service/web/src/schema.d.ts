@@ -535,6 +535,13 @@ export interface components {
              */
             colours: "none" | "error" | "expected_error";
             /**
+             * Axes
+             * @description Axes of PLY and OBJ. tracks: those of the tracks, as in shapes.npz. viewer: y up, as in shapes.glb.
+             * @default tracks
+             * @enum {string}
+             */
+            axes: "tracks" | "viewer";
+            /**
              * Glb Quantized
              * @description Write shapes.glb with 16-bit positions (KHR_mesh_quantization): two thirds of the size, and rounded to about a 65,000th of the largest extent.
              * @default false
