@@ -145,6 +145,10 @@ class Options(BaseModel):
         "residual where there is none. expected_error: by the error that the solver expects, in percent of the object's size; only "
         "prior gaussian estimates it. PLY, OBJ and USD are coloured in every frame, shapes.glb by the mean over frames.",
     )
+    axes: Literal["tracks", "viewer"] = Field(
+        "tracks",
+        description="Axes of PLY and OBJ. tracks: those of the tracks, as in shapes.npz. viewer: y up, as in shapes.glb.",
+    )
     glb_quantized: bool = Field(
         False,
         description="Write shapes.glb with 16-bit positions (KHR_mesh_quantization): two thirds of the size, and rounded to about a "

@@ -19,7 +19,7 @@ OnProgress = Callable[[float], None]
 
 
 def write_ply_zip(result: Result, file: IO[bytes], on_progress: OnProgress) -> None:
-    """Binary little-endian PLY of every frame, `frame_00000.ply` …; single precision, axes and unit of the tracks."""
+    """Binary little-endian PLY of every frame, `frame_00000.ply` …; single precision, unit of the tracks."""
     faces = result.faces
     rows = np.zeros(len(faces), dtype=[("count", "u1"), ("index", "<i4", (faces.shape[1],))])
     rows["count"], rows["index"] = faces.shape[1], faces
@@ -48,7 +48,7 @@ def write_ply_zip(result: Result, file: IO[bytes], on_progress: OnProgress) -> N
 
 
 def write_obj_zip(result: Result, file: IO[bytes], on_progress: OnProgress) -> None:
-    """Wavefront OBJ of every frame, `frame_00000.obj` …; nine digits, which is single precision, axes and unit of the tracks.
+    """Wavefront OBJ of every frame, `frame_00000.obj` …; nine digits, which is single precision, unit of the tracks.
 
     Colours, if there are any, stand behind the coordinates, as MeshLab, Blender and Open3D read them. With a texture, the archive also
     holds `shapes.mtl` and `texture.jpg`; v of `vt` points up.
@@ -82,15 +82,17 @@ def _corner(*, textured: bool, moving: bool) -> str:
 
 def _frame(result: Result, frame: int) -> tuple[Floats, Floats | None, Floats | None]:
     """Points, normals and sRGB colours `(P, 3)` of one frame; None for what is not wanted."""
-    points = result.solution.shapes[frame].astype(np.float32).astype(np.float64)
+    shape = result.standing(frame) if result.options.axes == "viewer" else result.solution.shapes[frame]
+    points = shape.astype(np.float32).astype(np.float64)
     moving = result.options.normals == "animated" and len(result.faces) > 0
     normals = vertex_normals(points, triangles_of(result.faces)).astype(np.float64) if moving else None
     return points, normals, result.picture_colours if result.painting is None else result.painting.frame(frame)
 
 
 def _said(result: Result) -> list[str]:
-    depth = "away from" if result.y_axis == "down" else "towards"
-    said = [f"x right, y {result.y_axis}, z {depth} the first camera; unit of the tracks"]
+    y_axis = "up" if result.options.axes == "viewer" else result.y_axis
+    depth = "away from" if y_axis == "down" else "towards"
+    said = [f"x right, y {y_axis}, z {depth} the first camera; unit of the tracks"]
     if result.painting is not None:
         painting = result.painting
         said.append(f"colour: {painting.quantity}, dark at 0, bright at {painting.top:.6g} ({painting.unit}) and above")

@@ -12,10 +12,11 @@ from pliant.worker.films.tracker import Tracked
 from pliant.worker.formats.errors import damaged
 from pliant.worker.formats.reading.arrays import read_file
 from pliant.worker.formats.records import Inputs, Limits, Selection
+from pliant.worker.formats.texture import Texture
 from pliant.worker.formats.tracks.decimation import thin
 from pliant.worker.formats.tracks.selection import hide_seldom_seen
 
-WANTED = frozenset(("tracks", "visibility", "confidence", "grid"))
+WANTED = frozenset(("tracks", "visibility", "confidence", "grid", "template_image", "uv"))
 
 
 def read_tracked(file: Path, tracked: Tracked, options: Options, *, limits: Limits = Limits()) -> Inputs:  # noqa: B008 - frozen
@@ -59,4 +60,5 @@ def read_tracked(file: Path, tracked: Tracked, options: Options, *, limits: Limi
     )  # fmt: skip
     frames = np.arange(checked.num_frames)
     selection = Selection(frames, kept, (len(frames), given))
-    return Inputs(checked, mesh, None, None, stated, selection if selection.narrows else None)
+    texture = Texture.from_tracked(arrays["template_image"], np.clip(arrays["uv"], 0, 1)).at_points(kept)
+    return Inputs(checked, mesh, None, None, stated, selection if selection.narrows else None, texture=texture)

@@ -105,7 +105,7 @@ export interface components {
             hidden_fraction: number;
             /**
              * Mesh Source
-             * @description `given`, `grid`, `delaunay` or `none`.
+             * @description `given`, `grid`, `delaunay`, `film` or `none`.
              */
             mesh_source: string;
             /**
@@ -193,7 +193,7 @@ export interface components {
             hidden_fraction: number;
             /**
              * Mesh Source
-             * @description `given`, `grid`, `delaunay` or `none`.
+             * @description `given`, `grid`, `delaunay`, `film` or `none`.
              */
             mesh_source: string;
             /**
@@ -535,6 +535,13 @@ export interface components {
              */
             colours: "none" | "error" | "expected_error";
             /**
+             * Axes
+             * @description Axes of PLY and OBJ. tracks: those of the tracks, as in shapes.npz. viewer: y up, as in shapes.glb.
+             * @default tracks
+             * @enum {string}
+             */
+            axes: "tracks" | "viewer";
+            /**
              * Glb Quantized
              * @description Write shapes.glb with 16-bit positions (KHR_mesh_quantization): two thirds of the size, and rounded to about a 65,000th of the largest extent.
              * @default false
@@ -612,6 +619,39 @@ export interface components {
              * @default 2
              */
             min_seen: number;
+            /**
+             * Template Frame
+             * @description Of a film: the frame whose points are followed to both ends, counted in the whole film from 0; null: the region's frame, or a sharp one in the middle where no region is given.
+             * @default null
+             */
+            template_frame: number | null;
+            /**
+             * Grid Step
+             * @description Of a film: distance of neighbouring points in the film's pixels; null: so that the region holds about 4,000 points.
+             * @default null
+             */
+            grid_step: number | null;
+            /**
+             * Longest Side
+             * @description Of a film: longest side of the frames that are tracked, pixels; larger films are reduced. Tracks stay in the film's own pixels.
+             * @default 960
+             */
+            longest_side: number;
+            /**
+             * Region Frame
+             * @description Of a film: the frame that the region was drawn on, counted in the whole film from 0.
+             * @default 0
+             */
+            region_frame: number;
+            /**
+             * Region Polygon
+             * @description Of a film: corners [x, y] around what is to be tracked, in the film's pixels, y down, instead of a mask picture; null: the mask, or the whole picture.
+             * @default null
+             */
+            region_polygon: [
+                number,
+                number
+            ][] | null;
         };
         /**
          * Problem
@@ -678,7 +718,7 @@ export interface components {
          * ProblemCode
          * @enum {string}
          */
-        ProblemCode: "bad_request" | "malformed_form" | "no_such_address" | "method_not_allowed" | "body_stalled" | "precondition_failed" | "body_too_large" | "text_too_large" | "unsupported_media_type" | "range_not_satisfiable" | "unknown_host" | "invalid_request" | "unknown_part" | "repeated_part" | "missing_part" | "not_a_file" | "not_utf8" | "name_too_long" | "invalid_limit" | "invalid_cursor" | "invalid_event_id" | "http_error" | "internal_error" | "not_ready" | "conflicting_headers" | "unauthorized" | "invalid_token" | "expired_token" | "insufficient_scope" | "cross_site_request" | "too_many_requests" | "unknown_job" | "unknown_artifact" | "unknown_example" | "not_allowed_now" | "not_finished" | "id_taken" | "idempotency_conflict" | "invalid_id" | "invalid_idempotency_key" | "too_many_queued" | "unknown_option" | "invalid_option" | "output_unavailable" | "invalid_webhook" | "invalid_webhook_secret" | "webhook_not_public" | "artifact_gone" | "timed_out" | "out_of_memory" | "worker_lost" | "storage_failed" | "interrupted" | "stale_attempt" | "store_unavailable" | "storage_full" | "quota_exceeded" | "worker_error" | "unknown_upload" | "upload_incomplete" | "upload_complete" | "upload_offset_mismatch" | "upload_busy" | "upload_taken_over" | "upload_too_large" | "inconsistent_upload_length" | "invalid_digest" | "digest_mismatch" | "too_many_uploads" | "unknown_format" | "empty_file" | "damaged_file" | "pickle_refused" | "object_array" | "unsupported_feature" | "too_large" | "too_slow" | "member_name" | "duplicate_member" | "duplicate_observation" | "missing_array" | "ambiguous_layout" | "ambiguous_coordinates" | "missing_image_size" | "wrong_type" | "wrong_shape" | "out_of_range" | "not_finite" | "too_few_frames" | "too_few_points" | "no_frames_left" | "nothing_visible" | "too_little_seen" | "no_extent" | "vertex_count_mismatch" | "mesh_mismatch" | "index_out_of_range" | "degenerate_face" | "not_a_rotation" | "camera_mismatch" | "invalid_setting" | "data_directory_in_use" | "server_failed" | "unknown_token" | "invalid_token_name" | "invalid_duration" | "no_scope";
+        ProblemCode: "bad_request" | "malformed_form" | "no_such_address" | "method_not_allowed" | "body_stalled" | "precondition_failed" | "body_too_large" | "text_too_large" | "unsupported_media_type" | "range_not_satisfiable" | "unknown_host" | "invalid_request" | "unknown_part" | "repeated_part" | "missing_part" | "conflicting_parts" | "not_a_file" | "not_utf8" | "name_too_long" | "invalid_limit" | "invalid_cursor" | "invalid_event_id" | "http_error" | "internal_error" | "not_ready" | "conflicting_headers" | "unauthorized" | "invalid_token" | "expired_token" | "insufficient_scope" | "cross_site_request" | "too_many_requests" | "unknown_job" | "unknown_artifact" | "unknown_example" | "not_allowed_now" | "not_finished" | "id_taken" | "idempotency_conflict" | "invalid_id" | "invalid_idempotency_key" | "too_many_queued" | "unknown_option" | "invalid_option" | "output_unavailable" | "invalid_webhook" | "invalid_webhook_secret" | "webhook_not_public" | "artifact_gone" | "timed_out" | "out_of_memory" | "worker_lost" | "storage_failed" | "interrupted" | "stale_attempt" | "store_unavailable" | "storage_full" | "quota_exceeded" | "worker_error" | "unknown_upload" | "upload_incomplete" | "upload_complete" | "upload_offset_mismatch" | "upload_busy" | "upload_taken_over" | "upload_too_large" | "inconsistent_upload_length" | "invalid_digest" | "digest_mismatch" | "too_many_uploads" | "unknown_format" | "empty_file" | "damaged_file" | "pickle_refused" | "object_array" | "unsupported_feature" | "too_large" | "too_slow" | "member_name" | "duplicate_member" | "duplicate_observation" | "missing_array" | "film_unavailable" | "unsupported_film" | "unreadable_film" | "empty_film" | "playlist" | "external_reference" | "truncated_film" | "undecodable_film" | "no_picture" | "broken_picture" | "changing_size" | "too_small" | "too_many_streams" | "too_many_pictures" | "too_many_bytes" | "too_many_pixels" | "too_many_frames" | "too_long" | "wrong_selection" | "no_such_frame" | "unreadable_region" | "wrong_region" | "wrong_region_size" | "wrong_polygon" | "empty_region" | "region_lost" | "no_texture" | "tracks_lost" | "unwritable_film" | "stopped" | "ambiguous_layout" | "ambiguous_coordinates" | "missing_image_size" | "wrong_type" | "wrong_shape" | "out_of_range" | "not_finite" | "too_few_frames" | "too_few_points" | "no_frames_left" | "nothing_visible" | "too_little_seen" | "no_extent" | "vertex_count_mismatch" | "mesh_mismatch" | "index_out_of_range" | "degenerate_face" | "not_a_rotation" | "camera_mismatch" | "invalid_setting" | "data_directory_in_use" | "server_failed" | "unknown_token" | "invalid_token_name" | "invalid_duration" | "no_scope";
         /**
          * Progress
          * @description How far a running job is.
@@ -686,7 +726,7 @@ export interface components {
         Progress: {
             /**
              * Stage
-             * @description `loading`, `cameras`, `initialise`, `reweight`, `finish` or `exporting`.
+             * @description `track` (films), `loading`, `cameras`, `initialise`, `reweight`, `finish` or `exporting`.
              */
             stage: string;
             /** Fraction */

@@ -211,6 +211,22 @@ def test_ply_carries_normals_and_colours_of_its_frame(tmp_path: Path) -> None:
     assert b"colour: distance from the truth, dark at 0" in members(files["shapes_ply.zip"])[0]
 
 
+@pytest.mark.parametrize(
+    ("axes", "y_axis", "turned"), [("viewer", "down", True), ("viewer", "up", False), ("tracks", "down", False)]
+)
+def test_meshes_stand_as_the_glb_does_if_wanted(tmp_path: Path, axes: str, y_axis: str, turned: bool) -> None:
+    made = make_result(outputs="ply,obj", axes=axes, y_axis=y_axis)
+    files = write(tmp_path, made)
+    expected = (made[1].shapes[2] * ([1, -1, -1] if turned else [1, 1, 1])).astype(np.float32)
+    vertex = plyfile.PlyData.read(io.BytesIO(members(files["shapes_ply.zip"])[2]))["vertex"]
+    np.testing.assert_array_equal(np.column_stack([vertex[axis] for axis in "xyz"]), expected)
+    lines = members(files["shapes_obj.zip"])[2].decode().splitlines()
+    rows = [line.split()[1:] for line in lines if line.startswith("v ")]
+    np.testing.assert_array_equal(np.array(rows, dtype=np.float32), expected)
+    up = axes == "viewer" or y_axis == "up"
+    assert lines[0].startswith(f"# x right, y {'up' if up else 'down'}, z {'towards' if up else 'away from'}")
+
+
 def test_obj_colours_are_read_by_others(tmp_path: Path) -> None:
     made = make_result(outputs="obj", colours="error", hidden=True)
     inputs, solution, _ = made
