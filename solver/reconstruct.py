@@ -10,7 +10,6 @@ import numpy as np
 from pliant.solver.cameras.camera_choice import with_camera_choice
 from pliant.solver.cameras.depth_rounds import settled
 from pliant.solver.cameras.estimation import CameraEstimate, estimate_cameras, given_cameras
-from pliant.solver.cameras.isometry import IsometricVerdict, isometric_surface
 from pliant.solver.cameras.joint_refinement import LEARNED_FRAMES, informative_frames, learn, learned_frames
 from pliant.solver.cameras.lens import given_lens
 from pliant.solver.cameras.perspective import Perspective, orthographic
@@ -21,6 +20,7 @@ from pliant.solver.energy.problem import Problem
 from pliant.solver.energy.robust_loss import largest_weight
 from pliant.solver.errors import InvalidInput, InvalidSettings
 from pliant.solver.evaluation.trust import assess
+from pliant.solver.isometry.surface import IsometricVerdict, isometric_surface
 from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.monitor import Monitor

@@ -10,9 +10,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from pliant.solver.cameras.isometry import IsometricSurface, IsometricVerdict
 from pliant.solver.evaluation.alignment import procrustes
 from pliant.solver.evaluation.trust import Trust, Verdict, turned
+from pliant.solver.isometry.surface import IsometricSurface, IsometricVerdict
 from pliant.solver.records import Camera, Choices, Floats, Outcome, Solution, Trace, Tracks, read_only
 from pliant.solver.settings import Settings
 

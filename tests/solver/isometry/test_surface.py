@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from pliant.solver import InvalidInput, InvalidSettings, KnownCamera, Outcome, Settings, Tracks, gallery, solve
-from pliant.solver.cameras.inextensible import SurfaceGraph, maximum_depth
-from pliant.solver.cameras.isometric_extension import complete_anchors, flatten, spline
-from pliant.solver.cameras.isometric_refinement import edge_lengths, inconsistency, refine, residuals, typical
-from pliant.solver.cameras.isometry import isometric_surface
-from pliant.solver.cameras.surface_anchors import Anchors, connected, nearest_neighbours
 from pliant.solver.evaluation.metrics import reprojection
+from pliant.solver.isometry.anchors import Anchors, connected, nearest_neighbours
+from pliant.solver.isometry.extension import complete_anchors, flatten, spline
+from pliant.solver.isometry.inextensible import SurfaceGraph, maximum_depth
+from pliant.solver.isometry.refinement import edge_lengths, inconsistency, refine, residuals, typical
+from pliant.solver.isometry.surface import isometric_surface
 from rolled_sheets import CENTRE, FOCAL, SIZE, one_scale_error, rolled
 
 

@@ -1,7 +1,7 @@
 """A sheet that bends without stretching, seen by a pinhole camera: its shapes and, where it is not given, the focal length.
 
-Maximum depth (`inextensible`) gives a start, refinement on the isometry itself (`isometric_refinement`) the depths of some anchors, splines
-(`isometric_extension`) those of all points. The isometric inconsistency I, the share of the edges' length that changes from frame
+Maximum depth (`inextensible`) gives a start, refinement on the isometry itself (`refinement`) the depths of some anchors, splines
+(`extension`) those of all points. The isometric inconsistency I, the share of the edges' length that changes from frame
 to frame, is computed without ground truth. As a function of the focal length it has its minimum at the true one wherever perspective is
 strong enough for the method to work, and is large or flat elsewhere. Isometry is therefore accepted only where I is small and
 clearly smaller than at the neighbouring focal lengths. The order of the frames has no effect.
@@ -14,11 +14,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.solver.cameras.focal_sweep import CLEAR, FocalSearch, Tried, judged, sweep
-from pliant.solver.cameras.inextensible import SurfaceGraph, maximum_depth
-from pliant.solver.cameras.isometric_extension import Extended, complete_anchors, extend, flatten
-from pliant.solver.cameras.isometric_refinement import Isometry, edge_lengths, inconsistency, refine, typical
-from pliant.solver.cameras.surface_anchors import Anchors, choose_anchors, connected, nearest_neighbours, unlike_frames
+from pliant.solver.isometry.anchors import Anchors, choose_anchors, connected, nearest_neighbours, unlike_frames
+from pliant.solver.isometry.extension import Extended, complete_anchors, extend, flatten
+from pliant.solver.isometry.focal_sweep import CLEAR, FocalSearch, Tried, judged, sweep
+from pliant.solver.isometry.inextensible import SurfaceGraph, maximum_depth
+from pliant.solver.isometry.refinement import Isometry, edge_lengths, inconsistency, refine, typical
 from pliant.solver.records import Floats, Tracks
 
 ANCHORS = 60

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from pliant.solver.cameras.inextensible import SurfaceGraph
+from pliant.solver.isometry.inextensible import SurfaceGraph
 from pliant.solver.records import Floats
 from scipy import sparse
 from scipy.sparse.linalg import LinearOperator, cg, splu

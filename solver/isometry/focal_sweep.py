@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.solver.cameras.inextensible import SurfaceGraph, maximum_depth
-from pliant.solver.cameras.isometric_refinement import Isometry, refine
-from pliant.solver.cameras.surface_anchors import Anchors
+from pliant.solver.isometry.anchors import Anchors
+from pliant.solver.isometry.inextensible import SurfaceGraph, maximum_depth
+from pliant.solver.isometry.refinement import Isometry, refine
 from pliant.solver.records import Floats
 
 SMALL = 0.012

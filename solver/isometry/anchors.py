@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.solver.cameras.inextensible import Indices
+from pliant.solver.isometry.inextensible import Indices
 from pliant.solver.records import Floats
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
