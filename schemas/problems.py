@@ -397,6 +397,12 @@ class ProblemCode(StrEnum):
     TRACKS_LOST = ("tracks_lost", 422, "Tracks lost",
      "Too few points stay visible through the film.",
      "Film more slowly and with more light.")
+    OUTSIDE_PICTURE = ("outside_picture", 422, "Outside the picture",
+     "Half or more of the visible observations lie outside `image_size`.",
+     "Correct `image_size`, or leave it out where tracks are not in pixels from the picture's corner.")
+    PRINCIPAL_POINT_FAR = ("principal_point_far", 422, "Principal point too far",
+     "`principal_point`, or the centre of `image_size`, lies far from all tracks.",
+     "Give x and y in the unit and axes of the tracks.")
     UNWRITABLE_FILM = ("unwritable_film", None, "Film cannot be written",
      "`pliant.tracking.rendering` could not write a film to the given path.",
      "Check the folder and its permissions.")

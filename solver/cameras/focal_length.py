@@ -56,6 +56,10 @@ GAIN = 0.02
 """Likelihood per point and frame, as a logarithm, by which perspective must be more probable than orthography, and one sign of depth than
 the other. Equal κ from different starts differ by up to .01."""
 
+DECISIVE = 10.0
+"""Likelihood of all observations together, as a logarithm, by which perspective must be more probable: few observations are no evidence.
+Kass and Raftery (1995), Bayes factors, call 5 very strong."""
+
 WRONG = 1.6
 """A given focal length is compared with ones that are longer and shorter by this factor."""
 
@@ -217,7 +221,7 @@ def _decided(view: Perspective, trials: dict[float, _Trial], frames: int, points
     nll = trials[best].nll
     opposite = min((each.nll for each in candidates if each.curvature * best < 0), default=np.inf)
     settled = len(view.signs) == 1 or bool(np.isfinite(opposite) and opposite - nll > GAIN)
-    needed = trials[0.0].nll - nll > GAIN and settled
+    needed = trials[0.0].nll - nll > max(GAIN, DECISIVE / (frames * points)) and settled
     if not (needed or view.required or view.given is not None):
         return replace(view, curvature=0.0, candidates=candidates)
     std, found = 0.0, _around(trials)

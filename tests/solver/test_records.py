@@ -168,7 +168,7 @@ class TestSettings:
         "wrong",
         [
             {"method": "magic"},
-            {"camera": "perspective"},
+            {"camera": "fisheye"},
             {"preset": "best"},
             {"loss": "l3"},
             {"laplacian": "none"},
