@@ -65,21 +65,11 @@ def films(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
 def filming(page: Page, url: str, finished: str) -> Page:
     """The front page of a service that tracks films; jobs are answered with a record instead of being made."""
     page.add_init_script(f"({KEEP_SENT})()")
-    page.route(f"{url}/", with_films_allowed)
     page.route("**/v1/options", with_film_options)
     page.route("**/v1/inspect", lambda route: route.fulfill(json=film_record(url, finished)["interpretation"]))
     page.goto(url)
     page.get_by_text("Drop a film here").wait_for()
     return page
-
-
-def with_films_allowed(route: Route) -> None:
-    """Serve the page with a policy that lets it decode a chosen film, which has an address of the scheme blob:."""
-    answer = route.fetch()
-    policy = answer.headers["content-security-policy"]
-    if "media-src" not in policy:
-        policy = f"{policy}; media-src 'self' blob:"
-    route.fulfill(response=answer, headers={**answer.headers, "content-security-policy": policy})
 
 
 def with_film_options(route: Route) -> None:
