@@ -59,6 +59,10 @@ def words(ran: Result) -> str:
 
 NO_FILE = "expected a file, an array or a dictionary of arrays, got no file at"
 A_FOLDER = "tracks: expected a file, got the folder FOLDER. Give the path of a file in it."
+NO_PICTURES = (
+    "film: expected pictures (.png, .jpg, .jpeg, .webp, .bmp), got none in folder. "
+    "Export the film's frames as PNG or JPEG, numbered in order."
+)
 A_FILE = "--output: expected a folder, got the file TRACKS. Choose another folder."
 LISTED = "`pliant options` lists every option."
 
@@ -67,8 +71,8 @@ LISTED = "`pliant options` lists every option."
     ("arguments", "sentence"),
     [
         ("solve nofile.npz -o OUT", f"tracks: {NO_FILE} nofile.npz."),
-        ("solve FOLDER -o OUT", A_FOLDER),
-        ("submit FOLDER", A_FOLDER),
+        ("solve FOLDER -o OUT", NO_PICTURES),
+        ("submit FOLDER", A_FOLDER.replace("tracks:", "film:")),
         ("inspect FOLDER", A_FOLDER),
         ("inspect TRACKS -g none.npz", f"ground_truth: {NO_FILE} none.npz."),
         ("solve TRACKS -o TRACKS", A_FILE),

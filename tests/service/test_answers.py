@@ -17,6 +17,7 @@ from pliant.service.app import STATUS_OF
 from pliant.service.settings import MB, InvalidServiceSetting, ServiceSettings
 from pliant.service.spool import Incoming
 from pliant.worker import errors
+from pliant.worker.records import utc_now
 from serving import Running, Serve, finish, settings_from, submit, until
 
 CONTENTS = os.urandom(3_000_000)
@@ -72,7 +73,7 @@ def test_a_file_that_is_deleted_meanwhile_is_gone(
     monkeypatch.setattr("pliant.worker.store.blobs.Blobs.get", lambda *_: stored)
     answer = http.get(address)
     assert (answer.status_code, answer.json()["code"]) == (410, "artifact_gone")
-    running.jobs.records.delete(job.id)
+    running.jobs.records.delete(job.id, at=utc_now())
     answer = http.get(address)
     assert (answer.status_code, answer.json()["code"]) == (404, "unknown_job")
 
