@@ -50,7 +50,10 @@ def solve(
     ctx.obj.json = as_json
     check_inputs(None if tracks.is_dir() else tracks, ground_truth, rotations)
     input_file(region, "region")
+    missing = not output.exists()
     output_folder(output, force=force)
+    if missing:  # made again when there are results: inputs that are refused leave no folder behind
+        output.rmdir()
     from pliant.worker.settings import NUMERICAL_THREADS
 
     # Read by the numerical libraries when they are imported, below; the solver has its own threads.

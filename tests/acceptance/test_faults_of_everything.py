@@ -13,7 +13,10 @@ from typing import Any
 
 import pytest
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="finds processes in /proc")
+pytestmark = [
+    pytest.mark.skipif(sys.platform != "linux", reason="finds processes in /proc"),
+    pytest.mark.slow,
+]
 
 WANTED = (
     "job_process_writing", "job_process_storing", "valkey_down", "api_uploading", "api_receiving", "api_waiting", "api_downloading",

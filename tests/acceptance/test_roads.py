@@ -20,6 +20,8 @@ from pliant.worker.jobs.service import Jobs
 from pliant.worker.processes.valkey import Valkey
 from pliant.worker.settings import Settings
 
+pytestmark = pytest.mark.slow
+
 ENVIRONMENT = {name: value for name, value in os.environ.items() if not name.startswith("PLIANT_")}
 
 
@@ -183,7 +185,7 @@ def test_up_stops_all_it_started_on_one_signal_and_refuses_a_second_one(tmp_path
         port = url.rpartition(":")[2]
         busy = pliant("up", "--port", port, "--data", "other", folder=tmp_path)
         assert busy.returncode == 3
-        assert "--port 0 takes a free port" in busy.stderr
+        assert "--port 0 takes a free one" in busy.stderr
         twice = pliant("up", "--port", "0", "--data", tmp_path / "one" / "data", folder=tmp_path)
         assert twice.returncode == 6
         assert "already used" in twice.stderr
@@ -230,7 +232,7 @@ def test_the_doctor_audits_what_is_stored(tmp_path: Path) -> None:
     valkey = Valkey.claim(data)
     server = valkey.start()
     try:
-        assert audit() == (0, [("good", "everything stored is as the records say")])
+        assert audit() == (0, [("good", "everything stored matches the records")])
         (data / "incoming" / "dead").mkdir(parents=True)
         (data / "incoming" / "dead.lock").touch()
         (data / "uploads" / "somebody" / "half").mkdir(parents=True)
@@ -238,7 +240,7 @@ def test_the_doctor_audits_what_is_stored(tmp_path: Path) -> None:
         assert code == 8
         assert found == [
             ("bad", "Upload half holds nothing, not one file."),
-            ("bad", "Folder incoming/dead belongs to a process that is gone."),
+            ("bad", "Folder incoming/dead belongs to a process that has ended."),
         ]
     finally:
         server.terminate()

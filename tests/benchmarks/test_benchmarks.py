@@ -16,6 +16,8 @@ from pliant.solver import KnownCamera, Mesh, Settings, solve
 from pliant.solver.gallery import corrupt, face, sphere
 from pliant.solver.tracks.normalization import normalize
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parent.parent.parent
 
 

@@ -169,10 +169,10 @@ def test_jobs_are_named_by_prefix_or_as_the_last_one(run: Run, tracks: Path) -> 
 
 def test_the_id_is_printed_before_waiting(run: Run, tracks: Path, service: InMemoryService) -> None:
     service.worker.steps = math.inf
-    ran = run("submit", tracks, "-m", "none", "--id", "early", "--wait", "--timeout", "0.5")
+    ran = run("submit", tracks, "-m", "none", "--id", "early", "--wait", "--timeout", "3")
     assert ran.exit_code == Exit.TIMEOUT
     assert words(ran).startswith("Job early")
-    assert "The timeout of 0.5 s passed during the wait for job early" in words(ran)
+    assert "The timeout of 3 s passed during the wait for job early" in words(ran)
     run("cancel", "early")
 
 

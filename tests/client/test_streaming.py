@@ -43,7 +43,7 @@ class Sink(httpx.BaseTransport, httpx.AsyncBaseTransport):
         self.received = 0
         self.largest = 0
         fake = Client("http://pliant.test", transport=InMemoryService())
-        self.job = fake.submit([[[0, 0]] * 9] * 4).record.model_dump_json()
+        self.job = fake.submit([[[10 * point, point**2] for point in range(9)]] * 4).record.model_dump_json()
 
     def take(self, piece: bytes) -> None:
         self.received += len(piece)

@@ -108,11 +108,6 @@ def test_a_crafted_file_is_refused_and_costs_nothing(house: House, attack: Attac
     assert len(house.http.get("/v1/jobs").json()["jobs"]) == jobs
 
 
-def test_the_table_names_every_attack() -> None:
-    text = DOCUMENT.read_text(encoding="utf-8")
-    assert [attack.name for attack in ATTACKS if f"| {attack.name} | {attack.what} |" not in text] == []
-
-
 def table(house: House) -> str:
     rows = [
         "| attack | what it is | part | bytes | answer | code | seconds | service grew by | child's peak |",

@@ -7,6 +7,8 @@ import pytest
 from pliant.solver import InvalidInput, KnownCamera, Mesh, Settings, Solution, Tracks, gallery, solve
 from pliant.solver.evaluation import metrics
 
+pytestmark = pytest.mark.slow
+
 METHODS = ("pseudo_inverse", "temporal", "spatio_temporal", "robust")
 MADE = gallery.face(12, 120, degrees=45, mesh="triangles")
 CAMERAS = KnownCamera.from_arrays(MADE.rotations, MADE.scales)

@@ -13,6 +13,8 @@ import pytest
 from pliant.solver import Camera, KnownCamera, Mesh, Settings, Solution, Tracks, gallery, solve
 from pliant.solver.evaluation import metrics
 
+pytestmark = pytest.mark.slow
+
 CLOSE = 2e-4
 """Relative difference that conjugate gradients, stopped at a reduction and not at the exact answer, may leave."""
 

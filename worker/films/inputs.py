@@ -16,7 +16,8 @@ from pliant.worker.formats.texture import Texture
 from pliant.worker.formats.tracks.decimation import thin
 from pliant.worker.formats.tracks.selection import hide_seldom_seen
 
-WANTED = frozenset(("tracks", "visibility", "confidence", "grid", "template_image", "uv"))
+NEEDED = frozenset(("tracks", "visibility", "confidence", "grid"))
+PICTURE = frozenset(("template_image", "uv"))
 
 
 def read_tracked(file: Path, tracked: Tracked, options: Options, *, limits: Limits = Limits()) -> Inputs:  # noqa: B008 - frozen
@@ -38,8 +39,8 @@ def read_tracked(file: Path, tracked: Tracked, options: Options, *, limits: Limi
     InvalidInput
         The arrays do not fit together, or an option leaves too few points.
     """
-    arrays = read_file(file, field="film", limits=limits, wanted=WANTED)
-    if set(arrays) < WANTED or arrays["tracks"].shape[:2] != arrays["confidence"].shape:
+    arrays = read_file(file, field="film", limits=limits, wanted=NEEDED | PICTURE)
+    if not set(arrays) >= NEEDED or arrays["tracks"].shape[:2] != arrays["confidence"].shape:
         raise damaged("film", "tracks without confidence or grid")
     points = arrays["tracks"].astype(np.float64)
     visible = np.where(arrays["visibility"].astype(bool), arrays["confidence"], 0).astype(np.float64)
@@ -60,5 +61,7 @@ def read_tracked(file: Path, tracked: Tracked, options: Options, *, limits: Limi
     )  # fmt: skip
     frames = np.arange(checked.num_frames)
     selection = Selection(frames, kept, (len(frames), given))
-    texture = Texture.from_tracked(arrays["template_image"], np.clip(arrays["uv"], 0, 1)).at_points(kept)
+    texture = None
+    if set(arrays) >= PICTURE:
+        texture = Texture.from_tracked(arrays["template_image"], np.clip(arrays["uv"], 0, 1)).at_points(kept)
     return Inputs(checked, mesh, None, None, stated, selection if selection.narrows else None, texture=texture)

@@ -19,6 +19,8 @@ from pliant.worker.formats.records import Arrays
 from track_files import COLUMNS, FORMATS, ROWS, Written
 from typer.testing import CliRunner
 
+pytestmark = pytest.mark.slow
+
 DOCUMENT = Path(__file__).parents[3] / "docs" / "reference" / "formats.md"
 MESH = f"{ROWS}x{COLUMNS}"
 QUICK = {"method": "temporal", "refine_rotations": False, "basis_size": 1, "y_axis": "down"}
