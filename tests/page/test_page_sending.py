@@ -141,5 +141,5 @@ def test_where_two_readings_fit_a_click_chooses_one(page: Page, url: str) -> Non
 
 def test_sending_nothing_says_what_is_missing(page: Page) -> None:
     page.get_by_role("button", name="Reconstruct").click()
-    expect(page.get_by_text("Choose a track file first")).to_be_visible()
+    expect(page.get_by_text("Choose a film or track file first")).to_be_visible()
     expect(page.get_by_label("Tracks", exact=True)).to_be_focused()
