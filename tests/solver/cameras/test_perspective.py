@@ -167,7 +167,7 @@ def test_tracks_with_y_up_are_the_same_scene_in_other_axes(close: Solution) -> N
 @pytest.mark.slow
 def test_a_principal_point_off_centre_is_used() -> None:
     corner = np.array([200.0, 650.0])
-    views = pinhole([*SEEN, 150.0, -200.0, 0.0], FOCAL, corner)
+    views = pinhole(SEEN + np.array([150.0, -200.0, 0.0]), FOCAL, corner)
     found = solve(views, settings=Settings(camera="perspective", focal=FOCAL, principal_point=(200.0, 650.0)))
     assert e3d_frame_scaled(found.shapes, SEEN) < 0.03
     assert reprojection(views, found).rms < 1.0
