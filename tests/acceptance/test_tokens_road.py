@@ -195,10 +195,10 @@ def test_the_page_asks_for_the_token_and_shows_its_jobs(url: str, first: dict[st
         page.goto(f"{url}/#job=paged")
         expect(page.get_by_role("alert").first).to_contain_text("requires a token", timeout=20_000)
         page.get_by_label("Token").fill("nonsense")
-        page.get_by_role("button", name="Use it").click()
-        expect(page.get_by_role("alert").first).to_contain_text("not known here")
+        page.get_by_role("button", name="Use", exact=True).click()
+        expect(page.get_by_role("alert").first).to_contain_text("not known")
         page.get_by_label("Token").fill(first["token"])
-        page.get_by_role("button", name="Use it").click()
+        page.get_by_role("button", name="Use", exact=True).click()
         expect(page.get_by_role("alert")).to_have_count(0, timeout=20_000)
         expect(page.get_by_text("seen in the page").first).to_be_visible(timeout=20_000)
         page.locator(".view canvas").wait_for(timeout=20_000)
@@ -207,7 +207,7 @@ def test_the_page_asks_for_the_token_and_shows_its_jobs(url: str, first: dict[st
         assert "metrics" in json.loads(Path(download.value.path()).read_text())
         page.get_by_text("New reconstruction").click()
         page.get_by_role("button", name="waving flag").click()
-        expect(page.get_by_role("region", name="How your files are understood")).to_contain_text(
+        expect(page.get_by_role("region", name="How your files are interpreted")).to_contain_text(
             "30 frames", timeout=20_000
         )
         with Client(url, token=first["token"]) as client:
