@@ -173,7 +173,7 @@ def _carry(run: _Run, mask: Bools, origin: int, template: int) -> Bools:
 
 
 def _track(run: _Run, found: Survey, plan: _Plan, step: float | None, *, whole: bool) -> TrackedFilm:
-    """Seed, chain, drop what is seldom seen, and assemble the result."""
+    """Seed, chain, drop points visible in few frames, and assemble the result."""
     template = run.store.read(plan.template)
     seeds, rough = place(template, plan.mask, step=step or default_step(plan.mask))
     if len(seeds.points) < LEAST_POINTS:

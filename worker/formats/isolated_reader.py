@@ -1,6 +1,6 @@
 """The isolated reader: read large inputs in a separate process, so that the server's memory does not grow.
 
-Checking and converting a gigabyte of tracks takes several gigabytes, freed memory seldom returns to the system, and a crafted file may
+Checking and converting a gigabyte of tracks takes several gigabytes, freed memory rarely returns to the system, and a crafted file may
 declare a hundred times its size. Inputs that declare more than `LARGE` bytes are therefore read, checked and stored by a process with
 limits of its own; the server gets the interpretation or the refusal. Smaller inputs are read in the server.
 """
