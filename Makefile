@@ -5,6 +5,8 @@ BIN := $(VENV)/bin
 RUNS := $(VENV)/.demo
 STAMP := $(VENV)/.installed
 
+GENERATOR := $(VENV)/generator
+
 PAGE := service/web/dist/index.html
 PAGE_SOURCES := $(wildcard service/web/*.json service/web/*.mjs service/web/src/* service/web/src/*/*)
 
@@ -34,6 +36,11 @@ $(RUNS): pyproject.toml constraints.txt
 $(STAMP): $(RUNS)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test,check]'
 	touch $@
+
+# openapi-python-client wants another Typer than the command line does, hence an environment of its own.
+$(GENERATOR): | $(STAMP)
+	$(PYTHON) -m venv $@
+	$@/bin/python -m pip install --quiet --disable-pip-version-check openapi-python-client
 
 # The web page needs Node.js: the machine's own, else the one from PyPI. Without a page everything else still works.
 $(PAGE): $(PAGE_SOURCES) | $(RUNS)

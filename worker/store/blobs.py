@@ -106,7 +106,8 @@ class Blobs:
             if url.startswith("file:"):
                 store = from_url(url, mkdir=True, automatic_cleanup=True)
                 return cls(store, directory=Path(unquote(urlsplit(url).path)))
-            return cls(from_url(url, client_options=CLIENT, retry_config=RETRIES), remote=True)
+            options = {**CLIENT, "allow_http": _plain_http()}
+            return cls(from_url(url, client_options=options, retry_config=RETRIES), remote=True)
 
     def put(self, key: str, file: Path) -> int:
         """Store a file whole or not at all; return its size in bytes.
@@ -195,6 +196,11 @@ class Blobs:
                 return call()
 
         return answered() if self._calls is None else self._calls.run(answered, seconds=seconds)
+
+
+def _plain_http() -> bool:
+    """Whether `AWS_ALLOW_HTTP` allows an endpoint without TLS: obstore does not read it beside client options."""
+    return os.environ.get("AWS_ALLOW_HTTP", "").strip().lower() in ("1", "t", "true", "yes", "on")
 
 
 def _linked(source: Path, target: Path) -> bool:

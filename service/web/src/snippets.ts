@@ -25,7 +25,7 @@ export class Snippets {
       { class: "panel", "aria-labelledby": "snippet-title" },
       h("h3", { id: "snippet-title" }, "Use from code"),
       h("div", { class: "row", role: "group", "aria-label": "Language" }, ...this.tabs, copy, this.copied),
-      h("pre", { tabindex: 0, "aria-label": "Code" }, this.code),
+      h("pre", { tabindex: 0, role: "region", "aria-label": "Code" }, this.code),
     );
   }
 

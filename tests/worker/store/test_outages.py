@@ -94,7 +94,7 @@ def test_jobs_run_on_a_redis_with_a_password_and_on_s3(
             assert (blob.size, digest.hexdigest()) == (artifact.bytes, artifact.sha256)
         for pid in house.supervisor.pids().values():
             assert password.encode() not in Path(f"/proc/{pid}/cmdline").read_bytes(), "anybody may read a command line"
-        assert not (tmp_path / "blobs").exists()
+        assert list((tmp_path / "blobs").rglob("*")) == [], "nothing is stored on this machine"
         settled(house)
         house.jobs.delete(job.id)
         assert house.jobs.blobs.list() == []
