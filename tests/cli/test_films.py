@@ -71,7 +71,13 @@ def test_inspect_describes_a_film(film: Path, tmp_path: Path) -> None:
     everything = json.loads(inspect(film, "--json").stdout)
     assert 0 < facts["points"] < 0.5 * everything["points"]
     words = " ".join(inspect(films.turned_by_90(copied(film, tmp_path)), "-O", "frames=::2").output.split())
-    for each in ("size 72×96 pixels", "frames 5 of 10", "rate 15 frames a second", "rotation 90°, applied", "tracking about"):
+    for each in (
+        "size 72×96 pixels",
+        "frames 5 of 10",
+        "rate 15 frames a second",
+        "rotation 90°, applied",
+        "tracking about",
+    ):
         assert each in words
     refused = inspect(film, "--mesh", "3x4")
     assert refused.exit_code == Exit.REFUSED

@@ -81,7 +81,12 @@ def test_points_without_a_mesh_stay_points(tmp_path: Path) -> None:
 def test_equal_results_are_equal_files(tmp_path: Path) -> None:
     first, second = (write(tmp_path / name, make_result(texture=True, outputs="abc")) for name in ("a", "b"))
     assert first.read_bytes() == second.read_bytes()
-    assert sorted(path.name for path in first.parent.iterdir()) == ["preview.bin", "report.json", "shapes.abc", "shapes.npz"]
+    assert sorted(path.name for path in first.parent.iterdir()) == [
+        "preview.bin",
+        "report.json",
+        "shapes.abc",
+        "shapes.npz",
+    ]
 
 
 def test_without_the_package_it_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
