@@ -134,7 +134,7 @@ def test_the_job_of_a_killed_worker_is_done_by_another(house: House) -> None:
     os.kill(worker, signal.SIGKILL)
     house.until(lambda: not running(job_process), "the job process dies with its worker")
     house.until(lambda: house.jobs.get(id).attempt == 2, "another worker begins it", seconds=30)
-    assert "Lost its worker" in house.jobs.log(id)
+    assert "The worker was lost" in house.jobs.log(id)
     house.jobs.cancel(id)
     assert house.final(id).status is Status.CANCELLED
 
