@@ -68,7 +68,7 @@ class Painting:
         colours[count == 0] = UNKNOWN
         return colours
 
-    def said(self) -> dict[str, Any]:
+    def legend(self) -> dict[str, Any]:
         """Say for the report and the files what the colours mean."""
         scale = ["#" + text for text in SCALE]
         return {"colours": {"quantity": self.quantity, "unit": self.unit, "top": self.top, "scale": scale}}

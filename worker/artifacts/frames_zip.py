@@ -38,7 +38,7 @@ def write_ply_zip(result: Result, file: IO[bytes], on_progress: OnProgress) -> N
         for _, name, column in fields:
             table[name] = column
         head = [
-            "ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in _said(result)),
+            "ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in _header_lines(result)),
             f"element vertex {len(points)}", *(f"property {kind} {name}" for kind, name, _ in fields),
             f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header\n",
         ]  # fmt: skip
@@ -54,7 +54,7 @@ def write_obj_zip(result: Result, file: IO[bytes], on_progress: OnProgress) -> N
     holds `shapes.mtl` and `texture.jpg`; v of `vt` points up.
     """
     texture = result.texture
-    head = "".join(f"# {line}\n" for line in _said(result)) + (MATERIAL_HEAD if texture is not None else "")
+    head = "".join(f"# {line}\n" for line in _header_lines(result)) + (MATERIAL_HEAD if texture is not None else "")
     moving = result.options.normals == "animated" and len(result.faces) > 0
     places = "" if texture is None else _lines("vt", np.column_stack([texture.uv[:, 0], 1 - texture.uv[:, 1]]), "%.6f")
     corner = _corner(textured=texture is not None, moving=moving)
@@ -89,16 +89,18 @@ def _frame(result: Result, frame: int) -> tuple[Floats, Floats | None, Floats | 
     return points, normals, result.picture_colours if result.painting is None else result.painting.frame(frame)
 
 
-def _said(result: Result) -> list[str]:
+def _header_lines(result: Result) -> list[str]:
     y_axis = "up" if result.options.axes == "viewer" else result.y_axis
     depth = "away from" if y_axis == "down" else "towards"
-    said = [f"x right, y {y_axis}, z {depth} the first camera; unit of the tracks"]
+    lines = [f"x right, y {y_axis}, z {depth} the first camera; unit of the tracks"]
     if result.painting is not None:
         painting = result.painting
-        said.append(f"colour: {painting.quantity}, dark at 0, bright at {painting.top:.6g} ({painting.unit}) and above")
+        lines.append(
+            f"colour: {painting.quantity}, dark at 0, bright at {painting.top:.6g} ({painting.unit}) and above"
+        )
     elif result.picture_colours is not None:
-        said.append("colour: the film's template frame")
-    return said
+        lines.append("colour: the film's template frame")
+    return lines
 
 
 def _lines(word: str, rows: Floats, number: str) -> str:

@@ -106,7 +106,7 @@ def _glb(result: Result, file: IO[bytes], on_progress: OnProgress) -> dict[str, 
     animation = animate(shapes, y_axis=result.y_axis)
     colours = None
     if painted is not None:
-        animation.extras.update(painted.said())
+        animation.extras.update(painted.legend())
         colours = _rgba(painted.mean())
     elif result.texture is None and result.picture_colours is not None:
         colours = _rgba(result.picture_colours)
@@ -128,7 +128,7 @@ def _rgba(colours: Floats) -> NDArray[np.uint16]:
 def _painted(write: Callable[[Result, IO[bytes], OnProgress], None]) -> Callable[..., dict[str, Any]]:
     def written(result: Result, file: IO[bytes], on_progress: OnProgress) -> dict[str, Any]:
         write(result, file, on_progress)
-        return {} if result.painting is None else result.painting.said()
+        return {} if result.painting is None else result.painting.legend()
 
     return written
 

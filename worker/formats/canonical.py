@@ -79,8 +79,10 @@ def load_inputs(path: Path) -> Inputs:
     if "source_frames" in arrays:
         frames, kept = (arrays[name].astype(np.intp) for name in ("source_frames", "source_points"))
         selection = Selection(frames, kept, (int(arrays["source_whole"][0]), int(arrays["source_whole"][1])))
-    told = Interpretation.model_validate(json.loads(arrays["interpretation"].tobytes()))
-    return Inputs(Tracks(points, _wide(arrays["visible"])), mesh, truth, cameras, told, selection, _texture(arrays))
+    interpretation = Interpretation.model_validate(json.loads(arrays["interpretation"].tobytes()))
+    return Inputs(
+        Tracks(points, _wide(arrays["visible"])), mesh, truth, cameras, interpretation, selection, _texture(arrays)
+    )
 
 
 def _texture(arrays: Arrays) -> Texture | None:

@@ -18,7 +18,7 @@ from pliant.worker.formats.reading.containers import read_arrays
 from pliant.worker.formats.records import FARTHEST, GroundTruth, Inputs, Limits, Selection
 from pliant.worker.formats.tracks.decimation import thin
 from pliant.worker.formats.tracks.interpretation import Understood, understand
-from pliant.worker.formats.tracks.selection import chosen_frames, hide_seldom_seen
+from pliant.worker.formats.tracks.selection import chosen_frames, hide_sparsely_observed
 from pliant.worker.formats.tracks.tracker_formats import KNOWN
 
 LISTED = 1000
@@ -65,7 +65,7 @@ def read_inputs(
         frames = chosen.selection.frames
         cameras = read_rotations(rotations, num_frames=len(understood.points), frames=frames, limits=limits)
     checked = chosen.tracks
-    told = Interpretation(
+    interpretation = Interpretation(
         num_frames=checked.num_frames, num_points=checked.num_points,
         num_faces=0 if chosen.mesh is None else len(chosen.mesh.faces),
         hidden_fraction=float((checked.visible == 0).mean()),
@@ -75,7 +75,9 @@ def read_inputs(
         num_left_out=len(chosen.left_out), left_out_points=chosen.left_out[:LISTED].tolist(),
         notes=[*understood.notes, *chosen.notes, *truth_notes],
     )  # fmt: skip
-    return Inputs(checked, chosen.mesh, truth, cameras, told, chosen.selection if chosen.selection.narrows else None)
+    return Inputs(
+        checked, chosen.mesh, truth, cameras, interpretation, chosen.selection if chosen.selection.narrows else None
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,11 +114,11 @@ def _choose(understood: Understood, mesh: Path | str | None, options: Options, l
     if source == "delaunay":
         made, more = triangulate(Tracks.from_arrays(points, visible), y_axis=understood.y_axis)
         source = "none" if made is None else source
-    confidence, left_out, seldom = hide_seldom_seen(points, visible, made, options)
+    confidence, left_out, sparse = hide_sparsely_observed(points, visible, made, options)
     checked = Tracks.from_arrays(points, confidence)
     _check_extent(checked)
     selection = Selection(frames, picked[kept], whole)
-    notes += [*surface.notes, *how, *_hidden_notes(checked), *seldom, *more]
+    notes += [*surface.notes, *how, *_hidden_notes(checked), *sparse, *more]
     return _Chosen(checked, made, source, whole_grid(surface), selection, left_out, notes)
 
 

@@ -136,7 +136,7 @@ def choose(
     AmbiguousInput
         When several do.
     """
-    allowed = [one for one in readings(name, array) if _asked_for(one, options)]
+    allowed = [one for one in readings(name, array) if _is_allowed(one, options)]
     if not allowed:
         raise refusal(
             "wrong_shape", field, expected="(frames, points, 2) or a matrix of 2·frames rows, with 3 frames and 4 points or more",
@@ -162,7 +162,7 @@ def choose(
     )  # fmt: skip
 
 
-def _asked_for(reading: Reading, options: Options) -> bool:
+def _is_allowed(reading: Reading, options: Options) -> bool:
     return options.layout in ("auto", reading.order) and (
         reading.rows is None or options.rows in ("auto", reading.rows)
     )

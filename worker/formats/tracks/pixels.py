@@ -146,11 +146,11 @@ def _kind(sample: NDArray[np.float64], options: Options, size: tuple[int, int] |
     if not len(sample) or not (np.ptp(sample, axis=0) > 0).any():
         return "pixels", []
     low, high = sample.min(axis=0), sample.max(axis=0)
-    said = f"values from {low.min():.3g} to {high.max():.3g}"
+    observed = f"values from {low.min():.3g} to {high.max():.3g}"
     if low.min() >= -1 and high.max() <= 2 and _inside(sample, 0.0, 1.0) >= MOST:
         if size is None:
-            raise _fractions_or_not(said)
-        return "unit", [f"Coordinates are fractions of the picture: {said}."]
+            raise _fractions_or_not(observed)
+        return "unit", [f"Coordinates are fractions of the picture: {observed}."]
     if (
         size is not None
         and min(size) > 4
@@ -158,7 +158,7 @@ def _kind(sample: NDArray[np.float64], options: Options, size: tuple[int, int] |
         and high.max() <= 3
         and _inside(sample, -1.0, 1.0) >= MOST
     ):
-        return "signed", [f"Coordinates run from −1 to 1 over the picture: {said}."]
+        return "signed", [f"Coordinates run from −1 to 1 over the picture: {observed}."]
     return "pixels", []
 
 
@@ -166,15 +166,15 @@ def _inside(sample: NDArray[np.float64], low: float, high: float) -> float:
     return float(((sample >= low - SLACK) & (sample <= high + SLACK)).all(axis=1).mean())
 
 
-def _fractions_or_not(said: str) -> AmbiguousInput:
+def _fractions_or_not(observed: str) -> AmbiguousInput:
     choices: list[dict[str, Any]] = [
         {
             "layout": "fractions of the picture's width and height", "options": {"coordinates": "unit"},
-            "evidence": f"{said}; give image_size=WIDTHxHEIGHT too",
+            "evidence": f"{observed}; give image_size=WIDTHxHEIGHT too",
         },
-        {"layout": "one unit for x and y, taken as it is", "options": {"coordinates": "pixels"}, "evidence": said},
+        {"layout": "one unit for x and y, taken as it is", "options": {"coordinates": "pixels"}, "evidence": observed},
     ]  # fmt: skip
     return AmbiguousInput(
-        code="ambiguous_coordinates", field="tracks", expected="coordinates whose unit is certain", got=said,
+        code="ambiguous_coordinates", field="tracks", expected="coordinates whose unit is certain", got=observed,
         hint="Give the option image_size=WIDTHxHEIGHT if they are fractions of the picture, else coordinates=pixels.", choices=choices,
     )  # fmt: skip

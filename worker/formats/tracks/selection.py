@@ -37,7 +37,7 @@ def chosen_frames(text: str | None, num_frames: int) -> tuple[NDArray[np.intp], 
     return frames, [f"{note}."]
 
 
-def hide_seldom_seen(
+def hide_sparsely_observed(
     points: NDArray[np.generic], visible: NDArray[np.float64] | None, mesh: Mesh | None, options: Options
 ) -> tuple[NDArray[np.float64], NDArray[np.intp], list[str]]:
     """Take the weight from points that are seen in too few frames.
