@@ -59,13 +59,13 @@ def test_however_it_is_cut_the_whole_is_the_whole(
 def test_a_part_cannot_be_taken_and_a_whole_one_not_be_written(uploads: Uploads, tmp_path: Path) -> None:
     send(uploads, "one", b"half", finish=False)
     assert (uploads.get("one").complete, uploads.get("one").sha256) == (False, None)
-    with pytest.raises(errors.Conflict, match="not whole yet") as caught:
+    with pytest.raises(errors.Conflict, match="not complete yet") as caught:
         uploads.take("one", tmp_path / "taken")
     assert caught.value.code == "upload_incomplete"
     assert not (tmp_path / "taken").exists()
     send(uploads, "one", b"", offset=4)
     for offset in (0, 4):
-        with pytest.raises(errors.Conflict, match="is whole"):
+        with pytest.raises(errors.Conflict, match="is complete"):
             send(uploads, "one", b"more", offset=offset)
     uploads.take("one", tmp_path / "taken")
     uploads.delete("one")
