@@ -26,9 +26,9 @@ def read_tracked(file: Path, tracked: Tracked, options: Options, *, limits: Limi
     Parameters
     ----------
     file : Path
-        As the film process wrote it; read with the checks of an uploaded file.
+        As written by the film process; validated like an uploaded file.
     tracked : Tracked
-        What else was found.
+        The other results of tracking.
     options : Options
         `stride`, `max_points` and `min_seen`.
     limits : Limits
