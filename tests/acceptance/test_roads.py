@@ -228,7 +228,7 @@ def test_the_doctor_audits_what_is_stored(tmp_path: Path) -> None:
         return ran.returncode, [(finding["verdict"], finding["found"]) for finding in found]
 
     code, ((verdict, said),) = audit()
-    assert (code, verdict, "cannot be used now" in said) == (8, "bad", True)
+    assert (code, verdict, "is unavailable" in said) == (8, "bad", True)
     valkey = Valkey.claim(data)
     server = valkey.start()
     try:

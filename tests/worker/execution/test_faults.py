@@ -293,7 +293,7 @@ def test_fsck_is_a_command(house: House) -> None:
     command = [sys.executable, "-m", "pliant.worker", "fsck"]
     env = {**os.environ, **house.settings.to_environment()}
     clean = subprocess.run(command, capture_output=True, text=True, check=False, env=env)
-    assert (clean.returncode, clean.stdout) == (0, "Everything stored is as the records state.\n")
+    assert (clean.returncode, clean.stdout) == (0, "The stores are consistent with the job records.\n")
     house.jobs.blobs.put("jobs/nobody/nobody-1/inputs.npz", house.short_inputs)
     found = subprocess.run(command, capture_output=True, text=True, check=False, env=env)
     assert (found.returncode, found.stdout) == (1, "File jobs/nobody/nobody-1/inputs.npz belongs to no job.\n")

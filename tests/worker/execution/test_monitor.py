@@ -81,7 +81,7 @@ def test_a_jobs_own_time_limit_is_enforced_too(running: Callable[..., Watch]) ->
     after = finalize(watch, status=KILLED, peak=0, patience=Patience(0))
     assert after is not None
     assert after.job.error is not None
-    assert (after.job.error.code, "4 s of its option time_limit" in after.job.error.detail) == ("timed_out", True)
+    assert (after.job.error.code, "option time_limit of 4 s" in after.job.error.detail) == ("timed_out", True)
 
 
 def test_without_a_limit_there_is_none(running: Callable[..., Watch]) -> None:
