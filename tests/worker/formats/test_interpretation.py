@@ -95,7 +95,7 @@ def test_y_axis_is_as_asked(tmp_path: Path) -> None:
     assert read(tmp_path, {"tracks": POINTS}).interpretation.y_axis == "down"
     up = read(tmp_path, {"tracks": POINTS}, y_axis="up").interpretation
     assert up.y_axis == "up"
-    assert "y points up, as asked." in up.notes
+    assert "y points up, as set by y_axis." in up.notes
 
 
 def test_numbers_above_1_are_a_mask_or_logits(tmp_path: Path) -> None:

@@ -83,7 +83,7 @@ def test_a_part_cannot_be_taken_and_a_whole_one_not_be_written(uploads: Uploads,
 
 def test_bytes_in_the_wrong_place_are_refused_and_beginning_anew_is_allowed(uploads: Uploads) -> None:
     send(uploads, "one", b"half", finish=False)
-    with pytest.raises(errors.OffsetMismatch, match=r"Go on at 4\.") as caught:
+    with pytest.raises(errors.OffsetMismatch, match=r"Continue at 4\.") as caught:
         send(uploads, "one", b"x", offset=3)
     assert caught.value.offset == 4
     send(uploads, "one", b"new")
