@@ -168,7 +168,7 @@ class Jobs:
         if known is not None:
             return known
         if job.status not in (Status.FAILED, Status.CANCELLED):
-            hint = "It has succeeded." if job.status is Status.SUCCEEDED else "Wait until it ends, or cancel it first."
+            hint = "It has its result." if job.status is Status.SUCCEEDED else "Wait until it ends, or cancel it first."
             raise NotAllowedNow(id, job.status, wanted="run again", hint=hint)
         again = Job(
             id=new_job_id(),

@@ -361,7 +361,7 @@ def test_jobs_count_the_uploads_and_the_quota_holds_at_the_moment_of_writing(job
     uploads = Uploads.open(tight.settings)
     with uploads.write("big-one", offset=0, length=None, capacity=Capacity(max_bytes=10**7)) as writer:
         writer.write(bytes(1_500_000))
-    with pytest.raises(QuotaExceeded, match="hold 1,500,000 bytes"):
+    with pytest.raises(QuotaExceeded, match="1,500,000 of 4,000,000 bytes"):
         submit(tight)
     uploads.delete("big-one")
     stored = jobs.records.get(submit(tight).id)
