@@ -60,7 +60,7 @@ class Truth:
         found = np.asarray(tracks, dtype=np.float64)
         rows = np.arange(film.num_frames) if frames is None else np.asarray(frames, dtype=np.int64)
         true, seen, shapes = film.follow(found[template], int(rows[template]))
-        on = np.isfinite(true).all(axis=(0, 2))
+        on = np.asarray(np.isfinite(true).all(axis=(0, 2)))
         return cls(on, true[rows][:, on], seen[rows][:, on], shapes[rows][:, on])
 
     def track_accuracy(self, tracks: ArrayLike, visibility: ArrayLike) -> TrackAccuracy:

@@ -102,6 +102,6 @@ def _texture(arrays: Arrays, num_points: int) -> Texture:
     if places.shape != (num_points, 2) or places.dtype.kind != "f" or not np.isfinite(places).all():
         raise damaged("tracks", f"texture coordinates of shape {places.shape} for {num_points} points")
     try:
-        return Texture.from_tracked(arrays["template_image"], np.clip(places, 0, 1))  # type: ignore[call-overload]
+        return Texture.from_tracked(arrays["template_image"], np.clip(places, 0, 1))
     except InvalidInput as error:
         raise damaged("tracks", f"a template_image that is no picture ({error.got})") from error
