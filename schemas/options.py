@@ -21,7 +21,7 @@ POINT = r"^-?\d{1,7}(\.\d{1,9})?,-?\d{1,7}(\.\d{1,9})?$"
 
 Weight = Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
 
-Output = Literal["glb", "ply", "obj", "usd", "mdd", "mat", "csv"]
+Output = Literal["glb", "ply", "obj", "usd", "abc", "mdd", "mat", "csv"]
 """A result file written on request; `shapes.npz`, `report.json` and `preview.bin` are always written."""
 
 
@@ -133,7 +133,7 @@ class Options(BaseModel):
     outputs: Outputs = Field(
         ("glb", "ply", "csv"),
         description="Files to write besides shapes.npz, report.json and preview.bin. glb: animated glTF. ply, obj: a mesh per frame, in a "
-        "zip. usd: USD with time samples. mdd: point cache for Blender, Maya and Houdini. mat: MATLAB. "
+        "zip. usd: USD with time samples. abc: Alembic. mdd: point cache for Blender, Maya and Houdini. mat: MATLAB. "
         "csv: metrics of every frame and of every point.",
     )
     normals: Literal["static", "animated", "none"] = Field(

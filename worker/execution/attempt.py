@@ -242,11 +242,10 @@ def _reconstruct(
             load_inputs(inputs), options, results, on_progress=attempt.report, should_stop=attempt.should_stop
         )
     settings, scratch = attempt.jobs.settings, inputs.with_name("film")
-    memory = min(FilmBounds().memory, settings.memory_limit or FilmBounds().memory)
     source = open_source(inputs, inputs.with_name("source"))
     scratch.mkdir()
     return reconstruct_film(
-        source, options, results, scratch=scratch, threads=settings.threads_per_job, bounds=FilmBounds(memory=memory),
+        source, options, results, scratch=scratch, threads=settings.threads_per_job, bounds=FilmBounds.of(settings),
         on_progress=attempt.report, should_stop=attempt.should_stop,
     )  # fmt: skip
 

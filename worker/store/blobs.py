@@ -105,7 +105,7 @@ class Blobs:
             if url.startswith("file:"):
                 store = from_url(url, mkdir=True, automatic_cleanup=True)
                 return cls(store, directory=Path(unquote(urlsplit(url).path)))
-            options = {**CLIENT, "allow_http": _plain_http()}
+            options: Any = {**CLIENT, "allow_http": _plain_http()}
             return cls(from_url(url, client_options=options, retry_config=RETRIES), remote=True)
 
     def put(self, key: str, file: Path) -> int:
