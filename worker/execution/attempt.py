@@ -80,15 +80,16 @@ class Attempt:
     """True once the job was cancelled, has taken too long, or belongs to another attempt."""
     _parent: int = field(default_factory=os.getppid)
     _next_tell: float = 0.0
+    _stage: str = ""
     _next_ask: float = 0.0
     _lines: list[str] = field(default_factory=list)
 
     def tell(self, progress: Progress) -> None:
-        """Write the progress, at most twice a second; a store that does not answer is no reason to stop."""
+        """Write the progress, each new stage and else at most twice a second; a store that does not answer is no reason to stop."""
         now = time.monotonic()
-        if now < self._next_tell:
+        if now < self._next_tell and progress.stage == self._stage:
             return
-        self._next_tell = now + TELL_EVERY
+        self._next_tell, self._stage = now + TELL_EVERY, progress.stage
         try:
             self.jobs.records.update(
                 self.id, lambda held: lifecycle.report(held, attempt_id=self.attempt_id, progress=progress)
