@@ -134,7 +134,8 @@ def test_one_key_at_two_api_processes_makes_one_job(hosts: Hosts) -> None:
     with ThreadPoolExecutor(4) as pool:
         ids = list(
             pool.map(
-                lambda number: hosts.submit(url=hosts.urls[number % 2], headers={"Idempotency-Key": "one key"}), range(4)
+                lambda number: hosts.submit(url=hosts.urls[number % 2], headers={"Idempotency-Key": "one key"}),
+                range(4),
             )
         )
     assert len(set(ids)) == 1

@@ -140,7 +140,9 @@ def test_which_scope_is_needed() -> None:
     assert [needed(method, "/v1/jobs/x") for method in ("GET", "HEAD", "PUT", "DELETE", "PATCH", "BREW")] == (
         [Scope.READ] * 2 + [Scope.SUBMIT] * 4
     )
-    assert [needed(method, "/v1/uploads/x") for method in ("GET", "HEAD", "PUT", "PATCH", "DELETE")] == [Scope.SUBMIT] * 5
+    assert [needed(method, "/v1/uploads/x") for method in ("GET", "HEAD", "PUT", "PATCH", "DELETE")] == [
+        Scope.SUBMIT
+    ] * 5
 
 
 def test_a_token_that_may_only_submit_sends_large_files(guarded: Running, monkeypatch: pytest.MonkeyPatch) -> None:

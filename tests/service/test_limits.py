@@ -8,9 +8,9 @@ import time
 import httpx
 import pytest
 import uvicorn
-from pliant.service import __main__ as main
 from pliant.client import Client, TooManyRequests
 from pliant.client.retry import Retry
+from pliant.service import __main__ as main
 from pliant.service.middleware.rate_limit import MOST_CLIENTS, Rates, _client
 from pliant.service.settings import USUAL_RATE, InvalidServiceSetting
 from pliant.worker.tokens import Scope

@@ -177,7 +177,9 @@ class Hosts:
     def workers(self) -> int:
         """Return how many workers have a recent heartbeat."""
         text = self.http.get("/metrics").text
-        return int(float(next(line.split()[1] for line in text.splitlines() if line.startswith("pliant_workers_alive "))))
+        return int(
+            float(next(line.split()[1] for line in text.splitlines() if line.startswith("pliant_workers_alive ")))
+        )
 
     def until(self, condition: Callable[[], object], what: str, *, seconds: float = 30.0) -> float:
         """Wait for a condition; return the seconds it took."""
@@ -189,7 +191,9 @@ class Hosts:
 
     def final(self, id: str, *, seconds: float = 60.0) -> dict[str, Any]:
         """Wait for the end of a job."""
-        self.until(lambda: self.get(id).get("status") in ("succeeded", "failed", "cancelled"), "the job ends", seconds=seconds)
+        self.until(
+            lambda: self.get(id).get("status") in ("succeeded", "failed", "cancelled"), "the job ends", seconds=seconds
+        )
         return self.get(id)
 
     def cancelled(self, id: str) -> None:
@@ -223,7 +227,9 @@ class Hosts:
 
     def tail(self) -> str:
         """Return the last lines of every log."""
-        return "\n".join(f"== {log.name}\n{log.read_text(errors='replace')[-1500:]}" for log in sorted(self.folder.glob("*.log")))
+        return "\n".join(
+            f"== {log.name}\n{log.read_text(errors='replace')[-1500:]}" for log in sorted(self.folder.glob("*.log"))
+        )
 
     def _cleared(self, host: str) -> bool:
         until = time.monotonic() + 8

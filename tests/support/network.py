@@ -49,7 +49,9 @@ class Network:
             _ip("-n", space, "link", "set", "eth0", "address", _mac(number), "up")
             _ip("-n", space, "link", "set", "lo", "up")
             _ip("-n", space, "addr", "add", f"{self.address[name]}/24", "dev", "eth0")
-        for name in self.names:  # fixed neighbours: with a cable pulled, packets are sent and lost, not refused as unroutable
+        for (
+            name
+        ) in self.names:  # fixed neighbours: with a cable pulled, packets are sent and lost, not refused as unroutable
             for number, other in enumerate(self.names, 1):
                 if other != name:
                     _ip("-n", self._space(name), "neigh", "replace", self.address[other], "lladdr", _mac(number),

@@ -181,7 +181,9 @@ def _verified(source: Path, manifest: dict[str, Any]) -> tuple[Path, Path]:
         file = source / "blobs" / key
         if ".." in Path(key).parts or not file.is_file() or file.stat().st_size != size:
             raise BadBackup(f"{file} is missing or was changed. Use another backup.")
-    records, rest = (next(source / name for name in manifest["files"] if name.startswith(start)) for start in ("jobs-", "rest-"))
+    records, rest = (
+        next(source / name for name in manifest["files"] if name.startswith(start)) for start in ("jobs-", "rest-")
+    )
     for line in _lines(records):
         record = json.loads(line)["record"]
         for artifact in record["job"]["artifacts"]:
@@ -211,7 +213,6 @@ def _remove(folder: Path, unwanted: Callable[[Path], bool]) -> None:
     for path in folder.iterdir():
         if path.is_file() and unwanted(path):
             path.unlink()
-
 
 
 def _sha256(file: Path) -> str:

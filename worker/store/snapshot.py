@@ -75,4 +75,3 @@ class Snapshot:
             for name in ("tokens", "tally"):
                 if rest.get(name):
                     self._redis.hset(f"{self._at}{name}", mapping=rest[name])
-

@@ -68,7 +68,9 @@ def succeed(jobs: Jobs, id: str, content: bytes, folder: Path) -> None:
 def sent(jobs: Jobs, submit: Submit, tmp_path: Path) -> dict[str, str]:
     """One job in each state, and a token; returns the ids."""
     webhook = Webhook(url="https://example.org/hook", secret="whsec_c2VjcmV0")
-    ids = {state: submit(name=state, webhook=webhook).id for state in ("done", "failed", "queued", "running", "cancelling")}
+    ids = {
+        state: submit(name=state, webhook=webhook).id for state in ("done", "failed", "queued", "running", "cancelling")
+    }
     succeed(jobs, ids["done"], secrets.token_bytes(100_000), tmp_path)
     for state in ("running", "cancelling"):
         jobs.queue.remove(claim(jobs, ids[state]))
@@ -79,9 +81,7 @@ def sent(jobs: Jobs, submit: Submit, tmp_path: Path) -> dict[str, str]:
     return ids
 
 
-def test_a_restored_installation_is_the_same(
-    jobs: Jobs, sent: dict[str, str], empty: Settings, tmp_path: Path
-) -> None:
+def test_a_restored_installation_is_the_same(jobs: Jobs, sent: dict[str, str], empty: Settings, tmp_path: Path) -> None:
     made = write_backup(jobs.settings, tmp_path / "backup")
     assert (made.jobs, made.blobs, made.copied) == (5, 6, 6)
     assert restore_backup(empty, tmp_path / "backup").jobs == 5
@@ -152,9 +152,7 @@ def backup(jobs: Jobs, sent: dict[str, str], tmp_path: Path) -> Iterator[Path]:
     yield copy
 
 
-def test_what_is_no_backup_or_not_empty_is_refused(
-    jobs: Jobs, backup: Path, empty: Settings, tmp_path: Path
-) -> None:
+def test_what_is_no_backup_or_not_empty_is_refused(jobs: Jobs, backup: Path, empty: Settings, tmp_path: Path) -> None:
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "letter.txt").write_text("Dear")
     for place in (tmp_path / "other", tmp_path / "other" / "letter.txt"):
@@ -166,7 +164,9 @@ def test_what_is_no_backup_or_not_empty_is_refused(
         restore_backup(jobs.settings, backup)
 
 
-@pytest.mark.parametrize("what", ["jobs-*", "blobs/**/inputs.npz", "blobs/**/shapes.npz", "flipped", "format", "schema"])
+@pytest.mark.parametrize(
+    "what", ["jobs-*", "blobs/**/inputs.npz", "blobs/**/shapes.npz", "flipped", "format", "schema"]
+)
 def test_a_damaged_backup_is_refused_before_anything_is_written(backup: Path, empty: Settings, what: str) -> None:
     error: type[Exception] = BadBackup
     manifest = json.loads((backup / "manifest.json").read_text())

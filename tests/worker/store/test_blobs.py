@@ -12,8 +12,8 @@ import time
 from pathlib import Path
 
 import pytest
-from pliant.worker.errors import StoreUnavailable
 from obstore.store import MemoryStore
+from pliant.worker.errors import StoreUnavailable
 from pliant.worker.store.blobs import CHUNK, CLIENT, Blobs, client_options
 from pliant.worker.store.calls import AT_ONCE, WAITING, RemoteCalls
 
