@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import secrets
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime
 from hashlib import sha256
@@ -145,11 +145,11 @@ def test_a_job_deleted_while_it_is_copied_is_left_out(
 
 
 @pytest.fixture
-def backup(jobs: Jobs, sent: dict[str, str], tmp_path: Path) -> Iterator[Path]:
+def backup(jobs: Jobs, sent: dict[str, str], tmp_path: Path) -> Path:
     write_backup(jobs.settings, tmp_path / "backup")
     copy = tmp_path / "copy"  # blobs of the backup are linked from the store
     shutil.copytree(tmp_path / "backup", copy)
-    yield copy
+    return copy
 
 
 def test_what_is_no_backup_or_not_empty_is_refused(jobs: Jobs, backup: Path, empty: Settings, tmp_path: Path) -> None:
