@@ -491,6 +491,9 @@ class ProblemCode(StrEnum):
     INVALID_TOKEN_NAME = ("invalid_token_name", None, "Invalid token name",
      "A token's name is empty, too long, or has control characters.",
      "Choose a short printable name.")
+    INVALID_TOKEN_TEXT = ("invalid_token_text", None, "Invalid token",
+     "The file of `pliant token create --from` does not hold a token.",
+     "Write a token of the stated form to it, or leave --from out.")
     INVALID_DURATION = ("invalid_duration", None, "Invalid duration",
      "`--expires` is not a duration such as `12h`, `90d` or `52w`.",
      "Correct it, or omit it for a token without expiry.")
