@@ -476,6 +476,12 @@ class ProblemCode(StrEnum):
     DATA_DIRECTORY_IN_USE = ("data_directory_in_use", None, "Data directory in use",
      "Another Pliant process owns the data directory.",
      "Stop it, or name another directory with `--data`.")
+    NEWER_DATA = ("newer_data", None, "Data of a newer version",
+     "A newer Pliant wrote the records, and this one could drop what it does not know.",
+     "Install that version, or restore a backup from before the upgrade.")
+    BAD_BACKUP = ("bad_backup", None, "Bad backup",
+     "The directory holds no backup, or a damaged one, or the installation is not empty.",
+     "Name another directory; restore into an installation without jobs and tokens.")
     SERVER_FAILED = ("server_failed", None, "Valkey did not start",
      "The embedded Valkey did not start; the message ends with its log.",
      "Run `pliant doctor`.")
@@ -485,6 +491,9 @@ class ProblemCode(StrEnum):
     INVALID_TOKEN_NAME = ("invalid_token_name", None, "Invalid token name",
      "A token's name is empty, too long, or has control characters.",
      "Choose a short printable name.")
+    INVALID_TOKEN_TEXT = ("invalid_token_text", None, "Invalid token",
+     "The file of `pliant token create --from` does not hold a token.",
+     "Write a token of the stated form to it, or leave --from out.")
     INVALID_DURATION = ("invalid_duration", None, "Invalid duration",
      "`--expires` is not a duration such as `12h`, `90d` or `52w`.",
      "Correct it, or omit it for a token without expiry.")

@@ -217,6 +217,25 @@ class DataDirectoryInUse(WorkerError):
         self.data, self.holder = data, holder
 
 
+class NewerData(WorkerError):
+    """A newer version wrote what is stored."""
+
+    code = "newer_data"
+
+    def __init__(self, *, found: int, known: int) -> None:
+        super().__init__(
+            f"The records were written by a newer Pliant (version {found} of their form; this one reads up to {known}). "
+            "Install that Pliant, or restore a backup that was made before the upgrade."
+        )
+        self.found, self.known = found, known
+
+
+class BadBackup(WorkerError):
+    """A backup cannot be written or restored."""
+
+    code = "bad_backup"
+
+
 class ServerFailed(WorkerError):
     """The embedded Valkey does not start."""
 

@@ -80,6 +80,9 @@ class Stored(BaseModel):
     version: int = 0
     """Number of changes, for the compare-and-set."""
 
+    record_schema: int = Field(2, validation_alias="schema", serialization_alias="schema")
+    """Version of the record's own form; see `pliant.worker.store.schema`."""
+
     @property
     def sort_key(self) -> str:
         """Order of creation, ties broken by id."""

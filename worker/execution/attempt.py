@@ -80,15 +80,16 @@ class Attempt:
     """Whether the job was cancelled, timed out, or belongs to another attempt."""
     _parent: int = field(default_factory=os.getppid)
     _next_report: float = 0.0
+    _stage: str = ""
     _next_look: float = 0.0
     _lines: list[str] = field(default_factory=list)
 
     def report(self, progress: Progress) -> None:
-        """Write the progress, at most every `PROGRESS_INTERVAL` seconds; an unavailable store is ignored."""
+        """Write the progress: each new stage, else at most every `PROGRESS_INTERVAL` seconds. An unavailable store is ignored."""
         now = time.monotonic()
-        if now < self._next_report:
+        if now < self._next_report and progress.stage == self._stage:
             return
-        self._next_report = now + PROGRESS_INTERVAL
+        self._next_report, self._stage = now + PROGRESS_INTERVAL, progress.stage
         try:
             self.jobs.records.update(
                 self.id, lambda held: lifecycle.report(held, attempt_id=self.attempt_id, progress=progress)
