@@ -124,6 +124,11 @@ def copied(source: Path, path: Path | str) -> Path:
     return target
 
 
+def loaded(job: Job) -> tuple[str, ...]:
+    """Return the files that `wait` and `result` download; a job that wrote further files has no arrays of its own."""
+    return LOADED if job.outputs_of is None else (REPORT,)
+
+
 def job_path(job: str) -> str:
     """Return the address of a job, relative to the service.
 

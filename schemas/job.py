@@ -139,6 +139,9 @@ class Job(Record):
     expires_at: datetime | None = Field(None, description="When the job and its files are removed; null: never.")
     attempt: int = Field(0, description="How often a worker has begun it.")
     retry_of: str | None = Field(None, description="The finished job whose inputs and options this one runs again.")
+    outputs_of: str | None = Field(
+        None, description="The finished job whose result this one writes in further files, without solving again."
+    )
     place_in_queue: int | None = Field(None, description="0 is next; null when not queued.")
     options: Options
     interpretation: Interpretation

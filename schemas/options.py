@@ -135,9 +135,9 @@ class Options(BaseModel):
         "csv: metrics of every frame and of every point.",
     )
     normals: Literal["static", "animated", "none"] = Field(
-        "static",
-        description="static: those of the first shape, in shapes.glb alone. animated: they move with the shape, and are in every "
-        "frame of PLY, OBJ and USD, too. none: viewers make their own.",
+        "animated",
+        description="animated: they move with the shape, in shapes.glb and in every frame of PLY, OBJ and USD. static: those of the "
+        "first shape, in shapes.glb alone. none: viewers make their own.",
     )
     colours: Literal["none", "error", "expected_error"] = Field(
         "none",
@@ -153,6 +153,11 @@ class Options(BaseModel):
         False,
         description="Write shapes.glb with 16-bit positions (KHR_mesh_quantization): two thirds of the size, and rounded to about a "
         "65,000th of the largest extent.",
+    )
+    glb_motion: Literal["auto", "frames"] = Field(
+        "auto",
+        description="How shapes.glb stores the motion. auto: modes of motion where that makes the file smaller, every point within a "
+        "thousandth of the bounding box's diagonal. frames: a morph target a frame, exact in single precision; up to 200 frames.",
     )
 
     layout: Literal["auto", "frames_points", "points_frames"] = Field(

@@ -4,6 +4,7 @@
     ├── UnknownJob              no job of that id (or not yours)
     ├── UnknownArtifact         the job has no such file
     ├── UnknownExample          there is no such made-up sequence, or it has no such file
+    ├── UnknownShare            the job has no such share link
     ├── UnknownToken            there is no token of that id
     ├── UnknownUpload           no upload of that id (or not yours)
     ├── NotAllowedNow           the job's status does not allow it
@@ -11,6 +12,7 @@
     │   └── OffsetMismatch      bytes that do not belong where the upload stands
     ├── InvalidRequest          an id or cursor that cannot be one
     │   └── UploadTooLarge      more bytes than one upload may have
+    ├── TooManyShares           more share links than one job may have
     ├── TooManyUploads          more uploads than one owner may have
     ├── InvalidSetting          a setting does not parse or is out of its range
     ├── TooManyQueued           as many jobs of yours wait as may
@@ -77,6 +79,18 @@ class UnknownExample(WorkerError):
     def __init__(self, name: str, file: str, *, known: list[str]) -> None:
         super().__init__(f"There is no example file {name}/{file}. There are: {', '.join(known)}.")
         self.name, self.file = name, file
+
+
+class UnknownShare(WorkerError):
+    """The job has no such share link."""
+
+    code = "unknown_share"
+
+    def __init__(self, id: str, share: str) -> None:
+        super().__init__(
+            f"Job {id!r} has no share link {share!r}; it may have expired. List the links to see which there are."
+        )
+        self.id, self.share = id, share
 
 
 class UnknownToken(WorkerError):
@@ -154,6 +168,16 @@ class TooManyUploads(WorkerError):
 
     def __init__(self, most: int) -> None:
         super().__init__(f"There are {most} uploads already. Delete some, or wait until they expire.")
+
+
+class TooManyShares(WorkerError):
+    """A job has as many valid share links as it may have."""
+
+    code = "too_many_shares"
+
+    def __init__(self, id: str, most: int) -> None:
+        super().__init__(f"Job {id!r} has {most} share links already. Revoke one, or wait until one expires.")
+        self.id, self.most = id, most
 
 
 class InvalidSetting(WorkerError):

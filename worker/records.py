@@ -38,6 +38,18 @@ class Webhook(BaseModel):
     secret: str
 
 
+class StoredShare(BaseModel):
+    """A link that reads one job's results; its secret is stored as a digest."""
+
+    model_config = ConfigDict(frozen=True)
+
+    id: str
+    digest: str
+    """SHA-256 of the secret."""
+    created_at: datetime
+    expires_at: datetime
+
+
 class Stored(BaseModel):
     """A job with what only the worker package needs."""
 
@@ -55,6 +67,9 @@ class Stored(BaseModel):
 
     inputs: str
     """Blob of the canonical inputs."""
+
+    result: str | None = None
+    """Blob of the arrays of a stored result, for a job that writes further files of it instead of solving."""
 
     bytes: int = 0
     """Size of everything kept for the job."""
@@ -76,6 +91,9 @@ class Stored(BaseModel):
 
     max_running: int | None = None
     """How many jobs of its owner may run at once, as the owner's token stated at submission; None: `Settings.max_running`."""
+
+    shares: tuple[StoredShare, ...] = ()
+    """Links that read the job's results without a token of its owner."""
 
     version: int = 0
     """Counts the changes; the compare-and-set compares it."""
