@@ -48,7 +48,8 @@ class Reconstruction:
 
     def __repr__(self) -> str:
         size = f"{self.job.interpretation.num_frames} frames × {self.job.interpretation.num_points} points"
-        return f"<{type(self).__name__} of job {self.job.id}: {size}, {self.job.outcome}>"
+        ended = ", ".join(str(each) for each in (self.job.verdict, self.job.outcome) if each is not None)
+        return f"<{type(self).__name__} of job {self.job.id}: {size}, {ended}>"
 
     @property
     def shapes(self) -> NDArray[np.float64]:

@@ -146,18 +146,18 @@ class Options(BaseModel):
         "prior gaussian estimates it. PLY, OBJ and USD are coloured in every frame, shapes.glb by the mean over frames.",
     )
     axes: Literal["tracks", "viewer"] = Field(
-        "tracks",
-        description="Axes of PLY and OBJ. tracks: those of the tracks, as in shapes.npz. viewer: y up, as in shapes.glb.",
+        "viewer",
+        description="Axes of PLY and OBJ. viewer: y up, as in shapes.glb. tracks: those of the tracks, as in shapes.npz.",
     )
     glb_quantized: bool = Field(
         False,
-        description="Write shapes.glb with 16-bit positions (KHR_mesh_quantization): two thirds of the size, and rounded to about a "
-        "65,000th of the largest extent.",
+        description="Write shapes.glb with 16-bit positions and 8-bit normals (KHR_mesh_quantization): about half the size, and rounded "
+        "to a 65,000th of the largest extent and half a degree.",
     )
     glb_motion: Literal["auto", "frames"] = Field(
         "auto",
-        description="How shapes.glb stores the motion. auto: modes of motion where that makes the file smaller, every point within a "
-        "thousandth of the bounding box's diagonal. frames: a morph target a frame, exact in single precision; up to 200 frames.",
+        description="How shapes.glb stores the motion. auto: as few modes of motion as keep every point within a thousandth "
+        "of the bounding box's diagonal. frames: a morph target a frame, exact in single precision; up to 200 frames.",
     )
 
     layout: Literal["auto", "frames_points", "points_frames"] = Field(

@@ -89,7 +89,8 @@ SUBMIT_BODY: dict[str, Any] = {
         "multipart/form-data": {
             "schema": {
                 "type": "object",
-                # Tracks, the upload that holds them, a film, or the inputs of an earlier job. Generators of clients cannot read an anyOf here.
+                # Tracks, the upload that holds them, a film, or the inputs of an earlier job.
+                # Generators of clients cannot read an anyOf in its place.
                 "if": {
                     "not": {
                         "anyOf": [

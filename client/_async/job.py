@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 from pliant.client._async.operations import OnJob
+from pliant.client.errors import JobEnded
 from pliant.client.multipart import OnBytes
 from pliant.client.result import ANIMATION, Reconstruction, copied, loaded
 from pliant.schemas.job import Job, Status
@@ -32,7 +33,7 @@ class AsyncRemoteJob:
         self.record = record
 
     def __repr__(self) -> str:
-        return f"<AsyncRemoteJob {self.id} {self.status}>"
+        return f"<AsyncRemoteJob {self.id} {self.status.value}>"
 
     @property
     def id(self) -> str:
@@ -64,13 +65,17 @@ class AsyncRemoteJob:
             if on_progress is not None:
                 on_progress(job)
 
-        result = await self._client.wait(
-            self.id,
-            on_progress=None if on_progress is None else report,
-            folder=folder,
-            load=load,
-            timeout=timeout,
-        )
+        try:
+            result = await self._client.wait(
+                self.id,
+                on_progress=None if on_progress is None else report,
+                folder=folder,
+                load=load,
+                timeout=timeout,
+            )
+        except JobEnded as ended:
+            self.record = ended.job
+            raise
         self.record = result.job
         return result
 
