@@ -145,6 +145,9 @@ class Job(Record):
     expires_at: datetime | None = Field(None, description="When the job and its files are removed; null: never.")
     attempt: int = Field(0, description="Number of attempts so far.")
     retry_of: str | None = Field(None, description="The finished job that this one repeats.")
+    outputs_of: str | None = Field(
+        None, description="The finished job whose result this one writes in further files, without solving again."
+    )
     place_in_queue: int | None = Field(None, description="Number of queued jobs ahead; null if not queued.")
     options: Options
     interpretation: Interpretation

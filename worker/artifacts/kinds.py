@@ -107,7 +107,7 @@ def _npz(result: Result, file: IO[bytes], on_progress: OnProgress) -> dict[str, 
 
 def _glb(result: Result, file: IO[bytes], on_progress: OnProgress) -> dict[str, Any]:
     options, shapes, painted = result.options, result.solution.shapes, result.painting
-    animation = animate(shapes, y_axis=result.y_axis)
+    animation = animate(shapes, y_axis=result.y_axis, motion=options.glb_motion)
     colours = None
     if painted is not None:
         animation.extras.update(painted.legend())
