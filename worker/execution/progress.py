@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 
-from pliant.schemas.job import Progress
+from pliant.schemas.job import FollowedPoints, Progress
 
 SHARES = {"loading": (0.0, 0.02), "solving": (0.02, 0.85), "exporting": (0.85, 1.0)}
 """Where each part of a job begins and ends on the way from 0 to 1."""
@@ -50,6 +50,7 @@ class Reporter:
         max_reweightings: int | None = None,
         objective: float | None = None,
         residual: float | None = None,
+        followed: FollowedPoints | None = None,
     ) -> None:
         """Say that `done` (0 to 1) of a part is done; numbers not given stay as they were told last.
 
@@ -59,6 +60,8 @@ class Reporter:
             A key of `shares`.
         stage : str, optional
             The user's word for it; by default the part's own.
+        followed : FollowedPoints, optional
+            Points of the film that were just tracked; not repeated later.
         """
         now = self.clock()
         if self._began is None:
@@ -76,6 +79,7 @@ class Reporter:
                 {
                     **self._last,
                     "stage": stage or part,
+                    "followed": followed,
                     "fraction": fraction,
                     "seconds_left": None if left is None else round(left, 1),
                     "updated_at": datetime.now(UTC),

@@ -7,6 +7,7 @@ import { button, fill, h, say } from "./dom";
 import { follow } from "./events";
 import { refusalBox } from "./refusal";
 import { Figures } from "./figures";
+import { LiveTracks } from "./live";
 import { newer, progressed } from "./news";
 import { Files, Metrics, Sheet, Warnings, saveLink } from "./results";
 import { Snippets } from "./snippets";
@@ -46,6 +47,7 @@ export class Detail {
   private readonly metrics = new Metrics();
   private readonly warnings = new Warnings();
   private readonly tab = new Tab();
+  private readonly live: LiveTracks;
   private readonly countdown = new Countdown((job) => this.showProgress(job));
   private readonly sheet = new Sheet();
   private readonly files = new Files();
@@ -58,6 +60,7 @@ export class Detail {
     readonly id: string,
     private readonly events: DetailEvents,
   ) {
+    this.live = new LiveTracks(id);
     this.element = h(
       "article",
       { class: "detail", "aria-labelledby": "job-title" },
@@ -68,6 +71,7 @@ export class Detail {
       h("div", { class: "meter" }, this.meter, this.share, this.tab.element),
       this.trouble,
       this.failure,
+      this.live.element,
       this.stage,
       this.figures.element,
       this.sheet.element,
@@ -83,6 +87,7 @@ export class Detail {
     this.leaving.abort();
     this.countdown.stop();
     this.tab.leave();
+    this.live.close();
   }
 
   focus(): void {
@@ -126,6 +131,7 @@ export class Detail {
     say(this.when, `${ago(job.created_at)}${job.expires_at ? `, kept until ${new Date(job.expires_at).toLocaleDateString()}` : ""}`);
     this.countdown.show(job);
     this.tab.show(job);
+    this.live.show(job);
     this.showMeter(job);
     this.showActions(job);
     fill(this.failure, JSON.stringify(job.error), () => (job.error ? [refusalBox(job.error)] : []));
