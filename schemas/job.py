@@ -54,6 +54,18 @@ class Problem(Record):
     )
 
 
+class FollowedPoints(Record):
+    """Some points of a film in the frame that was tracked last."""
+
+    frame: int = Field(ge=0, description="Number of the frame in the film, from 0.")
+    seconds: float = Field(ge=0, description="From the film's start.")
+    width: int = Field(ge=1, description="Of the film, pixels.")
+    height: int = Field(ge=1, description="Of the film, pixels.")
+    points: list[int] = Field(
+        max_length=400, description="x and y of each visible point in turn, rounded to the film's pixels."
+    )
+
+
 class Progress(Record):
     """Progress of a running job."""
 
@@ -66,6 +78,7 @@ class Progress(Record):
     objective: float | None = None
     residual: float | None = Field(None, description="Median visible reprojection residual, the tracks' unit.")
     seconds_left: float | None = Field(None, description="Estimate; null until one is possible.")
+    followed: FollowedPoints | None = Field(None, description="Points that the stage `track` tracked last.")
     updated_at: datetime
 
 

@@ -88,6 +88,37 @@ export interface components {
             examples: components["schemas"]["Example"][];
         };
         /**
+         * FollowedPoints
+         * @description Some points of a film in the frame that was tracked last.
+         */
+        FollowedPoints: {
+            /**
+             * Frame
+             * @description Number of the frame in the film, from 0.
+             */
+            frame: number;
+            /**
+             * Seconds
+             * @description From the film's start.
+             */
+            seconds: number;
+            /**
+             * Width
+             * @description Of the film, pixels.
+             */
+            width: number;
+            /**
+             * Height
+             * @description Of the film, pixels.
+             */
+            height: number;
+            /**
+             * Points
+             * @description x and y of each visible point in turn, rounded to the film's pixels.
+             */
+            points: number[];
+        };
+        /**
          * Inspection
          * @description Interpretation of inputs, with a sample of them.
          */
@@ -785,6 +816,8 @@ export interface components {
              * @description Estimate; null until one is possible.
              */
             seconds_left: number | null;
+            /** @description Points that the stage `track` tracked last. */
+            followed: components["schemas"]["FollowedPoints"] | null;
             /**
              * Updated At
              * Format: date-time
