@@ -64,7 +64,8 @@ class Options(BaseModel):
     )
     principal_point: Annotated[str, Field(pattern=POINT)] | None = Field(
         None,
-        description="Principal point X,Y in pixels, e.g. 319.5,239.5; null: the centre of image_size, or of the tracks without it.",
+        description="Principal point X,Y in pixels, e.g. 319.5,239.5; null: the centre of image_size, ((width - 1) / 2, (height - 1) / 2), or that "
+        "of the tracks without it.",
     )
     surface: Literal["auto", "isometric", "free"] = Field(
         "auto",
@@ -174,8 +175,8 @@ class Options(BaseModel):
     )
     image_size: Annotated[str, Field(pattern=r"^[1-9]\d{0,5}x[1-9]\d{0,5}$")] | None = Field(
         None,
-        description="WIDTHxHEIGHT of the picture in pixels, e.g. 640x480; needed where coordinates are fractions of it. Its centre is the "
-        "principal point of a perspective camera.",
+        description="WIDTHxHEIGHT of the picture in pixels, e.g. 640x480; needed where coordinates are fractions of it. Pixel centres lie at "
+        "whole numbers from 0. The picture's centre is the principal point of a perspective camera.",
     )
     coordinate_order: Literal["auto", "xy", "yx"] = Field(
         "auto", description="Order of a point's two coordinates. auto: x, y, unless only y, x lies inside image_size."

@@ -50,7 +50,8 @@ class Settings:
     """c as (x, y) in the tracks' unit; None: the centre of the picture, or of the tracks where `image_size` is not given."""
 
     image_size: tuple[float, float] | None = None
-    """(width, height) of the picture in the tracks' unit."""
+    """(width, height) of the picture in pixels. The centres of its pixels lie at whole numbers, the first at (0, 0): the picture reaches
+    from −½ to width − ½, and its centre is ((width − 1)/2, (height − 1)/2)."""
 
     y_up: bool = False
     """True: y of the tracks grows upwards. The third axis of the camera then points to the viewer instead of away."""
@@ -116,6 +117,13 @@ class Settings:
         if self.field_of_view is None or self.image_size is None:
             return self.focal
         return self.image_size[0] / (2 * tan(radians(self.field_of_view) / 2))
+
+    @property
+    def centre(self) -> tuple[float, float] | None:
+        """The principal point if it is given, else the picture's centre; None if neither is known."""
+        if self.principal_point is None and self.image_size is not None:
+            return ((self.image_size[0] - 1) / 2, (self.image_size[1] - 1) / 2)
+        return self.principal_point
 
     @property
     def gaussian(self) -> bool:
