@@ -25,6 +25,7 @@ Preset = Literal["auto", "paper"]
 Loss = Literal["l1", "l2", "huber"]
 Prior = Literal["gaussian", "smooth+low_rank", "smooth"]
 Surface = Literal["auto", "isometric", "free"]
+Order = Literal["auto", "film", "any"]
 Laplacian = Literal["auto", "grid8", "uniform", "cotangent"]
 
 
@@ -60,6 +61,10 @@ class Settings:
     """`isometric`: a sheet that bends without stretching, seen in perspective; `free`: none of that; `auto`: isometric where the tracks
     are those of a sheet and its edge lengths single out a focal length; tried only where `image_size` or the focal length is given, with
     the default camera model, method and prior."""
+
+    order: Order = "auto"
+    """`film`: neighbouring frames are alike; `any`: photographs in no order, of which no prior compares neighbours (Gaussian prior only);
+    `auto`: `film` where the tracks are more probable as a walk from frame to frame than as independent frames."""
 
     basis_size: int | None = None
     """K of the rank-3K factorization; None chooses it from the data and reports why."""
@@ -140,6 +145,7 @@ class Settings:
         _check_choice("method", self.method, Method)
         _check_choice("camera", self.camera, CameraModel)
         _check_choice("surface", self.surface, Surface)
+        _check_choice("order", self.order, Order)
         _check_choice("preset", self.preset, Preset)
         _check_choice("loss", self.loss, Loss)
         _check_choice("laplacian", self.laplacian, Laplacian)
@@ -159,6 +165,11 @@ class Settings:
             raise _out_of_range("max_reweightings", "a whole number from 1 to 1000", self.max_reweightings)
         if not 0 < self.tolerance < 1:
             raise _out_of_range("tolerance", "a number between 0 and 1", self.tolerance)
+        if self.order == "any" and not self.gaussian:
+            raise _contradiction(
+                "order", "prior gaussian with method robust and preset auto beside order any",
+                f"prior {self.prior}, method {self.method}, preset {self.preset}", "The other priors compare neighbouring frames.",
+            )  # fmt: skip
         if not 0 <= self.seed < 2**32:
             raise _out_of_range("seed", "a whole number from 0 to 4294967295", self.seed)
 

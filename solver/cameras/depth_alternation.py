@@ -129,6 +129,7 @@ def _relearned(view: Perspective, found: Learned, used: NDArray[np.intp], model_
         projections,
         max_modes=model_order.max_modes,
         noisy_start=model_order.noisy_start,
+        ordered=model_order.ordered,
         iterations=LEARNING,
     )
     return replace(found, covariance=covariance)
