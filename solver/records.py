@@ -372,7 +372,7 @@ class Trace:
     """Per-reweighting history, arrays of equal length; entry 0 is the initialisation."""
 
     objective: Floats
-    """E, normalized units; never rises, but where tracks are corrected anew for perspective."""
+    """E, normalized units; never rises within a fit. Tracks corrected anew for perspective begin a new fit, which may start higher."""
 
     residual: Floats
     """Median visible reprojection residual, the tracks' unit."""
