@@ -72,6 +72,24 @@ class Reconstruction:
         return self.job.verdict
 
     @property
+    def camera(self) -> dict[str, Any]:
+        """The camera model and its lens, as the report states them: `model`, `focal`, `focal_std`, `field_of_view`, `sentence` and more."""
+        camera: dict[str, Any] = self.report["camera"]
+        return camera
+
+    @property
+    def focal(self) -> float | None:
+        """Focal length in pixels of the tracks; None for orthographic cameras."""
+        focal: float | None = self.camera["focal"]
+        return focal
+
+    @property
+    def field_of_view(self) -> float | None:
+        """Horizontal field of view in degrees; None for orthographic cameras and where `image_size` is not known."""
+        angle: float | None = self.camera.get("field_of_view")
+        return angle
+
+    @property
     def faces(self) -> NDArray[np.int32]:
         """Triangles (T, 3) or quads (T, 4): indices into the points."""
         return self.arrays["faces"]
