@@ -209,7 +209,7 @@ def test_a_server_that_outlived_its_supervisor_is_taken_over_with_its_data(tmp_p
 def test_a_server_that_does_not_stop_keeps_its_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(valkey_module, "STOPS_WITHIN", 0.3)
     first = Valkey.claim(tmp_path)
-    holder = subprocess.Popen([sys.executable, "-S", "-c", SLEEP], pass_fds=(first.lock,))
+    holder = subprocess.Popen([sys.executable, "-S", "-c", SLEEP], pass_fds=(first.server_lock,))
     first.release()
     with pytest.raises(DataDirectoryInUse, match="a Valkey server that does not stop"):
         Valkey.claim(tmp_path)
