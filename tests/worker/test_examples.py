@@ -13,7 +13,7 @@ from pliant.worker.formats import read_inputs
 
 
 @pytest.mark.parametrize("name", sorted(EXAMPLES))
-def test_an_example_reads_as_what_it_says(name: str, tmp_path: Path) -> None:
+def test_every_example_is_read_as_described(name: str, tmp_path: Path) -> None:
     parts = {}
     for part, file in EXAMPLES[name].files:
         parts[part] = tmp_path / file
