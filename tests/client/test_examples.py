@@ -28,7 +28,7 @@ def run(service_url: str, tmp_path: Path):
     return run
 
 
-def test_there_are_five_and_each_is_run_here() -> None:
+def test_every_example_script_is_tested() -> None:
     scripts = {path.name for path in EXAMPLES.glob("*.py")}
     assert scripts == {"from_cotracker.py", "from_mat.py", "batch.py", "many_at_once.py", "evaluate.py"}
     assert all(f'run("{script}"' in Path(__file__).read_text() for script in scripts)
@@ -51,7 +51,7 @@ def test_from_mat(run, tmp_path: Path) -> None:
     assert np.load(tmp_path / "out.npz")["shapes"].shape == (frames, points, 3)
 
 
-def test_batch_goes_on_where_it_stopped(run, tmp_path: Path) -> None:
+def test_batch_resumes_where_it_stopped(run, tmp_path: Path) -> None:
     (tmp_path / "clips").mkdir()
     for name in ("a", "b"):
         np.savez(tmp_path / "clips" / f"{name}.npz", tracks=SEQUENCE.tracks.points)

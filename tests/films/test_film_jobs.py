@@ -71,9 +71,7 @@ def test_a_portrait_film_is_upright(tmp_path: Path) -> None:
     assert (facts.width, facts.height, facts.frames) == (72, 96, 6)
 
 
-def test_what_does_not_fit_the_film_is_refused_with_the_option_at_fault(
-    film: Path, region: Path, tmp_path: Path
-) -> None:
+def test_options_that_do_not_fit_the_film_are_rejected_by_name(film: Path, region: Path, tmp_path: Path) -> None:
     Image.new("L", (10, 10), 255).save(tmp_path / "small.png")
     wrong = refusal(FilmSource(film, tmp_path / "small.png"))
     assert (wrong.code, wrong.field) == ("wrong_region_size", "region")
@@ -90,7 +88,7 @@ def test_what_does_not_fit_the_film_is_refused_with_the_option_at_fault(
     assert refusal(FilmSource(many), bounds=FilmBounds(max_frames=3)).code == "too_many_frames"
 
 
-def test_too_little_memory_or_time_is_a_refusal(film: Path, tmp_path: Path) -> None:
+def test_too_little_memory_or_time_is_an_input_error(film: Path, tmp_path: Path) -> None:
     large = films.zip_of(tmp_path / "large.zip", {"1.png": films.png(np.zeros((2000, 3000, 3), np.uint8))})
     assert refusal(FilmSource(large), bounds=FilmBounds(memory=50 << 20)).code == "too_large"
     late = refusal(FilmSource(film), bounds=FilmBounds(check_seconds=0.01))
@@ -98,7 +96,7 @@ def test_too_little_memory_or_time_is_a_refusal(film: Path, tmp_path: Path) -> N
     assert "longest_side" in late.hint
 
 
-def test_how_the_film_process_died_becomes_a_sentence() -> None:
+def test_every_end_of_the_film_process_has_a_message() -> None:
     def code_of(code: int, answer: bytes = b"") -> str:
         fault = tracker._fault(Ended(code, answer, ""), FilmBounds(), 1.0)
         assert isinstance(fault, InvalidInput)
@@ -133,7 +131,7 @@ def test_a_film_and_its_region_are_stored_byte_for_byte(film: Path, region: Path
         open_source(films.zip_of(tmp_path / "bad.npz", {"film.json": b"[]"}), tmp_path / "b")
 
 
-def test_what_is_a_film_on_a_command_line(film: Path, tmp_path: Path) -> None:
+def test_films_are_recognised_on_the_command_line(film: Path, tmp_path: Path) -> None:
     np.savez(tmp_path / "tracks.npz", tracks=np.zeros(3))
     np.save(tmp_path / "tracks.npy", np.zeros(3))
     (tmp_path / "list.mp4").write_text("#EXTM3U\n")
@@ -206,7 +204,7 @@ def tracks_file(path: Path, **more: np.ndarray) -> Path:
     return path
 
 
-def test_tracks_weigh_what_the_tracker_is_sure_of(tmp_path: Path) -> None:
+def test_confidence_of_the_tracker_is_the_weight(tmp_path: Path) -> None:
     seen = np.ones((4, 9), bool)
     seen[1, 3] = False
     tracked = Tracked(container="mp4", warnings=("Only 4 frames.",))
@@ -243,12 +241,12 @@ def test_the_film_process_has_no_network_and_starts_no_programs() -> None:
     socket.socket().close()  # here it still works
 
 
-def test_there_is_no_filter_for_an_unknown_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unknown_architecture_has_no_network_filter(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("platform.machine", lambda: "pdp11")
     assert not forbid_network()
 
 
-def test_progress_is_passed_on_and_nonsense_dropped() -> None:
+def test_progress_is_passed_on_and_invalid_lines_dropped() -> None:
     heard: list[dict[str, object]] = []
     with _Progress(heard.append) as progress:
         assert progress.target is not None

@@ -85,7 +85,7 @@ def test_without_a_built_page_a_sentence_says_how_to_build_it(tmp_path: Path, ad
     assert answer.headers["cache-control"] == "no-store"
 
 
-def test_a_page_built_meanwhile_is_served_without_a_restart(tmp_path: Path) -> None:
+def test_a_page_built_later_is_served_without_a_restart(tmp_path: Path) -> None:
     app = FastAPI(docs_url=None)
     mount_page(app, tmp_path)
     client = TestClient(app)

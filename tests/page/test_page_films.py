@@ -177,7 +177,9 @@ def test_a_region_drawn_with_the_mouse_is_sent_with_the_film(
     assert corners.max(0) == pytest.approx([0.8 * WIDTH, 0.8 * HEIGHT], abs=2)
 
 
-def test_a_region_by_keyboard_alone(filming: Page, url: str, films: dict[str, bytes], finished: str) -> None:
+def test_a_region_is_drawn_with_the_keyboard_only(
+    filming: Page, url: str, films: dict[str, bytes], finished: str
+) -> None:
     answer_with(filming, film_record(url, finished))
     drop(filming, {"film.webm": films["film.webm"]})
     filming.get_by_role("button", name="Draw a region").press("Enter")
@@ -228,7 +230,7 @@ def test_a_region_drawn_with_a_finger(filming: Page, films: dict[str, bytes]) ->
     expect(status).to_contain_text("160 × 132 pixels")
 
 
-def test_a_film_that_the_browser_cannot_show_is_sent_whole(
+def test_a_film_that_the_browser_cannot_show_is_sent_without_a_region(
     filming: Page, url: str, films: dict[str, bytes], finished: str
 ) -> None:
     answer_with(filming, film_record(url, finished))
@@ -241,7 +243,7 @@ def test_a_film_that_the_browser_cannot_show_is_sent_whole(
     assert "region_polygon" not in sent_options(filming)
 
 
-def test_a_service_without_films_offers_no_place_for_one(page: Page, url: str) -> None:
+def test_a_service_without_films_offers_no_film_input(page: Page, url: str) -> None:
     def without(route: Route) -> None:
         answer = route.fetch()
         schema = answer.json()

@@ -91,7 +91,7 @@ def resident(pid: int) -> int:
 
 @pytest.mark.parametrize("attack", ATTACKS, ids=str)
 @pytest.mark.slow
-def test_a_crafted_file_is_refused_and_costs_nothing(house: House, attack: Attack) -> None:
+def test_a_crafted_file_is_rejected_without_side_effects(house: House, attack: Attack) -> None:
     jobs = len(house.http.get("/v1/jobs").json()["jobs"])
     outcome = send(house, attack)
     assert outcome.status in attack.statuses, outcome.problem
