@@ -104,6 +104,14 @@ class Interpretation(Record):
         description="Original coordinates: `pixels` (or another common unit), `unit` or `signed` fractions of the picture, or `projected`.",
     )
     y_axis: str = Field("down", description="`down` (pixels) or `up`.")
+    image_size: str | None = Field(
+        None,
+        description="WIDTHxHEIGHT of the picture where the input states it, as films and files of `pliant track` do; used unless the "
+        "options give another.",
+    )
+    fps: float | None = Field(
+        None, description="Frames per second where the input states them; used unless the options give others."
+    )
     given_frames: int | None = Field(None, description="Frames in the file, of which `num_frames` are used.")
     given_points: int | None = Field(None, description="Points in the file, of which `num_points` are used.")
     num_left_out: int = Field(
@@ -137,6 +145,9 @@ class Job(Record):
     expires_at: datetime | None = Field(None, description="When the job and its files are removed; null: never.")
     attempt: int = Field(0, description="Number of attempts so far.")
     retry_of: str | None = Field(None, description="The finished job that this one repeats.")
+    outputs_of: str | None = Field(
+        None, description="The finished job whose result this one writes in further files, without solving again."
+    )
     place_in_queue: int | None = Field(None, description="Number of queued jobs ahead; null if not queued.")
     options: Options
     interpretation: Interpretation

@@ -89,6 +89,18 @@ class Settings:
     read_memory: int = 8 << 30
     """Limit of the address space of the process that reads large inputs; inputs that need more are rejected as too_large."""
 
+    film_memory: int = 4 << 30
+    """Address space of the process that decodes and tracks a film; what needs more is refused as too_large."""
+
+    film_frames: int = 3600
+    """Frames of one film that may be tracked."""
+
+    film_pixels: int = 4096 * 2304
+    """Width times height of a film."""
+
+    film_seconds: float = 600.0
+    """Playing time of a film up to the last frame that is tracked."""
+
     upload_expiry: float = 86400.0
     """Time for which an upload is kept after its last byte or its last use by a job; 0: indefinitely."""
 
@@ -179,6 +191,10 @@ VARIABLES: dict[str, tuple[str, str, Callable[[str], Any]]] = {
     "retention": ("PLIANT_RETENTION", *_SECONDS),
     "disk_quota": ("PLIANT_DISK_QUOTA", *_BYTES),
     "read_memory": ("PLIANT_READ_MEMORY", "a whole number of bytes, at least 1 GiB", _at_least(1 << 30, int)),
+    "film_memory": ("PLIANT_FILM_MEMORY", "a whole number of bytes, at least 512 MiB", _at_least(512 << 20, int)),
+    "film_frames": ("PLIANT_FILM_FRAMES", "a whole number, at least 3", _at_least(3, int)),
+    "film_pixels": ("PLIANT_FILM_PIXELS", "a whole number, at least 256", _at_least(256, int)),
+    "film_seconds": ("PLIANT_FILM_SECONDS", "a number of seconds, at least 1", _at_least(1, float)),
     "upload_expiry": ("PLIANT_UPLOAD_EXPIRY", *_SECONDS),
 }
 """Field, its environment variable, what is expected, how it is read."""

@@ -1,5 +1,5 @@
 // Bundles src/ into dist/: one script, one stylesheet, names that change with their content, and a gzip twin of each.
-// The two HTML files keep their names; they are the only files that a browser has to revalidate.
+// The HTML files keep their names; they are the only files that a browser has to revalidate.
 
 import { build } from "esbuild";
 import { mkdir, readFile, readdir, rename, rm, writeFile } from "node:fs/promises";
@@ -42,7 +42,7 @@ for (const [path, output] of Object.entries(bundled.metafile.outputs)) {
   if (output.cssBundle) produced[basename(output.entryPoint).replace(/\.ts$/, ".css")] = basename(output.cssBundle);
 }
 
-for (const document of ["index.html", "docs.html"]) {
+for (const document of ["index.html", "docs.html", "guide.html"]) {
   const html = await readFile(join(here, "src", document), "utf8");
   const linked = html.replace(/"page\/([^"]+)"/g, (_, source) => {
     if (!(source in produced)) throw new Error(`src/${document} mentions page/${source}, which is not bundled`);

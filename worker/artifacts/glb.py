@@ -114,7 +114,7 @@ def write_glb(
     normals : str
         `static`: of the base shape; `animated`: displaced with every target; `none`.
     quantized : bool
-        16-bit positions by KHR_mesh_quantization.
+        16-bit positions and 8-bit normals by KHR_mesh_quantization.
     colours : array of uint16, shape (P, 4), optional
         RGBA of every point, linear light, 65535 for 1.
     texture : Texture, optional
@@ -132,7 +132,9 @@ def write_glb(
     attributes = {"POSITION": buffer.add(positions, target=VERTICES, bounds=True, normalised=quantized)}
     base_normals = vertex_normals(animation.base, triangles) if smooth != "none" else None
     if base_normals is not None:
-        attributes["NORMAL"] = buffer.add(base_normals, target=VERTICES)
+        attributes["NORMAL"] = buffer.add(
+            _in_bytes(base_normals) if quantized else base_normals, target=VERTICES, normalised=quantized
+        )
     if colours is not None:
         attributes["COLOR_0"] = buffer.add(colours, target=VERTICES, normalised=True)
     if texture is not None:
@@ -202,9 +204,15 @@ def _targets(
     for index in range(len(animation.names)):
         entry = {"POSITION": buffer.add(partial(target, index), target=VERTICES, bounds=True, normalised=quantized)}
         if base is not None:
-            entry["NORMAL"] = buffer.add(partial(turned, index), target=VERTICES)
+            small = (lambda index=index: _in_bytes(turned(index))) if quantized else partial(turned, index)
+            entry["NORMAL"] = buffer.add(small, target=VERTICES, normalised=quantized)
         found.append(entry)
     return found
+
+
+def _in_bytes(normals: Singles) -> NDArray[np.int8]:
+    """Round normals, or their displacements, to bytes: right to half a degree. Displacements beyond 1 are cut off."""
+    return np.rint(np.clip(normals, -1, 1) * 127).astype(np.int8)
 
 
 def _quantize(animation: Animation, node: dict[str, Any]) -> tuple[Array, Callable[[int], Array], dict[str, Any]]:

@@ -97,10 +97,20 @@ def _check(request: dict[str, Any], bounds: FilmBounds) -> dict[str, Any]:
     region = _region(request)
     if region is not None:
         read_region(region, film.size)
-    return {
+    facts = {
         "container": film.container, "width": film.size[0], "height": film.size[1], "fps": film.fps / step,
-        "stated_frames": film.stated_frames, "frames": count or 0,
+        "stated_frames": film.stated_frames, "frames": count or 0, "seconds": film.stated_frames / film.fps,
+        "rotation": film.rotation, "pixel_aspect": film.pixel_aspect,
     }  # fmt: skip
+    if request["estimate"]:
+        from pliant.tracking.estimate import estimate
+
+        expected = estimate(
+            film, region=region, region_frame=options["region_frame"], grid_step=options["grid_step"],
+            longest_side=options["longest_side"], threads=request["threads"],
+        )  # fmt: skip
+        facts |= {"points": expected.points, "track_seconds": expected.seconds}
+    return facts
 
 
 def _track(request: dict[str, Any], bounds: FilmBounds) -> dict[str, Any]:

@@ -43,6 +43,21 @@ class FilmFacts(BaseModel):
     frames: Count
     """Number of these frames that the option `frames` selects; 0 if unknown."""
 
+    seconds: Annotated[float, Field(ge=0, allow_inf_nan=False)]
+    """Playing time by the stated frames and rate; 0 if unknown."""
+
+    rotation: Annotated[int, Field(ge=0, lt=360)]
+    """Degrees clockwise by which the stored frames are turned to be upright."""
+
+    pixel_aspect: Annotated[float, Field(gt=0, allow_inf_nan=False)]
+    """Width over height of a stored pixel; `width` and `height` count square pixels."""
+
+    points: Count = 0
+    """Points that tracking would follow, about; 0 if it was not estimated."""
+
+    track_seconds: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
+    """Seconds that tracking would take on this machine, about; 0 if it was not estimated."""
+
 
 class Tracked(BaseModel):
     """Results of tracking besides the files."""
@@ -53,8 +68,24 @@ class Tracked(BaseModel):
     warnings: Annotated[tuple[Words, ...], Field(max_length=100)]
 
 
-def check_film(source: FilmSource, options: Options, bounds: FilmBounds = FilmBounds()) -> FilmFacts:  # noqa: B008 - frozen
+def check_film(
+    source: FilmSource,
+    options: Options,
+    bounds: FilmBounds = FilmBounds(),  # noqa: B008 - frozen
+    *,
+    estimate: bool = False,
+    threads: int = 1,
+) -> FilmFacts:
     """Open a film and its region without tracking it; takes seconds, whatever the film's length.
+
+    Parameters
+    ----------
+    source, options, bounds
+        The film, how it would be tracked, and what it may cost.
+    estimate
+        Also estimate how many points would be tracked, and the time that it would take with so many threads.
+    threads
+        Threads that tracking would have.
 
     Raises
     ------
@@ -63,7 +94,7 @@ def check_film(source: FilmSource, options: Options, bounds: FilmBounds = FilmBo
     """
     _check_region(source, options)
     with TemporaryDirectory(prefix="pliant-film-") as scratch:
-        ended = _run("check", source, options, bounds, Path(scratch), threads=1)
+        ended = _run("check", source, options, bounds, Path(scratch), threads=threads, estimate=estimate)
     return _answer(FilmFacts, ended, bounds, bounds.check_seconds)
 
 
@@ -119,7 +150,7 @@ def described(facts: FilmFacts, options: Options) -> Interpretation:
     return Interpretation(
         num_frames=facts.frames, num_points=0, num_faces=0, hidden_fraction=0.0, mesh_source="film",
         has_ground_truth=False, has_rotations=False, layout="tracks (F, P, 2)", format=f"film ({facts.container})",
-        given_frames=facts.stated_frames or None,
+        given_frames=facts.stated_frames or None, image_size=f"{facts.width}x{facts.height}", fps=facts.fps,
         notes=[f"A film of {facts.width}×{facts.height} pixels, {count}, {options.fps:.3g} frames per second. "
                "Its points are tracked when the job runs."],
     )  # fmt: skip
@@ -142,11 +173,11 @@ def _check_region(source: FilmSource, options: Options) -> None:
 
 
 def _run(
-    action: str, source: FilmSource, options: Options, bounds: FilmBounds, scratch: Path, *, threads: int,
+    action: str, source: FilmSource, options: Options, bounds: FilmBounds, scratch: Path, *, threads: int, estimate: bool = False,
     on_line: Callable[[dict[str, Any]], None] | None = None, should_stop: Callable[[], bool] | None = None,
 ) -> Ended:  # fmt: skip
     request = {
-        "action": action, "film": str(source.film.absolute()), "threads": max(1, min(threads, 64)),
+        "action": action, "film": str(source.film.absolute()), "threads": max(1, min(threads, 64)), "estimate": estimate,
         "region": None if source.region is None else str(source.region.absolute()),
         "options": options.model_dump(mode="json", include=NEEDED),
         "bounds": asdict(bounds), "folder": str(scratch.absolute()),

@@ -13,7 +13,15 @@ from pliant.worker.formats.records import Arrays
 from pliant.worker.formats.tracks.dense import flatten
 from pliant.worker.formats.tracks.layouts import Reading, choose
 from pliant.worker.formats.tracks.pixels import Placed, place, project
-from pliant.worker.formats.tracks.tracker_formats import INTRINSICS, PLAIN, TRUE_SHAPES, Dialect, recognise, short_names
+from pliant.worker.formats.tracks.tracker_formats import (
+    INTRINSICS,
+    OWN,
+    PLAIN,
+    TRUE_SHAPES,
+    Dialect,
+    recognise,
+    short_names,
+)
 from pliant.worker.formats.tracks.visibility import find_visibility
 
 CENTRED = 0.05
@@ -54,6 +62,8 @@ def understand(arrays: Arrays, options: Options) -> Understood:
     """
     named = short_names(arrays)
     dialect, name = _recognised(named)
+    if dialect.name == OWN:
+        return _of_our_tracker(named, name, options)
     flat = flatten(name, _numeric(named[name], name), field="tracks")
     array, depths, named = _two_numbers(flat.array, name, dialect, named)
     reading, notes = choose(name, array, dialect=dialect, options=options, field="tracks")
@@ -72,6 +82,21 @@ def understand(arrays: Arrays, options: Options) -> Understood:
     return Understood(
         points=placed.points, visible=visible, format=dialect.name, layout=layout, coordinates=placed.coordinates,
         y_axis=y_axis, grid=flat.grid, notes=[*whose, *notes, *placed.notes, *how, *why], arrays=named,
+    )  # fmt: skip
+
+
+def _of_our_tracker(named: Arrays, name: str, options: Options) -> Understood:
+    """Read tracks whose axes, unit and direction are known; visibility and mesh follow from the rest of the file."""
+    points = _numeric(named[name], name)
+    if points.ndim != 3 or points.shape[2] != 2:
+        raise refusal(
+            "wrong_shape", f"tracks.{name}", expected="(frames, points, 2), as pliant track writes it", got=str(points.shape),
+            hint="Save the file of pliant track as it is, or leave frame_indices out.",
+        )  # fmt: skip
+    y_axis = "down" if options.y_axis == "auto" else options.y_axis
+    return Understood(
+        points=points, visible=None, format=OWN, layout="tracks (F, P, 2)", coordinates="pixels", y_axis=y_axis, grid=None,
+        notes=["Recognised as the output of pliant track."], arrays=named,
     )  # fmt: skip
 
 
