@@ -6,6 +6,7 @@ import os
 import signal
 import time
 from contextlib import suppress
+from dataclasses import replace
 from threading import Thread
 
 from pliant.client import Status
@@ -228,7 +229,7 @@ for _stage in ("queued", "loading", "cameras", "reweight", "exporting"):
 @fault("an array larger than the memory that a job may take (RLIMIT_AS)")
 def memory(house: House) -> Told:
     """On an installation of its own, with PLIANT_MEMORY_LIMIT."""
-    lean = House(house.folder / "lean", environment={**SOON, "PLIANT_MEMORY_LIMIT": str(700 << 20)}, workers=1)
+    lean = House(house.folder / "lean", chosen=replace(SOON, memory_limit=700 << 20), workers=1)
     with lean:
         began = time.monotonic()
         id = submitted(lean, frames=200, points=9000, options=SHORT)

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -21,10 +21,7 @@ from pliant.worker.maintenance.fsck import findings
 from pliant.worker.processes.containment import die_with_parent
 from pliant.worker.settings import Settings
 
-SOON = {
-    "PLIANT_LOST_AFTER": "2", "PLIANT_STOP_GRACE": "1", "PLIANT_CANCEL_GRACE": "3", "PLIANT_THREADS": "1",
-    "PLIANT_MAX_ATTEMPTS": "1000",
-}  # fmt: skip
+SOON = Settings(lost_after=2, stop_grace=1, cancel_grace=3, threads=1, max_attempts=1000)
 """Settings under which faults are noticed within seconds."""
 
 PATIENT = Retry(first_contact=60, shortest_pause=0.05, longest_pause=0.5)
@@ -37,7 +34,9 @@ class House:
     """`pliant up` on one data directory; in `with`. It is started again at the same port after `kill_all` or `stop`."""
 
     folder: Path
-    environment: Mapping[str, str] = field(default_factory=lambda: SOON)
+    chosen: Settings = SOON
+    of_service: Mapping[str, str] = field(default_factory=dict)
+    """Variables of the service itself."""
     workers: int = 2
     port: int = 0
     url: str = ""
@@ -60,7 +59,7 @@ class House:
     @property
     def settings(self) -> Settings:
         """How it is set up."""
-        return Settings.from_environment({**self.environment, "PLIANT_DATA": str(self.folder / "data")})
+        return replace(self.chosen, data=self.folder / "data")
 
     @property
     def jobs(self) -> Jobs:
@@ -75,7 +74,8 @@ class House:
         """Start it; while the children of a killed one still hold the port or the directory, again, as a service manager does."""
         command = [sys.executable, "-m", "pliant.cli", "up", "--json", "--port", str(self.port)]
         command += ["--data", str(self.folder / "data"), "--workers", str(self.workers)]
-        environment = {**{k: v for k, v in os.environ.items() if not k.startswith("PLIANT_")}, **self.environment}
+        environment = {name: value for name, value in os.environ.items() if not name.startswith("PLIANT_")}
+        environment |= {**self.settings.to_environment(), **self.of_service}
         self.folder.mkdir(parents=True, exist_ok=True)
         deadline = time.monotonic() + 90
         while time.monotonic() < deadline:

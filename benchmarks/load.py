@@ -24,9 +24,9 @@ from pliant.client.multipart import LARGE
 from pliant.solver.gallery import face
 from pliant.worker.errors import NotAllowedNow
 
-from benchmarks.house import SOON, House, children, resident
+from benchmarks.house import House, children, resident
 
-UNLIMITED = {**SOON, "PLIANT_REQUESTS_PER_MINUTE": "0", "PLIANT_MAX_QUEUED": "0"}
+UNLIMITED = {"PLIANT_REQUESTS_PER_MINUTE": "0", "PLIANT_MAX_QUEUED": "0"}
 MB = 2**20
 
 
@@ -264,7 +264,7 @@ def main() -> int:
     parser.add_argument("--megabytes", type=int, default=300)
     given = parser.parse_args()
     wrong = 0
-    with tempfile.TemporaryDirectory() as folder, House(Path(folder), environment=UNLIMITED) as house:
+    with tempfile.TemporaryDirectory() as folder, House(Path(folder), of_service=UNLIMITED) as house:
         for load in given.loads:
             if load == "jobs":
                 wrong += jobs(house, number=given.jobs, clients=given.clients)

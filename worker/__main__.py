@@ -91,7 +91,7 @@ def main(arguments: list[str]) -> int:
         sys.stderr.write(f"{USAGE}\n")
         return 2
     try:
-        return task(Settings.from_environment(os.environ))
+        return task(Settings.from_environment())
     except WorkerError as error:
         sys.stderr.write(f"{error}\n")
         return 1

@@ -27,6 +27,7 @@ Every one carries a stable `code`, a whole sentence (`str(error)`) and whether t
 
 from __future__ import annotations
 
+from pliant.schemas.invalid import Invalid
 from pliant.schemas.job import Status
 
 
@@ -118,22 +119,22 @@ class Conflict(WorkerError):
         self.id = id
 
 
-class OffsetMismatch(Conflict):
+class OffsetMismatch(Invalid, Conflict):
     """Bytes were sent that do not belong where the upload stands."""
 
     def __init__(self, id: str, *, expected: int, got: int) -> None:
-        sentence = f"Upload {id!r} holds {expected} bytes, and what was sent begins at {got}. Go on at {expected}."
-        super().__init__("upload_offset_mismatch", id=id, sentence=sentence)
-        self.field, self.offset = "Upload-Offset", expected
-        self.expected, self.got = str(expected), str(got)
+        super().__init__(
+            "upload_offset_mismatch",
+            field="Upload-Offset",
+            expected=str(expected),
+            got=str(got),
+            hint=f"Go on at {expected}.",
+        )
+        self.id, self.offset = id, expected
 
 
-class InvalidRequest(WorkerError):
+class InvalidRequest(Invalid, WorkerError):
     """An id, cursor or key that cannot be one."""
-
-    def __init__(self, code: str, *, field: str, expected: str, got: str, hint: str) -> None:
-        super().__init__(f"{field}: expected {expected}, got {got}. {hint}")
-        self.code, self.field, self.expected, self.got, self.hint = code, field, expected, got, hint
 
 
 class UploadTooLarge(InvalidRequest):
@@ -156,14 +157,13 @@ class TooManyUploads(WorkerError):
         super().__init__(f"There are {most} uploads already. Delete some, or wait until they expire.")
 
 
-class InvalidSetting(WorkerError):
-    """A setting does not parse or is out of its range."""
+class InvalidSetting(Invalid, WorkerError):
+    """A setting does not parse, is out of its range, or leaves an installation that nobody could use."""
 
-    code = "invalid_setting"
-
-    def __init__(self, name: str, *, expected: str, got: str) -> None:
-        super().__init__(f"{name}: expected {expected}, got {got!r}. Correct the variable or leave it unset.")
-        self.name, self.expected, self.got = name, expected, got
+    def __init__(
+        self, variable: str, *, expected: str, got: str, hint: str = "Correct the variable or leave it unset."
+    ) -> None:
+        super().__init__("invalid_setting", field=variable, expected=expected, got=got, hint=hint)
 
 
 class TooManyQueued(WorkerError):

@@ -17,9 +17,10 @@ import pytest
 import redis
 import yaml
 from pliant.cli import app
-from pliant.service.settings import _Environment
+from pliant.service.settings import ServiceSettings
+from pliant.worker.environment import fields_of, variable_of
 from pliant.worker.processes.valkey import Valkey
-from pliant.worker.settings import VARIABLES, Settings
+from pliant.worker.settings import Settings
 from pliant.worker.store.queue import alive_key
 from typer.main import get_command
 
@@ -69,11 +70,7 @@ def test_the_image_alone_starts_the_whole_service() -> None:
 
 def read_variables() -> set[str]:
     """Return every variable that service or worker reads."""
-    of_service = {f"PLIANT_{name.upper()}" for name in _Environment.model_fields} - {
-        "PLIANT_MAX_BODY_BYTES",
-        "PLIANT_INCOMING",
-    }
-    return {variable for variable, _, _ in VARIABLES.values()} | of_service
+    return {variable_of(name) for record in (Settings, ServiceSettings) for name in fields_of(record)}
 
 
 def test_every_variable_that_is_set_is_one_that_is_read() -> None:

@@ -17,7 +17,8 @@ from pliant.schemas.job import Job
 from pliant.service import __main__ as process
 from pliant.service.app import create_app
 from pliant.service.middleware.auth import is_public, needed
-from pliant.service.settings import InvalidServiceSetting, ServiceSettings
+from pliant.service.settings import ServiceSettings
+from pliant.worker.errors import InvalidSetting
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.settings import Settings
 from pliant.worker.store.connection import connect
@@ -269,14 +270,14 @@ def test_tokens_are_off_on_loopback_and_on_elsewhere_by_default(valkey_url: str)
     assert [asks(HOST="0.0.0.0"), asks(HOST="::"), asks(HOST="10.0.0.1"), asks(HOST="example.org")] == [True] * 4
     assert asks(AUTH="required")
     assert not asks(HOST="0.0.0.0", AUTH="off")
-    with pytest.raises(InvalidServiceSetting, match="'auto', 'required' or 'off'"):
+    with pytest.raises(InvalidSetting, match="'auto', 'required' or 'off'"):
         asks(AUTH="no")
 
 
 def test_a_service_that_nobody_could_use_does_not_start(valkey_url: str, caplog: pytest.LogCaptureFixture) -> None:
     tokens = Tokens(connect(valkey_url, decode=True), prefix="check-door")
     strict, open_door = ServiceSettings(host="0.0.0.0"), ServiceSettings(host="0.0.0.0", auth="off")
-    with pytest.raises(InvalidServiceSetting, match=r"pliant token create.*PLIANT_AUTH=off"):
+    with pytest.raises(InvalidSetting, match=r"pliant token create.*PLIANT_AUTH=off"):
         process.check_access(strict, tokens)
     process.check_access(open_door, tokens)
     assert "can read and delete every job" in caplog.text

@@ -10,7 +10,8 @@ import pytest
 from pliant.client import Client, TooManyRequests
 from pliant.client.retry import Retry
 from pliant.service.middleware.rate_limit import MOST_CLIENTS, Rates, _client
-from pliant.service.settings import USUAL_RATE, InvalidServiceSetting
+from pliant.service.settings import USUAL_RATE
+from pliant.worker.errors import InvalidSetting
 from pliant.worker.tokens import Scope
 from serving import Running, Serve, claim, form, settings_from, submit, tracks
 
@@ -182,7 +183,7 @@ def test_the_default_rate_applies_where_the_service_is_reachable_from_outside() 
     assert rate(REQUESTS_PER_MINUTE="7") == 7
     assert rate(9, REQUESTS_PER_MINUTE="7") == 9
     for name in ("REQUESTS_PER_MINUTE", "MAX_QUEUED"):
-        with pytest.raises(InvalidServiceSetting, match=name):
+        with pytest.raises(InvalidSetting, match=name):
             rate(**{name: "-1"})
 
 

@@ -44,8 +44,8 @@ class Running:
         """Everything in the incoming folder but the process's own lock and empty folder."""
         return [
             path
-            for path in self.settings.incoming.rglob("*")
-            if len(path.relative_to(self.settings.incoming).parts) > 1
+            for path in self.jobs.settings.incoming.rglob("*")
+            if len(path.relative_to(self.jobs.settings.incoming).parts) > 1
         ]
 
     def client(self, *scopes: Scope, name: str = "somebody", **more: Any) -> httpx.Client:
@@ -123,7 +123,7 @@ def claim(running: Running, id: str) -> str:
 def finish(running: Running, id: str, contents: bytes, *, name: str = "shapes.npz") -> None:
     """Do as a worker would: claim the job, store a file, publish it."""
     attempt_id = claim(running, id)
-    file = running.settings.incoming.parent / f"{id}.tmp"
+    file = running.jobs.settings.data / f"{id}.tmp"
     file.write_bytes(contents)
     prefix = f"jobs/{id}/{attempt_id}/"
     running.jobs.blobs.put(f"{prefix}{name}", file)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import platform
-import resource
 import sys
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -98,8 +97,12 @@ def _trust(trust: Trust | None) -> dict[str, Any]:
     }
 
 
-def peak_memory() -> int:
-    """Largest resident size of this process so far, bytes."""
+def peak_memory() -> int | None:
+    """Largest resident size of this process so far, bytes; None on Windows."""
+    try:
+        import resource
+    except ModuleNotFoundError:
+        return None
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024
 
