@@ -126,7 +126,12 @@ def test_no_arrow_between_rooms_runs_back(folder: Path) -> None:
         pytest.fail(f"imports run in a circle: {' -> '.join(error.args[1])}")
 
 
-@pytest.mark.parametrize("folder", PACKAGES, ids=lambda path: str(path.relative_to(ROOT)))
+ALSO_ROOMS = sorted(
+    {path.parent for name in ("benchmarks", "tests", "examples") for path in (ROOT / name).rglob("*.py")}
+)
+
+
+@pytest.mark.parametrize("folder", [*PACKAGES, *ALSO_ROOMS], ids=lambda path: str(path.relative_to(ROOT)))
 def test_a_room_holds_few_files(folder: Path) -> None:
     files = [path.name for path in folder.glob("*.py")]
     assert len(files) <= MOST_FILES, f"{len(files)} Python files side by side: {files}"

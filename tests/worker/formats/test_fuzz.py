@@ -23,7 +23,7 @@ from pliant.solver import InvalidInput
 from pliant.worker.formats import Limits, load_inputs, read_inputs, save_inputs
 from pliant.worker.formats.tracks.tracker_formats import KNOWN
 
-SUPPORT = Path(__file__).parents[2] / "support"
+SUPPORT = Path(__file__).parents[2] / "support" / "files"
 DOCUMENT = Path(__file__).parents[3] / "build" / "fuzzing.md"
 sys.path.insert(0, str(SUPPORT))  # where pytest finds it too
 

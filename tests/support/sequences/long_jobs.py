@@ -6,7 +6,7 @@ import runpy
 from pathlib import Path
 from typing import Any
 
-_HOME = runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "long_jobs.py"))
+_HOME = runpy.run_path(str(Path(__file__).parents[3] / "benchmarks" / "installation" / "long_jobs.py"))
 LONG, long_sequence = _HOME["LONG"], _HOME["long_sequence"]
 
 

@@ -21,8 +21,8 @@ import cProfile
 import pstats
 from pathlib import Path
 
-from benchmarks.growth import FRAMES, POINTS, bandwidth, growth, mesh_against_grid
-from benchmarks.side_by_side import BASELINES, Workload, compare, solved
+from benchmarks.speed.growth import FRAMES, POINTS, bandwidth, growth, mesh_against_grid
+from benchmarks.speed.side_by_side import BASELINES, Workload, compare, solved
 
 
 def main() -> None:

@@ -1,6 +1,6 @@
 """Faults: every kind of process killed at every kind of moment, on a real installation; what the record said, and what was lost.
 
-    python -m benchmarks.faults
+    python -m benchmarks.installation.faults
 
 Prints a table. After each fault everything stored is compared with what the records say (as `pliant doctor --audit` does), the
 list of jobs with those that were acknowledged, and the process table with what was started. Exits with 1 if anything does not fit.
@@ -13,9 +13,9 @@ import sys
 import tempfile
 from pathlib import Path
 
-from benchmarks import fault_jobs, fault_service
-from benchmarks.fault_list import FAULTS, Told
-from benchmarks.house import House
+from benchmarks.installation import fault_jobs, fault_service
+from benchmarks.installation.fault_list import FAULTS, Told
+from benchmarks.installation.house import House
 
 assert fault_service.__doc__, "imported for what it lists"
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pliant.client import Job, NotAllowedNow
 from pliant.solver.gallery import face
 
-from benchmarks.house import House
-from benchmarks.long_jobs import LONG, long_sequence
+from benchmarks.installation.house import House
+from benchmarks.installation.long_jobs import LONG, long_sequence
 
 SHORT = {"max_reweightings": 3}
 LARGE = {"method": "pseudo_inverse"}

@@ -1,6 +1,6 @@
 """Load: many small jobs, many pollers, one large upload, on a real installation of two workers.
 
-    python -m benchmarks.load [jobs] [pollers] [upload]
+    python -m benchmarks.installation.load [jobs] [pollers] [upload]
 
 Prints a table for each. Exits with 1 if a request was lost: one that got no answer, or another than it should.
 """
@@ -24,7 +24,7 @@ from pliant.client.multipart import LARGE
 from pliant.solver.gallery import face
 from pliant.worker.errors import NotAllowedNow
 
-from benchmarks.house import House, children, resident
+from benchmarks.installation.house import House, children, resident
 
 UNLIMITED = {"PLIANT_REQUESTS_PER_MINUTE": "0", "PLIANT_MAX_QUEUED": "0"}
 MB = 2**20

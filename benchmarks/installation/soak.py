@@ -1,6 +1,6 @@
 """Soak: jobs come without pause while processes are killed at random; nothing acknowledged may be lost.
 
-    python benchmarks/soak.py --minutes 15
+    python -m benchmarks.installation.soak --minutes 15
 
 Prints a table of the faults, what the records said of the jobs that were hit, after how many seconds, and what was lost.
 Exits with 1 if anything was.

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.cells import CORRUPTIONS, METHODS
+from benchmarks.accuracy.cells import CORRUPTIONS, METHODS
 
 METRICS = (
     "e3d_frame", "e3d_sequence", "e3d_frame_similarity", "e3d_mocap", "rotation_degrees", "reprojection_median",

@@ -12,9 +12,9 @@ from threading import Thread
 from pliant.client import Status
 from pliant.solver.gallery import face
 
-from benchmarks.fault_list import LARGE, SHORT, Fault, Told, cancelled, fault, said, submitted
-from benchmarks.house import SOON, House, children, running
-from benchmarks.long_jobs import LONG
+from benchmarks.installation.fault_list import LARGE, SHORT, Fault, Told, cancelled, fault, said, submitted
+from benchmarks.installation.house import SOON, House, children, running
+from benchmarks.installation.long_jobs import LONG
 
 
 @fault("kill -9 the job process in mid solve")

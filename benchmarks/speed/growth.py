@@ -9,8 +9,8 @@ from dataclasses import replace
 import numpy as np
 from pliant.solver.threads import available_cores
 
-from benchmarks.apart import Measured, apart
-from benchmarks.side_by_side import Ours, Workload, run_ours
+from benchmarks.speed.apart import Measured, apart
+from benchmarks.speed.side_by_side import Ours, Workload, run_ours
 
 POINTS = (5_000, 10_000, 30_000, 100_000, 300_000)
 """At `FIXED_FRAMES` frames."""

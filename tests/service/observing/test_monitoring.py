@@ -14,7 +14,7 @@ from pliant.worker.jobs import lifecycle
 from prometheus_client.parser import text_string_to_metric_families
 from serving import NOW, Running, claim, finish, submit
 
-DEPLOY = Path(__file__).parents[2] / "deploy"
+DEPLOY = Path(__file__).parents[3] / "deploy"
 SELECTOR = re.compile(r"(pliant_\w+)(?:\{([^}]*)\})?")
 LABEL = re.compile(r"(\w+)\s*(?:=~|=|!=|!~)")
 GROUPED = re.compile(r"\bby \(([^)]*)\)")

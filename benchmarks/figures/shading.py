@@ -1,8 +1,9 @@
-"""A small software rasteriser: shaded, coloured meshes as arrays, with nothing but NumPy."""
+"""Shaded, coloured meshes and points as pictures; the tracker's rasteriser finds what each pixel shows."""
 
 from __future__ import annotations
 
 import numpy as np
+from pliant.tracking.rendering.rasterising import rasterise, triangulate
 
 LIGHTS = (((-0.55, -0.65, -0.60), 0.52), ((0.80, -0.05, -0.60), 0.20), ((0.0, 0.0, -1.0), 0.22))
 """Directions towards the light (x right, y down, z away from the viewer) and strengths: a key, a fill, and one beside the eye."""
@@ -11,6 +12,8 @@ COLOURED = 0.45
 """Share of the shading that is kept where colours mean something, so that dark stays the scale's dark."""
 SUPERSAMPLING = 2
 GREY = 0.86
+FAR = 1e6
+"""Distance of the camera in depths of the drawn mesh."""
 
 
 def draw_mesh(
@@ -40,23 +43,20 @@ def draw_mesh(
     """
     fine = SUPERSAMPLING
     height, width = size[0] * fine, size[1] * fine
-    triangles = split_quads(faces)
+    triangles = triangulate(faces)
     normals = _vertex_normals(points, triangles)
-    screen = (points[:, :2] - centre) * (scale * fine) + (width / 2, height / 2)
-    pixel, triangle, inside = _fragments(screen[triangles], height, width)
-    corner = triangles[triangle]
-    depth = np.einsum("nk,nk->n", inside, points[corner, 2])
-    order = np.argsort(-depth, kind="stable")  # far to near: the nearest is written last
-    pixel, corner, inside = pixel[order], corner[order], inside[order]
-    nearest = np.zeros(height * width, dtype=np.int64) - 1
-    nearest[pixel] = np.arange(len(pixel))
-    hit = nearest[nearest >= 0]
-    normal = np.einsum("nk,nkc->nc", inside[hit], normals[corner[hit]])
+    screen = (points[:, :2] - centre) * (scale * fine) + ((width - 1) / 2, (height - 1) / 2)
+    # Depths that differ by a millionth of themselves make the perspective of the rasteriser vanish.
+    near = points[:, 2] - points[:, 2].min()
+    shown = rasterise(screen, near + FAR * max(float(near.max()), 1e-9), triangles, size=(width, height))
+    hit = np.flatnonzero(shown.triangle >= 0)
+    corner, inside = triangles[shown.triangle.ravel()[hit]], shown.weights.reshape(-1, 3)[hit]
+    normal = np.einsum("nk,nkc->nc", inside, normals[corner])
     base = np.full((len(points), 3), GREY) if colours is None else colours
-    colour = np.einsum("nk,nkc->nc", inside[hit], base[corner[hit]])
+    colour = np.einsum("nk,nkc->nc", inside, base[corner])
     light = _shade(normal) if colours is None else 1 + COLOURED * (_shade(normal) - 1)
     image = np.full((height * width, 3), background)
-    image[pixel[hit]] = np.clip(colour * light[:, None], 0, 1)
+    image[hit] = np.clip(colour * light[:, None], 0, 1)
     return image.reshape(size[0], fine, size[1], fine, 3).mean(axis=(1, 3))
 
 
@@ -83,11 +83,6 @@ def draw_points(
     return image
 
 
-def split_quads(faces: np.ndarray) -> np.ndarray:
-    """Triangles of a triangle or quad mesh."""
-    return faces if faces.shape[1] == 3 else np.concatenate([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]])
-
-
 def _shade(normal: np.ndarray) -> np.ndarray:
     normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
     normal = np.where(normal[:, 2:] > 0, -normal, normal)  # the back of a sheet is lit like its front
@@ -104,27 +99,3 @@ def _vertex_normals(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     total = [np.bincount(triangles.ravel(), np.repeat(across[:, axis], 3), len(points)) for axis in range(3)]
     normals = np.stack(total, axis=1)
     return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-
-
-def _fragments(corners: np.ndarray, height: int, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pixel, triangle and barycentric coordinates of every covered pixel, going through triangles of one size at a time."""
-    low = np.floor(corners.min(axis=1)).astype(int)
-    span = np.ceil(corners.max(axis=1)).astype(int) - low
-    edges = corners[:, 1:] - corners[:, :1]
-    area = edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]
-    level = np.ceil(np.log2(np.maximum(span.max(axis=1), 1) + 1)).astype(int)
-    found = []
-    for power in np.unique(level):
-        some = np.flatnonzero((level == power) & (np.abs(area) > 1e-12))
-        steps = np.stack(np.meshgrid(np.arange(2**power), np.arange(2**power), indexing="xy"), axis=-1).reshape(-1, 2)
-        for part in np.array_split(some, max(1, len(some) * len(steps) // 2_000_000)):
-            place = low[part, None] + steps[None]
-            offset = place + 0.5 - corners[part, None, 0]
-            first, second = edges[part, None, 0], edges[part, None, 1]
-            b = (offset[..., 0] * second[..., 1] - offset[..., 1] * second[..., 0]) / area[part, None]
-            c = (first[..., 0] * offset[..., 1] - first[..., 1] * offset[..., 0]) / area[part, None]
-            bary = np.stack([1 - b - c, b, c], axis=-1)
-            ok = (bary >= -1e-9).all(axis=-1) & (place >= 0).all(axis=-1) & (place < (width, height)).all(axis=-1)
-            row, column = np.nonzero(ok)
-            found.append((place[row, column, 1] * width + place[row, column, 0], part[row], bary[row, column]))
-    return tuple(np.concatenate(parts) for parts in zip(*found, strict=True))  # type: ignore[return-value]

@@ -13,9 +13,9 @@ from pliant.client import Job, Status
 from pliant.client.multipart import Remainder
 from pliant.solver.gallery import face
 
-from benchmarks.fault_list import LARGE, SHORT, Told, cancelled, fault, said, submitted
-from benchmarks.house import House, running
-from benchmarks.long_jobs import LONG
+from benchmarks.installation.fault_list import LARGE, SHORT, Told, cancelled, fault, said, submitted
+from benchmarks.installation.house import House, running
+from benchmarks.installation.long_jobs import LONG
 
 
 @fault("kill -9 the API in mid upload")

@@ -1,6 +1,6 @@
 """Every crafted file, sent to the real service over HTTP: refused by a code, the service alive, memory bounded, nothing left behind.
 
-`python tests/service/test_attacks.py` sends them once more and writes a table of the answers to build/attacks.md.
+`python tests/service/access/test_attacks.py` sends them once more and writes a table of the answers to build/attacks.md.
 """
 
 from __future__ import annotations
@@ -16,14 +16,16 @@ from pathlib import Path
 import httpx
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "support"))  # where pytest finds it too
+sys.path[:0] = [
+    str(Path(__file__).parents[2] / "support" / room) for room in ("files", "processes")
+]  # as pytest has it
 
 from attack_files import ATTACKS, Attack
 from crafting import CANARY, HONEST
 from peaks import Watched, descendants, watched
 from pliant.cli.demo import running
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 DOCUMENT = ROOT / "build" / "attacks.md"
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="memory peaks are read from /proc")
 
@@ -126,7 +128,7 @@ def table(house: House) -> str:
 
 HEAD = """# Attacks tried
 
-Each row is a file made by `tests/support/attack_files.py` and sent to a running service as a form: what it is, the
+Each row is a file made by `tests/support/files/attack_files.py` and sent to a running service as a form: what it is, the
 answer, the time, by how much the service's resident memory peaked above its value before, and the largest resident
 memory of the process that read the file (– if none was started: the service refused before reading).
 

@@ -1,7 +1,7 @@
 """The page on a real service: time from `pliant up` to the first playing mesh, and the pictures in docs/images.
 
-    python benchmarks/page.py                      # times, as JSON
-    python benchmarks/page.py --pictures docs/images
+    python -m benchmarks.installation.page                      # times, as JSON
+    python -m benchmarks.installation.page --pictures docs/images
 
 Needs a Chromium, the built page (`make page`) and, for pictures, Pillow.
 """
@@ -25,8 +25,8 @@ from playwright.sync_api import Page
 from pliant.client import Client
 from pliant.solver.gallery import face
 
-ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT / "tests" / "support"))
+ROOT = Path(__file__).parents[2]
+sys.path.insert(0, str(ROOT / "tests" / "support" / "page"))
 
 from browsing import Browsing  # noqa: E402
 

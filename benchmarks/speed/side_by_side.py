@@ -16,10 +16,10 @@ from pliant.solver.shapes.initialization import pseudo_inverse, uniform_solution
 from pliant.solver.shapes.setup import build_problem
 from pliant.solver.tracks.normalization import normalize
 
-from benchmarks import baselines
-from benchmarks.apart import Measured, Stopwatch, apart
-from benchmarks.cells import parse_settings
+from benchmarks.accuracy.cells import parse_settings
 from benchmarks.sequences import Case, cases, from_gallery
+from benchmarks.speed import baselines
+from benchmarks.speed.apart import Measured, Stopwatch, apart
 
 GAP = 1.01
 """A baseline is done when its energy is within 1 % of the solver's last."""

@@ -22,14 +22,14 @@ from pathlib import Path
 
 from pliant.solver import InvalidInput
 
-from benchmarks import gate
-from benchmarks.aims import aims_table
-from benchmarks.cells import CORRUPTIONS, METHODS, Key, append_row, measure, read_rows
+from benchmarks.accuracy import gate
+from benchmarks.accuracy.aims import aims_table
+from benchmarks.accuracy.cells import CORRUPTIONS, METHODS, Key, append_row, measure, read_rows
+from benchmarks.accuracy.plan import PARTS
+from benchmarks.accuracy.summary import write_summary
+from benchmarks.accuracy.tables import METRICS, clean_table, corruption_table, cost_table, number
 from benchmarks.commit import commit
-from benchmarks.plan import PARTS
 from benchmarks.sequences import Case, cases, wanted
-from benchmarks.summary import write_summary
-from benchmarks.tables import METRICS, clean_table, corruption_table, cost_table, number
 
 SLOW = 10.0
 """Seconds; three trials instead of five where a run takes longer."""

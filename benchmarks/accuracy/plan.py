@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from benchmarks.cells import METHODS
+from benchmarks.accuracy.cells import METHODS
 
 CORRUPTED = ("facescan10_rot90", "facescan99_rot30", "aura_anim_rot45", "akhter_drink")
 FACES = ("facescan10_rot90", "facescan99_rot30", "ict_beat_9k_rot30", "aura_anim_rot45")

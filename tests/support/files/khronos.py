@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-ROOT = Path(__file__).parent.parent.parent
+ROOT = Path(__file__).parents[3]
 HOME = ROOT / "build" / "khronos"
 PACKAGE = "gltf-validator@2.0.0-dev.3.10"
 SCRIPT = """

@@ -1,4 +1,4 @@
-"""Figures drawn from `benchmarks/results/*.jsonl`: `python -m benchmarks.plots [--into docs/images]` (needs matplotlib)."""
+"""Figures drawn from `benchmarks/results/*.jsonl`: `python -m benchmarks.figures.plots [--into docs/images]` (needs matplotlib)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-RESULTS = Path(__file__).parent / "results"
+RESULTS = Path(__file__).parents[1] / "results"
 Records = list[dict[str, Any]]
 
 NAMES = {

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pliant.solver.gallery import face, flag, sphere
 
-from benchmarks.cells import METHODS, Key, measure
+from benchmarks.accuracy.cells import METHODS, Key, measure
 from benchmarks.commit import commit
 from benchmarks.sequences import from_gallery
 

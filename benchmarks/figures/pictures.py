@@ -1,13 +1,13 @@
 """Pictures: input tracks, truth and reconstruction side by side, the error as colour, at several frames.
 
-    python -m benchmarks.pictures                              the gallery
-    python -m benchmarks.pictures --data DIR --only face --frames 4
-    python -m benchmarks.pictures --data DIR --only samba --at 0,40,80 --camera film --full 40
-    python -m benchmarks.pictures --outliers .1 --side 50
+    python -m benchmarks.figures.pictures                              the gallery
+    python -m benchmarks.figures.pictures --data DIR --only face --frames 4
+    python -m benchmarks.figures.pictures --data DIR --only samba --at 0,40,80 --camera film --full 40
+    python -m benchmarks.figures.pictures --outliers .1 --side 50
 
 Surfaces are seen from one fixed place, the cameras' mean, or with `--camera film` from beside each frame's own camera. Without truth the
 reconstruction stands alone, coloured by its reprojection residual. Needs matplotlib (`pip install matplotlib`) for the frame around the
-drawings; the drawings are `benchmarks.raster`'s.
+drawings; the drawings are `benchmarks.figures.shading`'s.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from pliant.solver.evaluation.alignment import align, frobenius, procrustes
 from pliant.solver.evaluation.metrics import e3d_sequence
 from pliant.solver.gallery import corrupt_tracks
 
-from benchmarks.cells import parse_settings
-from benchmarks.raster import draw_mesh, draw_points
+from benchmarks.accuracy.cells import parse_settings
+from benchmarks.figures.shading import draw_mesh, draw_points
 from benchmarks.sequences import Case, cases
 
 mpl.use("Agg")

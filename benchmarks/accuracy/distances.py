@@ -1,6 +1,6 @@
 """Error against the distance of the camera: sequences with known cameras seen by a pinhole.
 
-    python -m benchmarks.distances --data DIR [--only NAME] [--points N] [--out FILE]
+    python -m benchmarks.accuracy.distances --data DIR [--only NAME] [--points N] [--out FILE]
 
 The true shapes, seen by their cameras, are scaled to a half-size (largest |coordinate| in the camera frame) of 300 px and projected from
 d half-sizes away into a picture of 1280 × 720 px: u = c + x/(1 + z/φ) with φ = 300·d px and c the centre. All points count as seen; the
