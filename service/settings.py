@@ -61,6 +61,9 @@ class ServiceSettings:
     other."""
     cors_origins: Listed = ()
     """Origins whose pages may call the service, separated by commas; empty: none."""
+    trusted_proxies: Listed = ()
+    """Addresses or networks of proxies whose `X-Forwarded-For` names the client, separated by commas; `*` for any
+   . Empty: none, because any user of the machine could choose the address that is counted."""
     log_level: LogLevel = "info"
     """Least level that is logged."""
     log_format: LogFormat = "console"

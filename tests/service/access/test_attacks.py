@@ -16,9 +16,8 @@ from pathlib import Path
 import httpx
 import pytest
 
-sys.path[:0] = [
-    str(Path(__file__).parents[2] / "support" / room) for room in ("files", "processes")
-]  # as pytest has it
+sys.path.insert(0, str(Path(__file__).parents[2] / "support" / "files"))  # where pytest finds them too
+sys.path.insert(0, str(Path(__file__).parents[2] / "support" / "processes"))
 
 from attack_files import ATTACKS, Attack
 from crafting import CANARY, HONEST
