@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from benchmarks.raster import draw_mesh
+from benchmarks.figures.shading import draw_mesh
 from PIL import Image
 from pliant.solver import Camera
 from pliant.tracking import open_film
