@@ -48,7 +48,8 @@ class Reconstruction:
 
     def __repr__(self) -> str:
         size = f"{self.job.interpretation.num_frames} frames × {self.job.interpretation.num_points} points"
-        return f"<{type(self).__name__} of job {self.job.id}: {size}, {self.job.outcome}>"
+        ended = ", ".join(str(each) for each in (self.job.verdict, self.job.outcome) if each is not None)
+        return f"<{type(self).__name__} of job {self.job.id}: {size}, {ended}>"
 
     @property
     def shapes(self) -> NDArray[np.float64]:
@@ -69,6 +70,24 @@ class Reconstruction:
     def verdict(self) -> str | None:
         """Whether the result can be used: `good`, `with_care` or `do_not_use`; None where it was not judged."""
         return self.job.verdict
+
+    @property
+    def camera(self) -> dict[str, Any]:
+        """The camera model and its lens, as the report states them: `model`, `focal`, `focal_std`, `field_of_view`, `sentence` and more."""
+        camera: dict[str, Any] = self.report["camera"]
+        return camera
+
+    @property
+    def focal(self) -> float | None:
+        """Focal length in pixels of the tracks; None for orthographic cameras."""
+        focal: float | None = self.camera["focal"]
+        return focal
+
+    @property
+    def field_of_view(self) -> float | None:
+        """Horizontal field of view in degrees; None for orthographic cameras and where `image_size` is not known."""
+        angle: float | None = self.camera.get("field_of_view")
+        return angle
 
     @property
     def faces(self) -> NDArray[np.int32]:
@@ -122,6 +141,11 @@ def copied(source: Path, path: Path | str) -> Path:
     target.parent.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(source, target)
     return target
+
+
+def loaded(job: Job) -> tuple[str, ...]:
+    """Return the files that `wait` and `result` download; a job that wrote further files has no arrays of its own."""
+    return LOADED if job.outputs_of is None else (REPORT,)
 
 
 def job_path(job: str) -> str:

@@ -76,6 +76,18 @@ class Problem(Record):
         return cls(title=title, status=status, code=code, detail=detail, **members)
 
 
+class FollowedPoints(Record):
+    """Some points of a film in the frame that was tracked last."""
+
+    frame: int = Field(ge=0, description="Number of the frame in the film, from 0.")
+    seconds: float = Field(ge=0, description="From the film's start.")
+    width: int = Field(ge=1, description="Of the film, pixels.")
+    height: int = Field(ge=1, description="Of the film, pixels.")
+    points: list[int] = Field(
+        max_length=400, description="x and y of each visible point in turn, rounded to the film's pixels."
+    )
+
+
 class Progress(Record):
     """Progress of a running job."""
 
@@ -88,6 +100,7 @@ class Progress(Record):
     objective: float | None = None
     residual: float | None = Field(None, description="Median visible reprojection residual, the tracks' unit.")
     seconds_left: float | None = Field(None, description="Estimate; null until one is possible.")
+    followed: FollowedPoints | None = Field(None, description="Points that the stage `track` tracked last.")
     updated_at: datetime
 
 
@@ -167,6 +180,9 @@ class Job(Record):
     expires_at: datetime | None = Field(None, description="When the job and its files are removed; null: never.")
     attempt: int = Field(0, description="Number of attempts so far.")
     retry_of: str | None = Field(None, description="The finished job that this one repeats.")
+    outputs_of: str | None = Field(
+        None, description="The finished job whose result this one writes in further files, without solving again."
+    )
     place_in_queue: int | None = Field(None, description="Number of queued jobs ahead; null if not queued.")
     options: Options
     interpretation: Interpretation

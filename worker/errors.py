@@ -4,6 +4,7 @@
     ├── UnknownJob              no job of that id (or not yours)
     ├── UnknownArtifact         the job has no such file
     ├── UnknownExample          no such example, or it has no such file
+    ├── UnknownShare            the job has no such share link
     ├── UnknownToken            there is no token of that id
     ├── UnknownUpload           no upload of that id (or not yours)
     ├── NotAllowedNow           the job's status does not allow it
@@ -11,6 +12,7 @@
     │   └── OffsetMismatch      the offset of the bytes is not the size of the upload
     ├── InvalidRequest          a malformed id or cursor
     │   └── UploadTooLarge      an upload exceeds its maximum size
+    ├── TooManyShares           the limit of share links of a job is reached
     ├── TooManyUploads          the owner's limit of uploads is reached
     ├── InvalidSetting          a setting does not parse or is out of range
     ├── TooManyQueued           the owner's limit of queued jobs is reached
@@ -78,6 +80,18 @@ class UnknownExample(WorkerError):
     def __init__(self, name: str, file: str, *, known: list[str]) -> None:
         super().__init__(f"There is no example file {name}/{file}. There are: {', '.join(known)}.")
         self.name, self.file = name, file
+
+
+class UnknownShare(WorkerError):
+    """The job has no such share link."""
+
+    code = "unknown_share"
+
+    def __init__(self, id: str, share: str) -> None:
+        super().__init__(
+            f"Job {id!r} has no share link {share!r}; it may have expired. List the links to see which there are."
+        )
+        self.id, self.share = id, share
 
 
 class UnknownToken(WorkerError):
@@ -154,6 +168,16 @@ class TooManyUploads(WorkerError):
         super().__init__(
             f"Upload limit reached: there are already {most} uploads. Delete some, or wait until they expire."
         )
+
+
+class TooManyShares(WorkerError):
+    """A job has as many valid share links as it may have."""
+
+    code = "too_many_shares"
+
+    def __init__(self, id: str, most: int) -> None:
+        super().__init__(f"Job {id!r} has {most} share links already. Revoke one, or wait until one expires.")
+        self.id, self.most = id, most
 
 
 class InvalidSetting(Invalid, WorkerError):

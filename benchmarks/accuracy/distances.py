@@ -63,7 +63,7 @@ def seen_from(case: Case, distance: float) -> tuple[Tracks, np.ndarray, np.ndarr
     unit = HALF_SIZE / float(np.abs(seen).max())
     shapes, seen = unit * shapes, unit * seen
     nearer = 1 + seen[..., 2:] / (HALF_SIZE * distance)
-    return Tracks.from_arrays(np.array(PICTURE) / 2 + seen[..., :2] / nearer), shapes, rotations
+    return Tracks.from_arrays((np.array(PICTURE) - 1) / 2 + seen[..., :2] / nearer), shapes, rotations
 
 
 def mirrored(shapes: np.ndarray, truth: np.ndarray) -> bool:

@@ -9,7 +9,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any, TypeVar
 
-from pliant.schemas.job import Interpretation
+from pliant.schemas.job import FollowedPoints, Interpretation
 from pliant.schemas.options import Options
 from pliant.solver.errors import InvalidInput
 from pliant.worker.errors import Interrupted
@@ -105,7 +105,7 @@ def track_film(
     *,
     bounds: FilmBounds = FilmBounds(),  # noqa: B008 - frozen
     threads: int = 1,
-    on_progress: Callable[[float], None] | None = None,
+    on_progress: Callable[[float, FollowedPoints | None], None] | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> Tracked:
     """Track a film; `tracks.npz` and `contact_sheet.jpg` are then in the scratch folder.
@@ -119,7 +119,7 @@ def track_film(
     threads : int
         Threads for optical flow.
     on_progress : callable, optional
-        Called with the completed share, in [0, 1].
+        Called with the completed share, in [0, 1], and the points that were just tracked, if any.
     should_stop : callable, optional
         Called ten times a second; the film process is killed once it returns True.
 
@@ -135,12 +135,20 @@ def track_film(
     def on_line(stated: dict[str, Any]) -> None:
         done = stated.get("done")
         if on_progress is not None and isinstance(done, int | float) and 0 <= done <= 1:
-            on_progress(float(done))
+            on_progress(float(done), _followed(stated.get("followed")))
 
     ended = _run("track", source, options, bounds, scratch, threads=threads, on_line=on_line, should_stop=should_stop)
     if ended.stopped:
         raise Interrupted
     return _answer(Tracked, ended, bounds, bounds.track_seconds)
+
+
+def _followed(stated: object) -> FollowedPoints | None:
+    """Take over points that the film process states; None for anything else."""
+    try:
+        return FollowedPoints.model_validate(stated)
+    except ValidationError:
+        return None
 
 
 def described(facts: FilmFacts, options: Options) -> Interpretation:

@@ -10,7 +10,7 @@ from pliant.solver import Tracks
 from pliant.solver.model.so3 import exponential
 
 FOCAL = 600.0
-CENTRE = (320.0, 240.0)
+CENTRE = (319.5, 239.5)
 SIZE = (640, 480)
 
 
