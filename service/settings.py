@@ -33,25 +33,25 @@ class ServiceSettings:
 
     host: str = "127.0.0.1"
     """Address to bind."""
-    port: int = Field(8000, ge=0, le=65535)
+    port: int = Field(default=8000, ge=0, le=65535)
     """TCP port to bind; 0 takes a free one."""
-    max_body_mb: float = Field(2048.0, gt=0, le=2**20)
+    max_body_mb: float = Field(default=2048.0, gt=0, le=2**20)
     """Largest body of one request, in MiB."""
-    max_text_bytes: int = Field(1 * MB, ge=1)
+    max_text_bytes: int = Field(default=1 * MB, ge=1)
     """Largest text field of a form, or whole JSON body, in bytes."""
-    max_queued: int = Field(1000, ge=0, le=10**7)
+    max_queued: int = Field(default=1000, ge=0, le=10**7)
     """Queued jobs of one token, unless the token has a limit of its own; 0: no limit. Where tokens are off, all jobs count as
     one token's."""
-    requests_per_minute: int | None = Field(None, ge=0, le=10**7)
+    requests_per_minute: int | None = Field(default=None, ge=0, le=10**7)
     """Requests per minute of one token, or of one address where tokens are off; 0: no limit; None: `USUAL_RATE` where the
     service is not on the loopback address or requires tokens, no limit elsewhere."""
-    parsers: int = Field(2, ge=1, le=64)
+    parsers: int = Field(default=2, ge=1, le=64)
     """Bodies that are parsed at once; each may hold a whole input in memory."""
-    stall_seconds: float = Field(60.0, gt=0)
+    stall_seconds: float = Field(default=60.0, gt=0)
     """Seconds without a byte of an unfinished body after which the request is refused."""
-    max_wait_seconds: int = Field(60, ge=0)
+    max_wait_seconds: int = Field(default=60, ge=0)
     """Longest `Prefer: wait=n` that is honoured, in seconds."""
-    heartbeat_seconds: float = Field(15.0, gt=0)
+    heartbeat_seconds: float = Field(default=15.0, gt=0)
     """Pause after which an event stream sends a comment line, in seconds."""
     allowed_hosts: Listed = ()
     """Values of the Host header that are answered, separated by commas. Empty: on the loopback address

@@ -181,7 +181,7 @@ class TooManyShares(WorkerError):
 
 
 class InvalidSetting(Invalid, WorkerError):
-    """A setting does not parse, is out of range, or leaves an installation that nobody could use."""
+    """A setting does not parse, is out of range, or leaves an installation that cannot be used."""
 
     def __init__(
         self, variable: str, *, expected: str, got: str, hint: str = "Correct the variable or leave it unset."

@@ -52,19 +52,19 @@ class Settings:
     data: Path = Path("pliant-data")
     """Directory of all persistent data: the embedded queue's log, blobs, working files."""
 
-    redis_url: str | None = Field(None, description="a URL")
+    redis_url: str | None = Field(default=None, description="a URL")
     """`redis://`, `rediss://` or `unix://` URL; None: the embedded Valkey of `data`."""
 
-    blob_url: str | None = Field(None, description="a URL")
+    blob_url: str | None = Field(default=None, description="a URL")
     """`file:///…` or `s3://bucket/prefix`; None: the directory `blobs` inside `data`."""
 
-    queue: str = Field("pliant", description="a name")
+    queue: str = Field(default="pliant", description="a name")
     """Name of the queue and prefix of every Redis key, so that two installations can share a server."""
 
-    workers: int = Field(1, ge=1)
+    workers: int = Field(default=1, ge=1)
     """Number of jobs that run at once."""
 
-    threads: int | None = Field(None, ge=1)
+    threads: int | None = Field(default=None, ge=1)
     """Threads of the numerical libraries in one job; None: the usable cores shared evenly among the workers."""
 
     time_limit: Seconds = 3600.0
@@ -79,17 +79,17 @@ class Settings:
     stop_grace: Seconds = 10.0
     """Time for a running job to finish after SIGTERM, before it is requeued."""
 
-    lost_after: float = Field(10.0, ge=1, allow_inf_nan=False, description="a number of seconds, at least 1")
+    lost_after: float = Field(default=10.0, ge=1, allow_inf_nan=False, description="a number of seconds, at least 1")
     """Time without heartbeats after which a running job is requeued."""
 
-    max_attempts: int = Field(3, ge=1)
+    max_attempts: int = Field(default=3, ge=1)
     """Maximum number of attempts at a job whose workers are lost."""
 
     webhook_networks: Networks = ""
     """Networks (CIDR, commas between them) whose addresses webhooks may be sent to although they are private, link-local,
     loopback or otherwise not of the public internet."""
 
-    max_running: int = Field(0, ge=0)
+    max_running: int = Field(default=0, ge=0)
     """Maximum number of running jobs per owner, the others wait; 0: no limit. Without tokens, all jobs have one owner."""
 
     retention: Seconds = 30 * 86400.0
@@ -98,19 +98,19 @@ class Settings:
     disk_quota: Bytes = 0
     """Total bytes of all jobs above which new ones are rejected; 0: no quota."""
 
-    read_memory: int = Field(8 << 30, ge=1 << 30, description="a whole number of bytes, at least 1 GiB")
+    read_memory: int = Field(default=8 << 30, ge=1 << 30, description="a whole number of bytes, at least 1 GiB")
     """Limit of the address space of the process that reads large inputs; inputs that need more are rejected as too_large."""
 
-    film_memory: int = Field(4 << 30, ge=512 << 20, description="a whole number of bytes, at least 512 MiB")
+    film_memory: int = Field(default=4 << 30, ge=512 << 20, description="a whole number of bytes, at least 512 MiB")
     """Address space of the process that decodes and tracks a film; what needs more is refused as too_large."""
 
-    film_frames: int = Field(3600, ge=3)
+    film_frames: int = Field(default=3600, ge=3)
     """Frames of one film that may be tracked."""
 
-    film_pixels: int = Field(4096 * 2304, ge=256)
+    film_pixels: int = Field(default=4096 * 2304, ge=256)
     """Width times height of a film."""
 
-    film_seconds: float = Field(600.0, ge=1, allow_inf_nan=False, description="a number of seconds, at least 1")
+    film_seconds: float = Field(default=600.0, ge=1, allow_inf_nan=False, description="a number of seconds, at least 1")
     """Playing time of a film up to the last frame that is tracked."""
 
     upload_expiry: Seconds = 86400.0
