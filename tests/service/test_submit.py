@@ -90,12 +90,12 @@ def test_a_file_that_cannot_be_written_here_is_refused_before_the_job_is_queued(
     running: Running, http: httpx.Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     wish = form(options={"outputs": ["usd"]})
-    monkeypatch.setattr("pliant.worker.artifacts.usd.available", lambda: False)
+    monkeypatch.setattr("pliant.worker.artifacts.scenes.usd.available", lambda: False)
     before = running.waiting
     problem = Problem.model_validate_json(http.post("/v1/jobs", files=wish).content)
     assert (problem.status, problem.code, problem.field) == (422, "output_unavailable", "options.outputs")
     assert running.waiting == before
-    monkeypatch.setattr("pliant.worker.artifacts.usd.available", lambda: True)
+    monkeypatch.setattr("pliant.worker.artifacts.scenes.usd.available", lambda: True)
     assert http.post("/v1/jobs", files=wish).status_code == 202
 
 
