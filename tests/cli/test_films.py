@@ -41,7 +41,7 @@ def test_a_film_is_solved_and_its_tracks_lie_beside_the_shapes(film: Path, tmp_p
     options = json.loads(Path(files["report.json"]).read_text())["options"]
     assert (options["fps"], options["image_size"]) == (30.0, "96x72")
     words = solve(film, "-o", tmp_path, "--force", "-O", "frames=:5", *QUICK).output
-    assert "A film of 96×72 pixels, 5 of 10 frames, 30 frames a second." in words
+    assert "A film of 96×72 pixels, 5 of 10 frames, 30 frames per second." in words
     assert "No region was given" in words
 
 

@@ -122,7 +122,7 @@ def test_no_more_jobs_wait_than_may(serve: Serve) -> None:
             "too_many_queued",
             "10",
         )
-        assert "2 of your jobs wait" in refused.json()["detail"]
+        assert "2 jobs are already queued" in refused.json()["detail"]
         assert http.put("/v1/jobs/third", files=form()).status_code == 429
         assert http.post("/v1/jobs", files=body, headers=key).json()["id"] == second.json()["id"], "no new job"
         assert running.waiting == 2

@@ -1,4 +1,4 @@
-"""The result files there are: their names, what they are, which option asks for them, and who writes them."""
+"""The kinds of result files: name, description, option that requests them, and writer."""
 
 from __future__ import annotations
 
@@ -27,36 +27,36 @@ class Kind:
 
     name: str
     output: Output | None
-    """The word of the option `outputs` that asks for it; None if it is always written."""
+    """Value of the option `outputs` that requests it; None if it is always written."""
 
     media_type: str
     description: str
     share: float
-    """Time it takes, in an arbitrary unit."""
+    """Relative time of writing."""
 
     write: Callable[[Result, IO[bytes], OnProgress], dict[str, Any]]
-    """Writes the file; returns what the report should say of it."""
+    """Writes the file; returns its entry for the report."""
 
     textured: bool | None = None
-    """Whether it is written only with, or only without, a picture on the surface; None: either way."""
+    """Whether it is written only with, or only without, a texture; None: in both cases."""
 
 
 def kinds_for(options: Options, *, size: tuple[int, int] = (0, 0), textured: bool = False) -> list[Kind]:
-    """Return what a job's options ask for, in the order of writing.
+    """Return the kinds that a job's options request, in the order of writing.
 
     Parameters
     ----------
     options : Options
         Of the job.
     size : tuple of int
-        Frames and points, as far as they are known.
+        Frames and points, if known.
     textured : bool
-        There is a picture to put on the surface.
+        Whether there is a texture.
 
     Raises
     ------
     InvalidInput
-        A file is asked for that cannot be written in this installation, or not in this size.
+        A requested file cannot be written in this installation or in this size.
     """
     if "usd" in options.outputs and not usd.available():
         raise InvalidInput(
@@ -106,7 +106,7 @@ def _glb(result: Result, file: IO[bytes], on_progress: OnProgress) -> dict[str, 
     animation = animate(shapes, y_axis=result.y_axis)
     colours = None
     if painted is not None:
-        animation.extras.update(painted.said())
+        animation.extras.update(painted.legend())
         colours = _rgba(painted.mean())
     elif result.texture is None and result.picture_colours is not None:
         colours = _rgba(result.picture_colours)
@@ -128,7 +128,7 @@ def _rgba(colours: Floats) -> NDArray[np.uint16]:
 def _painted(write: Callable[[Result, IO[bytes], OnProgress], None]) -> Callable[..., dict[str, Any]]:
     def written(result: Result, file: IO[bytes], on_progress: OnProgress) -> dict[str, Any]:
         write(result, file, on_progress)
-        return {} if result.painting is None else result.painting.said()
+        return {} if result.painting is None else result.painting.legend()
 
     return written
 

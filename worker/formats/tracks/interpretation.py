@@ -1,4 +1,4 @@
-"""From named arrays to tracks: which array, which axis, what its numbers and its visibility mean, which way is up; each said in words."""
+"""Interpretation of named arrays as tracks: array, axes, units, visibility and direction of y, each with a note."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ CENTRED = 0.05
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Understood:
-    """A track array, interpreted but not yet checked."""
+    """A track array, interpreted but not yet validated."""
 
     points: NDArray[np.generic]
     """Shape `(F, P, 2)`."""
 
     visible: NDArray[np.float64] | None
-    """Shape `(F, P)`, or None: all that is finite."""
+    """Shape `(F, P)`; None: all finite points are visible."""
 
     format: str
     layout: str
     coordinates: str
     y_axis: str
     grid: tuple[int, int] | None
-    """Rows and columns, where the points are all the pixels of a picture."""
+    """Rows and columns, if the points are all pixels of a picture."""
 
     notes: list[str]
     arrays: Arrays
-    """All that the file held, for truth that came along."""
+    """All arrays of the file, which may include ground truth."""
 
 
 def understand(arrays: Arrays, options: Options) -> Understood:
@@ -50,7 +50,7 @@ def understand(arrays: Arrays, options: Options) -> Understood:
     InvalidInput
         Codes missing_array, missing_image_size, wrong_type, wrong_shape.
     AmbiguousInput
-        Two readings fit.
+        Several interpretations fit.
     """
     named = short_names(arrays)
     dialect, name = _recognised(named)
@@ -76,23 +76,23 @@ def understand(arrays: Arrays, options: Options) -> Understood:
 
 
 def upwards(points: NDArray[np.generic], options: Options) -> tuple[str, list[str]]:
-    """Which way y grows: as told, else down unless the coordinates are centred on zero, as no picture's are."""
+    """Return the direction of y: from the options, else down unless the coordinates are centred on zero, unlike pixels."""
     if options.y_axis != "auto":
-        return options.y_axis, [f"y points {options.y_axis}, as asked."]
+        return options.y_axis, [f"y points {options.y_axis}, as set by y_axis."]
     flat = points.reshape(-1, 2)[:: max(1, points.shape[0] * points.shape[1] // 100_000)]
     finite = flat[np.isfinite(flat).all(axis=1)]
     shares = (finite < 0).mean(axis=0) if len(finite) else np.zeros(2)
     if (shares >= CENTRED).all():
         return "up", [
-            f"y is taken to point up: {shares[1]:.0%} of its values are negative, so these are not pixels of a picture."
+            f"y is assumed to point up: {shares[1]:.0%} of its values are negative, so these are not pixels of a picture."
         ]
-    return "down", ["y is taken to point down, as in pictures: coordinates are not centred on zero."]
+    return "down", ["y is assumed to point down, as in pictures: coordinates are not centred on zero."]
 
 
 def _two_numbers(
     array: NDArray[np.generic], name: str, dialect: Dialect, named: Arrays
 ) -> tuple[NDArray[np.generic], NDArray[np.generic] | None, Arrays]:
-    """Split off a third number of each point: visibility joins the named arrays, a point in space is returned whole."""
+    """Split off a third number of each point: visibility is added to the arrays; points in space are returned unchanged."""
     if array.ndim != 3 or array.shape[-1] != 3 or 2 in array.shape[:2]:
         return array, None, named
     if dialect.third == "depth" or any(one in named for one in INTRINSICS):
@@ -109,7 +109,7 @@ def _two_numbers(
 
 
 def _projected(depths: NDArray[np.generic], reading: Reading, named: Arrays) -> Placed:
-    """Take the picture of points in space; where no truth came along, they are the truth."""
+    """Project points in space; unless the file has ground truth, they are used as such."""
     spatial = depths.transpose(1, 0, 2) if reading.order == "points_frames" else depths
     intrinsics = next((named[one] for one in INTRINSICS if one in named), None)
     points, kind, notes = project(spatial, intrinsics)
