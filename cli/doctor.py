@@ -61,6 +61,7 @@ def doctor(
         *check_cores(),
         *check_storage(data),
         *check_valkey(),
+        *check_blobs(),
     ]
     report([*findings, *check_port(port), *check_service(session, url)], as_json=as_json)
 
@@ -155,11 +156,9 @@ def check_blas() -> Iterator[Finding]:
 
 def check_cores() -> Iterator[Finding]:
     """Check how the cores are divided among workers."""
-    import os
-
     from pliant.worker.settings import Settings, usable_cores
 
-    settings = Settings.from_environment(os.environ)
+    settings = Settings() if missing_modules() else Settings.from_environment()
     threads, cores = settings.threads_per_job, usable_cores()
     found = f"{cores} usable; {settings.workers} worker(s) of {threads} thread(s)"
     if threads * settings.workers > cores:
@@ -188,17 +187,16 @@ def check_storage(data: Path) -> Iterator[Finding]:
 
 def check_valkey() -> Iterator[Finding]:
     """Check the queue: the Redis server of PLIANT_REDIS_URL, or the program of the embedded server."""
-    import os
-
-    address = os.environ.get("PLIANT_REDIS_URL", "")
-    if address != "":
-        yield _redis(address)
-        return
     if missing_modules():
         return
     from pliant.worker.errors import WorkerError
     from pliant.worker.processes.valkey import find_binary
+    from pliant.worker.settings import Settings
 
+    address = Settings.from_environment().redis_url
+    if address is not None:
+        yield _redis(address)
+        return
     try:
         yield Finding("queue", "good", f"embedded Valkey, {find_binary()}")
     except WorkerError as fault:
@@ -239,7 +237,6 @@ def check_service(session: Session, url: str) -> Iterator[Finding]:
 
 def check_stored(data: Path) -> Iterator[Finding]:
     """Compare records, queue, blobs, scratch directories, uploads and incomplete request bodies with each other."""
-    import os
     from dataclasses import replace
 
     from pliant.service.spool import Incoming
@@ -248,7 +245,7 @@ def check_stored(data: Path) -> Iterator[Finding]:
     from pliant.worker.maintenance.fsck import findings
     from pliant.worker.settings import Settings
 
-    settings = replace(Settings.from_environment(os.environ), data=data)
+    settings = replace(Settings.from_environment(), data=data)
     try:
         found = findings(Jobs.open(settings))
     except StoreUnavailable as fault:
@@ -280,24 +277,42 @@ def show(findings: list[Finding]) -> None:
     out().print(table)
 
 
+def check_blobs() -> Iterator[Finding]:
+    """Check the blob store of PLIANT_BLOB_URL by listing what it holds."""
+    import os
+
+    if os.environ.get("PLIANT_BLOB_URL", "") == "" or missing_modules():
+        return
+    from pliant.worker.errors import StoreUnavailable
+    from pliant.worker.store.blobs import Blobs
+
+    url = os.environ["PLIANT_BLOB_URL"]
+    try:
+        Blobs.open(url).check()
+    except StoreUnavailable as fault:
+        advice = "Check the address, the bucket and the AWS_ variables; the line above has the store's own words."
+        yield Finding("blobs", "bad", f"{url} cannot be used ({fault.reason})", advice)
+    else:
+        yield Finding("blobs", "good", f"{url} answers")
+
+
 def _redis(address: str) -> Finding:
+    """Send a command with the password of the address, which only an authenticated connection may."""
     from urllib.parse import urlsplit
 
     parts = urlsplit(address)
     where = f"{parts.scheme}://{parts.hostname or parts.path}:{parts.port or 6379}"
-    if parts.scheme == "unix":
-        there = Path(parts.path).is_socket()
-    else:
-        try:
-            socket.create_connection((parts.hostname or "localhost", parts.port or 6379), timeout=3).close()
-            there = True
-        except OSError:
-            there = False
-    if there:
-        return Finding("queue", "good", f"{where} accepts connections")
-    return Finding(
-        "queue",
-        "bad",
-        f"{where} does not answer",
-        "Start that server, or unset PLIANT_REDIS_URL to use the embedded one.",
-    )
+    advice = "Start that server, or unset PLIANT_REDIS_URL to use the embedded one."
+    if missing_modules():
+        return Finding("queue", "note", f"{where} was not checked", "Checking it needs pip install 'pliant[server]'.")
+    from pliant.worker.errors import WorkerError
+    from pliant.worker.store.connection import check_server
+
+    try:
+        policy = check_server(address)
+    except WorkerError as fault:
+        return Finding("queue", "bad", f"{where}: {fault}", advice)
+    if policy not in ("noeviction", ""):
+        remedy = "Set maxmemory-policy to noeviction: a server that evicts keys loses jobs."
+        return Finding("queue", "bad", f"{where} has maxmemory-policy {policy}", remedy)
+    return Finding("queue", "good", f"{where} answers")

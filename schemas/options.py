@@ -10,7 +10,7 @@ from typing import Annotated, Literal, get_args
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
 SOLVER_FIELDS = (
-    "method", "camera", "surface", "basis_size", "refine_rotations", "preset", "temporal_weight", "spatial_weight", "robust_scale",
+    "method", "camera", "surface", "order", "basis_size", "refine_rotations", "preset", "temporal_weight", "spatial_weight", "robust_scale",
     "temporal_order", "loss", "laplacian", "prior", "low_rank_weight", "max_reweightings", "tolerance", "precision", "seed",
     "focal", "field_of_view", "principal_point", "image_size",
 )  # fmt: skip
@@ -21,7 +21,7 @@ POINT = r"^-?\d{1,7}(\.\d{1,9})?,-?\d{1,7}(\.\d{1,9})?$"
 
 Weight = Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
 
-Output = Literal["glb", "ply", "obj", "usd", "mdd", "mat", "csv"]
+Output = Literal["glb", "ply", "obj", "usd", "abc", "mdd", "mat", "csv"]
 """A result file written on request; `shapes.npz`, `report.json` and `preview.bin` are always written."""
 
 
@@ -64,13 +64,19 @@ class Options(BaseModel):
     )
     principal_point: Annotated[str, Field(pattern=POINT)] | None = Field(
         None,
-        description="Principal point X,Y in pixels, e.g. 319.5,239.5; null: the centre of image_size, or of the tracks without it.",
+        description="Principal point X,Y in pixels, e.g. 319.5,239.5; null: the centre of image_size, "
+        "((width - 1) / 2, (height - 1) / 2), or that of the tracks without it.",
     )
     surface: Literal["auto", "isometric", "free"] = Field(
         "auto",
         description="isometric: a sheet that bends without stretching, such as paper or cloth, seen in perspective. free: no such "
         "assumption. auto: isometric if the tracks are those of a sheet and its edge lengths determine a focal length; "
         "needs image_size or focal.",
+    )
+    order: Literal["auto", "film", "any"] = Field(
+        "auto",
+        description="film: neighbouring frames are alike. any: photographs in no order; results do not depend on it. "
+        "Needs prior gaussian and at most 360 frames. auto: any if neighbouring frames are no more alike than others.",
     )
     basis_size: Annotated[int, Field(ge=1, le=100)] | None = Field(
         None,
@@ -133,13 +139,13 @@ class Options(BaseModel):
     outputs: Outputs = Field(
         ("glb", "ply", "csv"),
         description="Files to write besides shapes.npz, report.json and preview.bin. glb: animated glTF. ply, obj: a mesh per frame, in a "
-        "zip. usd: USD with time samples. mdd: point cache for Blender, Maya and Houdini. mat: MATLAB. "
+        "zip. usd: USD with time samples. abc: Alembic. mdd: point cache for Blender, Maya and Houdini. mat: MATLAB. "
         "csv: metrics of every frame and of every point.",
     )
     normals: Literal["static", "animated", "none"] = Field(
-        "static",
-        description="static: those of the first shape, in shapes.glb only. animated: they move with the shape, and are also in every "
-        "frame of PLY, OBJ and USD. none: viewers compute their own.",
+        "animated",
+        description="animated: they move with the shape, in shapes.glb and in every frame of PLY, OBJ and USD. static: those of the "
+        "first shape, in shapes.glb only. none: viewers compute their own.",
     )
     colours: Literal["none", "error", "expected_error"] = Field(
         "none",
@@ -148,13 +154,18 @@ class Options(BaseModel):
         "prior gaussian estimates it. PLY, OBJ and USD are coloured in every frame, shapes.glb by the mean over frames.",
     )
     axes: Literal["tracks", "viewer"] = Field(
-        "tracks",
-        description="Axes of PLY and OBJ. tracks: those of the tracks, as in shapes.npz. viewer: y up, as in shapes.glb.",
+        "viewer",
+        description="Axes of PLY and OBJ. viewer: y up, as in shapes.glb. tracks: those of the tracks, as in shapes.npz.",
     )
     glb_quantized: bool = Field(
         False,
-        description="Write shapes.glb with 16-bit positions (KHR_mesh_quantization): two thirds of the size, and rounded to about a "
-        "65,000th of the largest extent.",
+        description="Write shapes.glb with 16-bit positions and 8-bit normals (KHR_mesh_quantization): about half the size, and rounded "
+        "to a 65,000th of the largest extent and half a degree.",
+    )
+    glb_motion: Literal["auto", "frames"] = Field(
+        "auto",
+        description="How shapes.glb stores the motion. auto: as few modes of motion as keep every point within a thousandth "
+        "of the bounding box's diagonal. frames: a morph target a frame, exact in single precision; up to 200 frames.",
     )
 
     layout: Literal["auto", "frames_points", "points_frames"] = Field(
@@ -176,8 +187,8 @@ class Options(BaseModel):
     )
     image_size: Annotated[str, Field(pattern=r"^[1-9]\d{0,5}x[1-9]\d{0,5}$")] | None = Field(
         None,
-        description="WIDTHxHEIGHT of the picture in pixels, e.g. 640x480; needed if coordinates are fractions of it. Its centre is the "
-        "principal point of a perspective camera.",
+        description="WIDTHxHEIGHT of the picture in pixels, e.g. 640x480; needed if coordinates are fractions of it. "
+        "Pixel centres lie at whole numbers from 0. The picture's centre is the principal point of a perspective camera.",
     )
     coordinate_order: Literal["auto", "xy", "yx"] = Field(
         "auto", description="Order of a point's two coordinates. auto: x, y, unless only y, x lies inside image_size."

@@ -140,6 +140,15 @@ class ProblemCode(StrEnum):
     EXPIRED_TOKEN = ("expired_token", 401, "Expired token",
      "The token's expiry date has passed.",
      "Ask the operator for a new one.")
+    INVALID_SHARE = ("invalid_share", 401, "Invalid share link",
+     "The link was revoked, its job was deleted, or the token is not complete.",
+     "Ask the sender of the link for a new one.")
+    EXPIRED_SHARE = ("expired_share", 401, "Expired share link",
+     "The link's expiry date has passed.",
+     "Ask the sender of the link for a new one.")
+    BEYOND_SHARE = ("beyond_share", 403, "Beyond the share link",
+     "A request with the token of a share link named another job, or something other than the job's record, events and files.",
+     "Use a token of the service for anything else.")
     INSUFFICIENT_SCOPE = ("insufficient_scope", 403, "Insufficient scope",
      "The token is valid but lacks the scope that the route needs; `expected` names it.",
      "Use a token with that scope.")
@@ -268,6 +277,12 @@ class ProblemCode(StrEnum):
     DIGEST_MISMATCH = ("digest_mismatch", 422, "Digest mismatch",
      "The SHA-256 of the received bytes differs from `Repr-Digest`. The upload was removed.",
      "Send it again.")
+    UNKNOWN_SHARE = ("unknown_share", 404, "Unknown share link",
+     "The job has no share link of that id; it may have expired.",
+     "`GET /v1/jobs/{id}/shares` lists the valid ones.")
+    TOO_MANY_SHARES = ("too_many_shares", 409, "Too many share links",
+     "The job has 20 valid share links.",
+     "Revoke one, or wait until one expires.")
     TOO_MANY_UPLOADS = ("too_many_uploads", 429, "Too many uploads",
      "The token has 100 uploads.",
      "Delete some, or wait until they expire.")
@@ -476,6 +491,12 @@ class ProblemCode(StrEnum):
     DATA_DIRECTORY_IN_USE = ("data_directory_in_use", None, "Data directory in use",
      "Another Pliant process owns the data directory.",
      "Stop it, or name another directory with `--data`.")
+    NEWER_DATA = ("newer_data", None, "Data of a newer version",
+     "A newer Pliant wrote the records, and this one could drop what it does not know.",
+     "Install that version, or restore a backup from before the upgrade.")
+    BAD_BACKUP = ("bad_backup", None, "Bad backup",
+     "The directory holds no backup, or a damaged one, or the installation is not empty.",
+     "Name another directory; restore into an installation without jobs and tokens.")
     SERVER_FAILED = ("server_failed", None, "Valkey did not start",
      "The embedded Valkey did not start; the message ends with its log.",
      "Run `pliant doctor`.")
@@ -485,6 +506,9 @@ class ProblemCode(StrEnum):
     INVALID_TOKEN_NAME = ("invalid_token_name", None, "Invalid token name",
      "A token's name is empty, too long, or has control characters.",
      "Choose a short printable name.")
+    INVALID_TOKEN_TEXT = ("invalid_token_text", None, "Invalid token",
+     "The file of `pliant token create --from` does not hold a token.",
+     "Write a token of the stated form to it, or leave --from out.")
     INVALID_DURATION = ("invalid_duration", None, "Invalid duration",
      "`--expires` is not a duration such as `12h`, `90d` or `52w`.",
      "Correct it, or omit it for a token without expiry.")

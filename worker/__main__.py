@@ -9,9 +9,10 @@ import os
 import secrets
 import signal
 import sys
+from contextlib import suppress
 from types import FrameType
 
-from pliant.worker.errors import WorkerError
+from pliant.worker.errors import StoreUnavailable, WorkerError
 from pliant.worker.execution.rq_worker import PliantWorker
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.maintenance.fsck import findings
@@ -21,6 +22,7 @@ from pliant.worker.settings import NUMERICAL_THREADS, Settings
 from pliant.worker.store.connection import BLOCK_WITHIN, connect
 from pliant.worker.store.queue import RedisQueue
 from pliant.worker.store.redis import RedisRecords
+from pliant.worker.store.schema import prepare
 from pliant.worker.webhooks.sender import WebhookSender
 
 USAGE = "usage: python -m pliant.worker [work|reconcile|fsck]"
@@ -91,7 +93,10 @@ def main(arguments: list[str]) -> int:
         sys.stderr.write(f"{USAGE}\n")
         return 2
     try:
-        return task(Settings.from_environment(os.environ))
+        settings = Settings.from_environment()
+        with suppress(StoreUnavailable):  # each task deals with a store that is away
+            prepare(settings)
+        return task(settings)
     except WorkerError as error:
         sys.stderr.write(f"{error}\n")
         return 1

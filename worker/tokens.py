@@ -104,6 +104,7 @@ class Tokens:
         max_queued: int | None = None,
         max_running: int | None = None,
         requests_per_minute: int | None = None,
+        text: str | None = None,
     ) -> tuple[Token, str]:
         """Create a token.
 
@@ -119,6 +120,9 @@ class Tokens:
             Id of a token whose jobs the new one shares, e.g. to replace it.
         max_body_bytes, max_queued, max_running, requests_per_minute : int, optional
             Limits of this token.
+        text : str, optional
+            The token itself, where it was made elsewhere, e.g. by a deployment; None: a new one. One that is known already stays as
+            it is.
 
         Returns
         -------
@@ -130,7 +134,7 @@ class Tokens:
         Raises
         ------
         InvalidRequest
-            The name is empty or too long, or there is no scope.
+            The name is empty or too long, there is no scope, or the text is no token.
         UnknownToken
             There is no token to share jobs with.
         """
@@ -144,8 +148,11 @@ class Tokens:
             expected = "at least one of " + ", ".join(Scope)
             raise InvalidRequest("no_scope", field="scope", expected=expected, got="none", hint="Give --scope read.")
         owner = None if sharing is None else self.get(sharing).owner
-        id = secrets.token_hex(6)
-        text = f"{PREFIX}{id}_{secrets.token_urlsafe(32)}"
+        known = None if text is None else self._checked(text)
+        if text is not None and known is not None:
+            return known, text
+        text = text or f"{PREFIX}{secrets.token_hex(6)}_{secrets.token_urlsafe(32)}"
+        id = text.removeprefix(PREFIX)[:12]
         now = self._clock()
         token = Token(
             id=id, name=label, scopes=tuple(dict.fromkeys(scopes)), owner=owner or id, sha256=_digest(text),
@@ -155,6 +162,15 @@ class Tokens:
         with reachable():
             self._redis.hset(self._key, id, token.model_dump_json())
         return token, text
+
+    def _checked(self, text: str) -> Token | None:
+        """Return what is kept of a token that was made elsewhere, None if it is new; refuse a text that is none."""
+        if _FORM.fullmatch(text) is None:
+            raise InvalidRequest(
+                "invalid_token_text", field="from", expected=f"{PREFIX}, 12 hexadecimal digits, _, 43 letters or digits",
+                got=f"{len(text)} characters", hint="`pliant token create` without it makes a token.",
+            )  # fmt: skip
+        return self.recognise(text)
 
     def recognise(self, text: str) -> Token | None:
         """Return the record of a token, expired or not; None if it is unknown or revoked."""

@@ -80,15 +80,16 @@ class Attempt:
     """Whether the job was cancelled, timed out, or belongs to another attempt."""
     _parent: int = field(default_factory=os.getppid)
     _next_report: float = 0.0
+    _stage: str = ""
     _next_look: float = 0.0
     _lines: list[str] = field(default_factory=list)
 
     def report(self, progress: Progress) -> None:
-        """Write the progress, at most every `PROGRESS_INTERVAL` seconds; an unavailable store is ignored."""
+        """Write the progress: each new stage, else at most every `PROGRESS_INTERVAL` seconds. An unavailable store is ignored."""
         now = time.monotonic()
-        if now < self._next_report:
+        if now < self._next_report and progress.stage == self._stage:
             return
-        self._next_report = now + PROGRESS_INTERVAL
+        self._next_report, self._stage = now + PROGRESS_INTERVAL, progress.stage
         try:
             self.jobs.records.update(
                 self.id, lambda held: lifecycle.report(held, attempt_id=self.attempt_id, progress=progress)
@@ -208,7 +209,10 @@ def work(
         attempt.wait_for_store(lambda: attempt.jobs.blobs.fetch(stored.inputs, file))
         results = directory / "artifacts"
         with threads_limited(attempt.jobs.settings.threads_per_job):
-            finished = _reconstruct(attempt, stored, file, results, reconstruct=reconstruct)
+            if stored.result is not None:
+                finished = _write_further(attempt, stored, file, results)
+            else:
+                finished = _reconstruct(attempt, stored, file, results, reconstruct=reconstruct)
         attempt.store(finished, results)
     except Interrupted:
         late = time.monotonic() >= attempt.deadline
@@ -242,13 +246,22 @@ def _reconstruct(
             load_inputs(inputs), options, results, on_progress=attempt.report, should_stop=attempt.should_stop
         )
     settings, scratch = attempt.jobs.settings, inputs.with_name("film")
-    memory = min(FilmBounds().memory, settings.memory_limit or FilmBounds().memory)
     source = open_source(inputs, inputs.with_name("source"))
     scratch.mkdir()
     return reconstruct_film(
-        source, options, results, scratch=scratch, threads=settings.threads_per_job, bounds=FilmBounds(memory=memory),
+        source, options, results, scratch=scratch, threads=settings.threads_per_job, bounds=FilmBounds.of(settings),
         on_progress=attempt.report, should_stop=attempt.should_stop,
     )  # fmt: skip
+
+
+def _write_further(attempt: Attempt, stored: Stored, inputs: Path, results: Path) -> Finished:
+    """Write further files of a stored result."""
+    from pliant.worker.execution.further_outputs import write_further
+
+    file, key = inputs.with_name("result.npz"), stored.result
+    assert key is not None
+    attempt.wait_for_store(lambda: attempt.jobs.blobs.fetch(key, file))
+    return write_further(inputs, file, stored.job, results, on_progress=attempt.report, should_stop=attempt.should_stop)
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from pliant.schemas.job import Interpretation
 from pliant.worker.formats.errors import damaged
+from pliant.worker.settings import Settings
 
 VERSION = 1
 _MARK, _FILM, _REGION = "film.json", "film", "region"
@@ -57,6 +58,15 @@ class FilmBounds:
 
     scratch_bytes: int = 8 << 30
     """Size of one file that this process writes: the grey frames of the film, packed without loss."""
+
+    @classmethod
+    def of(cls, settings: Settings, *, max_bytes: int = 1 << 30) -> FilmBounds:
+        """Return the bounds that an installation sets; a job's own limit on memory holds for its film, too."""
+        memory = min(settings.film_memory, settings.memory_limit or settings.film_memory)
+        return cls(
+            max_bytes=max_bytes, max_frames=settings.film_frames, max_pixels=settings.film_pixels,
+            max_seconds=settings.film_seconds, memory=memory,
+        )  # fmt: skip
 
 
 def looks_like_film(path: Path) -> bool:

@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pliant.schemas.job import Interpretation
 from pliant.schemas.options import Options
 from pliant.solver import InvalidInput, Mesh, Tracks
-from pliant.worker.formats.errors import refusal, too_large
+from pliant.worker.formats.errors import too_large
 from pliant.worker.formats.ground_truth import read_rotations, read_truth
-from pliant.worker.formats.meshes.surface import read_surface, whole_grid
+from pliant.worker.formats.meshes.surface import Surface, read_surface, whole_grid
 from pliant.worker.formats.meshes.triangulation import triangulate
 from pliant.worker.formats.reading.containers import read_arrays
 from pliant.worker.formats.records import FARTHEST, GroundTruth, Inputs, Limits, Selection
 from pliant.worker.formats.tracks.decimation import thin
+from pliant.worker.formats.tracks.film_tracks import FilmTracks, read_film_tracks
 from pliant.worker.formats.tracks.interpretation import Understood, understand
 from pliant.worker.formats.tracks.selection import chosen_frames, hide_sparsely_observed
-from pliant.worker.formats.tracks.tracker_formats import KNOWN
+from pliant.worker.formats.tracks.tracker_formats import KNOWN, OWN
 
 LISTED = 1000
 """Maximum number of hidden points that the interpretation lists by index."""
@@ -58,7 +60,11 @@ def read_inputs(
         Several interpretations fit; the error lists them.
     """
     understood = understand(read_arrays(tracks, field="tracks", limits=limits, wanted=KNOWN), options)
-    chosen = _choose(understood, mesh, options, limits)
+    film: FilmTracks | None = None
+    if understood.format == OWN:
+        film = read_film_tracks(tracks, shape=understood.points.shape[:2], limits=limits)
+        understood = replace(understood, visible=film.visible)
+    chosen = _choose(understood, mesh, options, limits, film)
     truth, truth_notes = _read_truth(ground_truth, understood, chosen.selection, limits)
     cameras = None
     if rotations is not None:
@@ -74,10 +80,17 @@ def read_inputs(
         given_frames=understood.points.shape[0], given_points=understood.points.shape[1],
         num_left_out=len(chosen.left_out), left_out_points=chosen.left_out[:LISTED].tolist(),
         notes=[*understood.notes, *chosen.notes, *truth_notes],
+        **({} if film is None else _stated(film, chosen.selection)),
     )  # fmt: skip
-    return Inputs(
-        checked, chosen.mesh, truth, cameras, interpretation, chosen.selection if chosen.selection.narrows else None
-    )
+    texture = None if film is None or film.texture is None else film.texture.at_points(chosen.selection.points)
+    selection = chosen.selection if chosen.selection.narrows else None
+    return Inputs(checked, chosen.mesh, truth, cameras, interpretation, selection, texture=texture)
+
+
+def _stated(film: FilmTracks, selection: Selection) -> dict[str, Any]:
+    """Picture size and rate of the chosen frames, as the interpretation gives them."""
+    step = float(np.median(np.diff(selection.frames)))
+    return {"image_size": f"{film.image_size[0]}x{film.image_size[1]}", "fps": film.fps / step}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,10 +107,15 @@ class _Chosen:
     notes: list[str]
 
 
-def _choose(understood: Understood, mesh: Path | str | None, options: Options, limits: Limits) -> _Chosen:
+def _choose(
+    understood: Understood, mesh: Path | str | None, options: Options, limits: Limits, film: FilmTracks | None
+) -> _Chosen:
     whole = understood.points.shape[:2]
     frames, notes = chosen_frames(options.frames, whole[0])
-    surface = read_surface(mesh, num_points=whole[1], picture=understood.grid, limits=limits)
+    if film is not None and mesh is None:
+        surface = Surface(film.mesh, "film", ["The mesh is the grid of the film's tracker."])
+    else:
+        surface = read_surface(mesh, num_points=whole[1], picture=understood.grid, limits=limits)
     points, visible = understood.points, understood.visible
     picked = np.arange(whole[1]) if surface.points is None else surface.points
     if len(frames) < whole[0]:
@@ -139,8 +157,8 @@ def _check_range(points: NDArray[np.generic], visible: NDArray[np.float64] | Non
     if visible is not None:
         far &= visible > 0
     if far.any():
-        raise refusal(
-            "out_of_range", "tracks", expected=f"visible coordinates within ±{FARTHEST:g}", got=f"{int(far.sum())} points beyond",
+        raise InvalidInput(
+            "out_of_range", field="tracks", expected=f"visible coordinates within ±{FARTHEST:g}", got=f"{int(far.sum())} points beyond",
             hint="Mark them as hidden, or set them to NaN.",
         )  # fmt: skip
 
@@ -151,8 +169,8 @@ def _check_extent(tracks: Tracks) -> None:
     low = np.where(seen, tracks.points, np.inf).min(axis=1)
     high = np.where(seen, tracks.points, -np.inf).max(axis=1)
     if not (high > low).any():
-        raise refusal(
-            "no_extent", "tracks", expected="points that differ from each other", got="one position for all points",
+        raise InvalidInput(
+            "no_extent", field="tracks", expected="points that differ from each other", got="one position for all points",
             hint="Check that the points' axis is the second one and that the tracks are not all zero.",
         )  # fmt: skip
 

@@ -165,7 +165,12 @@ class Supervisor:
 def valkey_child(valkey: Valkey) -> Child:
     """Return the embedded Valkey of a claimed data directory as a child."""
     return Child(
-        name="valkey", argv=valkey.argv, descriptors=(valkey.lock,), ready=valkey.wait, foundation=True, grace=15.0
+        name="valkey",
+        argv=valkey.argv,
+        descriptors=(valkey.server_lock,),
+        ready=valkey.wait,
+        foundation=True,
+        grace=15.0,
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import secrets
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime, timedelta
@@ -40,6 +40,10 @@ RETRIES: Any = {
     "backoff": {"init_backoff": timedelta(milliseconds=100), "max_backoff": timedelta(seconds=1), "base": 2},
 }
 """Time limits and retries of one HTTP request to a remote store; together they stay below `ANSWER_WITHIN` if packets are dropped."""
+
+SWITCHES = ("allow_http", "allow_invalid_certificates", "http1_only", "http2_only")
+TEXTS = ("proxy_url", "proxy_ca_certificate", "proxy_excludes", "user_agent")
+"""Options of the connection to S3 that `AWS_` variables of the same names set."""
 
 Answer = TypeVar("Answer")
 
@@ -105,7 +109,7 @@ class Blobs:
             if url.startswith("file:"):
                 store = from_url(url, mkdir=True, automatic_cleanup=True)
                 return cls(store, directory=Path(unquote(urlsplit(url).path)))
-            options = {**CLIENT, "allow_http": _plain_http()}
+            options: Any = {**CLIENT, **client_options(os.environ)}
             return cls(from_url(url, client_options=options, retry_config=RETRIES), remote=True)
 
     def put(self, key: str, file: Path) -> int:
@@ -197,9 +201,24 @@ class Blobs:
         return answered() if self._calls is None else self._calls.run(answered, seconds=seconds)
 
 
-def _plain_http() -> bool:
-    """Whether `AWS_ALLOW_HTTP` allows an endpoint without TLS; obstore ignores it when client options are given."""
-    return os.environ.get("AWS_ALLOW_HTTP", "").strip().lower() in ("1", "t", "true", "yes", "on")
+def client_options(environment: Mapping[str, str]) -> dict[str, object]:
+    """Return the `AWS_` variables about the connection: obstore does not read them itself beside options that it is given.
+
+    Those about credentials, region and endpoint are read by obstore. `AWS_TIMEOUT` and `AWS_CONNECT_TIMEOUT` have no effect,
+    because the time limits here depend on each other.
+    """
+    given: dict[str, object] = {}
+    for name in SWITCHES:
+        text = environment.get(f"AWS_{name.upper()}", "").strip().lower()
+        if text:
+            given[name] = text in ("1", "t", "true", "yes", "on")
+    for name in TEXTS:
+        if text := environment.get(f"AWS_{name.upper()}", "").strip():
+            given[name] = text
+    certificates = environment.get("AWS_CA_BUNDLE", "").strip()
+    if certificates:
+        given["root_certificate"] = Path(certificates).read_text()
+    return given
 
 
 def _linked(source: Path, target: Path) -> bool:

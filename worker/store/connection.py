@@ -43,11 +43,39 @@ def connect(url: str, *, decode: bool, retries: int = 3, answer_within: float | 
     )
 
 
+def check_server(url: str, *, answer_within: float = 3.0) -> str:
+    """Send a command that needs the password of the URL; return the server's policy for full memory, empty if it is not readable.
+
+    Raises
+    ------
+    StoreUnavailable
+        The server does not answer, or refuses the password.
+    """
+    try:
+        client = connect(url, decode=True, retries=0, answer_within=answer_within)
+    except ValueError as error:
+        raise StoreUnavailable("The job store", reason=str(error)) from error
+    try:
+        with reachable():
+            client.get("pliant:doctor")
+            try:
+                found: dict[str, str] = client.config_get("maxmemory-policy")  # type: ignore[assignment]
+            except redis.ResponseError:  # managed servers hide their configuration
+                return ""
+            return found.get("maxmemory-policy", "")
+    except redis.ResponseError as error:  # no password was sent where one is needed, or its user may not do this
+        raise StoreUnavailable("The job store", reason=str(error)[:200]) from error
+    finally:
+        client.close()
+
+
 @contextmanager
 def reachable() -> Iterator[None]:
     """Translate connection failures to `StoreUnavailable`; errors of commands pass through."""
     try:
         yield
+    except redis.AuthenticationError as error:
+        raise StoreUnavailable("The job store", reason="it refuses the password") from error
     except (redis.ConnectionError, redis.TimeoutError, redis.exceptions.ClusterDownError) as error:
         raise StoreUnavailable("The job store", reason=type(error).__name__) from error
     except redis.OutOfMemoryError as error:

@@ -48,7 +48,7 @@ class Writer:
     _digest: hashlib._Hash = field(default_factory=hashlib.sha256)
 
     def open(self, offset: int) -> None:
-        """Start or resume; the existing bytes are read once for the digest.
+        """Start or resume after the existing bytes.
 
         Raises
         ------
@@ -67,9 +67,6 @@ class Writer:
         elif offset == 0:
             (self.folder / LENGTH).unlink(missing_ok=True)
         part = self.folder / PART
-        if offset > 0:
-            with part.open("rb") as before:
-                self._digest = hashlib.file_digest(before, "sha256")
         self._file = part.open("ab" if offset > 0 else "wb", buffering=0)
         self.offset = self._began = offset
 
@@ -95,7 +92,8 @@ class Writer:
         try:
             while rest:
                 count = self._file.write(rest)
-                self._digest.update(rest[:count])
+                if self._began == 0:
+                    self._digest.update(rest[:count])
                 rest = rest[count:]
                 self.offset += count
         except OSError:
@@ -117,7 +115,7 @@ class Writer:
         """
         if self.length is not None and self.offset != self.length:
             raise inconsistent(f"{self.length} bytes in all", str(self.offset))
-        found = self._digest.hexdigest()
+        found = self._sha256()
         if sha256 is not None and sha256 != found:
             self.close()
             shutil.rmtree(self.folder)
@@ -143,6 +141,13 @@ class Writer:
             (self.folder / RESERVED).unlink(missing_ok=True)
             os.close(self._reservation)
             self._reservation = None
+
+    def _sha256(self) -> str:
+        """Return the digest of the whole. One that came in several requests is read once, here: not at each of them."""
+        if self._began == 0:
+            return self._digest.hexdigest()
+        with (self.folder / PART).open("rb") as whole:
+            return hashlib.file_digest(whole, "sha256").hexdigest()
 
     def _check(self, size: int) -> None:
         """Check the limits for a size in bytes, and reserve it.

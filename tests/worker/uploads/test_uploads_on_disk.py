@@ -11,6 +11,7 @@ import subprocess
 import sys
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import BinaryIO
 
 import pytest
 from hypothesis import given, settings
@@ -40,7 +41,7 @@ def now(**later: float) -> datetime:
 
 
 @given(data=st.binary(max_size=300), cuts=st.lists(st.integers(0, 300), max_size=5))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 def test_however_it_is_cut_the_whole_is_the_whole(
     tmp_path_factory: pytest.TempPathFactory, data: bytes, cuts: list[int]
 ) -> None:
@@ -269,3 +270,21 @@ def test_a_reservation_ends_with_its_process(uploads: Uploads) -> None:
     (next(uploads.directory.glob("*/one")) / "reserved").write_text("1000000")
     assert uploads.used() == 4
     assert list(uploads.findings(now())) == []
+
+
+def test_a_byte_more_does_not_read_what_is_there(uploads: Uploads, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each small PATCH used to read the whole upload again: a third of a second of processor time on 400 MB."""
+    read: list[int] = []
+    whole = hashlib.file_digest
+
+    def counted(file: BinaryIO, name: str) -> object:
+        read.append(os.fstat(file.fileno()).st_size)
+        return whole(file, name)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(hashlib, "file_digest", counted)
+    for offset in range(9):
+        send(uploads, "slow", b"x", offset=offset, finish=False)
+    assert read == []
+    send(uploads, "slow", b"y", offset=9)
+    assert read == [10]
+    assert uploads.get("slow").sha256 == hashlib.sha256(b"x" * 9 + b"y").hexdigest()

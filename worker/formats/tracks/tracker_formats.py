@@ -5,7 +5,7 @@ BootsTAPIR and LocoTrack `tracks (B, N, T, 2)` with `occlusion` and `expected_di
 `visible_logits` (its model returns y before x, its demonstrations turn that round); TAP-Vid `points (N, T, 2)` with `occluded`;
 AllTracker `trajs_e` and `visconfs_e`, or whole pictures `(B, T, 2, H, W)`; PIPs++ `trajs_e`; DOT `(B, T, H, W, 3)` or `(B, T, N, 3)`
 with visibility as the third number; TAPVid-3D `tracks_xyz` in metres before the camera; MATLAB data sets of non-rigid structure from
-motion `W`, `S`, `Rs`.
+motion `W`, `S`, `Rs`. Pliant's own tracker is known by `frame_indices`.
 """
 
 from __future__ import annotations
@@ -41,7 +41,11 @@ class Dialect:
     """Note for users of this format."""
 
 
+OWN = "Pliant"
+"""The output of `pliant track`; what else it holds is read by `film_tracks`."""
+
 DIALECTS = (
+    Dialect(name=OWN, tracks=("tracks",), needs=("frame_indices",)),
     Dialect(name="CoTracker", tracks=("pred_tracks",)),
     Dialect(
         name="AllTracker", tracks=("trajs_e", "traj_maps_e"), needs=("visconfs_e", "visconf_maps_e"),
@@ -78,7 +82,7 @@ TRUE_SHAPES = ("shapes", "S", "S_gt", "Shat_gt", "S_GT", "P3_gt", "GT", "gt")
 TRUE_ROTATIONS = ("rotations", "Rs", "R_gt", "Rs_gt", "R", "RO")
 
 TRACKS = frozenset(name for dialect in DIALECTS for name in dialect.tracks)
-KNOWN = TRACKS | {*VISIBILITY, *INTRINSICS, *TRUE_SHAPES, *TRUE_ROTATIONS}
+KNOWN = TRACKS | {"frame_indices", *VISIBILITY, *INTRINSICS, *TRUE_SHAPES, *TRUE_ROTATIONS}
 """All array names that the track reader uses; other members of an npz are never inflated."""
 
 
