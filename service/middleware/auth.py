@@ -19,7 +19,7 @@ from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Send
 from starlette.types import Scope as AsgiScope
 
-PUBLIC = frozenset({"/", "/docs", "/openapi.json", "/healthz", "/readyz", "/errors"})
+PUBLIC = frozenset({"/", "/docs", "/guide", "/openapi.json", "/healthz", "/readyz", "/errors"})
 """Paths that need no token: the page, which must load to ask for one, the API's description and reference, and the health checks."""
 PUBLIC_FOLDERS = ("/page/", "/errors/")
 """The files of the page, and the explanations of error codes."""

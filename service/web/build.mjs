@@ -58,7 +58,7 @@ for (const [path, output] of Object.entries({ ...bundled.metafile.outputs, ...al
   if (output.cssBundle) produced[basename(output.entryPoint).replace(/\.ts$/, ".css")] = basename(output.cssBundle);
 }
 
-for (const document of ["index.html", "docs.html"]) {
+for (const document of ["index.html", "docs.html", "guide.html"]) {
   const html = await readFile(join(here, "src", document), "utf8");
   const linked = html.replace(/"page\/([^"]+)"/g, (_, source) => {
     if (!(source in produced)) throw new Error(`src/${document} mentions page/${source}, which is not bundled`);

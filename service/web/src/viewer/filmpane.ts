@@ -85,7 +85,7 @@ export class FilmPane {
       context.lineTo(...to);
     }
     context.strokeStyle = this.colours.wire;
-    context.globalAlpha = 0.65;
+    context.globalAlpha = this.preview.points > 2000 ? 0.4 : 0.65;
     context.lineWidth = density * Math.max(0.35, Math.min(1, 40 / Math.sqrt(preview.points)));
     context.stroke();
     context.globalAlpha = 1;
