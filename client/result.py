@@ -48,7 +48,8 @@ class Reconstruction:
 
     def __repr__(self) -> str:
         size = f"{self.job.interpretation.num_frames} frames × {self.job.interpretation.num_points} points"
-        return f"<{type(self).__name__} of job {self.job.id}: {size}, {self.job.outcome}>"
+        ended = ", ".join(str(each) for each in (self.job.verdict, self.job.outcome) if each is not None)
+        return f"<{type(self).__name__} of job {self.job.id}: {size}, {ended}>"
 
     @property
     def shapes(self) -> NDArray[np.float64]:
@@ -122,6 +123,11 @@ def copied(source: Path, path: Path | str) -> Path:
     target.parent.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(source, target)
     return target
+
+
+def loaded(job: Job) -> tuple[str, ...]:
+    """Return the files that `wait` and `result` download; a job that wrote further files has no arrays of its own."""
+    return LOADED if job.outputs_of is None else (REPORT,)
 
 
 def job_path(job: str) -> str:

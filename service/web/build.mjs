@@ -1,5 +1,5 @@
 // Bundles src/ into dist/: one script, one stylesheet, names that change with their content, and a gzip twin of each.
-// The two HTML files keep their names; they are the only files that a browser has to revalidate.
+// The HTML files keep their names; they are the only files that a browser has to revalidate.
 
 import { build } from "esbuild";
 import { mkdir, readFile, readdir, rename, rm, writeFile } from "node:fs/promises";

@@ -1,6 +1,7 @@
 // One job: where it stands, what it was understood as, and what came of it.
 
 import { Refusal, artifactPath, cancelJob, deleteJob, getReport, listJobs, retryJob } from "./api";
+import { Afterwards } from "./afterwards";
 import { Countdown } from "./countdown";
 import { Curves } from "./curves";
 import { button, fill, h, say } from "./dom";
@@ -52,6 +53,7 @@ export class Detail {
   private readonly sheet = new Sheet();
   private readonly files = new Files();
   private readonly snippets = new Snippets();
+  private readonly afterwards = new Afterwards();
   private readonly leaving = new AbortController();
   private job: Job | null = null;
   private finished = false;
@@ -73,6 +75,7 @@ export class Detail {
       this.failure,
       this.live.element,
       this.stage,
+      this.afterwards.element,
       this.figures.element,
       this.sheet.element,
       this.curves.element,
@@ -105,7 +108,10 @@ export class Detail {
         this.learn(job);
       },
       onProgress: (progress: Progress) => this.progress(progress),
-      onTrouble: (refusal: Refusal | null) => this.trouble.replaceChildren(...(refusal ? [refusalBox(refusal.problem)] : [])),
+      onTrouble: (refusal: Refusal | null) => {
+        if (refusal && this.job === null) say(this.heading, refusal.problem.status === 404 ? "This job does not exist" : "This job cannot be shown");
+        this.trouble.replaceChildren(...(refusal ? [refusalBox(refusal.problem)] : []));
+      },
     };
     await follow(this.id, follower, this.leaving.signal);
   }
@@ -142,6 +148,7 @@ export class Detail {
     this.sheet.show(job);
     this.files.show(job);
     this.snippets.show(job);
+    this.afterwards.show(job);
     this.events.onJob(job);
     if (job.status === "succeeded" && !this.finished) {
       this.finished = true;
