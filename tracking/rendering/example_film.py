@@ -58,8 +58,8 @@ def write_example_film(path: Path | str, *, frames: int = FRAMES) -> Path:
 def example_region() -> list[list[float]]:
     """Return the corners of the face in the film's first frame, as the option `region_polygon` takes them."""
     outline = cv2.convexHull(_film(FRAMES).pixels[0].astype(np.float32))
-    corners = cv2.approxPolyDP(outline, OUTLINE_TOLERANCE, closed=True).reshape(-1, 2)
-    return np.round(corners, 1).astype(float).tolist()  # type: ignore[no-any-return]
+    corners = cv2.approxPolyDP(outline, OUTLINE_TOLERANCE, closed=True).reshape(-1, 2).astype(np.float64)
+    return [[round(float(x), 1), round(float(y), 1)] for x, y in corners]
 
 
 def _film(frames: int) -> RenderedFilm:

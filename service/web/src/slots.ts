@@ -146,7 +146,7 @@ export class Slots {
   private recording(): HTMLElement | string {
     if (!canRecord()) return "";
     const film = (recorded: File): void => void this.put("film", recorded);
-    return button("Record with the camera", () => void new CameraDialog(film).open(), { class: "link record" });
+    return h("span", { class: "record" }, button("Record with the camera", () => void new CameraDialog(film).open(), { class: "link" }));
   }
 
   private async put(part: Part, file: File | null): Promise<void> {

@@ -4,8 +4,8 @@ import { edges } from "./body";
 import type { FilmFrames } from "./filmframes";
 import { type Preview, isHidden } from "./preview";
 
-/** Points drawn at most. */
-const MOST = 3000;
+/** Points drawn at most, over a film and without one: the picture should be seen between them. */
+const MOST = { film: 500, plain: 3000 };
 const TAIL = 6;
 
 interface Frame {
@@ -32,7 +32,7 @@ export class FilmPane {
     private readonly residuals: Int16Array,
     private readonly film: FilmFrames | null,
   ) {
-    this.every = Math.max(1, Math.ceil(preview.points / MOST));
+    this.every = Math.max(1, Math.ceil(preview.points / (film ? MOST.film : MOST.plain)));
     this.frame = film ? { left: -0.5, top: -0.5, width: film.width, height: film.height } : this.around();
     this.canvas.setAttribute("role", "img");
     this.canvas.setAttribute("aria-label", film ? "The film at the same moment, with its tracks" : "The tracks at the same moment");
