@@ -453,7 +453,7 @@ export interface components {
             field_of_view: number | null;
             /**
              * Principal Point
-             * @description Principal point X,Y in pixels, e.g. 319.5,239.5; null: the centre of image_size, or of the tracks without it.
+             * @description Principal point X,Y in pixels, e.g. 319.5,239.5; null: the centre of image_size, ((width - 1) / 2, (height - 1) / 2), or that of the tracks without it.
              * @default null
              */
             principal_point: string | null;
@@ -464,6 +464,13 @@ export interface components {
              * @enum {string}
              */
             surface: "auto" | "isometric" | "free";
+            /**
+             * Order
+             * @description film: neighbouring frames are alike. any: photographs in no order; results do not depend on it. Needs prior gaussian and at most 360 frames. auto: any if neighbouring frames are no more alike than others.
+             * @default auto
+             * @enum {string}
+             */
+            order: "auto" | "film" | "any";
             /**
              * Basis Size
              * @description Number K of basis shapes in the factorization for the rotations; null: selected from the data.
@@ -645,7 +652,7 @@ export interface components {
             coordinates: "auto" | "pixels" | "unit" | "signed";
             /**
              * Image Size
-             * @description WIDTHxHEIGHT of the picture in pixels, e.g. 640x480; needed if coordinates are fractions of it. Its centre is the principal point of a perspective camera.
+             * @description WIDTHxHEIGHT of the picture in pixels, e.g. 640x480; needed if coordinates are fractions of it. Pixel centres lie at whole numbers from 0. The picture's centre is the principal point of a perspective camera.
              * @default null
              */
             image_size: string | null;
