@@ -79,6 +79,13 @@ class Artifact(Record):
     description: str = ""
 
 
+class Estimate(Record):
+    """What a job is expected to need, from the numbers of its frames and points. Right within a factor of about two."""
+
+    memory_bytes: int = Field(description="Largest memory of the process that works on the job.")
+    seconds: float = Field(description="Processor seconds on one core of a usual machine.")
+
+
 class Interpretation(Record):
     """How the inputs were understood."""
 
@@ -115,6 +122,9 @@ class Interpretation(Record):
     )
     notes: list[str] = Field(
         default_factory=list, description="Sentences: the evidence, what was dropped, what was assumed."
+    )
+    estimate: Estimate | None = Field(
+        None, description="Memory and time the job will need; null for films, whose points are not known before they are tracked."
     )
 
 

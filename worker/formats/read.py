@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from pliant.schemas.job import Interpretation
 from pliant.schemas.options import Options
 from pliant.solver import InvalidInput, Mesh, Tracks
+from pliant.worker.formats.cost import estimated
 from pliant.worker.formats.errors import refusal, too_large
 from pliant.worker.formats.ground_truth import read_rotations, read_truth
 from pliant.worker.formats.meshes.surface import read_surface, whole_grid
@@ -74,6 +75,7 @@ def read_inputs(
         given_frames=understood.points.shape[0], given_points=understood.points.shape[1],
         num_left_out=len(chosen.left_out), left_out_points=chosen.left_out[:LISTED].tolist(),
         notes=[*understood.notes, *chosen.notes, *truth_notes],
+        estimate=estimated(checked.num_frames, checked.num_points, options),
     )  # fmt: skip
     return Inputs(checked, chosen.mesh, truth, cameras, told, chosen.selection if chosen.selection.narrows else None)
 

@@ -20,6 +20,7 @@ from pliant.worker.errors import (
 )
 from pliant.worker.ids import check_id, is_id, new_attempt_id, new_job_id
 from pliant.worker.jobs import lifecycle
+from pliant.worker.jobs.admission import check_fits
 from pliant.worker.jobs.submission import Acceptance, Submission, key_digest
 from pliant.worker.jobs.validation import LARGEST_PAGE as LARGEST_PAGE
 from pliant.worker.jobs.validation import check_event_id, check_key, check_page
@@ -86,7 +87,7 @@ class Jobs:
         Conflict
             The id or the key belongs to a different request.
         InvalidRequest
-            The id or the key is malformed.
+            The id or the key is malformed, or no worker has the memory that the job needs.
         QuotaExceeded
             Jobs and uploads hold as many bytes as they may.
         TooManyQueued
@@ -103,6 +104,7 @@ class Jobs:
             options=submission.options,
             interpretation=interpretation,
         )
+        check_fits(interpretation, submission.options, self.queue.memories().values())
         size = inputs_file.stat().st_size
         return self._create(job, submission, lambda key: self.blobs.put(key, inputs_file), size=size)
 

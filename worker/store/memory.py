@@ -254,6 +254,10 @@ class MemoryQueue(Queue):
         """See `Queue.workers`."""
         return ["memory"]
 
+    def memories(self) -> dict[str, int]:
+        """See `Queue.memories`."""
+        return {}
+
 
 class MemoryHash:
     """The commands of Redis on hashes that `pliant.worker.tokens.Tokens` uses."""

@@ -65,6 +65,10 @@ class Queue(ABC):
     def workers(self) -> list[str]:
         """Return the names of the workers that have shown signs of life lately."""
 
+    @abstractmethod
+    def memories(self) -> dict[str, int]:
+        """Return the bytes that a job may take on each of these workers, by name; those that state none are left out."""
+
 
 class RedisQueue(Queue):
     """RQ on Redis, JSON only. One queue, so that RQ moves ids by BLMOVE and cannot drop one between two hands."""
@@ -149,3 +153,11 @@ class RedisQueue(Queue):
             for name in names:
                 pipe.exists(alive_key(self._name, name))
             return [name for name, alive in zip(names, pipe.execute(), strict=True) if alive]
+
+    def memories(self) -> dict[str, int]:
+        """See `Queue.memories`."""
+        names = self.workers()
+        with reachable():
+            signs = self._redis.mget([alive_key(self._name, name) for name in names]) if names else []
+        stated = {name: sign.decode().partition(" ")[2] for name, sign in zip(names, signs, strict=True) if sign is not None}
+        return {name: int(size) for name, size in stated.items() if size.isdigit()}
