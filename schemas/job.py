@@ -27,6 +27,10 @@ class Status(StrEnum):
         return self in (Status.SUCCEEDED, Status.FAILED, Status.CANCELLED)
 
 
+Priority = Literal["high", "normal", "low"]
+"""Order among the waiting jobs of one owner."""
+
+
 class Record(BaseModel):
     """Base of everything on the wire: unknown fields are ignored, so that an older client reads a newer service."""
 
@@ -149,6 +153,7 @@ class Job(Record):
     expires_at: datetime | None = Field(None, description="When the job and its files are removed; null: never.")
     attempt: int = Field(0, description="How often a worker has begun it.")
     retry_of: str | None = Field(None, description="The finished job whose inputs and options this one runs again.")
+    priority: Priority = Field("normal", description="Order among the waiting jobs of one owner; jobs of others are not passed.")
     place_in_queue: int | None = Field(None, description="0 is next; null when not queued.")
     options: Options
     interpretation: Interpretation

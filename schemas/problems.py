@@ -105,6 +105,9 @@ class ProblemCode(StrEnum):
     NOT_UTF8 = ("not_utf8", 422, "Not UTF-8",
      "A text part is not valid UTF-8.",
      "Encode it as UTF-8.")
+    INVALID_PRIORITY = ("invalid_priority", 422, "Invalid priority",
+     "The part `priority` is not one of high, normal and low.",
+     "Leave it out for normal.")
     NAME_TOO_LONG = ("name_too_long", 422, "Name too long",
      "The job's `name` has more than 200 characters.",
      "Shorten it.")

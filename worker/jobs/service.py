@@ -99,6 +99,7 @@ class Jobs:
         job = Job(
             id=submission.id or new_job_id(),
             name=submission.name,
+            priority=submission.priority,
             status=Status.QUEUED,
             created_at=self.clock(),
             options=submission.options,
@@ -178,6 +179,7 @@ class Jobs:
             status=Status.QUEUED,
             created_at=self.clock(),
             retry_of=id,
+            priority=job.priority,
             options=job.options,
             interpretation=job.interpretation,
         )
