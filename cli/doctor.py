@@ -1,4 +1,4 @@
-"""`pliant doctor`: check the installation and say what to fix."""
+"""`pliant doctor` checks the installation, `pliant fsck` the consistency of the stored data."""
 
 from __future__ import annotations
 
@@ -41,15 +41,14 @@ class Finding:
     """What to do; empty if nothing is wrong."""
 
 
+Data = Annotated[Path, typer.Option("--data", envvar="PLIANT_DATA", help="Data directory.")]
+
+
 def doctor(
     ctx: typer.Context,
-    data: Annotated[Path, typer.Option("--data", envvar="PLIANT_DATA", help="Data directory.")] = Path("pliant-data"),
+    data: Data = Path("pliant-data"),
     port: Annotated[int, typer.Option("--port", help="Port that `pliant up` would use.", min=1, max=65535)] = 8000,
     url: Url = HOME,
-    audit: Annotated[
-        bool,
-        typer.Option("--audit", help="Compare everything stored with the records; needs a running queue."),
-    ] = False,
     as_json: Json = False,
 ) -> None:
     """Check the installation; exit code 8 if something must be fixed."""
@@ -64,10 +63,22 @@ def doctor(
         *check_valkey(),
         *check_blobs(),
     ]
-    findings += [*check_port(port), *check_service(session, url)]
-    if audit:
-        require_server("pliant doctor --audit")
-        findings += check_stored(data)
+    report([*findings, *check_port(port), *check_service(session, url)], as_json=as_json)
+
+
+def fsck(ctx: typer.Context, data: Data = Path("pliant-data"), as_json: Json = False) -> None:
+    """Compare job records, queue, files, uploads and scratch directories; exit code 8 if they are inconsistent.
+
+    Needs a running queue: run it beside `pliant up`, or with PLIANT_REDIS_URL.
+    """
+    session: Session = ctx.obj
+    session.json = as_json
+    require_server("pliant fsck")
+    report(list(check_stored(data)), as_json=as_json)
+
+
+def report(findings: list[Finding], *, as_json: bool) -> None:
+    """Print the findings; raise `typer.Exit` if one of them is bad."""
     if as_json:
         print_json([asdict(finding) for finding in findings])
     else:
@@ -145,11 +156,9 @@ def check_blas() -> Iterator[Finding]:
 
 def check_cores() -> Iterator[Finding]:
     """Check how the cores are divided among workers."""
-    import os
-
     from pliant.worker.settings import Settings, usable_cores
 
-    settings = Settings.from_environment(os.environ)
+    settings = Settings() if missing_modules() else Settings.from_environment()
     threads, cores = settings.threads_per_job, usable_cores()
     found = f"{cores} usable; {settings.workers} worker(s) of {threads} thread(s)"
     if threads * settings.workers > cores:
@@ -178,17 +187,16 @@ def check_storage(data: Path) -> Iterator[Finding]:
 
 def check_valkey() -> Iterator[Finding]:
     """Check the queue: the Redis server of PLIANT_REDIS_URL, or the program of the embedded server."""
-    import os
-
-    address = os.environ.get("PLIANT_REDIS_URL", "")
-    if address != "":
-        yield _redis(address)
-        return
     if missing_modules():
         return
     from pliant.worker.errors import WorkerError
     from pliant.worker.processes.valkey import find_binary
+    from pliant.worker.settings import Settings
 
+    address = Settings.from_environment().redis_url
+    if address is not None:
+        yield _redis(address)
+        return
     try:
         yield Finding("queue", "good", f"embedded Valkey, {find_binary()}")
     except WorkerError as fault:
@@ -228,8 +236,7 @@ def check_service(session: Session, url: str) -> Iterator[Finding]:
 
 
 def check_stored(data: Path) -> Iterator[Finding]:
-    """Compare records, queue, blobs, working files, uploads and partly received bodies with each other."""
-    import os
+    """Compare records, queue, blobs, scratch directories, uploads and incomplete request bodies with each other."""
     from dataclasses import replace
 
     from pliant.service.spool import Incoming
@@ -238,7 +245,7 @@ def check_stored(data: Path) -> Iterator[Finding]:
     from pliant.worker.maintenance.fsck import findings
     from pliant.worker.settings import Settings
 
-    settings = replace(Settings.from_environment(os.environ), data=data)
+    settings = replace(Settings.from_environment(), data=data)
     try:
         found = findings(Jobs.open(settings))
     except StoreUnavailable as fault:
@@ -252,7 +259,7 @@ def check_stored(data: Path) -> Iterator[Finding]:
         advice = "The next start of the service removes it."
         yield Finding("stored", "bad", f"Folder incoming/{name} belongs to a process that has ended.", advice)
     if not found:
-        yield Finding("stored", "good", "everything stored matches the records")
+        yield Finding("stored", "good", "the stores are consistent with the job records")
 
 
 def show(findings: list[Finding]) -> None:

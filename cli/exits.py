@@ -33,7 +33,7 @@ class Exit(IntEnum):
     TIMEOUT = 7
     """`--timeout` passed; the job continues."""
     UNHEALTHY = 8
-    """`doctor` found a fault, or the command needs an extra that is not installed."""
+    """`doctor` or `fsck` found a fault, or the command needs an extra that is not installed."""
     INTERRUPTED = 130
     """Ctrl-C."""
 

@@ -41,7 +41,8 @@ def submit(
         typer.Argument(
             help="Track files in any format `pliant inspect` reads, or a film. Several files, a folder of track files or a quoted "
             "pattern such as 'takes/*.npz' make a job each.",
-            metavar="FILE...", show_default=False,
+            metavar="FILE...",
+            show_default=False,
         ),
     ],
     mesh: Mesh = None,

@@ -55,7 +55,9 @@ def create(
     ] = None,
     source: Annotated[
         Path | None,
-        typer.Option("--from", help="File with the token itself, made by a deployment; known ones stay.", metavar="FILE"),
+        typer.Option(
+            "--from", help="File with the token itself, made by a deployment; known ones stay.", metavar="FILE"
+        ),
     ] = None,
     data: Data = None,
     as_json: Json = False,

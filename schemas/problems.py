@@ -98,7 +98,7 @@ class ProblemCode(StrEnum):
      "Add it.")
     CONFLICTING_PARTS = ("conflicting_parts", 422, "Conflicting parts",
      "A form has parts that exclude each other: a film beside tracks, or a mask picture beside `region_polygon`.",
-     "Leave one of them out.")
+     "Omit one of them.")
     NOT_A_FILE = ("not_a_file", 422, "Part is not a file",
      "A part that must be a file was sent as text.",
      "Give the part a file name, as `curl -F tracks=@FILE` does.")
@@ -143,6 +143,15 @@ class ProblemCode(StrEnum):
     EXPIRED_TOKEN = ("expired_token", 401, "Expired token",
      "The token's expiry date has passed.",
      "Ask the operator for a new one.")
+    INVALID_SHARE = ("invalid_share", 401, "Invalid share link",
+     "The link was revoked, its job was deleted, or the token is not complete.",
+     "Ask the sender of the link for a new one.")
+    EXPIRED_SHARE = ("expired_share", 401, "Expired share link",
+     "The link's expiry date has passed.",
+     "Ask the sender of the link for a new one.")
+    BEYOND_SHARE = ("beyond_share", 403, "Beyond the share link",
+     "A request with the token of a share link named another job, or something other than the job's record, events and files.",
+     "Use a token of the service for anything else.")
     INSUFFICIENT_SCOPE = ("insufficient_scope", 403, "Insufficient scope",
      "The token is valid but lacks the scope that the route needs; `expected` names it.",
      "Use a token with that scope.")
@@ -192,7 +201,7 @@ class ProblemCode(StrEnum):
      "`GET /v1/options` lists types and bounds.")
     OUTPUT_UNAVAILABLE = ("output_unavailable", 422, "Output unavailable",
      "A requested output cannot be written here: `usd` without `usd-core` installed, or `mat` for shapes of 2 GiB or more.",
-     "Leave it out of `outputs`, or install `pliant[usd]` beside service and worker.")
+     "Remove it from `outputs`, or install `pliant[usd]` beside service and worker.")
     INVALID_WEBHOOK = ("invalid_webhook", 422, "Invalid webhook",
      "`webhook` is not an http(s) URL of at most 2,000 characters without user name, or it came without a secret.",
      "Correct the URL, and send `webhook_secret` with it.")
@@ -271,6 +280,12 @@ class ProblemCode(StrEnum):
     DIGEST_MISMATCH = ("digest_mismatch", 422, "Digest mismatch",
      "The SHA-256 of the received bytes differs from `Repr-Digest`. The upload was removed.",
      "Send it again.")
+    UNKNOWN_SHARE = ("unknown_share", 404, "Unknown share link",
+     "The job has no share link of that id; it may have expired.",
+     "`GET /v1/jobs/{id}/shares` lists the valid ones.")
+    TOO_MANY_SHARES = ("too_many_shares", 409, "Too many share links",
+     "The job has 20 valid share links.",
+     "Revoke one, or wait until one expires.")
     TOO_MANY_UPLOADS = ("too_many_uploads", 429, "Too many uploads",
      "The token has 100 uploads.",
      "Delete some, or wait until they expire.")
@@ -359,7 +374,7 @@ class ProblemCode(StrEnum):
      "The film has more than 16 streams.",
      "Keep the picture: `ffmpeg -i FILM -map 0:v:0 film.mp4`.")
     TOO_MANY_PICTURES = ("too_many_pictures", 422, "Too many pictures",
-     "A zip lists more pictures than can be looked at.",
+     "A zip lists more pictures than this installation accepts.",
      "Put fewer pictures in the zip.")
     TOO_MANY_BYTES = ("too_many_bytes", 422, "Too many bytes",
      "The film, or the pictures of a zip unpacked, are larger than this installation accepts.",
@@ -390,10 +405,10 @@ class ProblemCode(StrEnum):
      "Draw the region on a frame of this film, upright as it is shown.")
     WRONG_POLYGON = ("wrong_polygon", 422, "Wrong polygon",
      "The polygon has fewer than three corners, or coordinates that are not finite.",
-     "Draw around the thing to track.")
+     "Draw around the object to track.")
     EMPTY_REGION = ("empty_region", 422, "Empty region",
      "The region holds no pixel of the film.",
-     "Draw around the thing to track.")
+     "Draw around the object to track.")
     REGION_LOST = ("region_lost", 422, "Region lost",
      "The region cannot be followed from the frame it was drawn on to the template.",
      "Draw it on the template frame (`region_frame`), or choose a nearer `template_frame`.")
@@ -405,7 +420,7 @@ class ProblemCode(StrEnum):
      "Film more slowly and with more light.")
     OUTSIDE_PICTURE = ("outside_picture", 422, "Outside the picture",
      "Half or more of the visible observations lie outside `image_size`.",
-     "Correct `image_size`, or leave it out where tracks are not in pixels from the picture's corner.")
+     "Correct `image_size`, or omit it if tracks are not in pixels from the picture's corner.")
     PRINCIPAL_POINT_FAR = ("principal_point_far", 422, "Principal point too far",
      "`principal_point`, or the centre of `image_size`, lies far from all tracks.",
      "Give x and y in the unit and axes of the tracks.")
@@ -458,7 +473,7 @@ class ProblemCode(StrEnum):
      "Check the order of the axes.")
     VERTEX_COUNT_MISMATCH = ("vertex_count_mismatch", 422, "Vertex count mismatch",
      "The mesh file has another number of vertices than the tracks have points.",
-     "Vertex i must be point i. Omit the mesh to have one made.")
+     "Vertex i must be point i. Omit the mesh to have one generated.")
     MESH_MISMATCH = ("mesh_mismatch", 422, "Mesh mismatch",
      "The mesh given to `pliant.solver.solve` has another number of vertices than the tracks have points.",
      "Vertex i must be point i.")

@@ -1,13 +1,13 @@
-"""The one record of settings; every field is explained by its formula.
+"""Settings of a solve, each explained by its formula.
 
-The energy that these settings shape, in normalized units (per-frame centroid of the visible points removed, then
-divided by the RMS of what is left; λ is therefore dimensionless)::
+The energy, in normalized units (the centroid of each frame's visible points is subtracted and the result divided by its
+RMS, so λ is dimensionless)::
 
     E(S) = Σ_fp v_fp ρ(w_fp − s_f R_f S_fp)  +  λ1 ‖H S‖_F²  +  λ2 ‖A vec(S)‖²  (+ λ3 Σ_i log-det-like rank penalty)
 
 Dai, Deng, He (2017), eq. 7; the scale s_f, the weight v_fp and the rank term are ours. With the Gaussian prior λ1 Σ_p x_pᵀ Σ⁻¹ x_p
-stands where λ1 ‖H S‖² does, Σ the learned covariance of a point's positions x_p; λ2 then acts in the axes in which deformation varies
-alike, and neither H nor λ3 has a part in it.
+replaces λ1 ‖H S‖², with Σ the learned covariance of a point's positions x_p; λ2 then acts in the axes in which the
+deformation is isotropic, and H and λ3 are not used.
 """
 
 from __future__ import annotations
@@ -25,12 +25,13 @@ Preset = Literal["auto", "paper"]
 Loss = Literal["l1", "l2", "huber"]
 Prior = Literal["gaussian", "smooth+low_rank", "smooth"]
 Surface = Literal["auto", "isometric", "free"]
+Order = Literal["auto", "film", "any"]
 Laplacian = Literal["auto", "grid8", "uniform", "cotangent"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
-    """How to solve. The defaults are meant to need no change."""
+    """Settings of a solve. The defaults suit most sequences."""
 
     method: Method = "robust"
     """`pseudo_inverse` R†W; `temporal` closed form (eq. 5); `spatio_temporal` eq. 7 with L2; `robust` eq. 7 with `loss`."""
@@ -50,27 +51,32 @@ class Settings:
     """c as (x, y) in the tracks' unit; None: the centre of the picture, or of the tracks where `image_size` is not given."""
 
     image_size: tuple[float, float] | None = None
-    """(width, height) of the picture in the tracks' unit."""
+    """(width, height) of the picture in pixels. The centres of its pixels lie at whole numbers, the first at (0, 0): the picture reaches
+    from −½ to width − ½, and its centre is ((width − 1)/2, (height − 1)/2)."""
 
     y_up: bool = False
     """True: y of the tracks grows upwards. The third axis of the camera then points to the viewer instead of away."""
 
     surface: Surface = "auto"
-    """`isometric`: a sheet that bends without stretching, seen in perspective; `free`: none of that; `auto`: isometric where the tracks
-    are those of a sheet and its edge lengths single out a focal length; tried only where `image_size` or the focal length is given, with
-    the default camera model, method and prior."""
+    """`isometric`: a sheet that bends without stretching, seen in perspective; `free`: any surface; `auto`: isometric if the tracks
+    are those of a sheet and its edge lengths determine a focal length. `auto` tests this only if `image_size` or the focal length is
+    given, with the default camera model, method and prior."""
+
+    order: Order = "auto"
+    """`film`: neighbouring frames are alike; `any`: photographs in no order, of which no prior compares neighbours (Gaussian prior only);
+    `auto`: `film` where the tracks are more probable as a walk from frame to frame than as independent frames."""
 
     basis_size: int | None = None
-    """K of the rank-3K factorization; None chooses it from the data and reports why."""
+    """K of the rank-3K factorization; None selects it from the data and reports the reason."""
 
     refine_rotations: bool = True
-    """Refine the cameras by variable projection on the likelihood of the tracks; with the Gaussian prior, together with it."""
+    """Refine the cameras by variable projection on the likelihood of the tracks; with the Gaussian prior, jointly with it."""
 
     preset: Preset = "auto"
     """`paper`: λ1 = 1e-3, λ2 = 1, L1 with ε = 1e-3, first order; `auto`: weights from the noise and motion measured in the data."""
 
     temporal_weight: float | None = None
-    """λ1, dimensionless; None takes the preset's. 0 leaves depth to nothing but the start."""
+    """λ1, dimensionless; None takes the preset's. With 0, depth is determined by the starting point only."""
 
     spatial_weight: float | None = None
     """λ2, dimensionless; None takes the preset's. Unused without a mesh."""
@@ -79,7 +85,7 @@ class Settings:
     """ε of the smoothed L1 (r ↦ √(r² + ε²)) or δ of Huber, in normalized units; None takes the preset's."""
 
     temporal_order: Literal[1, 2] | None = None
-    """Order of the difference operator H; None takes the preset's. Without effect, and said so, with the Gaussian prior."""
+    """Order of the difference operator H; None takes the preset's. With the Gaussian prior it has no effect, which is reported."""
 
     loss: Loss = "l1"
     """ρ of the data term when `method` is `robust`."""
@@ -89,26 +95,26 @@ class Settings:
     else uniform."""
 
     prior: Prior = "gaussian"
-    """Of method `robust` with preset `auto`. `gaussian`: one Gaussian over all frames for the positions of a point, its covariance
-    learned from the tracks (modes and a random walk, by expectation maximisation), estimated cameras refined with it; λ1 weighs
-    it. `smooth`: the paper's method exactly; `smooth+low_rank` adds a reweighted nuclear norm on the F×3P shape matrix (with preset
-    `paper` only if `low_rank_weight` is given). With other methods or preset `paper`, `gaussian` means `smooth`."""
+    """Prior of method `robust` with preset `auto`. `gaussian`: a Gaussian over all frames for the positions of each point, with a
+    covariance learned from the tracks (modes and a random walk, by expectation maximisation) and weight λ1; estimated cameras are
+    refined with it. `smooth`: the paper's method; `smooth+low_rank` adds a reweighted nuclear norm on the F×3P shape matrix (with
+    preset `paper` only if `low_rank_weight` is given). With other methods or preset `paper`, `gaussian` means `smooth`."""
 
     low_rank_weight: float | None = None
-    """λ3, dimensionless, strength of the low-rank prior; None takes it from the data. Without effect, and said so, unless `prior` is
-    `smooth+low_rank`."""
+    """λ3, dimensionless, weight of the low-rank prior; None takes it from the data. Unless `prior` is `smooth+low_rank` it has no
+    effect, which is reported."""
 
     max_reweightings: int = 60
-    """Upper bound on the outer IRLS steps."""
+    """Maximum number of reweightings, the outer IRLS iterations."""
 
     tolerance: float = 1e-4
-    """Converged when the relative change of the objective over one reweighting falls below this."""
+    """Relative change of the objective over one reweighting below which the solve has converged."""
 
     precision: Literal["float64", "float32"] = "float64"
-    """Arithmetic of the large arrays. With the Gaussian prior always double, for its equations span ten magnitudes."""
+    """Precision of the large arrays. The Gaussian prior always uses float64, because its equations span ten orders of magnitude."""
 
     seed: int = 0
-    """Seed of every random choice (restarts, sampled points). The same seed and thread count give the same bits."""
+    """Seed of all random choices (restarts, sampled points). The same seed and thread count give bit-identical results."""
 
     @property
     def focal_length(self) -> float | None:
@@ -118,13 +124,20 @@ class Settings:
         return self.image_size[0] / (2 * tan(radians(self.field_of_view) / 2))
 
     @property
+    def centre(self) -> tuple[float, float] | None:
+        """The principal point if it is given, else the picture's centre; None if neither is known."""
+        if self.principal_point is None and self.image_size is not None:
+            return ((self.image_size[0] - 1) / 2, (self.image_size[1] - 1) / 2)
+        return self.principal_point
+
+    @property
     def gaussian(self) -> bool:
-        """True if the shapes get the Gaussian prior."""
+        """Whether the shapes have the Gaussian prior."""
         return self.prior == "gaussian" and self.method == "robust" and self.preset == "auto"
 
     @property
     def estimates_scales(self) -> bool:
-        """True if every frame may have its own scale."""
+        """Whether every frame may have its own scale."""
         return self.camera != "orthographic"
 
     def __post_init__(self) -> None:
@@ -132,6 +145,7 @@ class Settings:
         _check_choice("method", self.method, Method)
         _check_choice("camera", self.camera, CameraModel)
         _check_choice("surface", self.surface, Surface)
+        _check_choice("order", self.order, Order)
         _check_choice("preset", self.preset, Preset)
         _check_choice("loss", self.loss, Loss)
         _check_choice("laplacian", self.laplacian, Laplacian)
@@ -151,22 +165,27 @@ class Settings:
             raise _out_of_range("max_reweightings", "a whole number from 1 to 1000", self.max_reweightings)
         if not 0 < self.tolerance < 1:
             raise _out_of_range("tolerance", "a number between 0 and 1", self.tolerance)
+        if self.order == "any" and not self.gaussian:
+            raise _contradiction(
+                "order", "prior gaussian with method robust and preset auto beside order any",
+                f"prior {self.prior}, method {self.method}, preset {self.preset}", "The other priors compare neighbouring frames.",
+            )  # fmt: skip
         if not 0 <= self.seed < 2**32:
             raise _out_of_range("seed", "a whole number from 0 to 4294967295", self.seed)
 
 
 FARTHEST = 10.0
-"""Pictures that the principal point may lie beyond the border: what a crop leaves may be a tenth of the picture."""
+"""Maximum distance of the principal point from the picture, in picture sizes: a crop may keep a tenth of a picture."""
 
 
 def check_pinhole(settings: Settings) -> None:
-    """Check what is given about a pinhole camera.
+    """Validate the settings of a pinhole camera.
 
     Raises
     ------
     InvalidSettings
         A focal length or size that is not positive and finite, both `focal` and `field_of_view`, an angle without `image_size` or outside
-        0 to 180 degrees, or a principal point that is not finite or outside any picture.
+        0 to 180 degrees, or a principal point that is not finite or too far outside the picture.
     """
     focal, angle, centre, size = settings.focal, settings.field_of_view, settings.principal_point, settings.image_size
     if focal is not None and not (math.isfinite(focal) and focal > 0):

@@ -38,7 +38,9 @@ def expanded(given: list[Path], region: Path | None) -> list[Path]:
         if inside:
             found += inside
         elif path.is_dir() and region is None and not any(path.iterdir()):
-            raise BadArgument(f"{path}: expected track files ({', '.join(sorted(ENDINGS))}), got an empty folder. Name the files.")
+            raise BadArgument(
+                f"{path}: expected track files ({', '.join(sorted(ENDINGS))}), got an empty folder. Name the files."
+            )
         elif not path.exists() and any(sign in path.name for sign in "*?["):
             matching = sorted(path.parent.glob(path.name))
             if not matching:
@@ -94,7 +96,9 @@ class Batch:
 
         given = [word for word, value in (("--name", name), ("--id", job_id), ("--region", region)) if value]
         if given:
-            raise BadArgument(f"{', '.join(given)}: expected one file, got {len(self.files)}. Leave it out, or submit them singly.")
+            raise BadArgument(
+                f"{', '.join(given)}: expected one file, got {len(self.files)}. Leave it out, or submit them singly."
+            )
         for file in self.files:
             existing_file(file, "tracks")
         if self.output is None:
@@ -102,7 +106,9 @@ class Batch:
         names = [file.stem for file in self.files]
         twice = next((each for each in names if names.count(each) > 1), None)
         if twice is not None:
-            raise BadArgument(f"--output: several files are named {twice}, and would share a folder. Submit them apart.")
+            raise BadArgument(
+                f"--output: several files are named {twice}, and would share a folder. Submit them apart."
+            )
         for each in names:
             if not force and (self.output / each / "report.json").exists():
                 continue  # of an earlier run: `Client.download` fetches only what is missing or different
@@ -155,7 +161,11 @@ class Batch:
         for row in self.rows:
             job = row.job
             status = "refused" if job is None else str(job.status)
-            took = None if job is None or job.started_at is None or job.finished_at is None else job.finished_at - job.started_at
+            took = (
+                None
+                if job is None or job.started_at is None or job.finished_at is None
+                else job.finished_at - job.started_at
+            )
             table.add_row(
                 Text(str(row.file)), "" if job is None else job.id, Text(status, COLOURS.get(status, "red")),
                 "" if job is None else job.verdict or "", "" if took is None else f"{took.total_seconds():.1f}",
@@ -168,7 +178,9 @@ class Batch:
         from pliant.client.multipart import sha256
 
         content = sha256(file) if file.is_file() else str(file.absolute())
-        rest = json.dumps([self.key, self.options, {name: str(each) for name, each in self.shared.items()}], sort_keys=True)
+        rest = json.dumps(
+            [self.key, self.options, {name: str(each) for name, each in self.shared.items()}], sort_keys=True
+        )
         return f"batch/{hashlib.sha256(f'{content} {file.stem} {rest}'.encode()).hexdigest()}"
 
 

@@ -24,7 +24,11 @@ EVERYTHING = {
     "serviceAccount": {"annotations": {"role": "arn"}}, "nodeSelector": {"disk": "ssd"},
     "tolerations": [{"key": "k", "operator": "Exists"}], "imagePullSecrets": [{"name": "registry"}],
 }  # fmt: skip
-EXTERNAL = {"valkey": {"enabled": False}, "redis": {"existingSecret": "redis"}, "firstToken": {"existingSecret": "mine"}}
+EXTERNAL = {
+    "valkey": {"enabled": False},
+    "redis": {"existingSecret": "redis"},
+    "firstToken": {"existingSecret": "mine"},
+}
 VALUES: dict[str, dict[str, Any]] = {"usual": {}, "everything": EVERYTHING, "external": {**S3, **EXTERNAL}}
 
 
@@ -170,6 +174,10 @@ def test_the_first_token_is_one(tmp_path: Path) -> None:
 def test_values_that_cannot_work_are_refused(values: dict[str, Any], words: str) -> None:
     from helm_python.errors import HelmError
 
-    with helm().Chart.load(CHART) as chart, pytest.raises(HelmError, match=re.escape(words)):
-        chart.validate_schema(values)
-        chart.render(values, name="demo", namespace="ns")
+    def render() -> None:
+        with helm().Chart.load(CHART) as chart:
+            chart.validate_schema(values)
+            chart.render(values, name="demo", namespace="ns")
+
+    with pytest.raises(HelmError, match=re.escape(words)):
+        render()

@@ -1,11 +1,12 @@
-"""A moving shape as morph targets: one a frame where there are few, modes of motion where there are many.
+"""A moving shape as morph targets: modes of motion, or one target per frame.
 
-Viewers are right up to about 256 targets and slow beyond. Up to 200 frames each frame is its own target and the weights are one-hot, so
-every frame is exact in single precision. Above, the frames minus their mean are expanded in principal components (SVD); the weights are the
-coefficients, shifted and scaled into [0, 1] because viewers clamp weights to the slider's range (others come out wrong in Blender).
+The frames minus their mean are expanded in principal components (SVD); the weights are the coefficients, shifted and scaled to [0, 1]
+because viewers clamp weights to the range of their sliders (Blender does). The fewest modes are kept that bring every point of every frame
+within a bound, always fewer than frames. On request each frame is its own target instead, with one-hot weights, exact in single
+precision. Viewers handle about 256 targets correctly and slow down beyond, so more than 200 frames always become modes.
 
-Targets are made when they are asked for, and everything over all frames goes through a block of points at a time: what is held
-beside the shapes is a frame, or the modes, never another copy of the sequence.
+Targets are generated on demand, and operations over all frames process blocks of points, so that the memory beside the shapes is one
+frame or the modes, never a copy of the sequence.
 """
 
 from __future__ import annotations
@@ -21,10 +22,10 @@ from pliant.worker.artifacts.geometry import Floats, Singles, upright
 MAX_FRAME_TARGETS = 200
 MAX_MODES = 200
 BLOCK = 1 << 21
-"""Numbers (16 MB) of a block of points over all frames."""
+"""Numbers in a block of points over all frames (16 MB)."""
 
 ERROR_BOUND = 1e-3
-"""Largest distance between a point and its place in the file that is allowed to modes, as a share of the bounding box's diagonal."""
+"""Maximum error of a point's position due to modes, as a share of the bounding box's diagonal."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,7 +33,7 @@ class Animation:
     """Points of frame f = base + Σ_k weights[f, k] · target(k)."""
 
     base: Singles
-    """Shape `(P, 3)`, what a viewer shows that does not animate."""
+    """Shape `(P, 3)`, shown by viewers without animation."""
 
     target: Callable[[int], Singles]
     """Displacements `(P, 3)` of target k."""
@@ -41,15 +42,29 @@ class Animation:
     """Shape `(F, K)`, in [0, 1]."""
 
     names: list[str]
-    """One for each target."""
+    """Names of the targets."""
 
     extras: dict[str, Any]
-    """What the file says of itself: encoding and error bound, in the tracks' unit."""
+    """Metadata for the file: encoding and error bound, in the tracks' unit."""
 
 
-def animate(shapes: Floats, *, y_axis: str = "up") -> Animation:
-    """Encode shapes `(F, P, 3)`, turned to y up, exactly, or within the bound where there are more than 200 frames."""
-    return (_per_frame if len(shapes) <= MAX_FRAME_TARGETS else _modes)(shapes, y_axis)
+def animate(shapes: Floats, *, y_axis: str = "up", motion: str = "auto") -> Animation:
+    """Encode shapes `(F, P, 3)`, turned to y up.
+
+    Parameters
+    ----------
+    shapes : array, shape (F, P, 3)
+        World axes.
+    y_axis : {'up', 'down'}
+        Where y of the shapes points.
+    motion : {'auto', 'frames'}
+        auto: as few modes as keep every point within `ERROR_BOUND`. frames: exact, up to 200 frames.
+    """
+    if len(shapes) > MAX_FRAME_TARGETS:
+        return _modes(shapes, y_axis, MAX_MODES)
+    if motion == "frames" or len(shapes) < 3:
+        return _per_frame(shapes, y_axis)
+    return _modes(shapes, y_axis, len(shapes) - 1)  # as many hold any motion, and are still fewer than the frames
 
 
 def _per_frame(shapes: Floats, y_axis: str) -> Animation:
@@ -69,14 +84,14 @@ def _per_frame(shapes: Floats, y_axis: str) -> Animation:
     )
 
 
-def _modes(shapes: Floats, y_axis: str) -> Animation:
+def _modes(shapes: Floats, y_axis: str, most: int) -> Animation:
     frames, count, _ = shapes.shape
     mean = upright(shapes.mean(axis=0), y_axis)
     # The eigenvectors of the F × F Gram matrix are the left singular vectors; F is small beside 3P.
     gram = np.zeros((frames, frames))
     for _, moved in _blocks(shapes, y_axis, mean):
         gram += moved @ moved.T
-    left = scipy.linalg.eigh(gram, subset_by_index=(frames - MAX_MODES, frames - 1))[1][:, ::-1]
+    left = scipy.linalg.eigh(gram, subset_by_index=(frames - most, frames - 1))[1][:, ::-1]
     allowed = ERROR_BOUND * float(np.linalg.norm(shapes.max(axis=(0, 1)) - shapes.min(axis=(0, 1))))
     kept = _smallest(shapes, y_axis, mean, left, allowed)
     coefficients = left[:, :kept] * np.sqrt(frames)
@@ -107,8 +122,8 @@ def _blocks(shapes: Floats, y_axis: str, origin: Floats | Singles) -> Iterator[t
 
 
 def _smallest(shapes: Floats, y_axis: str, mean: Floats, left: Floats, allowed: float) -> int:
-    """Few modes whose worst point is within 90 % of what is allowed (the rest is for rounding), by bisection; at most 200."""
-    low, high = 1, MAX_MODES
+    """Return the fewest modes, at most those given, whose maximum error is within 90 % of the bound, by bisection (10 % for rounding)."""
+    low, high = 1, int(left.shape[1])
     while low < high:
         middle = (low + high) // 2
         if _within(0.9 * allowed, _blocks(shapes, y_axis, mean), left[:, :middle]):
@@ -119,7 +134,7 @@ def _smallest(shapes: Floats, y_axis: str, mean: Floats, left: Floats, allowed: 
 
 
 def _within(distance: float, blocks: Iterator[tuple[slice, Floats]], left: Floats) -> bool:
-    """Whether every point of every frame is that near to its projection on the modes."""
+    """Whether every point of every frame is within a distance of its projection on the modes."""
     for _, moved in blocks:
         rest = moved - left @ (left.T @ moved)
         if (rest.reshape(len(rest), -1, 3) ** 2).sum(axis=2).max() > distance**2:
@@ -130,7 +145,7 @@ def _within(distance: float, blocks: Iterator[tuple[slice, Floats]], left: Float
 def _rounded_errors(
     shapes: Floats, y_axis: str, base: Singles, targets: Singles, weights: Singles
 ) -> tuple[float, float]:
-    """Worst and root mean square distance of a point from where a viewer puts it, which computes with the rounded numbers."""
+    """Return the maximum and RMS distance between points and their positions in a viewer, which uses the rounded numbers."""
     worst, total = 0.0, 0.0
     for some, moved in _blocks(shapes, y_axis, base):
         modes = targets[:, some].reshape(len(targets), -1).astype(np.float64)

@@ -1,6 +1,6 @@
-"""Write an animated binary glTF 2.0 (.glb): one mesh, morph targets, one animation of their weights.
+"""Write an animated binary glTF 2.0 (.glb): one mesh, morph targets, a camera, one animation of their weights and its motion.
 
-The file is streamed: the JSON comes first, so sizes, offsets, minima and maxima are settled before any array is written.
+The file is streamed: the JSON comes first, so sizes, offsets, minima and maxima are computed before any array is written.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.worker.artifacts.animation import Animation
 from pliant.worker.artifacts.geometry import Ints, Singles, vertex_normals
+from pliant.worker.artifacts.view import View
 from pliant.worker.formats import Texture
 
 COMPONENTS = {"int8": 5120, "uint8": 5121, "int16": 5122, "uint16": 5123, "uint32": 5125, "float32": 5126}
@@ -31,9 +32,9 @@ Make = Callable[[], Array]
 
 
 class Buffer:
-    """Arrays in the order they will be written, and the glTF objects that point at them.
+    """Arrays in the order of writing, and the glTF objects that refer to them.
 
-    An array given as a function is made twice, once to be described and once to be written, and not held in between.
+    An array given as a function is generated twice, once for its bounds and once for writing, and not kept in between.
     """
 
     def __init__(self) -> None:
@@ -45,7 +46,7 @@ class Buffer:
     def add(
         self, given: Array | Make, *, target: int | None = None, bounds: bool = False, normalised: bool = False
     ) -> int:
-        """Append an array `(N,)` or `(N, width)` as a view of its own; returns the accessor's index.
+        """Append an array `(N,)` or `(N, width)` as a buffer view; return the index of its accessor.
 
         Rows of vertex data start at multiples of four bytes, so rows of other lengths are padded with zeros.
         """
@@ -76,7 +77,7 @@ class Buffer:
         return len(self.accessors) - 1
 
     def attach(self, content: bytes) -> int:
-        """Append a file as a view of its own; returns the view's index."""
+        """Append a file as a buffer view; return the view's index."""
         self.views.append({"buffer": 0, "byteOffset": self.bytes, "byteLength": len(content)})
         self.parts.append((lambda: np.frombuffer(content, dtype=np.uint8), 1))
         self.bytes += -(-len(content) // 4) * 4
@@ -95,14 +96,14 @@ class Buffer:
 def write_glb(
     file: IO[bytes], animation: Animation, triangles: Ints, *, fps: float, node: dict[str, Any], normals: str = "static",
     quantized: bool = False, colours: NDArray[np.uint16] | None = None, texture: Texture | None = None,
-    on_progress: Callable[[float], None] | None = None,
+    view: View | None = None, on_progress: Callable[[float], None] | None = None,
 ) -> None:  # fmt: skip
     """Write the animation.
 
     Parameters
     ----------
     file : binary file
-        Written from its position on, not closed.
+        Written from its current position, not closed.
     animation : Animation
         y up, right-handed.
     triangles : array of int, shape (T, 3)
@@ -110,15 +111,17 @@ def write_glb(
     fps : float
         Frames per second; frame f is at f / fps seconds, with linear interpolation between.
     node : dict
-        What the node carries besides the mesh, e.g. `scale`.
+        Properties of the node besides the mesh, e.g. `scale`.
     normals : str
         `static`: of the base shape; `animated`: displaced with every target; `none`.
     quantized : bool
-        16-bit positions by KHR_mesh_quantization.
+        16-bit positions and 8-bit normals by KHR_mesh_quantization.
     colours : array of uint16, shape (P, 4), optional
         RGBA of every point, linear light, 65535 for 1.
     texture : Texture, optional
         Base colour; embedded as JPEG.
+    view : View, optional
+        Camera, whose node follows that of the mesh and moves with it.
     on_progress : callable, optional
         Called with the share of bytes written.
     """
@@ -132,7 +135,9 @@ def write_glb(
     attributes = {"POSITION": buffer.add(positions, target=VERTICES, bounds=True, normalised=quantized)}
     base_normals = vertex_normals(animation.base, triangles) if smooth != "none" else None
     if base_normals is not None:
-        attributes["NORMAL"] = buffer.add(base_normals, target=VERTICES)
+        attributes["NORMAL"] = buffer.add(
+            _in_bytes(base_normals) if quantized else base_normals, target=VERTICES, normalised=quantized
+        )
     if colours is not None:
         attributes["COLOR_0"] = buffer.add(colours, target=VERTICES, normalised=True)
     if texture is not None:
@@ -170,18 +175,34 @@ def write_glb(
         ],
         "materials": [_material(coloured=colours is not None, textured=texture is not None)],
         "animations": [{"name": "motion", "samplers": [sampler], "channels": [{"sampler": 0, "target": {"node": 0, "path": "weights"}}]}],
-        "buffers": [{"byteLength": buffer.bytes}],
         "bufferViews": buffer.views,
         "accessors": buffer.accessors,
     }  # fmt: skip
+    if view is not None:
+        _add_camera(document, buffer, view)
     if texture is not None:
         document["images"] = [{"name": "film", "mimeType": "image/jpeg", "bufferView": buffer.attach(texture.jpeg)}]
         document["samplers"] = [{"magFilter": LINEAR, "minFilter": MIPMAPS, "wrapS": CLAMPED, "wrapT": CLAMPED}]
         document["textures"] = [{"source": 0, "sampler": 0}]
-        document["buffers"] = [{"byteLength": buffer.bytes}]
+    document["buffers"] = [{"byteLength": buffer.bytes}]
     if quantized:
         document["extensionsUsed"] = document["extensionsRequired"] = ["KHR_mesh_quantization"]
     _write(file, document, buffer, on_progress)
+
+
+def _add_camera(document: dict[str, Any], buffer: Buffer, view: View) -> None:
+    """Add camera, node and the two channels of its motion; their times are those of the weights."""
+    document["cameras"] = [view.lens]
+    document["nodes"].append(
+        {"name": "camera", "camera": 0, "rotation": view.rotations[0].tolist(), "translation": view.translations[0].tolist()}
+    )  # fmt: skip
+    document["scenes"][0]["nodes"].append(1)
+    motion = document["animations"][0]
+    for path, values in (("rotation", view.rotations), ("translation", view.translations)):
+        motion["channels"].append({"sampler": len(motion["samplers"]), "target": {"node": 1, "path": path}})
+        motion["samplers"].append(
+            {"input": motion["samplers"][0]["input"], "output": buffer.add(values), "interpolation": "LINEAR"}
+        )
 
 
 def _targets(
@@ -194,7 +215,7 @@ def _targets(
     base: Singles | None,
 ) -> list[dict[str, int]]:
     def turned(index: int) -> Singles:
-        # A mode's normals are those of the base moved by the whole mode: first order in the motion, as viewers blend them.
+        # A mode's normals are those of the base displaced by the full mode: first order in the motion, as viewers blend them.
         assert base is not None
         return vertex_normals(animation.base + animation.target(index), triangles) - base
 
@@ -202,13 +223,19 @@ def _targets(
     for index in range(len(animation.names)):
         entry = {"POSITION": buffer.add(partial(target, index), target=VERTICES, bounds=True, normalised=quantized)}
         if base is not None:
-            entry["NORMAL"] = buffer.add(partial(turned, index), target=VERTICES)
+            small = (lambda index=index: _in_bytes(turned(index))) if quantized else partial(turned, index)
+            entry["NORMAL"] = buffer.add(small, target=VERTICES, normalised=quantized)
         found.append(entry)
     return found
 
 
+def _in_bytes(normals: Singles) -> NDArray[np.int8]:
+    """Round normals, or their displacements, to bytes: right to half a degree. Displacements beyond 1 are cut off."""
+    return np.rint(np.clip(normals, -1, 1) * 127).astype(np.int8)
+
+
 def _quantize(animation: Animation, node: dict[str, Any]) -> tuple[Array, Callable[[int], Array], dict[str, Any]]:
-    """Positions and displacements as 16-bit fractions of one common size, which the node's scale undoes."""
+    """Return positions and displacements as 16-bit fractions of one size, which the node's scale restores."""
     low, high = animation.base.min(axis=0), animation.base.max(axis=0)
     centre = ((low + high) / 2).astype(np.float64)
     moved = max(float(np.abs(animation.target(index)).max()) for index in range(len(animation.names)))

@@ -1,10 +1,9 @@
-"""report.json: everything known about how a result came to be."""
+"""report.json: how a result was computed."""
 
 from __future__ import annotations
 
 import math
 import platform
-import resource
 import sys
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -27,16 +26,16 @@ def build_report(
     metrics: Mapping[str, float],
     seconds: Mapping[str, float] | None = None,
 ) -> dict[str, Any]:
-    """Gather what `report.json` says; plain values, ready for JSON.
+    """Return the content of `report.json` as plain values for JSON.
 
     Parameters
     ----------
     inputs, solution, options
         Of the job.
     metrics : mapping
-        By documented name; a number that is not finite is written as null.
+        By documented name; numbers that are not finite are written as null.
     seconds : mapping, optional
-        Wall time of stages outside the solver, e.g. `loading`; the solver's own come with the solution.
+        Wall time of stages outside the solver, e.g. `loading`; those of the solver are part of the solution.
     """
     choices = asdict(solution.choices)
     reasons, warnings = choices.pop("reasons"), choices.pop("warnings")
@@ -54,7 +53,7 @@ def build_report(
             for name, value in choices.items()
         },
         "reasons": reasons,
-        "camera": _camera(solution),
+        "camera": described_camera(solution, options),
         "options": options.model_dump(mode="json"),
         "interpretation": inputs.interpretation.model_dump(mode="json"),
         "trace": {
@@ -70,13 +69,24 @@ def build_report(
     return plain
 
 
-def _camera(solution: Solution) -> dict[str, Any]:
-    """Return what is the same in all frames: model, focal length in the tracks' unit, principal point, and how they were chosen."""
+def described_camera(solution: Solution, options: Options) -> dict[str, Any]:
+    """Return what is the same in all frames: model, lens, how they were chosen, and a sentence.
+
+    The horizontal field of view of a picture W wide is 2 atan(W / 2φ), in degrees; its standard deviation is that of φ times |dθ/dφ|.
+    """
     camera, choices = solution.camera, solution.choices
+    angle, angle_std = None, None
+    if camera.focal is not None and options.image_size is not None:
+        half = float(options.image_size.split("x")[0]) / 2
+        angle = math.degrees(2 * math.atan2(half, camera.focal))
+        angle_std = math.degrees(2 * half / (camera.focal**2 + half**2)) * (camera.focal_std or 0.0)
     return {
         "model": choices.camera,
         "focal": camera.focal,
         "focal_std": camera.focal_std,
+        "field_of_view": angle,
+        "field_of_view_std": angle_std,
+        "sentence": _camera_sentence(choices.camera, camera.focal, camera.focal_std, angle, angle_std),
         "principal_point": camera.principal_point.tolist(),
         "depth_sign": choices.depth_sign,
         "candidates": [asdict(each) for each in choices.focal_candidates],
@@ -84,8 +94,20 @@ def _camera(solution: Solution) -> dict[str, Any]:
     }
 
 
+def _camera_sentence(
+    model: str, focal: float | None, focal_std: float | None, angle: float | None, angle_std: float | None
+) -> str:
+    name = model.replace("_", " ").capitalize()
+    if focal is None:
+        return f"{name} camera."
+    known = " (given)" if focal_std == 0 else "" if focal_std is None else f" ± {focal_std:.2g}"
+    view = "" if angle is None else f", horizontal field of view {angle:.1f}°"
+    view += "" if angle is None or not angle_std else f" ± {angle_std:.2g}°"
+    return f"{name} camera, focal length {focal:.4g} px{known}{view}."
+
+
 def _trust(trust: Trust | None) -> dict[str, Any]:
-    """Describe how far the result can be trusted; nulls where the solver did not judge it."""
+    """Return the verdict on the result with its reasons; nulls if the solver gave none."""
     if trust is None:
         trust_fields = ("verdict", "expected_error", "expected_error_interval", "trust_sentence")
         return {**dict.fromkeys(trust_fields), "verdict_reasons": []}
@@ -98,20 +120,24 @@ def _trust(trust: Trust | None) -> dict[str, Any]:
     }
 
 
-def peak_memory() -> int:
-    """Largest resident size of this process so far, bytes."""
+def peak_memory() -> int | None:
+    """Return the peak resident size of this process, bytes; None on Windows."""
+    try:
+        import resource
+    except ModuleNotFoundError:
+        return None
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024
 
 
 def versions() -> dict[str, str]:
-    """Versions of what computed the numbers."""
+    """Return the versions of the software used."""
     libraries = {name: version(name) for name in ("pliant", "numpy", "scipy")}
     return {**libraries, "python": platform.python_version(), "system": f"{platform.system()} {platform.machine()}"}
 
 
 def _plain(value: Any) -> Any:
-    """JSON has no NaN and no infinity: they become null."""
+    """Return None for NaN and infinity, which JSON lacks."""
     if isinstance(value, Mapping):
         return {str(name): _plain(item) for name, item in value.items()}
     if isinstance(value, list | tuple):

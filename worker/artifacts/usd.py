@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import shutil
 import tempfile
 from collections.abc import Callable
@@ -16,7 +17,10 @@ from pliant.worker.artifacts.result import Result
 from pliant.worker.formats import Texture
 
 PICTURE = "texture.jpg"
-"""Name of the picture in the package."""
+"""Name of the texture in the package."""
+
+PACKED_AT = 315_619_200
+"""Time stamp of the package's files, seconds since 1970 (2 January 1980, which ZIP can state): equal results are equal files."""
 
 
 def available() -> bool:
@@ -25,9 +29,9 @@ def available() -> bool:
 
 
 def write_usd(result: Result, file: IO[bytes], on_progress: Callable[[float], None]) -> None:
-    """Write `/shape` with a time sample a frame; y up, right-handed, as in the glTF file.
+    """Write `/shape` with one time sample per frame; y up, right-handed, as in the glTF file.
 
-    The library wants a path with its own suffix, so it writes beside the file, into one that goes.
+    The library requires a path with its own suffix, so a temporary file beside the target is used.
     """
     path = Path(f"{file.name}.usdc")
     path.unlink(missing_ok=True)
@@ -40,7 +44,7 @@ def write_usd(result: Result, file: IO[bytes], on_progress: Callable[[float], No
 
 
 def write_usdz(result: Result, file: IO[bytes], on_progress: Callable[[float], None]) -> None:
-    """Write what `write_usd` does, in a package together with the picture on the surface."""
+    """Write the content of `write_usd` in a package together with the texture."""
     from pxr import UsdUtils
 
     with tempfile.TemporaryDirectory(dir=Path(file.name).parent, prefix=".usdz-") as folder:
@@ -48,6 +52,8 @@ def write_usdz(result: Result, file: IO[bytes], on_progress: Callable[[float], N
         assert result.texture is not None
         (Path(folder) / PICTURE).write_bytes(result.texture.jpeg)
         _build(stage, result, on_progress)
+        for path in Path(folder).iterdir():
+            os.utime(path, (PACKED_AT, PACKED_AT))
         if not UsdUtils.CreateNewUsdzPackage(str(stage), str(package)):
             raise OSError(f"USD could not write the package {package}.")
         with package.open("rb") as made:
@@ -85,7 +91,7 @@ def _describe_stage(stage: Any, result: Result) -> None:
     from pxr import UsdGeom
 
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
-    # How large the thing is nobody knows; its scale brings it to a few units, which are taken for metres as in glTF.
+    # The real size is unknown; the object is scaled to a few units, interpreted as metres as in glTF.
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     stage.SetTimeCodesPerSecond(result.options.fps)
     stage.SetFramesPerSecond(result.options.fps)
@@ -94,7 +100,7 @@ def _describe_stage(stage: Any, result: Result) -> None:
 
 
 def _define(stage: Any, result: Result) -> Any:
-    """Make the prim without what moves: a mesh with its faces, or points; scaled to a size that viewers like."""
+    """Return the static prim: a mesh with faces, or points, scaled to a suitable size for viewers."""
     from pxr import Gf, UsdGeom, Vt
 
     scale = viewer_scale(result.solution.shapes)
@@ -109,7 +115,7 @@ def _define(stage: Any, result: Result) -> Any:
         return shape
     shape.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), faces.shape[1], np.int32)))
     shape.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.ascontiguousarray(faces.reshape(-1))))
-    # Subdivision would move the surface away from the points.
+    # Subdivision would move the surface off the points.
     shape.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     shape.CreateDoubleSidedAttr(True)
     if result.texture is not None:
@@ -118,7 +124,7 @@ def _define(stage: Any, result: Result) -> Any:
 
 
 def _put_picture(stage: Any, shape: Any, texture: Texture) -> None:
-    """Bind a material that shows the picture: a UsdPreviewSurface with texture coordinates `st`, whose t points up."""
+    """Bind a material with the texture: a UsdPreviewSurface with texture coordinates `st`, whose t points up."""
     from pxr import Sdf, UsdGeom, UsdShade, Vt
 
     places = np.column_stack([texture.uv[:, 0], 1 - texture.uv[:, 1]]).astype(np.float32)

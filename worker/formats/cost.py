@@ -3,7 +3,7 @@
 Memory is a constant for the interpreter and the libraries, and a share for each of the F·P observations, since every array of the
 solver and of the exporters is linear in them. Time is a share for each frame, for cameras and prior, and one for each observation.
 
-Basis: whole jobs with the default options and outputs on one busy core, gallery faces (`python -m benchmarks.cost`):
+Basis: whole jobs with the default options and outputs on one busy core, gallery faces (`python -m benchmarks.installation.cost`):
 
     frames × points   peak, MB   estimate   processor, s   estimate
     10 × 500               107        113            2.3        2.2

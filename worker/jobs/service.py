@@ -1,4 +1,4 @@
-"""The operations on jobs that the service offers: submit, look, list, cancel, run again, delete."""
+"""The operations on jobs: submit, get, list, cancel, retry, delete."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from pliant.worker.errors import (
 from pliant.worker.ids import check_id, is_id, new_attempt_id, new_job_id
 from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.admission import check_fits
-from pliant.worker.jobs.submission import Acceptance, Submission, key_digest
+from pliant.worker.jobs.submission import Acceptance, Submission, copy_beside, key_digest, result_beside
 from pliant.worker.jobs.validation import LARGEST_PAGE as LARGEST_PAGE
 from pliant.worker.jobs.validation import check_event_id, check_key, check_page
 from pliant.worker.paths import make_data_directory
@@ -35,9 +35,9 @@ from pliant.worker.store.redis import RedisRecords
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Jobs:
-    """Jobs of one owner, or of everybody.
+    """Jobs of one owner, or of all owners.
 
-    Every method may raise `StoreUnavailable`, and every one that takes an id `UnknownJob`.
+    Every method may raise `StoreUnavailable`; those that take an id may raise `UnknownJob`.
     """
 
     records: Records
@@ -45,7 +45,7 @@ class Jobs:
     queue: Queue
     settings: Settings
     owner: str | None = None
-    """None: everybody's jobs; otherwise this owner's alone, and the others do not exist for it."""
+    """None: jobs of all owners; otherwise only those of this owner are visible."""
     max_queued: int = 0
     """Jobs of one owner that may be queued at once; 0: any number."""
     max_running: int | None = None
@@ -54,9 +54,9 @@ class Jobs:
 
     @classmethod
     def open(cls, settings: Settings) -> Jobs:
-        """Connect to what the settings name. Nothing is sent before it is needed, so Redis may still be starting."""
+        """Return the jobs of the stores in the settings. Connections are made on first use, so Redis may still be starting."""
         if settings.blob_url is None:
-            with suppress(OSError):  # what is wrong is said by what opens it
+            with suppress(OSError):  # opening the store reports the error
                 make_data_directory(settings.data)
         return cls(
             records=RedisRecords(connect(settings.redis, decode=True), prefix=settings.queue),
@@ -66,19 +66,19 @@ class Jobs:
         )
 
     def of(self, owner: str) -> Jobs:
-        """Return the same jobs as this owner sees them."""
+        """Return the jobs of this owner."""
         return replace(self, owner=owner)
 
     def submit(self, inputs_file: Path, submission: Submission, *, interpretation: Interpretation) -> Job:
-        """Accept a job. Once this returns, the job will end with a result or a reason, whichever process is killed.
+        """Accept a job. After this returns the job ends with a result or an error, whichever process is killed.
 
         Parameters
         ----------
         inputs_file : Path
-            Canonical inputs, as `worker.formats.save_inputs` writes them. Linked or copied; the caller may remove the
-            name, and must not write to the file.
+            Canonical inputs, as written by `worker.formats.save_inputs`. Linked or copied: the caller may unlink the
+            file, but must not write to it.
         submission : Submission
-            What the client asks for.
+            The client's request.
         interpretation : Interpretation
             How the inputs were read.
 
@@ -89,9 +89,9 @@ class Jobs:
         InvalidRequest
             The id or the key is malformed, or no worker has the memory that the job needs.
         QuotaExceeded
-            Jobs and uploads hold as many bytes as they may.
+            Jobs and uploads have reached the disk quota.
         TooManyQueued
-            As many jobs of this owner are queued as may be.
+            The owner's limit of queued jobs is reached.
         """
         known = self.known(submission)
         if known is not None:
@@ -107,10 +107,10 @@ class Jobs:
         )
         check_fits(interpretation, submission.options, self.queue.memories().values())
         size = inputs_file.stat().st_size
-        return self._create(job, submission, lambda key: self.blobs.put(key, inputs_file), size=size)
+        return self.create(job, submission, lambda key: self.blobs.put(key, inputs_file), size=size)
 
     def known(self, submission: Submission) -> Job | None:
-        """Return the job that a repeated request has already made, None if the request is new. Raises as `submit`."""
+        """Return the job of an earlier identical request, None if the request is new. Raises as `submit`."""
         if submission.id is not None:
             check_id(submission.id)
         if submission.idempotency_key is not None:
@@ -123,14 +123,14 @@ class Jobs:
         return None if found is None else self._same(found, submission)
 
     def check_capacity(self, *, id: str | None = None, idempotency_key: str | None = None) -> None:
-        """Check that the queue has a place for a submission, before its inputs are received.
+        """Check the limit of queued jobs before the inputs of a submission are received.
 
-        A repeated request passes: it makes no new job. The limit is checked again, atomically, when the record is written.
+        A repeated request passes, since it creates no job. The limit is checked again, atomically, when the record is written.
 
         Raises
         ------
         TooManyQueued
-            As many jobs of this owner are queued as may be.
+            The owner's limit of queued jobs is reached.
         """
         if not 0 < self.max_queued <= self.records.count([Status.QUEUED], owner=self.owner or ""):
             return
@@ -159,9 +159,9 @@ class Jobs:
         NotAllowedNow
             The job is not finished, or has succeeded.
         UnknownJob
-            There is no such job, or it was deleted meanwhile.
+            There is no such job, or it was deleted in the meantime.
         """
-        stored = self._stored(id)
+        stored = self.stored(id)
         job = stored.job
         submission = Submission(
             options=job.options, name=job.name, idempotency_key=idempotency_key, webhook=stored.webhook,
@@ -179,21 +179,24 @@ class Jobs:
             status=Status.QUEUED,
             created_at=self.clock(),
             retry_of=id,
+            outputs_of=job.outputs_of,
             priority=job.priority,
             options=job.options,
             interpretation=job.interpretation,
         )
         try:
-            size = self.blobs.get(stored.inputs).size
-            return self._create(
-                again, submission, lambda key: self.blobs.copy(stored.inputs, key), size=size, owner=stored.owner
-            )
+            copies = [(stored.inputs, "inputs.npz"), *([(stored.result, "result.npz")] if stored.result else [])]
+            size = sum(self.blobs.get(key).size for key, _ in copies)
+            return self.create(
+                again, submission, lambda key: copy_beside(self.blobs, copies, key), size=size, owner=stored.owner,
+                from_result=stored.result is not None,
+            )  # fmt: skip
         except FileNotFoundError:  # deleted between our look and the copy
             raise UnknownJob(id) from None
 
     def get(self, id: str) -> Job:
         """Return a job."""
-        return self._placed(self._stored(id))
+        return self._placed(self.stored(id))
 
     def page(self, *, cursor: str | None = None, limit: int = 50, statuses: Sequence[Status] | None = None) -> JobPage:
         """Return jobs, newest first.
@@ -201,16 +204,16 @@ class Jobs:
         Parameters
         ----------
         cursor : str, optional
-            `JobPage.next` of the page before.
+            `JobPage.next` of the previous page.
         limit : int
             1–200.
         statuses : sequence of Status, optional
-            Only these.
+            Statuses to include; all by default.
 
         Raises
         ------
         InvalidRequest
-            The cursor is not one, or the limit is out of range.
+            The cursor is malformed, or the limit is out of range.
         """
         check_page(cursor, limit)
         wanted = tuple(Status) if statuses is None else tuple(statuses)
@@ -231,14 +234,14 @@ class Jobs:
         return self.records.count(statuses, owner=self.owner)
 
     def cancel(self, id: str) -> Job:
-        """Ask a job to end: a queued one is cancelled at once, a running one is `cancelling` until it has stopped.
+        """Cancel a job: a queued one ends at once, a running one is `cancelling` until it has stopped.
 
         Raises
         ------
         NotAllowedNow
             The job has succeeded or failed.
         """
-        attempt_id = self._stored(id).attempt_id
+        attempt_id = self.stored(id).attempt_id
         after = self.records.update(
             id, lambda stored: lifecycle.cancel(stored, now=self.clock(), retention=self.settings.retention)
         )
@@ -247,14 +250,14 @@ class Jobs:
         return after.job
 
     def delete(self, id: str) -> None:
-        """Remove a finished job, its record and its files. Files that cannot be removed now are removed by the reconciler.
+        """Remove a finished job with its record and files. Files that cannot be removed now are removed by the reconciler.
 
         Raises
         ------
         NotAllowedNow
             The job is not finished.
         """
-        stored = self._stored(id)
+        stored = self.stored(id)
         if not stored.job.status.final:
             raise NotAllowedNow(id, stored.job.status, wanted="deleted", hint="Cancel it first.")
         self.records.delete(id, at=self.clock())
@@ -263,50 +266,68 @@ class Jobs:
             self.records.forget_deleted(id)
 
     def artifact(self, id: str, name: str) -> tuple[Artifact, Blob]:
-        """Return a result file's description and its bytes, readable in ranges.
+        """Return the record of a result file, and the file, readable in ranges.
 
         Raises
         ------
         UnknownArtifact
             The job has no file of that name, or no files yet.
         """
-        stored = self._stored(id)
+        stored = self.stored(id)
         for each in stored.job.artifacts:
             if each.name == name and stored.prefix is not None:
                 return each, self.blobs.get(f"{stored.prefix}{name}")
         raise UnknownArtifact(id, name, names=[each.name for each in stored.job.artifacts])
 
+    def kept_inputs(self, id: str, file: Path) -> tuple[Job, Path]:
+        """Return a job and its stored inputs under a local name, to submit them again. Do not write to the file.
+
+        Raises
+        ------
+        NotAllowedNow
+            The job holds further files of another one, whose inputs are meant.
+        """
+        stored = self.stored(id)
+        if stored.job.outputs_of is not None:
+            hint = f"It holds further files of job {stored.job.outputs_of!r}: name that one."
+            raise NotAllowedNow(id, stored.job.status, wanted="run with other options", hint=hint)
+        try:
+            self.blobs.fetch(stored.inputs, file)
+        except FileNotFoundError:  # deleted between our look and the copy
+            raise UnknownJob(id) from None
+        return stored.job, file
+
     def log(self, id: str) -> str:
-        """Return what the job's attempts have logged so far."""
-        self._stored(id)
+        """Return the log of the job's attempts so far."""
+        self.stored(id)
         return "".join(f"{line}\n" for line in self.records.log(id))
 
     def events(self, id: str, *, after: str | None = None) -> list[Event]:
-        """Return the job's changes after one of them; `records.changes` reports when there are new ones.
+        """Return the job's events after a given one; `records.changes` signals new ones.
 
         The last event of a finished job is a `job` event with a final status; nothing follows it.
 
         Parameters
         ----------
         after : str, optional
-            `Event.id`; None returns all that are kept (the latest 256; of a finished job the latest 16).
+            `Event.id`; None returns all that are kept: the latest 256, or the latest 16 of a finished job.
 
         Raises
         ------
         InvalidRequest
-            `after` is not an event's id.
+            `after` is not an event id.
         """
         if after is not None:
             check_event_id(after)
-        self._stored(id)
+        self.stored(id)
         return self.records.events(id, after=after)
 
     def used(self) -> int:
-        """Return the bytes that everybody's jobs hold together."""
+        """Return the total bytes of all jobs."""
         return self.records.used()
 
     def ready(self) -> dict[str, str]:
-        """Return for `redis`, `blobs` and `workers` the word `ok`, or a sentence that says what is wrong."""
+        """Return `ok` or a sentence with the fault, for each of `redis`, `blobs` and `workers`."""
         found: dict[str, str] = {}
         for part, check in (("redis", self.records.ping), ("blobs", self.blobs.check)):
             try:
@@ -321,7 +342,8 @@ class Jobs:
             found["workers"] = str(error)
         return found
 
-    def _stored(self, id: str) -> Stored:
+    def stored(self, id: str) -> Stored:
+        """Return a job with what only the worker package needs of it."""
         if not is_id(id):
             raise UnknownJob(id[:80])
         stored = self.records.get(id)
@@ -329,9 +351,28 @@ class Jobs:
             raise UnknownJob(id)
         return stored
 
-    def _create(
-        self, job: Job, submission: Submission, put: Callable[[str], object], *, size: int, owner: str | None = None
-    ) -> Job:
+    def create(
+        self, job: Job, submission: Submission, put: Callable[[str], object], *, size: int, owner: str | None = None,
+        from_result: bool = False,
+    ) -> Job:  # fmt: skip
+        """Store a new job and queue it.
+
+        Parameters
+        ----------
+        put : callable
+            Stores the inputs under a blob key, and the result to work from beside them, see `result_beside`.
+        size : int
+            Bytes that `put` stores.
+        owner : str, optional
+            Whose job it is; None: the owner of these jobs.
+        from_result : bool
+            The job works from a stored result instead of solving.
+
+        Raises
+        ------
+        Conflict, QuotaExceeded, TooManyQueued
+            As `submit`.
+        """
         acceptance = Acceptance(records=self.records, blobs=self.blobs, queue=self.queue, settings=self.settings)
         acceptance.check_quota(size)
         attempt_id = new_attempt_id(job.id)
@@ -339,7 +380,8 @@ class Jobs:
             job=job,
             owner=owner if owner is not None else self.owner or "",
             attempt_id=attempt_id,
-            inputs=f"jobs/{job.id}/{attempt_id}/inputs.npz",
+            inputs=(inputs := f"jobs/{job.id}/{attempt_id}/inputs.npz"),
+            result=result_beside(inputs) if from_result else None,
             bytes=size,
             key=key_digest(submission.idempotency_key, self.owner),
             fingerprint=submission.fingerprint,
@@ -350,7 +392,7 @@ class Jobs:
         return self._placed(kept) if kept.inputs == stored.inputs else self._same(kept, submission, wanted=job.id)
 
     def _same(self, found: Stored, submission: Submission, *, wanted: str | None = None) -> Job:
-        """Return the job of a repeated request, or refuse a different one."""
+        """Return the job of a repeated request; raise `Conflict` for a different one."""
         mine = self.owner is None or found.owner == self.owner
         if mine and submission.fingerprint is not None and found.fingerprint == submission.fingerprint:
             return self._placed(found)
@@ -359,7 +401,7 @@ class Jobs:
             sentence = f"The id {wanted!r} is already used by a different job. Choose another id."
             raise Conflict("id_taken", id=wanted, sentence=sentence)
         sentence = (
-            f"This Idempotency-Key was used for a different request, which made job {found.job.id!r}. Use a new key."
+            f"This Idempotency-Key was used for a different request, which created job {found.job.id!r}. Use a new key."
         )
         raise Conflict("idempotency_conflict", id=found.job.id, sentence=sentence)
 

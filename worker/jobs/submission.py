@@ -1,9 +1,9 @@
-"""The record of what a client submits, and the writing of a new job: quota, inputs, record, queue, in this order."""
+"""The submission record, and the creation of a job: quota, inputs, record and queue entry, in this order."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -16,14 +16,13 @@ from pliant.worker.store.blobs import Blobs
 from pliant.worker.store.queue import Queue
 from pliant.worker.uploads.service import Uploads
 
-
 RANKS: dict[Priority, int] = {"high": 0, "normal": 1, "low": 2}
 """Smaller comes first."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Submission:
-    """What a client asks for, besides the input files."""
+    """A client's request, besides the input files."""
 
     options: Options
     """How to solve and which files to write."""
@@ -32,13 +31,13 @@ class Submission:
     """The user's label."""
 
     id: str | None = None
-    """The client's own id: 3–64 letters, digits, underscores, dashes; None: one is made."""
+    """Id chosen by the client: 3–64 letters, digits, underscores, dashes; None: generated."""
 
     idempotency_key: str | None = None
-    """A repeated request with the same key returns the first job; a key is kept as long as its job."""
+    """A repeated request with the same key returns the existing job; a key is kept as long as its job."""
 
     fingerprint: str | None = None
-    """SHA-256 of the whole request, which distinguishes a repeated request from a different one."""
+    """SHA-256 of the complete request, which distinguishes a repeated request from a different one."""
 
     webhook: Webhook | None = None
     """Called when the job has ended."""
@@ -49,7 +48,7 @@ class Submission:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Acceptance:
-    """Writes new jobs to the stores."""
+    """Creates jobs in the stores."""
 
     records: Records
     blobs: Blobs
@@ -57,19 +56,19 @@ class Acceptance:
     settings: Settings
 
     def check_quota(self, more: int) -> None:
-        """Check that `more` bytes fit beside what jobs and uploads hold or have reserved.
+        """Check that `more` bytes fit into the disk quota beside jobs, uploads and reservations.
 
         Raises
         ------
         QuotaExceeded
-            They do not.
+            The quota would be exceeded.
         """
         quota = self.settings.disk_quota
         if quota > 0 and (used := self.records.used() + self._uploaded()) + more > quota:
             raise QuotaExceeded(used=used, quota=quota)
 
     def create(self, stored: Stored, put: Callable[[str], object], *, max_queued: int) -> Stored:
-        """Store inputs, then the record, then the queue entry; a failure in between leaves nothing that was promised.
+        """Store inputs, record and queue entry, in this order; a failure in between leaves no accepted job.
 
         Parameters
         ----------
@@ -88,7 +87,7 @@ class Acceptance:
         Raises
         ------
         TooManyQueued, QuotaExceeded
-            Nothing is kept.
+            Nothing is stored.
         """
         put(stored.inputs)
         quota = self.settings.disk_quota
@@ -96,10 +95,10 @@ class Acceptance:
         try:
             kept = self.records.create(stored, max_queued=max_queued, max_bytes=most)
         except (TooManyQueued, QuotaExceeded):
-            self.blobs.delete(stored.inputs)
+            self.blobs.delete(_folder_of(stored.inputs))
             raise
         if kept.inputs != stored.inputs:
-            self.blobs.delete(stored.inputs)
+            self.blobs.delete(_folder_of(stored.inputs))
             return kept
         try:
             if self._over_running_limit(stored):
@@ -109,7 +108,7 @@ class Acceptance:
                 if stored.job.priority != "normal":
                     self._order(stored.owner)
         except StoreUnavailable:
-            return kept  # the record is safe, and the reconciler queues what the queue lacks
+            return kept  # the record is stored, and the reconciler adds the missing queue entry
         return kept
 
     def _order(self, owner: str) -> None:
@@ -127,13 +126,39 @@ class Acceptance:
         return Uploads.open(self.settings).used()
 
     def _over_running_limit(self, stored: Stored) -> bool:
-        """Return True if the new job waits until fewer jobs of its owner run; the reconciler queues it then.
+        """Whether the new job is held back until fewer jobs of its owner run; the reconciler queues it then.
 
-        Counted after the record was written, so two simultaneous submissions cannot both miss each other.
+        Counted after the record is written, so that simultaneous submissions count each other.
         """
         most = self.settings.max_running if stored.max_running is None else stored.max_running
         unfinished = (Status.QUEUED, Status.RUNNING, Status.CANCELLING)
         return most > 0 and self.records.count(unfinished, owner=stored.owner) > most
+
+
+def result_beside(inputs: str) -> str:
+    """Return the blob key of the stored result that a job works from, beside its inputs."""
+    return f"{_folder_of(inputs)}result.npz"
+
+
+def copy_beside(blobs: Blobs, copies: Sequence[tuple[str, str]], inputs: str) -> None:
+    """Copy blobs, each to a name beside the inputs of a new job; all or none.
+
+    Raises
+    ------
+    FileNotFoundError
+        One of them is gone.
+    """
+    folder = _folder_of(inputs)
+    try:
+        for key, name in copies:
+            blobs.copy(key, f"{folder}{name}")
+    except FileNotFoundError:
+        blobs.delete(folder)
+        raise
+
+
+def _folder_of(inputs: str) -> str:
+    return inputs.rpartition("/")[0] + "/"
 
 
 def key_digest(idempotency_key: str | None, owner: str | None) -> str | None:

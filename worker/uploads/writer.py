@@ -1,4 +1,4 @@
-"""An upload while it grows: bytes at the end of a file, their digest, and how many there may be."""
+"""Writing of an upload: append bytes, update the digest, enforce the limits."""
 
 from __future__ import annotations
 
@@ -14,32 +14,32 @@ from pliant.worker.errors import InvalidRequest, QuotaExceeded, UploadTooLarge
 from pliant.worker.uploads.folder import LENGTH, PART, RESERVED, WHOLE, counting, reserve, taken
 
 STEP = 16 << 20
-"""Bytes that are reserved at a time for an upload whose length is not known."""
+"""Bytes reserved at a time for an upload of unknown length."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Capacity:
-    """How much one upload may take."""
+    """Limits of one upload."""
 
     max_bytes: int
-    """Size of the whole upload."""
+    """Maximum size of the complete upload, bytes."""
     quota: int = 0
-    """Bytes that everything stored may take together; 0: no quota."""
+    """Disk quota for jobs and uploads together, bytes; 0: no quota."""
     used: int = 0
-    """Bytes that the jobs take."""
+    """Bytes used by the jobs."""
 
 
 @dataclass(slots=True, kw_only=True)
 class Writer:
-    """An upload while it grows, behind its lock; made by `Uploads.write`."""
+    """An upload open for writing, under its lock; created by `Uploads.write`."""
 
     id: str
     folder: Path
     length: int | None
-    """Bytes of the whole upload, where they are known."""
+    """Bytes of the complete upload, if known."""
     capacity: Capacity
     offset: int = 0
-    """Bytes that it holds."""
+    """Bytes received so far."""
     _began: int = 0
     _reservation: int | None = None
     """Descriptor of the locked reservation."""
@@ -48,12 +48,12 @@ class Writer:
     _digest: hashlib._Hash = field(default_factory=hashlib.sha256)
 
     def open(self, offset: int) -> None:
-        """Begin, or go on after what is there.
+        """Start or resume after the existing bytes.
 
         Raises
         ------
         OSError
-            ENOSPC: the disk has no room for the rest of it.
+            ENOSPC: the remaining bytes do not fit on the disk.
         """
         if self.capacity.quota > 0:
             self._reservation = reserve(self.folder)
@@ -71,18 +71,18 @@ class Writer:
         self.offset = self._began = offset
 
     def write(self, piece: bytes) -> None:
-        """Add bytes.
+        """Append bytes.
 
         Raises
         ------
         InvalidRequest
-            They are more than the upload's length; what fitted is kept.
+            They exceed the upload's length; the bytes that fit are kept.
         UploadTooLarge
-            The upload is larger than it may be; it is removed, since it can never become whole.
+            The upload exceeds its maximum size; it is removed, since it can never be completed.
         QuotaExceeded
-            Everything stored is as much as it may be; what fitted is kept.
+            The disk quota is reached; the bytes that fit are kept.
         OSError
-            The disk is full; what this request brought is given back to it, since others need the room.
+            The disk is full; the bytes of this request are removed to free the space.
         """
         assert self._file is not None
         if self.length is not None and self.offset + len(piece) > self.length:
@@ -101,17 +101,17 @@ class Writer:
             raise
 
     def finish(self, *, sha256: str | None) -> None:
-        """Make the upload whole.
+        """Complete the upload.
 
         Parameters
         ----------
         sha256 : str, optional
-            What the sender says that it is.
+            Expected digest, from the sender.
 
         Raises
         ------
         InvalidRequest
-            Bytes are missing; or they are not the sender's, and then the upload is removed.
+            Bytes are missing, or the digest differs; then the upload is removed.
         """
         if self.length is not None and self.offset != self.length:
             raise inconsistent(f"{self.length} bytes in all", str(self.offset))
@@ -121,7 +121,7 @@ class Writer:
             shutil.rmtree(self.folder)
             raise InvalidRequest(
                 "digest_mismatch", field="Repr-Digest", expected=sha256, got=found,
-                hint="The bytes changed on their way; the upload was removed, send it again.",
+                hint="The bytes changed in transit; the upload was removed, send it again.",
             )  # fmt: skip
         self.close()
         (self.folder / PART).rename(self.folder / f"{WHOLE}{found}")
@@ -132,7 +132,7 @@ class Writer:
             os.close(folder)
 
     def close(self) -> None:
-        """Put what has arrived on the disk, and give back what was reserved beyond it."""
+        """Flush the received bytes to disk and release the unused reservation."""
         if self._file is not None:
             os.fsync(self._file.fileno())
             self._file.close()
@@ -150,10 +150,10 @@ class Writer:
             return hashlib.file_digest(whole, "sha256").hexdigest()
 
     def _check(self, size: int) -> None:
-        """Check that the upload may have so many bytes, and reserve them.
+        """Check the limits for a size in bytes, and reserve it.
 
-        Bytes are reserved before they are written, those of a declared length at once and others in steps, so that uploads which
-        arrive at the same time cannot exceed the quota together.
+        Bytes are reserved before they are written, all at once for a declared length and otherwise in steps, so that
+        concurrent uploads cannot exceed the quota together.
         """
         capacity = self.capacity
         if size > capacity.max_bytes:
@@ -173,8 +173,8 @@ class Writer:
 
 
 def inconsistent(expected: str, got: str) -> InvalidRequest:
-    """Return the error of an upload whose bytes do not fit its declared length."""
+    """Return the error for an upload that does not match its declared length."""
     return InvalidRequest(
         "inconsistent_upload_length", field="Upload-Length", expected=expected, got=got,
-        hint="Send what is missing, or begin anew at Upload-Offset: 0.",
+        hint="Send the missing bytes, or start again at Upload-Offset: 0.",
     )  # fmt: skip

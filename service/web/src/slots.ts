@@ -8,7 +8,7 @@ import type { Point } from "./region";
 import { PARTS, type Part } from "./types";
 import { bytes } from "./words";
 
-const PLACES: Record<Part, { label: string; hint: string }> = {
+export const PLACES: Record<Part, { label: string; hint: string }> = {
   film: { label: "Film", hint: "mp4, mov, webm, avi, gif, zip of pictures" },
   tracks: { label: "Tracks", hint: "npz, npy, mat, csv …" },
   mesh: { label: "Mesh", hint: "optional: obj, ply, glb, npz" },
@@ -21,6 +21,7 @@ interface Slot {
   input: HTMLInputElement;
   hint: HTMLElement;
   contents: HTMLElement;
+  answer: HTMLElement;
   remove: HTMLButtonElement;
   file: File | null;
 }
@@ -68,6 +69,25 @@ export class Slots {
     return this.slots.get(part)?.file ?? null;
   }
 
+  /** The file that a job would be named after. */
+  get main(): File | null {
+    return this.file("film") ?? this.file("tracks");
+  }
+
+  /** Show a refusal in the place of its file; false where that place is not shown. */
+  refuse(part: string, box: HTMLElement): boolean {
+    const slot = this.slots.get((part === "region" ? "film" : part) as Part);
+    if (slot === undefined || slot.row.hidden) return false;
+    slot.answer.replaceChildren(box);
+    slot.row.scrollIntoView({ block: "nearest" });
+    return true;
+  }
+
+  /** Remove all refusals. */
+  clear(): void {
+    for (const { answer } of this.slots.values()) answer.replaceChildren();
+  }
+
   focus(part: Part): void {
     this.slots.get(part)?.input.focus();
   }
@@ -97,6 +117,7 @@ export class Slots {
       input: h("input", { type: "file", id, class: "visually-hidden", "aria-describedby": `${id}-hint` }),
       hint: h("span", { class: "hint", id: `${id}-hint` }, hint),
       contents: h("p", { class: "contents hint" }),
+      answer: h("div", { class: "slot-answer", "aria-live": "assertive" }),
       remove: button("×", () => void this.put(part, null).then(() => slot.input.focus()), {
         class: "quiet",
         hidden: true,
@@ -112,6 +133,7 @@ export class Slots {
     slot.row.append(slot.input, choose, pick, slot.hint, slot.remove, slot.contents);
     if (part === "mesh") slot.row.append(h("span", { class: "grid-size" }, h("label", { for: "grid" }, "or points on a grid"), this.grid));
     if (part === "film") slot.row.append(this.filming.element);
+    slot.row.append(slot.answer);
     return slot.row;
   }
 

@@ -69,7 +69,7 @@ def test_what_is_asked_for_is_written_and_no_more(tmp_path: Path, outputs: objec
 @pytest.mark.parametrize("normals", ["static", "animated"])
 @pytest.mark.parametrize("mesh", ["grid", "triangles"])
 def test_obj_zip_holds_every_frame(tmp_path: Path, mesh: str, normals: str) -> None:
-    made = make_result(mesh=mesh, outputs="obj", normals=normals)
+    made = make_result(mesh=mesh, outputs="obj", normals=normals, axes="tracks")
     inputs, solution, _ = made
     contents = members(write(tmp_path, made)["shapes_obj.zip"])
     assert len(contents) == 7
@@ -88,7 +88,7 @@ def test_obj_zip_holds_every_frame(tmp_path: Path, mesh: str, normals: str) -> N
 
 
 def test_obj_without_a_mesh_is_points(tmp_path: Path) -> None:
-    made = make_result(mesh="none", outputs="obj", normals="animated")
+    made = make_result(mesh="none", outputs="obj", normals="animated", axes="tracks")
     content = members(write(tmp_path, made)["shapes_obj.zip"])[3]
     read = trimesh.load(io.BytesIO(content), file_type="obj", process=False, maintain_order=True)
     np.testing.assert_array_equal(read.vertices.astype(np.float32), made[1].shapes[3].astype(np.float32))
@@ -190,7 +190,7 @@ def test_tables_leave_out_what_was_hidden(tmp_path: Path) -> None:
 
 
 def test_ply_carries_normals_and_colours_of_its_frame(tmp_path: Path) -> None:
-    made = make_result(truth=True, outputs="ply", normals="animated", colours="error")
+    made = make_result(truth=True, outputs="ply", normals="animated", colours="error", axes="tracks")
     inputs, solution, _ = made
     files = write(tmp_path, made)
     distances = point_errors(solution.shapes, inputs.ground_truth.shapes)
@@ -228,7 +228,7 @@ def test_meshes_stand_as_the_glb_does_if_wanted(tmp_path: Path, axes: str, y_axi
 
 
 def test_obj_colours_are_read_by_others(tmp_path: Path) -> None:
-    made = make_result(outputs="obj", colours="error", hidden=True)
+    made = make_result(outputs="obj", axes="tracks", colours="error", hidden=True)
     inputs, solution, _ = made
     files = write(tmp_path, made)
     read = trimesh.load(

@@ -58,8 +58,16 @@ def test_what_fits_is_what_the_estimate_says() -> None:
     for prior in ("gaussian", "smooth", "smooth+low_rank"):
         options = Options(prior=prior)
         points, frames = largest_that_fits(2_000_000_000, 50, 1000, options)
-        assert estimated(50, points, options).memory_bytes <= 2_000_000_000 < estimated(50, points + 1, options).memory_bytes
-        assert estimated(frames, 1000, options).memory_bytes <= 2_000_000_000 < estimated(frames + 1, 1000, options).memory_bytes
+        assert (
+            estimated(50, points, options).memory_bytes
+            <= 2_000_000_000
+            < estimated(50, points + 1, options).memory_bytes
+        )
+        assert (
+            estimated(frames, 1000, options).memory_bytes
+            <= 2_000_000_000
+            < estimated(frames + 1, 1000, options).memory_bytes
+        )
     assert largest_that_fits(LIBRARIES - 1, 50, 1000, Options()) == (0, 0)
 
 
@@ -89,7 +97,11 @@ def test_a_job_that_fits_no_worker_is_refused_with_what_would_fit() -> None:
 
 
 def test_inputs_come_with_their_estimate(tmp_path: Path) -> None:
-    np.save(tmp_path / "t.npy", np.random.default_rng(0).normal(size=(6, 40, 2)).cumsum(axis=0) + 100 * np.random.default_rng(1).normal(size=(40, 2)))
+    np.save(
+        tmp_path / "t.npy",
+        np.random.default_rng(0).normal(size=(6, 40, 2)).cumsum(axis=0)
+        + 100 * np.random.default_rng(1).normal(size=(40, 2)),
+    )
     found = read_inputs(tracks=tmp_path / "t.npy", mesh=None, ground_truth=None, rotations=None, options=Options())
     assert found.interpretation.estimate == estimated(6, 40, Options())
 
@@ -148,5 +160,7 @@ def test_a_worker_leaves_a_job_that_is_too_large_to_a_larger_one(
         other = house.submit()
         assert house.final(other).status is Status.SUCCEEDED
         assert house.jobs.get(id).status is Status.QUEUED
-        assert house.jobs.queue.waiting() == [house.jobs.records.get(id).attempt_id] or house.jobs.queue.place(id) is None
+        assert (
+            house.jobs.queue.waiting() == [house.jobs.records.get(id).attempt_id] or house.jobs.queue.place(id) is None
+        )
         house.jobs.cancel(id)

@@ -174,7 +174,7 @@ def test_workers_are_told_their_settings_and_threads(tmp_path: Path) -> None:
     children = worker_children(settings)
     assert [child.name for child in children] == ["worker-1", "worker-2", "reconciler"]
     for child in children:
-        assert Settings.from_environment(child.env) == settings
+        assert child.env.items() >= settings.to_environment().items()
         assert child.env["OPENBLAS_NUM_THREADS"] == child.env["OMP_NUM_THREADS"] == "1"  # the solver has its own
 
 
@@ -253,7 +253,7 @@ def test_a_socket_directory_that_others_may_write_is_refused(tmp_path: Path) -> 
     directory.mkdir(mode=0o700)
     try:
         directory.chmod(0o777)
-        with pytest.raises(ServerFailed, match="can be written by others"):
+        with pytest.raises(ServerFailed, match="is writable by other users"):
             Valkey.claim(deep)
         directory.chmod(0o700)
         valkey = Valkey.claim(deep)
@@ -271,7 +271,7 @@ def test_a_socket_directory_that_is_a_link_is_refused(tmp_path: Path) -> None:
     (tmp_path / "elsewhere").mkdir(mode=0o700)
     directory.symlink_to(tmp_path / "elsewhere")
     try:
-        with pytest.raises(ServerFailed, match="can be written by others"):
+        with pytest.raises(ServerFailed, match="is writable by other users"):
             Valkey.claim(deep)
     finally:
         directory.unlink()

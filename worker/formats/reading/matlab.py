@@ -1,6 +1,6 @@
-"""MATLAB .mat files of version 5, as non-rigid structure-from-motion data sets come: W, S, Rs, perhaps inside structs.
+"""MATLAB .mat files of version 5, the format of non-rigid structure-from-motion data sets: W, S, Rs, possibly inside structs.
 
-SciPy's reader trusts sizes and offsets, so a crafted file can crash it: this runs in a child process (see `child`), never in a server.
+SciPy's reader trusts sizes and offsets, so a crafted file can crash it; it runs in the sandbox (`reading.sandbox`), never in a server.
 """
 
 from __future__ import annotations
@@ -13,14 +13,15 @@ from typing import IO
 import numpy as np
 import scipy.io
 from numpy.typing import NDArray
-from pliant.worker.formats.errors import damaged, refusal, too_large
+from pliant.solver import InvalidInput
+from pliant.worker.formats.errors import damaged, too_large
 from pliant.worker.formats.records import Arrays, Limits
 
 UNREADABLE = (
     ValueError, TypeError, KeyError, IndexError, OSError, NotImplementedError, zlib.error, struct.error, NameError, ArithmeticError,
     EOFError, AttributeError, RecursionError, scipy.io.matlab.MatReadError,
 )  # fmt: skip
-"""What SciPy raises at damaged files; NameError where it does not expect a class."""
+"""Exceptions of SciPy's reader for damaged files; NameError for unexpected classes."""
 
 MAX_DEPTH = 4
 MAX_ARRAYS = 256
@@ -55,8 +56,8 @@ def read_matlab5(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
         if not name.startswith("__"):
             _collect(name, value, found, 0)
     if not found:
-        raise refusal(
-            "missing_array", field, expected="a numeric matrix such as W", got=f"variables {', '.join(names[:20]) or 'none'}",
+        raise InvalidInput(
+            "missing_array", field=field, expected="a numeric matrix such as W", got=f"variables {', '.join(names[:20]) or 'none'}",
             hint="Save the 2F × P matrix: save('tracks.mat', 'W', '-v7').",
         )  # fmt: skip
     return found

@@ -1,4 +1,4 @@
-"""The parsers that run in a child process, by name, and how a file is recognised as theirs."""
+"""The parsers that run in the sandbox, by name, and detection of their formats."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from importlib import import_module
 from typing import IO
 
 from pliant.solver import InvalidInput
-from pliant.worker.formats.errors import refusal, too_large
+from pliant.worker.formats.errors import too_large
 from pliant.worker.formats.reading.arrays import pickle_refusal
 from pliant.worker.formats.reading.csv import looks_like_csv
 from pliant.worker.formats.records import Arrays, Limits
@@ -16,7 +16,7 @@ from pliant.worker.formats.records import Arrays, Limits
 
 @dataclass(frozen=True, slots=True)
 class Parser:
-    """A parser by name: its libraries are loaded when they are needed, since a child that parses a PNG needs no SciPy."""
+    """A parser by module and name, so that the sandbox imports only the libraries of the parser it runs."""
 
     module: str
     function: str
@@ -72,7 +72,7 @@ def recognise(head: bytes, field: str) -> str:
 
 
 def parse(parser: Callable[..., Arrays], stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
-    """Run a parser; running out of memory is the file's fault, since the limits left enough for honest ones."""
+    """Run a parser; a MemoryError becomes an input error, since the limits are sufficient for valid files."""
     try:
         return parser(stream, field=field, limits=limits)
     except MemoryError as error:
@@ -80,11 +80,11 @@ def parse(parser: Callable[..., Arrays], stream: IO[bytes], *, field: str, limit
 
 
 def unknown_format(field: str, head: bytes) -> InvalidInput:
-    """Say that none of the readers knows the file."""
+    """Return the error for a file of an unknown format."""
     mesh = "npz, npy, OBJ, PLY, glTF, GLB or a PNG mask"
     kinds = mesh if field == "mesh" else "npz, npy, MATLAB .mat or CSV with the columns frame, point, x, y"
-    return refusal(
-        "unknown_format", field, expected=f"{kinds}, recognised by content", got=f"a file that starts with {head[:16]!r}",
+    return InvalidInput(
+        "unknown_format", field=field, expected=f"{kinds}, recognised by content", got=f"a file that starts with {head[:16]!r}",
         hint="Convert it, e.g. numpy.savez('tracks.npz', tracks=points, visibility=visible).",
     )  # fmt: skip
 

@@ -15,9 +15,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 from pliant.schemas.options import Options
-from pliant.solver import Mesh
+from pliant.solver import InvalidInput, Mesh
 from pliant.solver.records import MIN_POINTS
-from pliant.worker.formats.errors import refusal
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
@@ -38,22 +37,22 @@ def thin(
     Parameters
     ----------
     points : ndarray, shape (F, P, 2)
-        Of the chosen frames; NaN where not seen.
+        Points of the selected frames; NaN where hidden.
     visible : ndarray, shape (F, P), optional
         Confidence.
     mesh : Mesh, optional
-        The mesh of all points; None: the points are a list, whose neighbours are not known yet.
+        The mesh of all points; None if neighbours are not known yet.
     options : Options
         `stride` and `max_points`.
 
     Returns
     -------
     kept : ndarray
-        Indices of the kept points, rising.
+        Indices of the kept points, increasing.
     mesh : Mesh or None
-        The mesh of the kept points; None where none was given.
+        The mesh of the kept points; None without `mesh`.
     notes : list of str
-        What was done.
+        Notes for the interpretation.
 
     Raises
     ------
@@ -85,8 +84,8 @@ def _thin_grid(grid: NDArray[np.int32], stride: int, limit: int) -> tuple[Indice
     coarse = grid[::stride, ::stride]
     kept = np.sort(coarse[coarse >= 0])
     if len(kept) < MIN_POINTS:
-        raise refusal(
-            "too_few_points", "options.stride", expected=f"a stride that leaves {MIN_POINTS} points or more",
+        raise InvalidInput(
+            "too_few_points", field="options.stride", expected=f"a stride that leaves {MIN_POINTS} points or more",
             got=f"{len(kept)} points at stride {stride}", hint="Use a smaller stride, or a larger max_points.",
         )  # fmt: skip
     numbers = np.full(int(grid.max()) + 1, -1)
@@ -128,7 +127,7 @@ def _thin_mesh(
         f"{len(mesh.faces)} faces became {len(coarse.faces)}."
     ]
     if alone:
-        notes.append(f"{alone} of the points used belong to no face, so no smoothness in space reaches them.")
+        notes.append(f"{alone} of the points used belong to no face and have no smoothness in space.")
     return kept, coarse, notes
 
 
@@ -138,13 +137,13 @@ def spread(places: NDArray[np.float64], seen: NDArray[np.bool], limit: int, part
     Parameters
     ----------
     places : ndarray, shape (m, P, 2)
-        Places in some frames.
+        Positions in some frames.
     seen : ndarray of bool, shape (m, P)
-        Where the places mean something.
+        Whether the positions are valid.
     limit : int
-        Most points.
+        Maximum number of points.
     parts : ndarray, shape (P,), optional
-        Number of the connected part that each point belongs to; each is sampled by itself.
+        Index of each point's connected component; components are sampled separately.
     """
     with np.errstate(invalid="ignore"):
         weight = seen[..., None].astype(np.float64)

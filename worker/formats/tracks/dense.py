@@ -1,4 +1,4 @@
-"""Batch axes, and tracks of every pixel of a picture: arrays of four and five axes brought to three, and the pixel grid they came from."""
+"""Batch axes and tracks of all pixels: arrays of four and five axes reduced to three, with the original pixel grid."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.worker.formats.errors import refusal
+from pliant.solver import InvalidInput
 
 STEADY = 0.95
 """Share of neighbouring pixels whose coordinates must rise for two axes to count as rows and columns."""
@@ -20,14 +20,14 @@ class Flat:
     """Two axes (a matrix), or three of which one is the coordinates."""
 
     grid: tuple[int, int] | None = None
-    """Rows and columns, where the points were the pixels of a picture; point index = row · columns + column."""
+    """Rows and columns, if the points were the pixels of a picture; point index = row · columns + column."""
 
 
 def flatten(name: str, array: NDArray[np.generic], *, field: str) -> Flat:
-    """Remove a batch axis of length 1, and lay the pixels of whole pictures in a row.
+    """Remove a batch axis of length 1, and flatten the pixels of pictures.
 
-    Whole pictures are `(F, H, W, 2 or 3)` or `(F, 2, H, W)`, with or without a batch axis. Four axes whose first is longer than 1
-    are pictures if the first frame's x rises along the columns and y along the rows; else they are a batch.
+    Pictures are `(F, H, W, 2 or 3)` or `(F, 2, H, W)`, with or without a batch axis. Four axes with a first axis longer than 1 are
+    pictures if the first frame's x increases along the columns and y along the rows; otherwise they are a batch.
 
     Raises
     ------
@@ -43,8 +43,8 @@ def flatten(name: str, array: NDArray[np.generic], *, field: str) -> Flat:
             return _pictures(array)
         return Flat(_single(array, field))
     if array.ndim > 5:
-        raise refusal(
-            "wrong_shape", field, expected="(frames, points, 2)", got=f"{name} of shape {array.shape}",
+        raise InvalidInput(
+            "wrong_shape", field=field, expected="(frames, points, 2)", got=f"{name} of shape {array.shape}",
             hint="Reshape the array to three axes.",
         )  # fmt: skip
     return Flat(array)
@@ -64,8 +64,8 @@ def flatten_like(array: NDArray[np.generic], grid: tuple[int, int] | None) -> ND
 
 def _single(array: NDArray[np.generic], field: str) -> NDArray[np.generic]:
     if array.shape[0] != 1:
-        raise refusal(
-            "wrong_shape", field, expected="one video", got=f"a batch of {array.shape[0]}",
+        raise InvalidInput(
+            "wrong_shape", field=field, expected="one video", got=f"a batch of {array.shape[0]}",
             hint="Submit each element of the batch as its own job.",
         )  # fmt: skip
     return array.reshape(array.shape[1:])
