@@ -37,7 +37,8 @@ sequence = gallery.face(frames, points)
 stated = Interpretation(num_frames=frames, num_points=points, num_faces=0, hidden_fraction=0, mesh_source="given",
                         has_ground_truth=False, has_rotations=False, layout="")
 with threads_limited(1), tempfile.TemporaryDirectory() as folder:
-    reconstruct(Inputs(sequence.tracks, sequence.mesh, None, None, stated), Options(prior=prior, max_reweightings=2, camera="scaled_orthographic"), Path(folder))
+    options = Options(prior=prior, max_reweightings=2, camera="scaled_orthographic")
+    reconstruct(Inputs(sequence.tracks, sequence.mesh, None, None, stated), options, Path(folder))
 print(sequence.tracks.num_points, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
 """
 
@@ -97,11 +98,9 @@ def test_a_job_that_fits_no_worker_is_refused_with_what_would_fit() -> None:
 
 
 def test_inputs_come_with_their_estimate(tmp_path: Path) -> None:
-    np.save(
-        tmp_path / "t.npy",
-        np.random.default_rng(0).normal(size=(6, 40, 2)).cumsum(axis=0)
-        + 100 * np.random.default_rng(1).normal(size=(40, 2)),
-    )
+    generator = np.random.default_rng(0)
+    paths = generator.normal(size=(6, 40, 2)).cumsum(axis=0) + 100 * generator.normal(size=(40, 2))
+    np.save(tmp_path / "t.npy", paths)
     found = read_inputs(tracks=tmp_path / "t.npy", mesh=None, ground_truth=None, rotations=None, options=Options())
     assert found.interpretation.estimate == estimated(6, 40, Options())
 
@@ -139,7 +138,7 @@ def test_a_submission_asks_the_workers_that_run(jobs: Jobs, inputs_file: Path) -
     alive(jobs, "old", "")  # of a version that states none
     alive(jobs, "small", " 500000000")
     assert jobs.queue.memories() == {"small": 500_000_000}
-    with pytest.raises(InvalidRequest, match="0.5 GB"):
+    with pytest.raises(InvalidRequest, match=r"0\.5 GB"):
         jobs.submit(inputs_file, submission, interpretation=large)
     assert jobs.count(list(Status)) == 1
     alive(jobs, "large", " 64000000000")
