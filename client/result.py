@@ -186,10 +186,9 @@ def finished(job: Job) -> Job:
     """
     if not job.status.final:
         raise NotAllowedNow(
-            Problem(
-                title="The job is not finished",
-                status=409,
-                code="not_finished",
+            Problem.of(
+                "not_finished",
+                409,
                 detail=f"Job {job.id} is {job.status}; there is no result yet. Wait for it.",
                 retryable=True,
             )
@@ -201,10 +200,8 @@ def unknown_file(job: Job, name: str) -> NotFound:
     """Return the error for a file that a job does not have."""
     held = ", ".join(artifact.name for artifact in job.artifacts) or "none"
     return NotFound(
-        Problem(
-            title="No such file",
-            status=404,
-            code="unknown_artifact",
+        Problem.of(
+            "unknown_artifact",
             detail=f"Job {job.id} ({job.status}) has no file {name!r}. Its files: {held}.",
         )
     )

@@ -100,7 +100,7 @@ def test_small_films_are_enlarged_and_large_ones_reduced() -> None:
     assert tracking_scale((3840, 2160), 960) == 0.25
 
 
-def test_matches_follow_the_motion_and_notice_what_leaves() -> None:
+def test_matches_follow_the_motion_and_detect_lost_points() -> None:
     first, second = grey()
     points = np.array([[30.0, 30.0], [50.5, 40.25], [94.5, 40.0]], np.float32)
     with opencv_serial():
@@ -116,7 +116,7 @@ def test_sampling_is_bilinear() -> None:
     np.testing.assert_allclose(sample(field, points), [[5.25, 3.375], [0, 0], [14, 20], [4, 0]], atol=1e-5)
 
 
-def test_patches_notice_what_hides_a_point() -> None:
+def test_patches_detect_occlusion() -> None:
     first, second = grey()
     seeds, _ = place(first, np.ones_like(first, bool), step=6)
     beside = neighbours(seeds.grid, len(seeds.points))

@@ -16,7 +16,7 @@ from pliant.solver.errors import InvalidInput
 from pliant.worker.films import frame_strip
 from pliant.worker.films.frame_strip import write_frames
 from pliant.worker.films.sources import FilmBounds
-from pliant.worker.formats.errors import refusal, too_large
+from pliant.worker.formats.errors import too_large
 from pliant.worker.processes.contained import limit_process, serve
 from pliant.worker.processes.no_network import forbid_network
 
@@ -55,8 +55,8 @@ def _answer(request: dict[str, Any]) -> str:
     try:
         import pliant.tracking as tracking
     except ImportError as error:
-        raise refusal(
-            "film_unavailable", "film", expected="tracks, or a service with OpenCV", got="a film",
+        raise InvalidInput(
+            "film_unavailable", field="film", expected="tracks, or a service with OpenCV", got="a film",
             hint="Install OpenCV beside service and worker (pip install 'pliant[film]'), or send tracks.",
         ) from error  # fmt: skip
     bounds = FilmBounds(**request["bounds"])

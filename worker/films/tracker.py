@@ -14,7 +14,7 @@ from pliant.schemas.options import Options
 from pliant.solver.errors import InvalidInput
 from pliant.worker.errors import Interrupted
 from pliant.worker.films.sources import FilmBounds, FilmSource
-from pliant.worker.formats.errors import damaged, refusal, too_large
+from pliant.worker.formats.errors import damaged, too_large
 from pliant.worker.processes.contained import DONE, REFUSED, Ended, refusal_in, run_contained
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -174,8 +174,8 @@ def film_options(options: Options, facts: FilmFacts) -> Options:
 
 def _check_region(source: FilmSource, options: Options) -> None:
     if source.region is not None and options.region_polygon is not None:
-        raise refusal(
-            "conflicting_parts", "options.region_polygon", expected="a mask picture or a polygon", got="both",
+        raise InvalidInput(
+            "conflicting_parts", field="options.region_polygon", expected="a mask picture or a polygon", got="both",
             hint="Omit one of them.",
         )  # fmt: skip
 
@@ -221,8 +221,8 @@ def _fault(ended: Ended, bounds: FilmBounds, seconds: float) -> Exception:
         del parts["choices"]
         return InvalidInput(parts.pop("code"), **parts)
     if ended.overdue or ended.code == -signal.SIGXCPU:
-        return refusal(
-            "too_slow", "film", expected=f"a film that is decoded and tracked within {seconds:g} s", got="one that takes longer",
+        return InvalidInput(
+            "too_slow", field="film", expected=f"a film that is decoded and tracked within {seconds:g} s", got="one that takes longer",
             hint="Select fewer frames, lower longest_side, or convert the film: ffmpeg -i FILM -vf scale=1280:-2 film.mp4",
         )  # fmt: skip
     if ended.code == -signal.SIGKILL:
