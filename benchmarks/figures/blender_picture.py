@@ -1,7 +1,7 @@
 """Import a result into Blender and render some of its frames side by side.
 
     pip install bpy          # in an environment of its own; Blender as a Python module, 350 MB
-    python benchmarks/blender_picture.py RESULT/shapes.glb PICTURE [--frames 3] [--height 240] [--side 35]
+    python benchmarks/figures/blender_picture.py RESULT/shapes.glb PICTURE [--frames 3] [--height 240] [--side 35]
 
 Uses no part of Pliant. The steps are those of the tutorial: set the frame rate, import, play.
 """
