@@ -92,9 +92,25 @@ def test_the_slow_pages_exist() -> None:
     assert {path.relative_to(ROOT).as_posix() for path in DOCUMENTS} >= SLOW
 
 
+@pytest.fixture(scope="session")
+def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with `film.mp4` and `region.png`, drawn on frame 8: the film of the tutorial from a film to Blender."""
+    from PIL import Image
+    from pliant.tracking.rendering import face_paint, render_film
+
+    path = tmp_path_factory.mktemp("film")
+    rendered = render_film(face(16, 800, degrees=30), size=(160, 120), distance=5, paint=face_paint(800))
+    rendered.write(path / "film.mp4")
+    Image.fromarray(rendered.region(8)).save(path / "region.png")
+    return path
+
+
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    """The files that documents speak of."""
+def folder(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
+    """The files that documents speak of; a film only for the tutorial that uses one in a shell."""
+    if "blender" in request.node.name and request.node.name.startswith("test_shell"):
+        for file in request.getfixturevalue("film").iterdir():
+            (tmp_path / file.name).symlink_to(file)
     sequence = face(12, 60)
     points = sequence.tracks.points
     np.savez(tmp_path / "tracks.npz", tracks=points)

@@ -71,9 +71,7 @@ def test_a_film_is_checked_without_being_tracked(film: Path, region: Path) -> No
 
 
 def test_an_installation_sets_the_bounds_of_films(film: Path) -> None:
-    settings = Settings.from_environment(
-        {"PLIANT_FILM_FRAMES": "8", "PLIANT_FILM_PIXELS": "5000", "PLIANT_FILM_SECONDS": "2"}
-    )
+    settings = Settings(film_frames=8, film_pixels=5000, film_seconds=2)
     bounds = FilmBounds.of(settings, max_bytes=10**6)
     assert (bounds.max_bytes, bounds.max_frames, bounds.max_pixels, bounds.max_seconds) == (10**6, 8, 5000, 2.0)
     assert bounds.memory == settings.film_memory == FilmBounds().memory
