@@ -74,7 +74,7 @@ def test_inspect_describes_a_film(film: Path, tmp_path: Path) -> None:
     for each in (
         "size 72×96 pixels",
         "frames 5 of 10",
-        "rate 15 frames a second",
+        "rate 15 frames per second",
         "rotation 90°, applied",
         "tracking about",
     ):

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import errno
+import io
+import itertools
 import json
 import os
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import textwrap
@@ -20,9 +23,10 @@ from PIL import Image
 from pliant.schemas.job import Progress
 from pliant.schemas.options import Options
 from pliant.solver.errors import InvalidInput
+from pliant.tracking import open_film
 from pliant.worker.errors import Interrupted, TimedOut
 from pliant.worker.execution.film import reconstruct_film
-from pliant.worker.films import tracker
+from pliant.worker.films import frame_strip, tracker
 from pliant.worker.films.inputs import read_tracked
 from pliant.worker.films.sources import FilmBounds, FilmSource, is_source, looks_like_film, open_source, save_source
 from pliant.worker.films.tracker import Tracked, check_film, described, film_options, track_film
@@ -171,6 +175,52 @@ def test_a_film_becomes_shapes_tracks_and_a_contact_sheet(film: Path, region: Pa
     assert report["seconds"]["track"] > 0
     with Image.open(tmp_path / "out" / "contact_sheet.jpg") as sheet:
         assert sheet.format == "JPEG"
+    check_followed(told, tmp_path / "out")
+    check_film_frames(tmp_path / "out", count=10)
+
+
+def check_followed(told: list[Progress], folder: Path) -> None:
+    """Points that are reported while tracking runs are those of the finished tracks."""
+    followed = next(each.followed for each in told if each.followed is not None)
+    assert told[-1].followed is None
+    assert (followed.width, followed.height) == SIZE
+    places = np.array(followed.points).reshape(-1, 2)
+    assert 4 <= len(places) <= 150
+    with np.load(folder / "tracks.npz") as file:
+        row = int(np.flatnonzero(file["frame_indices"] == followed.frame)[0])
+        assert followed.seconds == pytest.approx(file["frame_times"][row])
+        apart = np.linalg.norm(places[:, None] - file["tracks"][row][None], axis=2).min(axis=1)
+    assert np.median(apart) <= 0.71  # rounding to whole pixels
+
+
+def check_film_frames(folder: Path, *, count: int) -> None:
+    """film_frames.bin read by the layout that its docstring states: one picture for each tracked frame."""
+    raw = (folder / "film_frames.bin").read_bytes()
+    assert raw[:8] == b"PLIANTFF"
+    version, length = struct.unpack_from("<II", raw, 8)
+    header = json.loads(raw[16 : 16 + length])
+    assert (version, header["width"], header["height"]) == (1, *SIZE)
+    offsets = header["offsets"]
+    assert len(offsets) == count + 1
+    assert offsets[-1] == len(raw)
+    pictures = [np.asarray(Image.open(io.BytesIO(raw[a:b]))) for a, b in itertools.pairwise(offsets)]
+    assert {picture.shape for picture in pictures} == {(SIZE[1], SIZE[0], 3)}
+    # The texture moves to the right, a pixel a frame.
+    moved = np.abs(pictures[5][:, 5:].astype(float) - pictures[0][:, :-5]).mean()
+    assert moved < 0.5 * np.abs(pictures[5].astype(float) - pictures[0]).mean()
+
+
+def test_large_pictures_are_reduced_and_long_films_have_no_film_frames(
+    film: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wide = np.zeros((300, 960, 3), np.uint8)
+    with Image.open(io.BytesIO(frame_strip.small_jpeg(wide))) as picture:
+        assert picture.size == (480, 150)
+    opened = open_film(film)
+    assert not frame_strip.write_frames(opened, np.array([0, 3, 99]), tmp_path / "a")  # the film has no frame 99
+    monkeypatch.setattr(frame_strip, "MOST_BYTES", 1000)
+    assert not frame_strip.write_frames(opened, np.arange(10), tmp_path / "a")
+    assert not (tmp_path / "a").exists()
 
 
 def shapes_count(folder: Path) -> int:

@@ -195,3 +195,22 @@ def test_rendered_films_are_written_in_known_containers_only(tmp_path: Path) -> 
     with pytest.raises(FilmError) as caught:
         film.write(tmp_path / "missing" / "film.avi")
     assert caught.value.code == "unwritable_film"
+
+
+def test_refinement_finds_the_point_that_the_flow_missed() -> None:
+    wide = cv2.cvtColor(films.textured_pictures(1, (96, 72))[0], cv2.COLOR_RGB2GRAY)
+    turn = cv2.getRotationMatrix2D((48, 36), 6, 1.05)
+    frame = np.asarray(cv2.warpAffine(wide, turn, (96, 72), flags=cv2.INTER_CUBIC), np.uint8)
+    frame = np.clip(0.8 * frame + 20.0, 0, 255).astype(np.uint8)  # the light changes, too
+    seeds, _ = place(wide, np.pad(np.ones((40, 64), bool), 16), step=4)
+    appearance = Appearance.of(wide, seeds.points, neighbours(seeds.grid, len(seeds.points)))
+    true = seeds.points @ turn[:, :2].T.astype(np.float32) + turn[:, 2].astype(np.float32)
+    flowed = true + np.random.default_rng(0).normal(0, 0.3, true.shape).astype(np.float32)
+    visible = np.ones(len(true), bool)
+    refined = appearance.refine(frame, flowed, visible)
+    before, after = (np.median(np.linalg.norm(found - true, axis=1)) for found in (flowed, refined))
+    assert after < 0.4 * before
+    np.testing.assert_array_equal(appearance.refine(frame, flowed, ~visible), flowed)
+    other = cv2.cvtColor(films.textured_pictures(1, (96, 72), seed=5)[0], cv2.COLOR_RGB2GRAY)
+    kept = (appearance.refine(other, flowed, visible) == flowed).all(axis=1)
+    assert kept.mean() > 0.95, "what shows something else is left where it was"
