@@ -1,4 +1,4 @@
-"""The load runs at a tiny size: real processes, nothing lost, memory told."""
+"""The load benchmark at a tiny size: real processes, no losses, memory reported."""
 
 from __future__ import annotations
 
