@@ -1,4 +1,4 @@
-"""The page's manners: the keyboard alone, accessibility, and no request to anybody else."""
+"""Keyboard use, accessibility, and no requests to other hosts."""
 
 from __future__ import annotations
 
