@@ -22,7 +22,7 @@ from pliant.worker.artifacts import build_report, write_artifacts
 from pliant.worker.artifacts.animation import animate
 from pliant.worker.artifacts.colours import linear, shade
 from pliant.worker.artifacts.geometry import triangles_of, upright, vertex_normals, viewer_scale
-from pliant.worker.artifacts.glb import write_glb
+from pliant.worker.artifacts.gltf.glb import write_glb
 from pliant.worker.formats import Inputs
 from results import make_result, moving_sheet
 

@@ -17,7 +17,7 @@ from PIL import Image
 from pliant.schemas.options import Options
 from pliant.solver import InvalidInput
 from pliant.worker.artifacts.animation import animate
-from pliant.worker.artifacts.glb import write_glb
+from pliant.worker.artifacts.gltf.glb import write_glb
 from pliant.worker.formats import Inputs, Limits, read_inputs
 from pliant.worker.formats.reading.csv import read_csv
 from pliant.worker.formats.reading.gltf import read_gltf

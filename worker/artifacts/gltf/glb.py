@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.worker.artifacts.animation import Animation
 from pliant.worker.artifacts.geometry import Ints, Singles, vertex_normals
-from pliant.worker.artifacts.view import View
+from pliant.worker.artifacts.gltf.view import View
 from pliant.worker.formats import Texture
 
 COMPONENTS = {"int8": 5120, "uint8": 5121, "int16": 5122, "uint16": 5123, "uint32": 5125, "float32": 5126}

@@ -1,0 +1,1 @@
+"""Animated glTF: the mesh and its camera."""
