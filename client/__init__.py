@@ -45,6 +45,7 @@ if TYPE_CHECKING:
         Status,
     )
     from pliant.schemas.options import Options
+    from pliant.schemas.shares import Share
 
 _HOMES = {
     "errors": (
@@ -60,6 +61,7 @@ _HOMES = {
 }  # fmt: skip
 _HOME_OF = {name: f"pliant.client.{module}" for module, names in _HOMES.items() for name in names} | {
     "Options": "pliant.schemas.options",
+    "Share": "pliant.schemas.shares",
     **dict.fromkeys(
         ("Artifact", "Interpretation", "Job", "Problem", "Progress", "ServiceLimits", "Status"), "pliant.schemas.job"
     ),
@@ -67,7 +69,7 @@ _HOME_OF = {name: f"pliant.client.{module}" for module, names in _HOMES.items() 
 
 __all__ = [  # noqa: RUF022 - by use, not by alphabet
     "Client", "RemoteJob", "Result", "AsyncClient", "AsyncRemoteJob", "AsyncResult", "Retry", "Options",
-    "Artifact", "Interpretation", "Job", "Problem", "Progress", "ServiceLimits", "Status",
+    "Artifact", "Interpretation", "Job", "Problem", "Progress", "ServiceLimits", "Share", "Status",
     "PliantError", "Unreachable", "WaitTimeout", "UnexpectedAnswer", "CorruptDownload", "BadArgument", "NotLoaded",
     "InvalidSignature", "APIStatusError", "InvalidRequest", "NotAuthorized", "NotFound", "NotAllowedNow", "TooManyRequests",
     "ServiceFailed", "JobEnded", "JobFailed", "JobCancelled",

@@ -33,8 +33,10 @@ class Call:
     """Multipart body; its files are reopened for each attempt."""
     body: Remainder | None = None
     """Raw body, likewise."""
+    content: bytes | None = None
+    """Short body, sent as it is."""
     changes_nothing: bool = False
-    """True for a POST without side effects."""
+    """True for a POST without side effects, or whose repetition finds the first one's work."""
 
     @property
     def repeatable(self) -> bool:
@@ -85,6 +87,7 @@ def request_for(
         params=dict(call.params) or None,
         headers=dict(call.headers),
         files=files,
+        content=call.content,
         timeout=_limits(timeout),
     )
 

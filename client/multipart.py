@@ -9,6 +9,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from dataclasses import fields as dataclass_fields
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, cast
 
@@ -128,6 +129,7 @@ class Inputs:
     mesh: Source | tuple[int, int] | None = None
     ground_truth: Source | None = None
     rotations: Source | None = None
+    inputs_of: str | None = None
 
     def form(self, folder: Path, fields: Mapping[str, str], on_upload: OnBytes | None) -> Form:
         """Return the form that carries them; arrays are written to files in `folder`.
@@ -138,6 +140,8 @@ class Inputs:
             An input cannot be sent.
         """
         texts = dict(fields)
+        if self.inputs_of is not None:
+            return Form(fields=texts | {"inputs_of": self._alone()}, files={}, on_upload=on_upload)
         if (self.tracks is None) == (self.film is None):
             raise BadArgument(
                 f"tracks, film: expected one of them, got {'both' if self.film is not None else 'neither'}."
@@ -160,6 +164,18 @@ class Inputs:
         if self.rotations is not None:
             files["rotations"] = array_part(self.rotations, "rotations", "rotations", folder)
         return Form(fields=texts, files=files, on_upload=on_upload)
+
+    def _alone(self) -> str:
+        """Return the job whose inputs are used again, if nothing else was given."""
+        others = [
+            each.name
+            for each in dataclass_fields(self)
+            if each.name != "inputs_of" and getattr(self, each.name) is not None
+        ]
+        if others:
+            raise BadArgument(f"inputs_of: expected no other inputs, got {', '.join(others)} as well.")
+        assert self.inputs_of is not None
+        return self.inputs_of
 
 
 def tracks_file(tracks: Source, visible: ArrayLike | None, folder: Path) -> Path:

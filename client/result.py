@@ -48,7 +48,8 @@ class Reconstruction:
 
     def __repr__(self) -> str:
         size = f"{self.job.interpretation.num_frames} frames × {self.job.interpretation.num_points} points"
-        return f"<{type(self).__name__} of job {self.job.id}: {size}, {self.job.outcome}>"
+        ended = ", ".join(str(each) for each in (self.job.verdict, self.job.outcome) if each is not None)
+        return f"<{type(self).__name__} of job {self.job.id}: {size}, {ended}>"
 
     @property
     def shapes(self) -> NDArray[np.float64]:
@@ -142,6 +143,11 @@ def copied(source: Path, path: Path | str) -> Path:
     return target
 
 
+def loaded(job: Job) -> tuple[str, ...]:
+    """Return the files that `wait` and `result` download; a job that wrote further files has no arrays of its own."""
+    return LOADED if job.outputs_of is None else (REPORT,)
+
+
 def job_path(job: str) -> str:
     """Return the address of a job, relative to the service.
 
@@ -180,10 +186,9 @@ def finished(job: Job) -> Job:
     """
     if not job.status.final:
         raise NotAllowedNow(
-            Problem(
-                title="The job is not finished",
-                status=409,
-                code="not_finished",
+            Problem.of(
+                "not_finished",
+                409,
                 detail=f"Job {job.id} is {job.status}; there is no result yet. Wait for it.",
                 retryable=True,
             )
@@ -195,10 +200,8 @@ def unknown_file(job: Job, name: str) -> NotFound:
     """Return the error for a file that a job does not have."""
     held = ", ".join(artifact.name for artifact in job.artifacts) or "none"
     return NotFound(
-        Problem(
-            title="No such file",
-            status=404,
-            code="unknown_artifact",
+        Problem.of(
+            "unknown_artifact",
             detail=f"Job {job.id} ({job.status}) has no file {name!r}. Its files: {held}.",
         )
     )

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from datetime import datetime
 from enum import StrEnum
+from http import HTTPStatus
 from typing import Any, Literal
 
 from pliant.schemas.options import Options
-from pliant.schemas.problems import type_of
+from pliant.schemas.problems import RETRYABLE_STATUSES, find_code, type_of
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 
@@ -25,6 +26,10 @@ class Status(StrEnum):
     def final(self) -> bool:
         """True if the status is final."""
         return self in (Status.SUCCEEDED, Status.FAILED, Status.CANCELLED)
+
+
+Priority = Literal["high", "normal", "low"]
+"""Order among the waiting jobs of one owner."""
 
 
 class Record(BaseModel):
@@ -53,6 +58,39 @@ class Problem(Record):
         None, description="The possible interpretations of an ambiguous input."
     )
 
+    @classmethod
+    def of(cls, code: str, status: int | None = None, *, detail: str, **members: Any) -> Problem:
+        """Return the problem of a code, with the title and the status of the code's entry in the table.
+
+        Parameters
+        ----------
+        code : str
+            Stable machine-readable name.
+        status : int, optional
+            HTTP status code, if not the code's own.
+        detail : str
+            A whole sentence that ends with what to do.
+        **members
+            Further members, e.g. those of an error: `pliant.schemas.invalid.members_of`.
+        """
+        known = find_code(code)
+        status = status or (known.status if known is not None else None) or 500
+        title = HTTPStatus(status).phrase if known is None else known.heading
+        members.setdefault("retryable", status in RETRYABLE_STATUSES)
+        return cls(title=title, status=status, code=code, detail=detail, **members)
+
+
+class FollowedPoints(Record):
+    """Some points of a film in the frame that was tracked last."""
+
+    frame: int = Field(ge=0, description="Number of the frame in the film, from 0.")
+    seconds: float = Field(ge=0, description="From the film's start.")
+    width: int = Field(ge=1, description="Of the film, pixels.")
+    height: int = Field(ge=1, description="Of the film, pixels.")
+    points: list[int] = Field(
+        max_length=400, description="x and y of each visible point in turn, rounded to the film's pixels."
+    )
+
 
 class Progress(Record):
     """Progress of a running job."""
@@ -66,6 +104,7 @@ class Progress(Record):
     objective: float | None = None
     residual: float | None = Field(None, description="Median visible reprojection residual, the tracks' unit.")
     seconds_left: float | None = Field(None, description="Estimate; null until one is possible.")
+    followed: FollowedPoints | None = Field(None, description="Points that the stage `track` tracked last.")
     updated_at: datetime
 
 
@@ -77,6 +116,13 @@ class Artifact(Record):
     bytes: int
     sha256: str
     description: str = ""
+
+
+class Estimate(Record):
+    """What a job is expected to need, from the numbers of its frames and points. Right within a factor of about two."""
+
+    memory_bytes: int = Field(description="Largest memory of the process that works on the job.")
+    seconds: float = Field(description="Processor seconds on one core of a usual machine.")
 
 
 class Interpretation(Record):
@@ -122,6 +168,10 @@ class Interpretation(Record):
         default_factory=list, description="Their indices in the result, the first thousand."
     )
     notes: list[str] = Field(default_factory=list, description="Sentences with evidence, exclusions and assumptions.")
+    estimate: Estimate | None = Field(
+        None,
+        description="Memory and time the job will need; null for films, whose points are not known before they are tracked.",
+    )
 
 
 class Inspection(Interpretation):
@@ -145,6 +195,12 @@ class Job(Record):
     expires_at: datetime | None = Field(None, description="When the job and its files are removed; null: never.")
     attempt: int = Field(0, description="Number of attempts so far.")
     retry_of: str | None = Field(None, description="The finished job that this one repeats.")
+    outputs_of: str | None = Field(
+        None, description="The finished job whose result this one writes in further files, without solving again."
+    )
+    priority: Priority = Field(
+        "normal", description="Order among the waiting jobs of one owner; jobs of others are not passed."
+    )
     place_in_queue: int | None = Field(None, description="Number of queued jobs ahead; null if not queued.")
     options: Options
     interpretation: Interpretation

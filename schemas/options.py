@@ -143,9 +143,9 @@ class Options(BaseModel):
         "csv: metrics of every frame and of every point.",
     )
     normals: Literal["static", "animated", "none"] = Field(
-        "static",
-        description="static: those of the first shape, in shapes.glb only. animated: they move with the shape, and are also in every "
-        "frame of PLY, OBJ and USD. none: viewers compute their own.",
+        "animated",
+        description="animated: they move with the shape, in shapes.glb and in every frame of PLY, OBJ and USD. static: those of the "
+        "first shape, in shapes.glb only. none: viewers compute their own.",
     )
     colours: Literal["none", "error", "expected_error"] = Field(
         "none",
@@ -154,13 +154,18 @@ class Options(BaseModel):
         "prior gaussian estimates it. PLY, OBJ and USD are coloured in every frame, shapes.glb by the mean over frames.",
     )
     axes: Literal["tracks", "viewer"] = Field(
-        "tracks",
-        description="Axes of PLY and OBJ. tracks: those of the tracks, as in shapes.npz. viewer: y up, as in shapes.glb.",
+        "viewer",
+        description="Axes of PLY and OBJ. viewer: y up, as in shapes.glb. tracks: those of the tracks, as in shapes.npz.",
     )
     glb_quantized: bool = Field(
         False,
-        description="Write shapes.glb with 16-bit positions (KHR_mesh_quantization): two thirds of the size, and rounded to about a "
-        "65,000th of the largest extent.",
+        description="Write shapes.glb with 16-bit positions and 8-bit normals (KHR_mesh_quantization): about half the size, and rounded "
+        "to a 65,000th of the largest extent and half a degree.",
+    )
+    glb_motion: Literal["auto", "frames"] = Field(
+        "auto",
+        description="How shapes.glb stores the motion. auto: as few modes of motion as keep every point within a thousandth "
+        "of the bounding box's diagonal. frames: a morph target a frame, exact in single precision; up to 200 frames.",
     )
 
     layout: Literal["auto", "frames_points", "points_frames"] = Field(

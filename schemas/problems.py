@@ -105,6 +105,9 @@ class ProblemCode(StrEnum):
     NOT_UTF8 = ("not_utf8", 422, "Not UTF-8",
      "A text part is not valid UTF-8.",
      "Encode it as UTF-8.")
+    INVALID_PRIORITY = ("invalid_priority", 422, "Invalid priority",
+     "The part `priority` is not one of high, normal and low.",
+     "Leave it out for normal.")
     NAME_TOO_LONG = ("name_too_long", 422, "Name too long",
      "The job's `name` has more than 200 characters.",
      "Shorten it.")
@@ -140,6 +143,15 @@ class ProblemCode(StrEnum):
     EXPIRED_TOKEN = ("expired_token", 401, "Expired token",
      "The token's expiry date has passed.",
      "Ask the operator for a new one.")
+    INVALID_SHARE = ("invalid_share", 401, "Invalid share link",
+     "The link was revoked, its job was deleted, or the token is not complete.",
+     "Ask the sender of the link for a new one.")
+    EXPIRED_SHARE = ("expired_share", 401, "Expired share link",
+     "The link's expiry date has passed.",
+     "Ask the sender of the link for a new one.")
+    BEYOND_SHARE = ("beyond_share", 403, "Beyond the share link",
+     "A request with the token of a share link named another job, or something other than the job's record, events and files.",
+     "Use a token of the service for anything else.")
     INSUFFICIENT_SCOPE = ("insufficient_scope", 403, "Insufficient scope",
      "The token is valid but lacks the scope that the route needs; `expected` names it.",
      "Use a token with that scope.")
@@ -268,6 +280,12 @@ class ProblemCode(StrEnum):
     DIGEST_MISMATCH = ("digest_mismatch", 422, "Digest mismatch",
      "The SHA-256 of the received bytes differs from `Repr-Digest`. The upload was removed.",
      "Send it again.")
+    UNKNOWN_SHARE = ("unknown_share", 404, "Unknown share link",
+     "The job has no share link of that id; it may have expired.",
+     "`GET /v1/jobs/{id}/shares` lists the valid ones.")
+    TOO_MANY_SHARES = ("too_many_shares", 409, "Too many share links",
+     "The job has 20 valid share links.",
+     "Revoke one, or wait until one expires.")
     TOO_MANY_UPLOADS = ("too_many_uploads", 429, "Too many uploads",
      "The token has 100 uploads.",
      "Delete some, or wait until they expire.")
@@ -295,6 +313,9 @@ class ProblemCode(StrEnum):
     TOO_LARGE = ("too_large", 422, "Input too large",
      "The file declares or contains more than this installation accepts.",
      "Use fewer frames or points, or ask the operator; `GET /v1/limits` has the numbers.")
+    NEEDS_MORE_MEMORY = ("needs_more_memory", 422, "Needs more memory than any worker has",
+     "The job's estimated memory exceeds that of every running worker.",
+     "Use the `max_points` or `frames` that the hint names, or ask the operator for a larger worker.")
     TOO_SLOW = ("too_slow", 422, "Parsing took too long",
      "The file could not be parsed within the time limit.",
      "Convert it to npz.")

@@ -19,7 +19,7 @@ from pliant.service.middleware.origin import OriginCheck
 from pliant.service.middleware.rate_limit import RateLimit
 from pliant.service.middleware.security_headers import SECURITY_HEADERS, SecurityHeaders
 from pliant.service.page import mount_page
-from pliant.service.routes import artifacts, events, examples, inspection, jobs, meta, uploads
+from pliant.service.routes import artifacts, events, examples, inspection, jobs, meta, outputs, shares, uploads
 from pliant.service.routes import errors as error_pages
 from pliant.service.routes import metrics as metrics_route
 from pliant.service.settings import ServiceSettings
@@ -28,6 +28,7 @@ from pliant.service.upload_locks import UploadLocks
 from pliant.worker import errors
 from pliant.worker.formats import InvalidInput, Limits
 from pliant.worker.jobs.service import Jobs
+from pliant.worker.records import Records
 from pliant.worker.tokens import Tokens
 from pliant.worker.uploads.service import Uploads
 from starlette.middleware import Middleware
@@ -39,12 +40,14 @@ STATUS_OF: dict[type[Exception], int] = {
     errors.UnknownJob: 404,
     errors.UnknownArtifact: 404,
     errors.UnknownExample: 404,
+    errors.UnknownShare: 404,
     errors.UnknownToken: 404,
     errors.UnknownUpload: 404,
     errors.NotAllowedNow: 409,
     errors.Conflict: 409,
     errors.InvalidRequest: 422,
     errors.UploadTooLarge: 413,
+    errors.TooManyShares: 409,
     errors.TooManyUploads: 429,
     errors.TooManyQueued: 429,
     errors.QuotaExceeded: 507,
@@ -80,7 +83,7 @@ def create_app(
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        incoming = Incoming(settings.incoming)
+        incoming = Incoming(jobs_of_all.settings.incoming)
         incoming.open()
         app.state.service = Service(
             jobs=jobs_of_all,
@@ -104,19 +107,31 @@ def create_app(
         lifespan=lifespan,
         openapi_tags=openapi.TAGS,
         servers=[{"url": "/", "description": "This service"}],
-        middleware=middleware(settings, tokens, metrics),
+        middleware=middleware(settings, tokens, metrics, jobs_of_all.records),
         docs_url=None,  # FastAPI's page loads Swagger UI from a CDN, which the content-security policy forbids; see `page`
         redoc_url=None,
     )
     problems.install(app, STATUS_OF, security_headers=SECURITY_HEADERS)
-    for each in (jobs, inspection, uploads, artifacts, events, meta, metrics_route, examples, error_pages):
+    for each in (
+        jobs,
+        outputs,
+        shares,
+        inspection,
+        uploads,
+        artifacts,
+        events,
+        meta,
+        metrics_route,
+        examples,
+        error_pages,
+    ):
         app.include_router(each.router)
     mount_page(app)
     app.openapi = lambda: openapi.document(app)  # type: ignore[method-assign]
     return app
 
 
-def middleware(settings: ServiceSettings, tokens: Tokens, metrics: Metrics) -> list[Middleware]:
+def middleware(settings: ServiceSettings, tokens: Tokens, metrics: Metrics, records: Records) -> list[Middleware]:
     """Return the middleware, the outermost first."""
     stack = [
         Middleware(AccessLog),
@@ -149,6 +164,6 @@ def middleware(settings: ServiceSettings, tokens: Tokens, metrics: Metrics) -> l
             )
         )
     # Inside CORS: a browser's preflight carries no token, and a page of an allowed origin may read a refusal.
-    stack.append(Middleware(Authentication, settings=settings, tokens=tokens))
+    stack.append(Middleware(Authentication, settings=settings, tokens=tokens, records=records))
     stack.append(Middleware(RateLimit, settings=settings))
     return stack

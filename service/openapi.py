@@ -8,7 +8,9 @@ from typing import Any
 from fastapi import FastAPI
 from pliant.schemas.job import Problem
 from pliant.schemas.options import Options
+from pliant.schemas.outputs import OutputRequest
 from pliant.schemas.problems import ProblemCode, type_of
+from pliant.schemas.shares import ShareRequest
 from pliant.service.middleware.auth import is_public
 from pliant.service.problems import MEDIA_TYPE
 
@@ -87,8 +89,15 @@ SUBMIT_BODY: dict[str, Any] = {
         "multipart/form-data": {
             "schema": {
                 "type": "object",
-                # Tracks, or the upload that holds them. Generators of clients cannot read an anyOf here.
-                "if": {"not": {"required": ["tracks_upload"]}},
+                # Tracks, the upload that holds them, a film, or the inputs of an earlier job.
+                # Generators of clients cannot read an anyOf in its place.
+                "if": {
+                    "not": {
+                        "anyOf": [
+                            {"required": [part]} for part in ("tracks_upload", "film", "film_upload", "inputs_of")
+                        ]
+                    }
+                },
                 "then": {"required": ["tracks"]},
                 "properties": {
                     "tracks": {
@@ -122,12 +131,21 @@ SUBMIT_BODY: dict[str, Any] = {
                         "contentSchema": {"$ref": "#/components/schemas/Options"},
                         "description": "A JSON object, also described at /v1/options.",
                     },
+                    "inputs_of": {
+                        "type": "string",
+                        "description": "Instead of files: the id of a job of yours, whose inputs are used again with these options.",
+                    },
                     "name": {"type": "string", "maxLength": 200, "description": "A label of your own."},
                     "webhook": {
                         "type": "string",
                         "format": "uri",
                         "maxLength": 2000,
                         "description": "URL that receives a POST once the job has ended, signed as in Standard Webhooks 1.0.",
+                    },
+                    "priority": {
+                        "type": "string",
+                        "enum": ["high", "normal", "low"],
+                        "description": "Order among your own waiting jobs; `normal` where it is absent.",
                     },
                     "webhook_secret": {
                         "type": "string",
@@ -204,6 +222,8 @@ def document(app: FastAPI) -> dict[str, Any]:
         }
         # The schema of a request: every option may be left out.
         schemas["Options"] = Options.model_json_schema(ref_template=_REF)
+        for model in (OutputRequest, ShareRequest):
+            schemas[model.__name__] = model.model_json_schema(ref_template=_REF)
         for name in (
             "HTTPValidationError",
             "ValidationError",

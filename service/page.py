@@ -1,4 +1,4 @@
-"""The web page at `/`, the API reference at `/docs`, and their files at `/page`."""
+"""The web page at `/`, the guide at `/guide`, the API reference at `/docs`, and their files at `/page`."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ class PageFiles(StaticFiles):
 
 
 def mount_page(app: FastAPI, directory: Path = BUILT) -> None:
-    """Serve the built page. Without one, `/` and `/docs` answer 503 with a sentence that says how to build it.
+    """Serve the built page. Without one, `/`, `/guide` and `/docs` answer 503 with a sentence that says how to build it.
 
     Parameters
     ----------
@@ -103,6 +103,6 @@ def mount_page(app: FastAPI, directory: Path = BUILT) -> None:
 
         return answer
 
-    for path, name in (("/", "index.html"), ("/docs", "docs.html")):
+    for path, name in (("/", "index.html"), ("/docs", "docs.html"), ("/guide", "guide.html")):
         app.add_route(path, document(name), methods=["GET", "HEAD"], include_in_schema=False)
     app.mount("/page", files)

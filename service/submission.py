@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
-from pliant.schemas.job import Interpretation, Job
+from pliant.schemas.job import Interpretation, Job, Priority
 from pliant.schemas.options import Options
 from pliant.schemas.problems import ProblemCode
 from pliant.service.multipart import File, Form, FormRules
@@ -15,7 +16,7 @@ from pliant.service.problems import Refusal, from_validation, wrong_input
 from pliant.service.settings import ServiceSettings
 from pliant.worker.artifacts import kinds_for
 from pliant.worker.errors import Conflict, UnknownUpload
-from pliant.worker.films.sources import FilmBounds, FilmSource, save_source
+from pliant.worker.films.sources import FilmBounds, FilmSource, is_source, open_source, save_source
 from pliant.worker.films.tracker import check_film, described, film_options
 from pliant.worker.formats import Limits, store_inputs
 from pliant.worker.formats.tracks.film_tracks import tracks_options
@@ -30,7 +31,13 @@ OF_FILM = ("film", "region")
 FILES = frozenset({*OF_TRACKS, *OF_FILM})
 UPLOADS = {f"{part}_upload": part for part in sorted(FILES)}
 """Text parts that name an upload, and the part that each stands for."""
-TEXTS = frozenset({"mesh", "options", "name", "webhook", "webhook_secret", *UPLOADS})
+KEPT = "inputs_of"
+"""Text part that names a job whose kept inputs are used again."""
+TEXTS = frozenset({"mesh", "options", "name", "priority", "webhook", "webhook_secret", KEPT, *UPLOADS})
+READING = (
+    "layout", "rows", "y_axis", "coordinates", "coordinate_order", "visibility", "frames", "stride", "max_points", "min_seen",
+)  # fmt: skip
+"""Options that say how tracks are read: kept inputs have been read already."""
 LONGEST_NAME = 200
 """Characters of the user's label."""
 
@@ -86,8 +93,12 @@ def accept(
         Nothing is queued.
     """
     form = with_uploads(form, folder, uploads)
+    fingerprint = form.fingerprint
     options = parse_options(form.texts.get("options", ""))
     name = _name(form.texts.get("name", ""))
+    kept = kept_inputs(form, options, folder, jobs)
+    if kept is not None:
+        form, options, name = kept.form, kept.options, name or kept.job.name
     webhook = parse_webhook(
         form.texts.get("webhook", "").strip(),
         form.texts.get("webhook_secret", "").strip(),
@@ -98,17 +109,76 @@ def accept(
         name=name,
         id=id,
         idempotency_key=idempotency_key,
-        fingerprint=form.fingerprint,
+        fingerprint=fingerprint,
         webhook=webhook,
+        priority=_priority(form.texts.get("priority", "")),
     )
     known = jobs.known(submission)
     if known is not None:
         return known, False
     canonical = folder / "canonical.npz"
+    if kept is not None and kept.canonical is not None:
+        read = kept.job.interpretation
+        kinds_for(options, size=(read.num_frames, read.num_points))
+        return jobs.submit(kept.canonical, submission, interpretation=read), True
     films = FilmBounds.of(jobs.settings, max_bytes=limits.max_bytes)
     interpretation, options = read_form(form, options, limits, films=films, target=canonical)
     job = jobs.submit(canonical, replace(submission, options=options), interpretation=interpretation)
     return job, True
+
+
+@dataclass(frozen=True)
+class Kept:
+    """The inputs of an earlier job, to be used again."""
+
+    job: Job
+    form: Form
+    """The form with the earlier job's film, where it had one."""
+    options: Options
+    """Those given, with the earlier job's ways of reading its tracks."""
+    canonical: Path | None
+    """The tracks as they were read; None for a film, which is tracked again."""
+
+
+def kept_inputs(form: Form, options: Options, folder: Path, jobs: Jobs) -> Kept | None:
+    """Return the inputs that a form names by the part `inputs_of`; None if it has no such part.
+
+    Raises
+    ------
+    Refusal
+        The form has files as well, or an option would read kept tracks in another way.
+    UnknownJob
+        There is no such job.
+    NotAllowedNow
+        The job holds further files of another one.
+    """
+    id = form.texts.get(KEPT, "").strip()
+    if not id:
+        return None
+    others = sorted({*form.files, *(("mesh",) if form.texts.get("mesh", "").strip() else ())})
+    if others:
+        raise wrong_input(
+            ProblemCode.CONFLICTING_PARTS, field=KEPT, expected="either inputs_of or files", got=f"inputs_of and {', '.join(others)}",
+            hint="Leave one of them out.",
+        )  # fmt: skip
+    job, file = jobs.kept_inputs(id, folder / "kept.npz")
+    if is_source(file):
+        source = open_source(file, folder / "kept")
+        files = {
+            part: File(path, path.stat().st_size, hashlib.sha256(f"{id} {part}".encode()).hexdigest())
+            for part, path in (("film", source.film), ("region", source.region))
+            if path is not None
+        }
+        return Kept(job, Form(files=files, texts={**form.texts, KEPT: id}), options, None)
+    for name in READING:
+        wanted, had = getattr(options, name), getattr(job.options, name)
+        if name in options.model_fields_set and wanted != had:
+            raise wrong_input(
+                ProblemCode.CONFLICTING_PARTS, field=f"options.{name}", expected=f"{had!r}, as the inputs of job {id!r} were read",
+                got=repr(wanted), hint="Send the files again to read them in another way.",
+            )  # fmt: skip
+    had = {name: getattr(job.options, name) for name in READING}
+    return Kept(job, form, options.model_copy(update=had), file)
 
 
 def with_uploads(form: Form, folder: Path, uploads: Uploads) -> Form:
@@ -244,6 +314,16 @@ def parse_options(text: str) -> Options:
 def _not_an_object(got: str) -> Refusal:
     hint = 'For example {"method": "robust"}; the schema is at /v1/options.'
     return wrong_input(ProblemCode.INVALID_OPTION, field="options", expected="a JSON object", got=got, hint=hint)
+
+
+def _priority(text: str) -> Priority:
+    """Return the priority of a job; empty text means normal."""
+    given = text.strip() or "normal"
+    for each in get_args(Priority):
+        if given == each:
+            return each  # type: ignore[no-any-return]
+    code, names = ProblemCode.INVALID_PRIORITY, ", ".join(get_args(Priority))
+    raise wrong_input(code, field="priority", expected=names, got=repr(given[:40]), hint="Leave it out for normal.")
 
 
 def _name(text: str) -> str:

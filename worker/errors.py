@@ -4,6 +4,7 @@
     ├── UnknownJob              no job of that id (or not yours)
     ├── UnknownArtifact         the job has no such file
     ├── UnknownExample          no such example, or it has no such file
+    ├── UnknownShare            the job has no such share link
     ├── UnknownToken            there is no token of that id
     ├── UnknownUpload           no upload of that id (or not yours)
     ├── NotAllowedNow           the job's status does not allow it
@@ -11,6 +12,7 @@
     │   └── OffsetMismatch      the offset of the bytes is not the size of the upload
     ├── InvalidRequest          a malformed id or cursor
     │   └── UploadTooLarge      an upload exceeds its maximum size
+    ├── TooManyShares           the limit of share links of a job is reached
     ├── TooManyUploads          the owner's limit of uploads is reached
     ├── InvalidSetting          a setting does not parse or is out of range
     ├── TooManyQueued           the owner's limit of queued jobs is reached
@@ -27,6 +29,7 @@ Every one carries a stable `code`, a whole sentence (`str(error)`) and whether t
 
 from __future__ import annotations
 
+from pliant.schemas.invalid import Invalid
 from pliant.schemas.job import Status
 
 
@@ -79,6 +82,18 @@ class UnknownExample(WorkerError):
         self.name, self.file = name, file
 
 
+class UnknownShare(WorkerError):
+    """The job has no such share link."""
+
+    code = "unknown_share"
+
+    def __init__(self, id: str, share: str) -> None:
+        super().__init__(
+            f"Job {id!r} has no share link {share!r}; it may have expired. List the links to see which there are."
+        )
+        self.id, self.share = id, share
+
+
 class UnknownToken(WorkerError):
     """There is no token of that id."""
 
@@ -118,22 +133,19 @@ class Conflict(WorkerError):
         self.id = id
 
 
-class OffsetMismatch(Conflict):
+class OffsetMismatch(Invalid, Conflict):
     """The offset of the bytes is not the current size of the upload."""
 
     def __init__(self, id: str, *, expected: int, got: int) -> None:
-        sentence = f"Upload {id!r} has {expected} bytes, but the data sent starts at {got}. Continue at {expected}."
-        super().__init__("upload_offset_mismatch", id=id, sentence=sentence)
-        self.field, self.offset = "Upload-Offset", expected
-        self.expected, self.got = str(expected), str(got)
+        hint = f"Continue at {expected}."
+        super().__init__(
+            "upload_offset_mismatch", field="Upload-Offset", expected=str(expected), got=str(got), hint=hint
+        )
+        self.id, self.offset = id, expected
 
 
-class InvalidRequest(WorkerError):
+class InvalidRequest(Invalid, WorkerError):
     """A malformed id, cursor or key."""
-
-    def __init__(self, code: str, *, field: str, expected: str, got: str, hint: str) -> None:
-        super().__init__(f"{field}: expected {expected}, got {got}. {hint}")
-        self.code, self.field, self.expected, self.got, self.hint = code, field, expected, got, hint
 
 
 class UploadTooLarge(InvalidRequest):
@@ -158,14 +170,23 @@ class TooManyUploads(WorkerError):
         )
 
 
-class InvalidSetting(WorkerError):
-    """A setting does not parse or is out of range."""
+class TooManyShares(WorkerError):
+    """A job has as many valid share links as it may have."""
 
-    code = "invalid_setting"
+    code = "too_many_shares"
 
-    def __init__(self, name: str, *, expected: str, got: str) -> None:
-        super().__init__(f"{name}: expected {expected}, got {got!r}. Correct the variable or leave it unset.")
-        self.name, self.expected, self.got = name, expected, got
+    def __init__(self, id: str, most: int) -> None:
+        super().__init__(f"Job {id!r} has {most} share links already. Revoke one, or wait until one expires.")
+        self.id, self.most = id, most
+
+
+class InvalidSetting(Invalid, WorkerError):
+    """A setting does not parse, is out of range, or leaves an installation that cannot be used."""
+
+    def __init__(
+        self, variable: str, *, expected: str, got: str, hint: str = "Correct the variable or leave it unset."
+    ) -> None:
+        super().__init__("invalid_setting", field=variable, expected=expected, got=got, hint=hint)
 
 
 class TooManyQueued(WorkerError):

@@ -38,6 +38,18 @@ class Webhook(BaseModel):
     secret: str
 
 
+class StoredShare(BaseModel):
+    """A link that reads one job's results; its secret is stored as a digest."""
+
+    model_config = ConfigDict(frozen=True)
+
+    id: str
+    digest: str
+    """SHA-256 of the secret."""
+    created_at: datetime
+    expires_at: datetime
+
+
 class Stored(BaseModel):
     """A job with the internal fields of the worker package."""
 
@@ -55,6 +67,9 @@ class Stored(BaseModel):
 
     inputs: str
     """Blob of the canonical inputs."""
+
+    result: str | None = None
+    """Blob of the arrays of a stored result, for a job that writes further files of it instead of solving."""
 
     bytes: int = 0
     """Total size of the job's files, bytes."""
@@ -76,6 +91,9 @@ class Stored(BaseModel):
 
     max_running: int | None = None
     """Limit of concurrently running jobs of the owner, from the token at submission; None: `Settings.max_running`."""
+
+    shares: tuple[StoredShare, ...] = ()
+    """Links that read the job's results without a token of its owner."""
 
     version: int = 0
     """Number of changes, for the compare-and-set."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import ssl
 import tempfile
-from collections.abc import AsyncGenerator, Callable, Iterable, Mapping
+from collections.abc import AsyncGenerator, Callable, Iterable, Mapping, Sequence
 from contextlib import aclosing
 from pathlib import Path
 from types import TracebackType
@@ -14,15 +14,18 @@ from typing import Any, Self
 import httpx
 from numpy.typing import ArrayLike
 from pliant.client._async import operations
+from pliant.client._async.batch import OnFailure, mapped
 from pliant.client._async.job import AsyncRemoteJob, AsyncResult
 from pliant.client._async.operations import OnJob
 from pliant.client._async.transport import Exchange
 from pliant.client.call import base_of, headers_of
 from pliant.client.multipart import Inputs, OnBytes, Source
-from pliant.client.result import LOADED, finished, succeeded
+from pliant.client.requests import further, sharing
+from pliant.client.result import finished, loaded, succeeded
 from pliant.client.retry import Attempts, Contact, Retry
-from pliant.schemas.job import Interpretation, Job, ServiceLimits, Status
-from pliant.schemas.options import Options
+from pliant.schemas.job import Interpretation, Job, Priority, ServiceLimits, Status
+from pliant.schemas.options import Options, Output
+from pliant.schemas.shares import Share
 
 DEFAULT_URL = "http://127.0.0.1:8000"
 
@@ -100,12 +103,14 @@ class AsyncClient:
         mesh: Source | tuple[int, int] | None = None,
         ground_truth: Source | None = None,
         rotations: Source | None = None,
+        inputs_of: str | None = None,
         options: Options | Mapping[str, Any] | None = None,
         name: str = "",
         job_id: str | None = None,
         idempotency_key: str | None = None,
         webhook: str | None = None,
         webhook_secret: str | None = None,
+        priority: Priority = "normal",
         on_upload: OnBytes | None = None,
         timeout: float | None = None,
     ) -> AsyncRemoteJob:
@@ -130,6 +135,8 @@ class AsyncClient:
             True shapes (F, P, 3); the job then has error metrics.
         rotations : array_like or path, optional
             Known cameras (F, 2, 3) or (F, 3, 3).
+        inputs_of : str, optional
+            Instead of files: the id of an earlier job, whose inputs are used again with these options.
         options : Options or mapping, optional
             Options of the reconstruction; validated before anything is sent.
         name : str
@@ -143,6 +150,8 @@ class AsyncClient:
             URL that receives the finished job; check messages with `pliant.client.webhooks.verified`.
         webhook_secret : str, optional
             Signs the webhook; create one with `pliant.client.webhooks.new_secret`.
+        priority : str
+            ``"high"``, ``"normal"`` or ``"low"``: the order of your own waiting jobs; those of others are not passed.
         on_upload : callable, optional
             Called with (bytes sent, total bytes).
         timeout : float, optional
@@ -156,7 +165,8 @@ class AsyncClient:
             See `pliant.client.errors`.
         """
         inputs = Inputs(
-            tracks=tracks, film=film, region=region, visible=visible, mesh=mesh, ground_truth=ground_truth, rotations=rotations
+            tracks=tracks, film=film, region=region, visible=visible, mesh=mesh, ground_truth=ground_truth, rotations=rotations,
+            inputs_of=inputs_of,
         )  # fmt: skip
         with tempfile.TemporaryDirectory(prefix="pliant-submit-") as folder:
             job = await operations.submit(
@@ -169,9 +179,53 @@ class AsyncClient:
                 idempotency_key=idempotency_key,
                 webhook=webhook,
                 webhook_secret=webhook_secret,
+                priority=priority,
                 on_upload=on_upload,
             )
         return AsyncRemoteJob(self, job)
+
+    async def map(
+        self,
+        inputs: Iterable[Source | Mapping[str, Any]],
+        *,
+        at_once: int = 8,
+        key: str | None = None,
+        on_failure: OnFailure | None = None,
+        load: bool = True,
+        timeout: float | None = None,
+        **submission: Any,
+    ) -> AsyncGenerator[AsyncResult, None]:
+        """Submit many inputs and yield their results in the order of the inputs.
+
+        Parameters
+        ----------
+        inputs : iterable
+            Each as the first parameter of `submit`.
+        at_once : int
+            Jobs that are submitted ahead of the result that is waited for.
+        key : str, optional
+            Makes the whole call idempotent: repeated with the same key and inputs, it finds the jobs of the first time.
+        on_failure : callable, optional
+            Called with the number of an input, from 0, and the error, where an input is refused or its job fails; the others go on.
+            Without it that error ends the iteration.
+        load : bool
+            Download the arrays and the report of each.
+        timeout : float, optional
+            Seconds to wait for each result.
+        **submission
+            Further parameters of `submit`, the same for all: `mesh`, `options`, `priority`, …
+
+        Raises
+        ------
+        PliantError
+            An input was refused or its job failed, and there is no `on_failure`.
+        """
+        results = mapped(
+            self, inputs, at_once=at_once, key=key, on_failure=on_failure, load=load, timeout=timeout, submission=submission
+        )  # fmt: skip
+        async with aclosing(results):
+            async for result in results:
+                yield result
 
     async def inspect(
         self,
@@ -256,7 +310,7 @@ class AsyncClient:
         record = succeeded(await operations.wait(exchange, job, on_progress=on_progress))
         result = AsyncResult(self, record, folder)
         if load:
-            await operations.fetch(exchange, record, result.folder, names=LOADED, on_download=None)
+            await operations.fetch(exchange, record, result.folder, names=loaded(record), on_download=None)
         return result
 
     async def events(self, job: str, *, timeout: float | None = None) -> AsyncGenerator[Job, None]:
@@ -277,7 +331,7 @@ class AsyncClient:
         record = finished(await operations.get(exchange, job))
         result = AsyncResult(self, record, folder)
         if load:
-            await operations.fetch(exchange, record, result.folder, names=LOADED, on_download=None)
+            await operations.fetch(exchange, record, result.folder, names=loaded(record), on_download=None)
         return result
 
     async def log(self, job: str, *, timeout: float | None = None) -> str:
@@ -291,6 +345,62 @@ class AsyncClient:
     async def retry(self, job: str, *, timeout: float | None = None) -> AsyncRemoteJob:
         """Queue and return a new job with the inputs and options of a failed or cancelled one."""
         return AsyncRemoteJob(self, await operations.retry(self._exchange(timeout), job))
+
+    async def make_outputs(
+        self,
+        job: str,
+        outputs: Iterable[Output] | str,
+        *,
+        fps: float | None = None,
+        idempotency_key: str | None = None,
+        timeout: float | None = None,
+        **options: Any,
+    ) -> AsyncRemoteJob:
+        """Have further files written of a finished job's result, without solving again, and return the job that writes them.
+
+        Parameters
+        ----------
+        job : str
+            The id of a job that has succeeded.
+        outputs : iterable of str, or str
+            Any of ``glb``, ``ply``, ``obj``, ``usd``, ``mdd``, ``mat`` and ``csv``; a text is split at commas.
+        fps : float, optional
+            Frames per second of the written animation; by default the job's.
+        idempotency_key : str, optional
+            By default the same request returns the same job, unless that one failed or was cancelled.
+        **options
+            ``normals``, ``colours``, ``axes``, ``glb_quantized`` and ``glb_motion``; those not given stay as the job has them.
+
+        Raises
+        ------
+        BadArgument
+            An output or an option is unknown or invalid; nothing was sent.
+        InvalidRequest, NotAllowedNow, NotFound
+            The service refuses; see `pliant.client.errors`.
+        """
+        request = further(outputs, {**options, **({} if fps is None else {"fps": fps})})
+        exchange = self._exchange(timeout, "the request for further files")
+        return AsyncRemoteJob(self, await operations.make_outputs(exchange, job, request, key=idempotency_key))
+
+    async def share(self, job: str, *, days: float = 7, timeout: float | None = None) -> Share:
+        """Create a link that shows a finished job's result, read-only, until it expires or is revoked.
+
+        ``f"{client.url}/{share.path}"`` is the address to send; it holds the secret, which the service does not store.
+
+        Parameters
+        ----------
+        days : float
+            How long the link is valid, a minute to 366 days.
+        """
+        return await operations.share(self._exchange(timeout), job, sharing(days))
+
+    async def shares(self, job: str, *, timeout: float | None = None) -> Sequence[Share]:
+        """Return the valid share links of a job, without their secrets."""
+        return await operations.shares(self._exchange(timeout), job)
+
+    async def revoke_share(self, job: str, share: str, *, timeout: float | None = None) -> None:
+        """End a share link, named by its id."""
+        await operations.revoke_share(self._exchange(timeout), job, share)
 
     async def delete(self, job: str, *, timeout: float | None = None) -> None:
         """Delete a finished job and its files."""

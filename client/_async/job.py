@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncGenerator, Iterable
+from collections.abc import AsyncGenerator, Iterable, Mapping
 from contextlib import aclosing
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from pliant.client._async.operations import OnJob
+from pliant.client.errors import JobEnded
 from pliant.client.multipart import OnBytes
-from pliant.client.result import ANIMATION, LOADED, Reconstruction, copied
+from pliant.client.result import ANIMATION, Reconstruction, copied, loaded
 from pliant.schemas.job import Job, Status
+from pliant.schemas.options import Options, Output
+from pliant.schemas.shares import Share
 
 if TYPE_CHECKING:
     from pliant.client._async.client import AsyncClient
@@ -30,7 +33,7 @@ class AsyncRemoteJob:
         self.record = record
 
     def __repr__(self) -> str:
-        return f"<AsyncRemoteJob {self.id} {self.status}>"
+        return f"<AsyncRemoteJob {self.id} {self.status.value}>"
 
     @property
     def id(self) -> str:
@@ -62,13 +65,17 @@ class AsyncRemoteJob:
             if on_progress is not None:
                 on_progress(job)
 
-        result = await self._client.wait(
-            self.id,
-            on_progress=None if on_progress is None else report,
-            folder=folder,
-            load=load,
-            timeout=timeout,
-        )
+        try:
+            result = await self._client.wait(
+                self.id,
+                on_progress=None if on_progress is None else report,
+                folder=folder,
+                load=load,
+                timeout=timeout,
+            )
+        except JobEnded as ended:
+            self.record = ended.job
+            raise
         self.record = result.job
         return result
 
@@ -92,6 +99,30 @@ class AsyncRemoteJob:
         """Queue and return a new job with the same inputs and options, after this one failed or was cancelled."""
         return await self._client.retry(self.id, timeout=timeout)
 
+    async def make_outputs(
+        self,
+        outputs: Iterable[Output] | str,
+        *,
+        fps: float | None = None,
+        idempotency_key: str | None = None,
+        timeout: float | None = None,
+        **options: Any,
+    ) -> AsyncRemoteJob:
+        """Have further files written of the result, without solving again: see `AsyncClient.make_outputs`."""
+        return await self._client.make_outputs(
+            self.id, outputs, fps=fps, idempotency_key=idempotency_key, timeout=timeout, **options
+        )
+
+    async def run_again(
+        self, options: Options | Mapping[str, Any] | None = None, *, name: str = "", timeout: float | None = None
+    ) -> AsyncRemoteJob:
+        """Submit the same inputs with other options, without sending them again; without a name the new job has this one's."""
+        return await self._client.submit(inputs_of=self.id, options=options, name=name, timeout=timeout)
+
+    async def share(self, *, days: float = 7, timeout: float | None = None) -> Share:
+        """Create a read-only link to the result: see `AsyncClient.share`."""
+        return await self._client.share(self.id, days=days, timeout=timeout)
+
     async def delete(self, *, timeout: float | None = None) -> None:
         """Delete the job and its files."""
         await self._client.delete(self.id, timeout=timeout)
@@ -106,7 +137,7 @@ class AsyncResult(Reconstruction):
 
     async def load(self, *, timeout: float | None = None) -> Self:
         """Download the arrays and the report."""
-        await self._client.download(self.job.id, self.folder, names=LOADED, timeout=timeout)
+        await self._client.download(self.job.id, self.folder, names=loaded(self.job), timeout=timeout)
         return self
 
     async def download(

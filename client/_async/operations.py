@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import secrets
-from collections.abc import AsyncGenerator, Callable, Iterable, Mapping
+from collections.abc import AsyncGenerator, Callable, Iterable, Mapping, Sequence
 from contextlib import aclosing
 from functools import partial
 from pathlib import Path
@@ -22,6 +22,8 @@ from pliant.client.pauses import async_sleep, in_thread
 from pliant.client.result import job_path, unknown_file
 from pliant.schemas.job import Interpretation, Job, JobPage, ServiceLimits, Status
 from pliant.schemas.options import Options
+from pliant.schemas.outputs import OutputRequest
+from pliant.schemas.shares import Share, ShareRequest
 
 OnJob = Callable[[Job], None]
 """Called with the job each time its record changes."""
@@ -40,10 +42,14 @@ async def submit(
     idempotency_key: str | None,
     webhook: str | None,
     webhook_secret: str | None,
+    priority: str,
     on_upload: OnBytes | None,
 ) -> Job:
     """Submit inputs and return the new job. Temporary files are written to `folder`, which the caller removes."""
-    texts = {"name": name, "webhook": webhook or "", "webhook_secret": webhook_secret or ""}
+    texts = {
+        "name": name, "webhook": webhook or "", "webhook_secret": webhook_secret or "",
+        "priority": "" if priority == "normal" else priority,  # a service that does not know it accepts the usual one
+    }  # fmt: skip
     fields = _fields(options) | {key: text for key, text in texts.items() if text != ""}
     whole = await in_thread(partial(inputs.form, folder, fields, on_upload))
     key = idempotency_key if idempotency_key is not None else secrets.token_urlsafe(16)
@@ -144,6 +150,32 @@ async def retry(exchange: Exchange, job: str) -> Job:
     """Queue a new job with the inputs and options of a failed or cancelled one."""
     headers = {"Idempotency-Key": secrets.token_urlsafe(16)}
     return await exchange.record(Call(method="POST", path=f"{job_path(job)}/retry", headers=headers), Job)
+
+
+async def make_outputs(exchange: Exchange, job: str, request: OutputRequest, *, key: str | None) -> Job:
+    """Queue a job that writes further files of a result."""
+    headers = {"Content-Type": JSON} | ({} if key is None else {"Idempotency-Key": key})
+    body = request.model_dump_json(exclude_unset=True).encode()
+    call = Call(method="POST", path=f"{job_path(job)}/outputs", headers=headers, content=body, changes_nothing=True)
+    return await exchange.record(call, Job)
+
+
+async def share(exchange: Exchange, job: str, request: ShareRequest) -> Share:
+    """Create a share link."""
+    body = request.model_dump_json(exclude_unset=True).encode()
+    call = Call(method="POST", path=f"{job_path(job)}/shares", headers={"Content-Type": JSON}, content=body)
+    return await exchange.record(call, Share)
+
+
+async def shares(exchange: Exchange, job: str) -> Sequence[Share]:
+    """Read the valid share links of a job."""
+    _, body = await exchange.answer(Call(method="GET", path=f"{job_path(job)}/shares", headers={"Accept": JSON}))
+    return [Share.model_validate(each) for each in json.loads(body)]
+
+
+async def revoke_share(exchange: Exchange, job: str, share_id: str) -> None:
+    """End a share link."""
+    await exchange.answer(Call(method="DELETE", path=f"{job_path(job)}/shares/{quote(share_id, safe='')}"))
 
 
 async def delete(exchange: Exchange, job: str) -> None:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import os
 import ssl
 import tempfile
-from collections.abc import Callable, Generator, Iterable, Mapping
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from types import TracebackType
@@ -15,15 +15,18 @@ from typing import Any, Self
 import httpx
 from numpy.typing import ArrayLike
 from pliant.client._sync import operations
+from pliant.client._sync.batch import OnFailure, mapped
 from pliant.client._sync.job import RemoteJob, Result
 from pliant.client._sync.operations import OnJob
 from pliant.client._sync.transport import Exchange
 from pliant.client.call import base_of, headers_of
 from pliant.client.multipart import Inputs, OnBytes, Source
-from pliant.client.result import LOADED, finished, succeeded
+from pliant.client.requests import further, sharing
+from pliant.client.result import finished, loaded, succeeded
 from pliant.client.retry import Attempts, Contact, Retry
-from pliant.schemas.job import Interpretation, Job, ServiceLimits, Status
-from pliant.schemas.options import Options
+from pliant.schemas.job import Interpretation, Job, Priority, ServiceLimits, Status
+from pliant.schemas.options import Options, Output
+from pliant.schemas.shares import Share
 
 DEFAULT_URL = "http://127.0.0.1:8000"
 
@@ -101,12 +104,14 @@ class Client:
         mesh: Source | tuple[int, int] | None = None,
         ground_truth: Source | None = None,
         rotations: Source | None = None,
+        inputs_of: str | None = None,
         options: Options | Mapping[str, Any] | None = None,
         name: str = "",
         job_id: str | None = None,
         idempotency_key: str | None = None,
         webhook: str | None = None,
         webhook_secret: str | None = None,
+        priority: Priority = "normal",
         on_upload: OnBytes | None = None,
         timeout: float | None = None,
     ) -> RemoteJob:
@@ -131,6 +136,8 @@ class Client:
             True shapes (F, P, 3); the job then has error metrics.
         rotations : array_like or path, optional
             Known cameras (F, 2, 3) or (F, 3, 3).
+        inputs_of : str, optional
+            Instead of files: the id of an earlier job, whose inputs are used again with these options.
         options : Options or mapping, optional
             Options of the reconstruction; validated before anything is sent.
         name : str
@@ -144,6 +151,8 @@ class Client:
             URL that receives the finished job; check messages with `pliant.client.webhooks.verified`.
         webhook_secret : str, optional
             Signs the webhook; create one with `pliant.client.webhooks.new_secret`.
+        priority : str
+            ``"high"``, ``"normal"`` or ``"low"``: the order of your own waiting jobs; those of others are not passed.
         on_upload : callable, optional
             Called with (bytes sent, total bytes).
         timeout : float, optional
@@ -157,7 +166,8 @@ class Client:
             See `pliant.client.errors`.
         """
         inputs = Inputs(
-            tracks=tracks, film=film, region=region, visible=visible, mesh=mesh, ground_truth=ground_truth, rotations=rotations
+            tracks=tracks, film=film, region=region, visible=visible, mesh=mesh, ground_truth=ground_truth, rotations=rotations,
+            inputs_of=inputs_of,
         )  # fmt: skip
         with tempfile.TemporaryDirectory(prefix="pliant-submit-") as folder:
             job = operations.submit(
@@ -170,9 +180,53 @@ class Client:
                 idempotency_key=idempotency_key,
                 webhook=webhook,
                 webhook_secret=webhook_secret,
+                priority=priority,
                 on_upload=on_upload,
             )
         return RemoteJob(self, job)
+
+    def map(
+        self,
+        inputs: Iterable[Source | Mapping[str, Any]],
+        *,
+        at_once: int = 8,
+        key: str | None = None,
+        on_failure: OnFailure | None = None,
+        load: bool = True,
+        timeout: float | None = None,
+        **submission: Any,
+    ) -> Generator[Result, None, None]:
+        """Submit many inputs and yield their results in the order of the inputs.
+
+        Parameters
+        ----------
+        inputs : iterable
+            Each as the first parameter of `submit`.
+        at_once : int
+            Jobs that are submitted ahead of the result that is waited for.
+        key : str, optional
+            Makes the whole call idempotent: repeated with the same key and inputs, it finds the jobs of the first time.
+        on_failure : callable, optional
+            Called with the number of an input, from 0, and the error, where an input is refused or its job fails; the others go on.
+            Without it that error ends the iteration.
+        load : bool
+            Download the arrays and the report of each.
+        timeout : float, optional
+            Seconds to wait for each result.
+        **submission
+            Further parameters of `submit`, the same for all: `mesh`, `options`, `priority`, …
+
+        Raises
+        ------
+        PliantError
+            An input was refused or its job failed, and there is no `on_failure`.
+        """
+        results = mapped(
+            self, inputs, at_once=at_once, key=key, on_failure=on_failure, load=load, timeout=timeout, submission=submission
+        )  # fmt: skip
+        with closing(results):
+            for result in results:
+                yield result
 
     def inspect(
         self,
@@ -257,7 +311,7 @@ class Client:
         record = succeeded(operations.wait(exchange, job, on_progress=on_progress))
         result = Result(self, record, folder)
         if load:
-            operations.fetch(exchange, record, result.folder, names=LOADED, on_download=None)
+            operations.fetch(exchange, record, result.folder, names=loaded(record), on_download=None)
         return result
 
     def events(self, job: str, *, timeout: float | None = None) -> Generator[Job, None, None]:
@@ -278,7 +332,7 @@ class Client:
         record = finished(operations.get(exchange, job))
         result = Result(self, record, folder)
         if load:
-            operations.fetch(exchange, record, result.folder, names=LOADED, on_download=None)
+            operations.fetch(exchange, record, result.folder, names=loaded(record), on_download=None)
         return result
 
     def log(self, job: str, *, timeout: float | None = None) -> str:
@@ -292,6 +346,62 @@ class Client:
     def retry(self, job: str, *, timeout: float | None = None) -> RemoteJob:
         """Queue and return a new job with the inputs and options of a failed or cancelled one."""
         return RemoteJob(self, operations.retry(self._exchange(timeout), job))
+
+    def make_outputs(
+        self,
+        job: str,
+        outputs: Iterable[Output] | str,
+        *,
+        fps: float | None = None,
+        idempotency_key: str | None = None,
+        timeout: float | None = None,
+        **options: Any,
+    ) -> RemoteJob:
+        """Have further files written of a finished job's result, without solving again, and return the job that writes them.
+
+        Parameters
+        ----------
+        job : str
+            The id of a job that has succeeded.
+        outputs : iterable of str, or str
+            Any of ``glb``, ``ply``, ``obj``, ``usd``, ``mdd``, ``mat`` and ``csv``; a text is split at commas.
+        fps : float, optional
+            Frames per second of the written animation; by default the job's.
+        idempotency_key : str, optional
+            By default the same request returns the same job, unless that one failed or was cancelled.
+        **options
+            ``normals``, ``colours``, ``axes``, ``glb_quantized`` and ``glb_motion``; those not given stay as the job has them.
+
+        Raises
+        ------
+        BadArgument
+            An output or an option is unknown or invalid; nothing was sent.
+        InvalidRequest, NotAllowedNow, NotFound
+            The service refuses; see `pliant.client.errors`.
+        """
+        request = further(outputs, {**options, **({} if fps is None else {"fps": fps})})
+        exchange = self._exchange(timeout, "the request for further files")
+        return RemoteJob(self, operations.make_outputs(exchange, job, request, key=idempotency_key))
+
+    def share(self, job: str, *, days: float = 7, timeout: float | None = None) -> Share:
+        """Create a link that shows a finished job's result, read-only, until it expires or is revoked.
+
+        ``f"{client.url}/{share.path}"`` is the address to send; it holds the secret, which the service does not store.
+
+        Parameters
+        ----------
+        days : float
+            How long the link is valid, a minute to 366 days.
+        """
+        return operations.share(self._exchange(timeout), job, sharing(days))
+
+    def shares(self, job: str, *, timeout: float | None = None) -> Sequence[Share]:
+        """Return the valid share links of a job, without their secrets."""
+        return operations.shares(self._exchange(timeout), job)
+
+    def revoke_share(self, job: str, share: str, *, timeout: float | None = None) -> None:
+        """End a share link, named by its id."""
+        operations.revoke_share(self._exchange(timeout), job, share)
 
     def delete(self, job: str, *, timeout: float | None = None) -> None:
         """Delete a finished job and its files."""

@@ -3,15 +3,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterable
+from collections.abc import Generator, Iterable, Mapping
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from pliant.client._sync.operations import OnJob
+from pliant.client.errors import JobEnded
 from pliant.client.multipart import OnBytes
-from pliant.client.result import ANIMATION, LOADED, Reconstruction, copied
+from pliant.client.result import ANIMATION, Reconstruction, copied, loaded
 from pliant.schemas.job import Job, Status
+from pliant.schemas.options import Options, Output
+from pliant.schemas.shares import Share
 
 if TYPE_CHECKING:
     from pliant.client._sync.client import Client
@@ -31,7 +34,7 @@ class RemoteJob:
         self.record = record
 
     def __repr__(self) -> str:
-        return f"<RemoteJob {self.id} {self.status}>"
+        return f"<RemoteJob {self.id} {self.status.value}>"
 
     @property
     def id(self) -> str:
@@ -63,13 +66,17 @@ class RemoteJob:
             if on_progress is not None:
                 on_progress(job)
 
-        result = self._client.wait(
-            self.id,
-            on_progress=None if on_progress is None else report,
-            folder=folder,
-            load=load,
-            timeout=timeout,
-        )
+        try:
+            result = self._client.wait(
+                self.id,
+                on_progress=None if on_progress is None else report,
+                folder=folder,
+                load=load,
+                timeout=timeout,
+            )
+        except JobEnded as ended:
+            self.record = ended.job
+            raise
         self.record = result.job
         return result
 
@@ -93,6 +100,30 @@ class RemoteJob:
         """Queue and return a new job with the same inputs and options, after this one failed or was cancelled."""
         return self._client.retry(self.id, timeout=timeout)
 
+    def make_outputs(
+        self,
+        outputs: Iterable[Output] | str,
+        *,
+        fps: float | None = None,
+        idempotency_key: str | None = None,
+        timeout: float | None = None,
+        **options: Any,
+    ) -> RemoteJob:
+        """Have further files written of the result, without solving again: see `Client.make_outputs`."""
+        return self._client.make_outputs(
+            self.id, outputs, fps=fps, idempotency_key=idempotency_key, timeout=timeout, **options
+        )
+
+    def run_again(
+        self, options: Options | Mapping[str, Any] | None = None, *, name: str = "", timeout: float | None = None
+    ) -> RemoteJob:
+        """Submit the same inputs with other options, without sending them again; without a name the new job has this one's."""
+        return self._client.submit(inputs_of=self.id, options=options, name=name, timeout=timeout)
+
+    def share(self, *, days: float = 7, timeout: float | None = None) -> Share:
+        """Create a read-only link to the result: see `Client.share`."""
+        return self._client.share(self.id, days=days, timeout=timeout)
+
     def delete(self, *, timeout: float | None = None) -> None:
         """Delete the job and its files."""
         self._client.delete(self.id, timeout=timeout)
@@ -107,7 +138,7 @@ class Result(Reconstruction):
 
     def load(self, *, timeout: float | None = None) -> Self:
         """Download the arrays and the report."""
-        self._client.download(self.job.id, self.folder, names=LOADED, timeout=timeout)
+        self._client.download(self.job.id, self.folder, names=loaded(self.job), timeout=timeout)
         return self
 
     def download(

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 import secrets
-from collections.abc import Callable, Generator, Iterable, Mapping
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -23,6 +23,8 @@ from pliant.client.pauses import in_place, sleep
 from pliant.client.result import job_path, unknown_file
 from pliant.schemas.job import Interpretation, Job, JobPage, ServiceLimits, Status
 from pliant.schemas.options import Options
+from pliant.schemas.outputs import OutputRequest
+from pliant.schemas.shares import Share, ShareRequest
 
 OnJob = Callable[[Job], None]
 """Called with the job each time its record changes."""
@@ -41,10 +43,14 @@ def submit(
     idempotency_key: str | None,
     webhook: str | None,
     webhook_secret: str | None,
+    priority: str,
     on_upload: OnBytes | None,
 ) -> Job:
     """Submit inputs and return the new job. Temporary files are written to `folder`, which the caller removes."""
-    texts = {"name": name, "webhook": webhook or "", "webhook_secret": webhook_secret or ""}
+    texts = {
+        "name": name, "webhook": webhook or "", "webhook_secret": webhook_secret or "",
+        "priority": "" if priority == "normal" else priority,  # a service that does not know it accepts the usual one
+    }  # fmt: skip
     fields = _fields(options) | {key: text for key, text in texts.items() if text != ""}
     whole = in_place(partial(inputs.form, folder, fields, on_upload))
     key = idempotency_key if idempotency_key is not None else secrets.token_urlsafe(16)
@@ -145,6 +151,32 @@ def retry(exchange: Exchange, job: str) -> Job:
     """Queue a new job with the inputs and options of a failed or cancelled one."""
     headers = {"Idempotency-Key": secrets.token_urlsafe(16)}
     return exchange.record(Call(method="POST", path=f"{job_path(job)}/retry", headers=headers), Job)
+
+
+def make_outputs(exchange: Exchange, job: str, request: OutputRequest, *, key: str | None) -> Job:
+    """Queue a job that writes further files of a result."""
+    headers = {"Content-Type": JSON} | ({} if key is None else {"Idempotency-Key": key})
+    body = request.model_dump_json(exclude_unset=True).encode()
+    call = Call(method="POST", path=f"{job_path(job)}/outputs", headers=headers, content=body, changes_nothing=True)
+    return exchange.record(call, Job)
+
+
+def share(exchange: Exchange, job: str, request: ShareRequest) -> Share:
+    """Create a share link."""
+    body = request.model_dump_json(exclude_unset=True).encode()
+    call = Call(method="POST", path=f"{job_path(job)}/shares", headers={"Content-Type": JSON}, content=body)
+    return exchange.record(call, Share)
+
+
+def shares(exchange: Exchange, job: str) -> Sequence[Share]:
+    """Read the valid share links of a job."""
+    _, body = exchange.answer(Call(method="GET", path=f"{job_path(job)}/shares", headers={"Accept": JSON}))
+    return [Share.model_validate(each) for each in json.loads(body)]
+
+
+def revoke_share(exchange: Exchange, job: str, share_id: str) -> None:
+    """End a share link."""
+    exchange.answer(Call(method="DELETE", path=f"{job_path(job)}/shares/{quote(share_id, safe='')}"))
 
 
 def delete(exchange: Exchange, job: str) -> None:

@@ -10,16 +10,17 @@ import time
 from anyio import to_thread
 from fastapi.responses import Response
 from pliant.schemas.problems import ProblemCode
+from pliant.service.middleware.share_links import authorize_share, share_of
 from pliant.service.problems import ProblemResponse, answer, from_error
 from pliant.service.settings import ServiceSettings
 from pliant.worker.errors import StoreUnavailable, UnknownToken
-from pliant.worker.records import utc_now
+from pliant.worker.records import Records, utc_now
 from pliant.worker.tokens import Scope, Token, Tokens
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Send
 from starlette.types import Scope as AsgiScope
 
-PUBLIC = frozenset({"/", "/docs", "/openapi.json", "/healthz", "/readyz", "/errors"})
+PUBLIC = frozenset({"/", "/guide", "/docs", "/openapi.json", "/healthz", "/readyz", "/errors"})
 """Paths that need no token: the page, which must load to ask for one, the API's description and reference, and the health checks."""
 PUBLIC_FOLDERS = ("/page/", "/errors/")
 """The files of the page, and the explanations of error codes."""
@@ -76,18 +77,28 @@ class StillValid:
 class Authentication:
     """ASGI middleware that requires a valid token and sets `pliant.token` and `pliant.owner` in the request's scope.
 
-    The owner is None where all jobs are visible: with tokens off, and with the scope `admin`.
+    The owner is None where all jobs are visible: with tokens off, and with the scope `admin`. The token of a share link is checked
+    even where tokens are off.
     """
 
-    def __init__(self, app: ASGIApp, settings: ServiceSettings, tokens: Tokens) -> None:
+    def __init__(self, app: ASGIApp, settings: ServiceSettings, tokens: Tokens, records: Records) -> None:
         self._app = app
+        self._records = records
         self._on = settings.asks_for_tokens
         self._tokens = tokens
         self._recheck = settings.heartbeat_seconds
 
     async def __call__(self, scope: AsgiScope, receive: Receive, send: Send) -> None:
         """Pass on an authorized request, refuse the others."""
-        if scope["type"] != "http" or not self._on or is_public(scope["path"]):
+        if scope["type"] != "http" or is_public(scope["path"]):
+            await self._app(scope, receive, send)
+            return
+        share = share_of(scope)
+        if share is not None:
+            refusal = await authorize_share(scope, share, self._records)
+            await (self._app if refusal is None else refusal)(scope, receive, send)
+            return
+        if not self._on:
             await self._app(scope, receive, send)
             return
         try:

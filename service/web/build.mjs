@@ -1,5 +1,5 @@
 // Bundles src/ into dist/: one script, one stylesheet, names that change with their content, and a gzip twin of each.
-// The two HTML files keep their names; they are the only files that a browser has to revalidate.
+// The HTML files keep their names; they are the only files that a browser has to revalidate.
 
 import { build } from "esbuild";
 import { mkdir, readFile, readdir, rename, rm, writeFile } from "node:fs/promises";
@@ -34,15 +34,31 @@ const bundled = await build({
   logLevel: "warning",
 });
 
+// The viewer that a saved page holds: one classic script, because a page opened from a disk cannot load modules.
+const alone = await build({
+  absWorkingDir: here,
+  entryPoints: ["src/standalone.ts"],
+  entryNames: "[name]-[hash]",
+  outdir: next,
+  bundle: true,
+  minify: true,
+  format: "iife",
+  target: ["es2022"],
+  legalComments: "inline",
+  metafile: true,
+  logLevel: "warning",
+});
+entries.push("src/standalone.ts");
+
 const produced = {};
-for (const [path, output] of Object.entries(bundled.metafile.outputs)) {
+for (const [path, output] of Object.entries({ ...bundled.metafile.outputs, ...alone.metafile.outputs })) {
   if (!entries.includes(output.entryPoint)) continue;
   produced[basename(output.entryPoint)] = basename(path);
   // A script that imports a stylesheet has a second output beside it.
   if (output.cssBundle) produced[basename(output.entryPoint).replace(/\.ts$/, ".css")] = basename(output.cssBundle);
 }
 
-for (const document of ["index.html", "docs.html"]) {
+for (const document of ["index.html", "docs.html", "guide.html"]) {
   const html = await readFile(join(here, "src", document), "utf8");
   const linked = html.replace(/"page\/([^"]+)"/g, (_, source) => {
     if (!(source in produced)) throw new Error(`src/${document} mentions page/${source}, which is not bundled`);

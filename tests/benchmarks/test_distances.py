@@ -26,7 +26,7 @@ def standing(frames: int = 60, points: int = 80) -> Tracks:
 
 
 def test_a_pinhole_at_a_distance_is_orthography_in_the_limit(bench) -> None:
-    distances = bench("distances")
+    distances = bench("accuracy.distances")
     case = distances.cases(None, points=60, visibility="all", only=["sphere"])
     case = next(iter(case))
     near, shapes, _ = distances.seen_from(case, 3.0)
@@ -40,7 +40,7 @@ def test_a_pinhole_at_a_distance_is_orthography_in_the_limit(bench) -> None:
 
 
 def test_drift_grows_like_a_random_walk_and_noise_does_not(bench) -> None:
-    spoiling = bench("spoiling")
+    spoiling = bench("accuracy.spoiling")
     tracks = standing(points=2000)
     drift = spoiling.spoiled(tracks, spoiling.SPOILINGS["drift"]).points - tracks.points
     np.testing.assert_allclose(drift.std(axis=(1, 2)), 0.1 * np.sqrt(np.arange(60)), rtol=0.1, atol=1e-9)
@@ -50,7 +50,7 @@ def test_drift_grows_like_a_random_walk_and_noise_does_not(bench) -> None:
 
 
 def test_tracks_begin_and_end_anywhere_and_some_jump(bench) -> None:
-    spoiling = bench("spoiling")
+    spoiling = bench("accuracy.spoiling")
     tracks = standing(points=2000)
     found = spoiling.spoiled(tracks, spoiling.SPOILINGS["births"])
     seen = found.visible > 0
@@ -66,7 +66,7 @@ def test_tracks_begin_and_end_anywhere_and_some_jump(bench) -> None:
 
 @pytest.mark.slow
 def test_distances_are_measured_once_and_drawn(bench, tmp_path, monkeypatch) -> None:
-    distances, plots = bench("distances"), bench("plots")
+    distances, plots = bench("accuracy.distances"), bench("figures.plots")
     out = tmp_path / "distances.jsonl"
     given = ["--only", "sphere", "--points", "60", "--distances", "inf", "--methods", "orthographic", "--out", str(out)]
     distances.main(given)
@@ -85,7 +85,7 @@ def test_distances_are_measured_once_and_drawn(bench, tmp_path, monkeypatch) -> 
 
 @pytest.mark.slow
 def test_the_choice_of_a_camera_is_tabulated(bench, tmp_path, capsys) -> None:
-    choice = bench("camera_choice")
+    choice = bench("accuracy.camera_choice")
     out = tmp_path / "choice.jsonl"
     choice.main(["--only", "sphere", "--points", "60", "--out", str(out)])
     row = json.loads(out.read_text())

@@ -18,19 +18,26 @@ from pliant.client import (
     AsyncClient,
     AsyncRemoteJob,
     AsyncResult,
+    BadArgument,
     Client,
     InvalidRequest,
     Job,
     JobCancelled,
+    JobFailed,
     NotAllowedNow,
+    NotAuthorized,
     NotFound,
+    Problem,
     Retry,
     Status,
 )
 from pliant.service.testing import InMemoryService
 
 PATIENT = Retry(shortest_pause=0.01, poll_interval=0.02)
-FAST = {"prior": "smooth+low_rank", "max_reweightings": 2, "tolerance": 0.1}
+FAST = {
+    "prior": "smooth+low_rank", "max_reweightings": 2, "tolerance": 0.1, "refine_rotations": False, "surface": "free",
+    "camera": "orthographic",
+}  # fmt: skip
 """Options with which a tiny job ends within a second."""
 
 
@@ -100,7 +107,7 @@ def test_a_result_holds_arrays_report_and_job(client: Client, tmp_path: Path) ->
     assert set(everything) == {artifact.name for artifact in result.job.artifacts}
 
 
-def test_what_the_service_refuses_is_a_typed_error_with_its_sentence(client: Client) -> None:
+def test_rejected_requests_raise_typed_errors_with_the_services_message(client: Client) -> None:
     with pytest.raises(InvalidRequest) as caught:
         client.submit(np.ones((2, 9, 2)), name="too-short")
     assert caught.value.code == "too_few_frames"
@@ -110,7 +117,7 @@ def test_what_the_service_refuses_is_a_typed_error_with_its_sentence(client: Cli
     assert "too-short" not in [job.record.name for job in client.list()]
 
 
-def test_inspecting_says_what_the_job_would_and_makes_none(client: Client) -> None:
+def test_inspecting_returns_the_interpretation_without_creating_a_job(client: Client) -> None:
     points = moving_points()
     points[2, 3] = np.nan
     before = [job.id for job in client.list()]
@@ -125,7 +132,7 @@ def test_inspecting_says_what_the_job_would_and_makes_none(client: Client) -> No
     assert caught.value.code == "too_few_frames"
 
 
-def test_the_same_idempotency_key_makes_one_job(client: Client) -> None:
+def test_the_same_idempotency_key_creates_one_job(client: Client) -> None:
     points, key = moving_points(), secrets.token_hex()
     first = client.submit(points, options=FAST, idempotency_key=key)
     assert client.submit(points, options=FAST, idempotency_key=key).id == first.id
@@ -134,7 +141,7 @@ def test_the_same_idempotency_key_makes_one_job(client: Client) -> None:
         client.submit(points + 1, options=FAST, idempotency_key=key)
 
 
-def test_a_job_may_bring_its_own_id(client: Client) -> None:
+def test_a_job_can_have_an_id_chosen_by_the_client(client: Client) -> None:
     points, mine = moving_points(), f"take-{secrets.token_hex(4)}"
     assert client.submit(points, options=FAST, job_id=mine).id == mine
     assert client.submit(points, options=FAST, job_id=mine).id == mine
@@ -191,7 +198,7 @@ def test_many_jobs_at_once(asked: dict[str, Any]) -> None:
     asyncio.run(use())
 
 
-def test_events_tell_a_job_from_its_queue_to_its_end(client: Client) -> None:
+def test_events_follow_a_job_from_the_queue_to_its_end(client: Client) -> None:
     job = client.submit(moving_points(), options=FAST)
     seen = list(job.events(timeout=60))
     assert [each.status for each in seen][-1] is Status.SUCCEEDED
@@ -200,7 +207,7 @@ def test_events_tell_a_job_from_its_queue_to_its_end(client: Client) -> None:
     assert [order.index(each.status) for each in seen] == sorted(order.index(each.status) for each in seen)
 
 
-def test_a_result_before_its_time_is_refused(client: Client) -> None:
+def test_a_result_of_an_unfinished_job_is_an_error(client: Client) -> None:
     job = client.submit(**long_request())
     with pytest.raises(NotAllowedNow, match="no result yet"):
         client.result(job.id)
@@ -229,7 +236,7 @@ def test_cancelling_ends_the_wait_and_a_retry_is_a_new_job(kind: str, asked: dic
         again.cancel()
 
 
-def test_what_is_large_is_sent_ahead_and_comes_to_the_same(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_inputs_are_uploaded_first_with_the_same_result(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
     points, key = moving_points(6, 4000), secrets.token_hex()
     carried = client.submit(points, options=FAST, idempotency_key=key)
     monkeypatch.setattr("pliant.client.multipart.LARGE", 100_000)
@@ -248,3 +255,95 @@ def test_what_is_large_is_sent_ahead_and_comes_to_the_same(client: Client, monke
     with pytest.raises(InvalidRequest) as caught:
         client.submit(np.ones((2, 9000, 2)))
     assert caught.value.code == "too_few_frames"
+
+
+def test_further_files_are_made_of_the_stored_result_without_solving(client: Client, tmp_path: Path) -> None:
+    solved = client.submit(moving_points(), options={**FAST, "outputs": ("csv",)}, name="sheet")
+    result = solved.wait(timeout=60)
+    more = solved.make_outputs(["mdd", "glb"], fps=50)
+    assert (more.record.outputs_of, more.record.name, more.record.options.fps) == (solved.id, "sheet", 50)
+    done = more.wait(timeout=60)
+    assert [each.name for each in done.job.artifacts] == ["shapes.glb", "shapes.mdd", "report.json"]
+    assert (done.job.verdict, done.job.metrics) == (result.job.verdict, result.job.metrics)
+    assert done.report["outputs_of"] == solved.id
+    cache = done.download(tmp_path, names=["shapes.mdd"])["shapes.mdd"].read_bytes()
+    assert np.frombuffer(cache, ">i4", 2).tolist() == [6, 16]
+    np.testing.assert_allclose(np.frombuffer(cache, ">f4", 6, 8), np.arange(6) / 50, rtol=1e-6)
+    upright = result.shapes * [1, -1, -1]
+    np.testing.assert_allclose(np.frombuffer(cache, ">f4", offset=32).reshape(6, 16, 3), upright, rtol=1e-5, atol=1e-4)
+    assert solved.make_outputs("glb,mdd", fps=50).id == more.id, "the same request returns the same job"
+    assert solved.make_outputs(["mdd"]).id != more.id
+    solved.delete()
+    assert client.get(more.id).status is Status.SUCCEEDED, "it has copies of what it needs"
+    with pytest.raises(NotFound):
+        solved.make_outputs(["obj"])
+
+
+def test_further_files_are_refused_where_there_is_no_result(client: Client) -> None:
+    job = client.submit(**long_request())
+    with pytest.raises(NotAllowedNow, match="Wait until it has succeeded"):
+        job.make_outputs(["obj"])
+    job.cancel()
+    with pytest.raises(BadArgument, match="outputs"):
+        job.make_outputs(["fbx"])
+    with pytest.raises(BadArgument, match="fps"):
+        job.make_outputs(["glb"], fps=0)
+    finished = client.submit(moving_points(), options=FAST)
+    finished.wait(timeout=60)
+    more = finished.make_outputs(["csv"])
+    more.wait(timeout=60)
+    with pytest.raises(NotAllowedNow, match=f"make them from that one|{finished.id}"):
+        more.make_outputs(["obj"])
+
+
+def test_kept_inputs_run_again_with_other_options(client: Client) -> None:
+    first = client.submit(moving_points(), options={**FAST, "stride": 2}, name="walk")
+    shapes = first.wait(timeout=60).shapes
+    again = first.run_again({**FAST, "loss": "l2"})
+    assert (again.record.name, again.record.options.stride, again.record.options.loss) == ("walk", 2, "l2")
+    assert again.record.interpretation == first.record.interpretation
+    assert again.wait(timeout=60).shapes.shape == shapes.shape
+    with pytest.raises(InvalidRequest) as caught:
+        first.run_again({**FAST, "stride": 3})
+    assert (caught.value.code, caught.value.problem.field) == ("conflicting_parts", "options.stride")
+    with pytest.raises(BadArgument, match="expected no other inputs, got tracks as well"):
+        client.submit(moving_points(), inputs_of=first.id)
+    with pytest.raises(NotFound):
+        client.submit(inputs_of="no-such-job")
+
+
+def test_a_share_link_reads_one_result_until_it_is_revoked(
+    client: Client, asked: dict[str, Any], tmp_path: Path
+) -> None:
+    job, other = (client.submit(moving_points(), options=FAST) for _ in range(2))
+    job.wait(timeout=60)
+    share = job.share(days=1)
+    assert share.token is not None
+    assert share.path == f"#share={share.token}"
+    with opened("sync", {**asked, "token": share.token}) as guest:
+        assert guest.get(job.id).status is Status.SUCCEEDED
+        assert guest.result(job.id, folder=tmp_path).shapes.shape == (6, 16, 3)
+        for forbidden in (lambda: guest.get(other.id), lambda: guest.log(job.id), lambda: guest.delete(job.id)):
+            with pytest.raises(NotAuthorized) as caught:
+                forbidden()
+            assert caught.value.code == "beyond_share"
+        assert [each.id for each in client.shares(job.id)] == [share.id]
+        assert [each.token for each in client.shares(job.id)] == [None]
+        client.revoke_share(job.id, share.id)
+        with pytest.raises(NotAuthorized) as caught:
+            guest.get(job.id)
+        assert caught.value.code == "invalid_share"
+    with pytest.raises(NotFound):
+        client.revoke_share(job.id, share.id)
+    with pytest.raises(BadArgument, match="a minute"):
+        job.share(days=1000)
+
+
+def test_a_job_that_failed_is_failed_after_the_wait(kind: str) -> None:
+    problem = Problem(title="Too short", status=422, code="too_few_frames", detail="Track more frames.")
+    with opened(kind, {"url": "http://pliant.test", "transport": InMemoryService(problem=problem)}) as client:
+        job = client.submit(moving_points(), options=FAST)
+        with pytest.raises(JobFailed):
+            job.wait(timeout=60)
+        assert job.status is Status.FAILED
+        assert kind == "async" or repr(job) == f"<RemoteJob {job.id} failed>"

@@ -67,12 +67,12 @@ def test_estimated_cameras_and_a_mesh_run_end_to_end() -> None:
 
 
 def test_the_same_call_gives_the_same_bits() -> None:
-    _, _, tracks, mesh = scene()
+    _, _, tracks, mesh = scene(5)
     one, two = solve(tracks, mesh), solve(tracks, mesh)
     assert np.array_equal(one.shapes, two.shapes)
 
 
-def test_stopping_gives_the_last_shapes_and_says_so() -> None:
+def test_stopping_returns_the_last_shapes_with_outcome_stopped() -> None:
     _, rotations, tracks, mesh = scene()
     asked = iter([False] * 3)
     found = solve(tracks, mesh, cameras=cameras_of(rotations), should_stop=lambda: next(asked, True))

@@ -1,8 +1,9 @@
-"""A moving shape as morph targets: one per frame for short sequences, modes of motion for long ones.
+"""A moving shape as morph targets: modes of motion, or one target per frame.
 
-Viewers handle about 256 targets correctly and slow down beyond. Up to 200 frames, each frame is a target with one-hot weights, so every
-frame is exact in single precision. Above, the frames minus their mean are expanded in principal components (SVD); the weights are the
-coefficients, shifted and scaled to [0, 1] because viewers clamp weights to the range of their sliders (Blender does).
+The frames minus their mean are expanded in principal components (SVD); the weights are the coefficients, shifted and scaled to [0, 1]
+because viewers clamp weights to the range of their sliders (Blender does). The fewest modes are kept that bring every point of every frame
+within a bound, always fewer than frames. On request each frame is its own target instead, with one-hot weights, exact in single
+precision. Viewers handle about 256 targets correctly and slow down beyond, so more than 200 frames always become modes.
 
 Targets are generated on demand, and operations over all frames process blocks of points, so that the memory beside the shapes is one
 frame or the modes, never a copy of the sequence.
@@ -47,9 +48,23 @@ class Animation:
     """Metadata for the file: encoding and error bound, in the tracks' unit."""
 
 
-def animate(shapes: Floats, *, y_axis: str = "up") -> Animation:
-    """Encode shapes `(F, P, 3)` with y up, exactly up to 200 frames and within the error bound above."""
-    return (_per_frame if len(shapes) <= MAX_FRAME_TARGETS else _modes)(shapes, y_axis)
+def animate(shapes: Floats, *, y_axis: str = "up", motion: str = "auto") -> Animation:
+    """Encode shapes `(F, P, 3)`, turned to y up.
+
+    Parameters
+    ----------
+    shapes : array, shape (F, P, 3)
+        World axes.
+    y_axis : {'up', 'down'}
+        Where y of the shapes points.
+    motion : {'auto', 'frames'}
+        auto: as few modes as keep every point within `ERROR_BOUND`. frames: exact, up to 200 frames.
+    """
+    if len(shapes) > MAX_FRAME_TARGETS:
+        return _modes(shapes, y_axis, MAX_MODES)
+    if motion == "frames" or len(shapes) < 3:
+        return _per_frame(shapes, y_axis)
+    return _modes(shapes, y_axis, len(shapes) - 1)  # as many hold any motion, and are still fewer than the frames
 
 
 def _per_frame(shapes: Floats, y_axis: str) -> Animation:
@@ -69,14 +84,14 @@ def _per_frame(shapes: Floats, y_axis: str) -> Animation:
     )
 
 
-def _modes(shapes: Floats, y_axis: str) -> Animation:
+def _modes(shapes: Floats, y_axis: str, most: int) -> Animation:
     frames, count, _ = shapes.shape
     mean = upright(shapes.mean(axis=0), y_axis)
     # The eigenvectors of the F × F Gram matrix are the left singular vectors; F is small beside 3P.
     gram = np.zeros((frames, frames))
     for _, moved in _blocks(shapes, y_axis, mean):
         gram += moved @ moved.T
-    left = scipy.linalg.eigh(gram, subset_by_index=(frames - MAX_MODES, frames - 1))[1][:, ::-1]
+    left = scipy.linalg.eigh(gram, subset_by_index=(frames - most, frames - 1))[1][:, ::-1]
     allowed = ERROR_BOUND * float(np.linalg.norm(shapes.max(axis=(0, 1)) - shapes.min(axis=(0, 1))))
     kept = _smallest(shapes, y_axis, mean, left, allowed)
     coefficients = left[:, :kept] * np.sqrt(frames)
@@ -107,8 +122,8 @@ def _blocks(shapes: Floats, y_axis: str, origin: Floats | Singles) -> Iterator[t
 
 
 def _smallest(shapes: Floats, y_axis: str, mean: Floats, left: Floats, allowed: float) -> int:
-    """Return the fewest modes, at most 200, whose maximum error is within 90 % of the bound, by bisection (10 % for rounding)."""
-    low, high = 1, MAX_MODES
+    """Return the fewest modes, at most those given, whose maximum error is within 90 % of the bound, by bisection (10 % for rounding)."""
+    low, high = 1, int(left.shape[1])
     while low < high:
         middle = (low + high) // 2
         if _within(0.9 * allowed, _blocks(shapes, y_axis, mean), left[:, :middle]):

@@ -10,16 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.schemas.options import Options, Output
 from pliant.solver import InvalidInput
-from pliant.worker.artifacts import alembic, matlab, preview, usd
+from pliant.worker.artifacts import matlab, preview
 from pliant.worker.artifacts.animation import animate
 from pliant.worker.artifacts.colours import linear
 from pliant.worker.artifacts.frames_zip import OnProgress, write_obj_zip, write_ply_zip
 from pliant.worker.artifacts.geometry import Floats, triangles_of, viewer_scale
-from pliant.worker.artifacts.gltf.glb import write_glb
-from pliant.worker.artifacts.gltf.view import view_of
-from pliant.worker.artifacts.mdd import write_mdd
+from pliant.worker.artifacts.glb import write_glb
 from pliant.worker.artifacts.result import Result
+from pliant.worker.artifacts.scenes import alembic, usd
+from pliant.worker.artifacts.scenes.mdd import write_mdd
 from pliant.worker.artifacts.tables import write_frames_csv, write_points_csv
+from pliant.worker.artifacts.view import view_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +109,7 @@ def _npz(result: Result, file: IO[bytes], on_progress: OnProgress) -> dict[str, 
 
 def _glb(result: Result, file: IO[bytes], on_progress: OnProgress) -> dict[str, Any]:
     options, shapes, painted = result.options, result.solution.shapes, result.painting
-    animation = animate(shapes, y_axis=result.y_axis)
+    animation = animate(shapes, y_axis=result.y_axis, motion=options.glb_motion)
     colours = None
     if painted is not None:
         animation.extras.update(painted.legend())
@@ -159,6 +160,7 @@ def _preview(result: Result, file: IO[bytes]) -> None:
         truth=None if inputs.ground_truth is None else inputs.ground_truth.shapes,
         y_axis=inputs.interpretation.y_axis,
         fps=result.options.fps,
+        image_size=result.options.image_size,
     )
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import platform
-import resource
 import sys
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -121,8 +120,12 @@ def _trust(trust: Trust | None) -> dict[str, Any]:
     }
 
 
-def peak_memory() -> int:
-    """Return the peak resident size of this process, bytes."""
+def peak_memory() -> int | None:
+    """Return the peak resident size of this process, bytes; None on Windows."""
+    try:
+        import resource
+    except ModuleNotFoundError:
+        return None
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024
 

@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import IO, Any
 
@@ -50,9 +50,37 @@ def write_artifacts(
     began = time.perf_counter()
     result = Result(inputs, solution, options)
     report_share: OnProgress = on_progress or (lambda _: None)
+    kinds = kinds_for(options, textured=result.texture is not None)
+    written, entries = write_kinds(result, kinds, directory, on_progress=report_share)
+    seconds = {**report.get("seconds", {}), "exporting": time.perf_counter() - began}
+    written.append(write_report({**report, "seconds": seconds, "artifacts": entries}, directory))
+    report_share(1.0)
+    return written
+
+
+def write_kinds(
+    result: Result, kinds: Sequence[Kind], directory: Path, *, on_progress: OnProgress
+) -> tuple[list[Artifact], dict[str, Any]]:
+    """Write some result files into a directory that exists.
+
+    Parameters
+    ----------
+    result : Result
+        What is written.
+    kinds : sequence of Kind
+        Which files, in the order of writing.
+    directory, on_progress
+        As `write_artifacts`.
+
+    Returns
+    -------
+    written : list of Artifact
+        In the order of `kinds`.
+    entries : dict
+        What the report states of each, by file name.
+    """
     written: list[Artifact] = []
     entries: dict[str, Any] = {}
-    kinds = kinds_for(options, textured=result.texture is not None)
     done, total = 0.0, sum(kind.share for kind in kinds)
     for kind in kinds:
         start, share = done / total, kind.share / total
@@ -65,17 +93,19 @@ def write_artifacts(
             share: float = share,
             extra: dict[str, Any] = extra,
         ) -> None:
-            extra.update(kind.write(result, file, lambda part: report_share(start + share * part)))
+            extra.update(kind.write(result, file, lambda part: on_progress(start + share * part)))
 
         artifact = _written(directory, kind.name, kind.media_type, kind.description, put)
         written.append(artifact)
         entries[kind.name] = {"bytes": artifact.bytes, "sha256": artifact.sha256, **extra}
         done += kind.share
-    seconds = {**report.get("seconds", {}), "exporting": time.perf_counter() - began}
-    text = json.dumps({**report, "seconds": seconds, "artifacts": entries}, indent=2, allow_nan=False).encode()
-    written.append(_written(directory, "report.json", "application/json", REPORT, lambda file: file.write(text)))
-    report_share(1.0)
-    return written
+    return written, entries
+
+
+def write_report(report: dict[str, Any], directory: Path) -> Artifact:
+    """Write `report.json` and return its record."""
+    text = json.dumps(report, indent=2, allow_nan=False).encode()
+    return _written(directory, "report.json", "application/json", REPORT, lambda file: file.write(text))
 
 
 def _written(

@@ -209,7 +209,10 @@ def work(
         attempt.wait_for_store(lambda: attempt.jobs.blobs.fetch(stored.inputs, file))
         results = directory / "artifacts"
         with threads_limited(attempt.jobs.settings.threads_per_job):
-            finished = _reconstruct(attempt, stored, file, results, reconstruct=reconstruct)
+            if stored.result is not None:
+                finished = _write_further(attempt, stored, file, results)
+            else:
+                finished = _reconstruct(attempt, stored, file, results, reconstruct=reconstruct)
         attempt.store(finished, results)
     except Interrupted:
         late = time.monotonic() >= attempt.deadline
@@ -249,6 +252,16 @@ def _reconstruct(
         source, options, results, scratch=scratch, threads=settings.threads_per_job, bounds=FilmBounds.of(settings),
         on_progress=attempt.report, should_stop=attempt.should_stop,
     )  # fmt: skip
+
+
+def _write_further(attempt: Attempt, stored: Stored, inputs: Path, results: Path) -> Finished:
+    """Write further files of a stored result."""
+    from pliant.worker.execution.further_outputs import write_further
+
+    file, key = inputs.with_name("result.npz"), stored.result
+    assert key is not None
+    attempt.wait_for_store(lambda: attempt.jobs.blobs.fetch(key, file))
+    return write_further(inputs, file, stored.job, results, on_progress=attempt.report, should_stop=attempt.should_stop)
 
 
 def _listed(names: Sequence[str]) -> str:

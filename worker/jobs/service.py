@@ -20,7 +20,8 @@ from pliant.worker.errors import (
 )
 from pliant.worker.ids import check_id, is_id, new_attempt_id, new_job_id
 from pliant.worker.jobs import lifecycle
-from pliant.worker.jobs.submission import Acceptance, Submission, key_digest
+from pliant.worker.jobs.admission import check_fits
+from pliant.worker.jobs.submission import Acceptance, Submission, copy_beside, key_digest, result_beside
 from pliant.worker.jobs.validation import LARGEST_PAGE as LARGEST_PAGE
 from pliant.worker.jobs.validation import check_event_id, check_key, check_page
 from pliant.worker.paths import make_data_directory
@@ -86,7 +87,7 @@ class Jobs:
         Conflict
             The id or the key belongs to a different request.
         InvalidRequest
-            The id or the key is malformed.
+            The id or the key is malformed, or no worker has the memory that the job needs.
         QuotaExceeded
             Jobs and uploads have reached the disk quota.
         TooManyQueued
@@ -98,13 +99,15 @@ class Jobs:
         job = Job(
             id=submission.id or new_job_id(),
             name=submission.name,
+            priority=submission.priority,
             status=Status.QUEUED,
             created_at=self.clock(),
             options=submission.options,
             interpretation=interpretation,
         )
+        check_fits(interpretation, submission.options, self.queue.memories().values())
         size = inputs_file.stat().st_size
-        return self._create(job, submission, lambda key: self.blobs.put(key, inputs_file), size=size)
+        return self.create(job, submission, lambda key: self.blobs.put(key, inputs_file), size=size)
 
     def known(self, submission: Submission) -> Job | None:
         """Return the job of an earlier identical request, None if the request is new. Raises as `submit`."""
@@ -158,7 +161,7 @@ class Jobs:
         UnknownJob
             There is no such job, or it was deleted in the meantime.
         """
-        stored = self._stored(id)
+        stored = self.stored(id)
         job = stored.job
         submission = Submission(
             options=job.options, name=job.name, idempotency_key=idempotency_key, webhook=stored.webhook,
@@ -176,20 +179,24 @@ class Jobs:
             status=Status.QUEUED,
             created_at=self.clock(),
             retry_of=id,
+            outputs_of=job.outputs_of,
+            priority=job.priority,
             options=job.options,
             interpretation=job.interpretation,
         )
         try:
-            size = self.blobs.get(stored.inputs).size
-            return self._create(
-                again, submission, lambda key: self.blobs.copy(stored.inputs, key), size=size, owner=stored.owner
-            )
-        except FileNotFoundError:  # deleted since it was read
+            copies = [(stored.inputs, "inputs.npz"), *([(stored.result, "result.npz")] if stored.result else [])]
+            size = sum(self.blobs.get(key).size for key, _ in copies)
+            return self.create(
+                again, submission, lambda key: copy_beside(self.blobs, copies, key), size=size, owner=stored.owner,
+                from_result=stored.result is not None,
+            )  # fmt: skip
+        except FileNotFoundError:  # deleted between our look and the copy
             raise UnknownJob(id) from None
 
     def get(self, id: str) -> Job:
         """Return a job."""
-        return self._placed(self._stored(id))
+        return self._placed(self.stored(id))
 
     def page(self, *, cursor: str | None = None, limit: int = 50, statuses: Sequence[Status] | None = None) -> JobPage:
         """Return jobs, newest first.
@@ -234,7 +241,7 @@ class Jobs:
         NotAllowedNow
             The job has succeeded or failed.
         """
-        attempt_id = self._stored(id).attempt_id
+        attempt_id = self.stored(id).attempt_id
         after = self.records.update(
             id, lambda stored: lifecycle.cancel(stored, now=self.clock(), retention=self.settings.retention)
         )
@@ -250,7 +257,7 @@ class Jobs:
         NotAllowedNow
             The job is not finished.
         """
-        stored = self._stored(id)
+        stored = self.stored(id)
         if not stored.job.status.final:
             raise NotAllowedNow(id, stored.job.status, wanted="deleted", hint="Cancel it first.")
         self.records.delete(id, at=self.clock())
@@ -266,15 +273,33 @@ class Jobs:
         UnknownArtifact
             The job has no file of that name, or no files yet.
         """
-        stored = self._stored(id)
+        stored = self.stored(id)
         for each in stored.job.artifacts:
             if each.name == name and stored.prefix is not None:
                 return each, self.blobs.get(f"{stored.prefix}{name}")
         raise UnknownArtifact(id, name, names=[each.name for each in stored.job.artifacts])
 
+    def kept_inputs(self, id: str, file: Path) -> tuple[Job, Path]:
+        """Return a job and its stored inputs under a local name, to submit them again. Do not write to the file.
+
+        Raises
+        ------
+        NotAllowedNow
+            The job holds further files of another one, whose inputs are meant.
+        """
+        stored = self.stored(id)
+        if stored.job.outputs_of is not None:
+            hint = f"It holds further files of job {stored.job.outputs_of!r}: name that one."
+            raise NotAllowedNow(id, stored.job.status, wanted="run with other options", hint=hint)
+        try:
+            self.blobs.fetch(stored.inputs, file)
+        except FileNotFoundError:  # deleted between our look and the copy
+            raise UnknownJob(id) from None
+        return stored.job, file
+
     def log(self, id: str) -> str:
         """Return the log of the job's attempts so far."""
-        self._stored(id)
+        self.stored(id)
         return "".join(f"{line}\n" for line in self.records.log(id))
 
     def events(self, id: str, *, after: str | None = None) -> list[Event]:
@@ -294,7 +319,7 @@ class Jobs:
         """
         if after is not None:
             check_event_id(after)
-        self._stored(id)
+        self.stored(id)
         return self.records.events(id, after=after)
 
     def used(self) -> int:
@@ -317,7 +342,8 @@ class Jobs:
             found["workers"] = str(error)
         return found
 
-    def _stored(self, id: str) -> Stored:
+    def stored(self, id: str) -> Stored:
+        """Return a job with what only the worker package needs of it."""
         if not is_id(id):
             raise UnknownJob(id[:80])
         stored = self.records.get(id)
@@ -325,9 +351,28 @@ class Jobs:
             raise UnknownJob(id)
         return stored
 
-    def _create(
-        self, job: Job, submission: Submission, put: Callable[[str], object], *, size: int, owner: str | None = None
-    ) -> Job:
+    def create(
+        self, job: Job, submission: Submission, put: Callable[[str], object], *, size: int, owner: str | None = None,
+        from_result: bool = False,
+    ) -> Job:  # fmt: skip
+        """Store a new job and queue it.
+
+        Parameters
+        ----------
+        put : callable
+            Stores the inputs under a blob key, and the result to work from beside them, see `result_beside`.
+        size : int
+            Bytes that `put` stores.
+        owner : str, optional
+            Whose job it is; None: the owner of these jobs.
+        from_result : bool
+            The job works from a stored result instead of solving.
+
+        Raises
+        ------
+        Conflict, QuotaExceeded, TooManyQueued
+            As `submit`.
+        """
         acceptance = Acceptance(records=self.records, blobs=self.blobs, queue=self.queue, settings=self.settings)
         acceptance.check_quota(size)
         attempt_id = new_attempt_id(job.id)
@@ -335,7 +380,8 @@ class Jobs:
             job=job,
             owner=owner if owner is not None else self.owner or "",
             attempt_id=attempt_id,
-            inputs=f"jobs/{job.id}/{attempt_id}/inputs.npz",
+            inputs=(inputs := f"jobs/{job.id}/{attempt_id}/inputs.npz"),
+            result=result_beside(inputs) if from_result else None,
             bytes=size,
             key=key_digest(submission.idempotency_key, self.owner),
             fingerprint=submission.fingerprint,

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
-from pliant.schemas.job import Status
+from pliant.schemas.job import Priority, Status
 from pliant.schemas.options import Options
-from pliant.worker.errors import QuotaExceeded, StoreUnavailable, TooManyQueued
+from pliant.worker.errors import QuotaExceeded, StoreUnavailable, TooManyQueued, UnknownJob
 from pliant.worker.records import Records, Stored, Webhook
 from pliant.worker.settings import Settings
 from pliant.worker.store.blobs import Blobs
 from pliant.worker.store.queue import Queue
 from pliant.worker.uploads.service import Uploads
+
+RANKS: dict[Priority, int] = {"high": 0, "normal": 1, "low": 2}
+"""Smaller comes first."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,6 +41,9 @@ class Submission:
 
     webhook: Webhook | None = None
     """Called when the job has ended."""
+
+    priority: Priority = "normal"
+    """Order among the waiting jobs of the owner."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,19 +95,32 @@ class Acceptance:
         try:
             kept = self.records.create(stored, max_queued=max_queued, max_bytes=most)
         except (TooManyQueued, QuotaExceeded):
-            self.blobs.delete(stored.inputs)
+            self.blobs.delete(_folder_of(stored.inputs))
             raise
         if kept.inputs != stored.inputs:
-            self.blobs.delete(stored.inputs)
+            self.blobs.delete(_folder_of(stored.inputs))
             return kept
         try:
             if self._over_running_limit(stored):
                 self.queue.hold(stored.attempt_id)
             else:
                 self.queue.push(stored.job.id, stored.attempt_id)
+                if stored.job.priority != "normal":
+                    self._order(stored.owner)
         except StoreUnavailable:
             return kept  # the record is stored, and the reconciler adds the missing queue entry
         return kept
+
+    def _order(self, owner: str) -> None:
+        """Order the waiting jobs of one owner by priority, on the places that they hold: nobody else's job moves."""
+        waiting = set(self.queue.waiting())
+        ranks: dict[str, int] = {}
+        for id in self.records.ids(Status.QUEUED):
+            with suppress(UnknownJob):
+                held = self.records.get(id)
+                if held.owner == owner and held.attempt_id in waiting:
+                    ranks[held.attempt_id] = RANKS[held.job.priority]
+        self.queue.order(ranks)
 
     def _uploaded(self) -> int:
         return Uploads.open(self.settings).used()
@@ -113,6 +133,32 @@ class Acceptance:
         most = self.settings.max_running if stored.max_running is None else stored.max_running
         unfinished = (Status.QUEUED, Status.RUNNING, Status.CANCELLING)
         return most > 0 and self.records.count(unfinished, owner=stored.owner) > most
+
+
+def result_beside(inputs: str) -> str:
+    """Return the blob key of the stored result that a job works from, beside its inputs."""
+    return f"{_folder_of(inputs)}result.npz"
+
+
+def copy_beside(blobs: Blobs, copies: Sequence[tuple[str, str]], inputs: str) -> None:
+    """Copy blobs, each to a name beside the inputs of a new job; all or none.
+
+    Raises
+    ------
+    FileNotFoundError
+        One of them is gone.
+    """
+    folder = _folder_of(inputs)
+    try:
+        for key, name in copies:
+            blobs.copy(key, f"{folder}{name}")
+    except FileNotFoundError:
+        blobs.delete(folder)
+        raise
+
+
+def _folder_of(inputs: str) -> str:
+    return inputs.rpartition("/")[0] + "/"
 
 
 def key_digest(idempotency_key: str | None, owner: str | None) -> str | None:

@@ -60,6 +60,8 @@ def _of_record(stored: Stored, sizes: dict[str, int]) -> Iterator[str]:
     job = stored.job
     if stored.inputs not in sizes:
         yield f"Job {job.id} ({job.status.value}) has lost its inputs."
+    if stored.result is not None and stored.result not in sizes:
+        yield f"Job {job.id} ({job.status.value}) has lost the result that it works from."
     for artifact in job.artifacts:
         held = sizes.get(f"{stored.prefix}{artifact.name}")
         if held != artifact.bytes:
@@ -78,7 +80,7 @@ def _of_files(jobs: Jobs, records: list[Stored], sizes: dict[str, int]) -> Itera
         held = ours.get(key.split("/")[1])
         if held is None:
             yield f"File {key} belongs to no job."
-        elif key != held.inputs and not _counts(held, key):
+        elif key not in (held.inputs, held.result) and not _counts(held, key):
             yield f"File {key} belongs to no current attempt of its job."
     attempt_ids = {stored.attempt_id for stored in records if stored.job.status in ACTIVE}
     work = jobs.settings.work

@@ -133,4 +133,4 @@ def is_wanted(jobs: Jobs, key: str) -> bool | None:
         return None
     running = held.job.status in lifecycle.ACTIVE and f"/{held.attempt_id}/" in key
     published = held.prefix is not None and key.startswith(held.prefix)
-    return key == held.inputs or running or published
+    return key in (held.inputs, held.result) or running or published

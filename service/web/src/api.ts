@@ -1,6 +1,6 @@
 // Every call to the service. Addresses are relative, so the page also works behind a proxy that adds a path.
 
-import type { Inspection, Job, JobPage, Problem, Schema } from "./types";
+import type { Inspection, Job, JobPage, Problem, Schema, Share } from "./types";
 
 /** The service said no, or did not answer: `problem.detail` is the sentence to show. */
 export class Refusal extends Error {
@@ -17,8 +17,16 @@ export function setToken(token: string): void {
   else sessionStorage.removeItem(TOKEN);
 }
 
+/** The token of the share link that this page was opened with: it goes before a token of one's own. */
+let share: string | null = null;
+
+/** Read through a share link from now on. */
+export function setShare(token: string): void {
+  share = token;
+}
+
 export function headers(): Record<string, string> {
-  const token = sessionStorage.getItem(TOKEN);
+  const token = share ?? sessionStorage.getItem(TOKEN);
   return token ? { Authorization: `Bearer ${token}` } : {};
 }
 
@@ -73,6 +81,18 @@ export const listJobs = (cursor?: string | null): Promise<JobPage> =>
   json(`v1/jobs?limit=25${cursor ? `&cursor=${encodeURIComponent(cursor)}` : ""}`);
 export const cancelJob = (id: string): Promise<Job> => json(`${at(id)}/cancel`, { method: "POST" });
 export const retryJob = (id: string): Promise<Job> => json(`${at(id)}/retry`, { method: "POST" });
+const posted = (body: unknown): RequestInit => ({
+  method: "POST",
+  headers: { "Content-Type": "application/json" },
+  body: JSON.stringify(body),
+});
+/** Have further files written of a result; the answer is the job that writes them. */
+export const makeOutputs = (id: string, wanted: Record<string, unknown>): Promise<Job> => json(`${at(id)}/outputs`, posted(wanted));
+export const createShare = (id: string, seconds: number): Promise<Share> => json(`${at(id)}/shares`, posted({ expires_in: seconds }));
+export const listShares = (id: string): Promise<Share[]> => json(`${at(id)}/shares`);
+export const revokeShare = async (id: string, shareId: string): Promise<void> => {
+  await call(`${at(id)}/shares/${encodeURIComponent(shareId)}`, { method: "DELETE" });
+};
 export const deleteJob = async (id: string): Promise<void> => {
   await call(at(id), { method: "DELETE" });
 };
@@ -99,6 +119,8 @@ export interface Example {
   name: string;
   title: string;
   files: { part: string; file: string }[];
+  /** What to track in a film: corners in its first frame. */
+  region_polygon?: [number, number][] | null;
 }
 export const listExamples = (): Promise<{ examples: Example[] }> => json("v1/examples");
 

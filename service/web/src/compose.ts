@@ -2,12 +2,13 @@
 
 import { type Example, Refusal, exampleFile, getOptions, listExamples, newKey, submit } from "./api";
 import { button, h } from "./dom";
-import { OptionsForm } from "./options";
+import { rememberFilm } from "./live";
+import { OptionsForm, nameOf } from "./options";
 import { refusalBox } from "./refusal";
-import { Slots } from "./slots";
+import { PLACES, Slots } from "./slots";
 import { type Job, PARTS, type Part } from "./types";
 import { Inspection } from "./understood";
-import { percent } from "./words";
+import { percent, title } from "./words";
 
 export class Compose {
   readonly element: HTMLDetailsElement;
@@ -15,7 +16,7 @@ export class Compose {
   private readonly slots = new Slots(() => this.changed());
   private readonly inspection = new Inspection(
     () => this.form(),
-    (refusal) => (refusal ? this.refuse(refusal, () => undefined) : this.answer.replaceChildren()),
+    (refusal) => (refusal ? this.refuse(refusal, () => undefined) : this.clear()),
   );
   private readonly label = h("input", { type: "text", id: "job-name", maxlength: 200, autocomplete: "off" });
   private readonly send = h("button", { type: "submit", class: "primary" }, "Reconstruct");
@@ -26,23 +27,27 @@ export class Compose {
   /** Kept while it is unknown whether the service has got the job: sending again must not make a second one. */
   private key: string | null = null;
   private offered: Example[] = [];
+  /** The job whose inputs are used again; null: the files in the form. */
+  private kept: Job | null = null;
+  private readonly keeping = h("div", { class: "keeping", hidden: true });
+  /** What the name was filled in with; a name that a person typed stays. */
+  private filledIn = "";
 
   constructor(private readonly onJob: (job: Job) => void) {
     const form = h(
       "form",
       { class: "compose", onsubmit: (event: SubmitEvent) => void this.submit(event), "aria-labelledby": "compose-title" },
+      this.keeping,
       this.slots.element,
       this.examples,
       this.inspection.element,
-      this.options.first,
-      this.options.more,
       h("div", { class: "option" }, h("label", { for: "job-name" }, "Name (optional)"), this.label),
-      h("div", { class: "row send" }, this.send, this.stop),
-      this.answer,
+      this.options.element,
+      h("div", { class: "send" }, this.answer, h("div", { class: "row" }, this.send, this.stop)),
     );
     const summary = h("summary", {}, h("h2", { id: "compose-title" }, "New reconstruction"));
     form.addEventListener("change", () => (this.key = null));
-    this.options.more.addEventListener("change", () => this.changed());
+    this.options.element.addEventListener("change", () => this.changed());
     this.element = h("details", { class: "card", open: true }, summary, form);
     document.addEventListener("drop", () => (this.element.open = true));
   }
@@ -50,6 +55,8 @@ export class Compose {
   /** Other files, or other options of reading them. */
   private changed(): void {
     this.key = null;
+    const stem = this.slots.main?.name.replace(/\.[^.]*$/, "").slice(0, 200) ?? "";
+    if (this.label.value === this.filledIn) this.label.value = this.filledIn = stem;
     if (!this.sending) this.inspection.changed();
   }
 
@@ -77,18 +84,49 @@ export class Compose {
     return ["No files at hand? Try the example ", ...buttons, "."];
   }
 
-  /** Take the first example and send it: the shortest way to a moving mesh. */
-  async tryOut(): Promise<void> {
-    const example = this.offered[0];
+  /** Fill the form with the options of a job, to run its inputs again with others. */
+  again(job: Job): void {
+    this.keep(job);
+    this.options.fill(job.options);
+    this.label.value = this.filledIn = job.name;
+    this.element.open = true;
+    this.element.scrollIntoView({ block: "start" });
+    this.options.focus();
+  }
+
+  private keep(job: Job | null): void {
+    this.kept = job;
+    this.key = null;
+    this.inspection.stop();
+    this.clear();
+    this.keeping.hidden = job === null;
+    this.slots.element.hidden = this.examples.hidden = this.inspection.element.hidden = job !== null;
+    if (job === null) this.keeping.replaceChildren();
+    else {
+      const other = button("Use other files", () => this.keep(null), { class: "link" });
+      this.keeping.replaceChildren(h("p", {}, `The inputs of “${title(job)}” are used again. Change the options below. `, other));
+    }
+  }
+
+  /** Remove what was refused. */
+  private clear(): void {
+    this.answer.replaceChildren();
+    this.slots.clear();
+    this.options.clear();
+  }
+
+  /** Take the first example, or the first film, and send it: the shortest way to a moving mesh. */
+  async tryOut(kind: "tracks" | "film"): Promise<void> {
+    const example = this.offered.find(({ files }) => files.some(({ part }) => part === kind));
     if (example === undefined) return;
     this.element.open = true;
     await this.takeExample(example);
-    if (this.slots.file("tracks")) this.send.form?.requestSubmit();
+    if (this.slots.file(kind)) this.send.form?.requestSubmit();
   }
 
-  /** True where the service makes examples. */
-  get hasExamples(): boolean {
-    return this.offered.length > 0;
+  /** True where the service makes an example of tracks, or of a film. */
+  hasExample(kind: "tracks" | "film"): boolean {
+    return this.offered.some(({ files }) => files.some(({ part }) => part === kind));
   }
 
   private async takeExample(example: Example): Promise<void> {
@@ -101,6 +139,7 @@ export class Compose {
       this.label.value = example.title;
       this.answer.replaceChildren();
       await this.slots.fill(files);
+      if (example.region_polygon) await this.slots.outline(example.region_polygon);
       this.send.focus();
     } catch (error) {
       this.refuse(error);
@@ -110,7 +149,8 @@ export class Compose {
   private async submit(event: SubmitEvent): Promise<void> {
     event.preventDefault();
     if (this.sending) return;
-    const form = this.form();
+    const form = this.kept ? this.keptForm(this.kept) : this.form();
+    this.clear();
     if (form === null) {
       this.answer.replaceChildren(h("p", { class: "sentence bad" }, `Choose a ${this.slots.hasFilms ? "film or track file" : "track file"} first, or try an example.`));
       this.slots.focus("tracks");
@@ -131,6 +171,7 @@ export class Compose {
       const job = await submit(form, this.key, onSent, this.sending.signal);
       this.key = null;
       this.answer.replaceChildren();
+      rememberFilm(job.id, this.slots.file("film"));
       this.onJob(job);
     } catch (error) {
       if (!(error instanceof Refusal && error.problem.status === 0)) this.key = null;
@@ -141,7 +182,16 @@ export class Compose {
     }
   }
 
+  private keptForm(job: Job): FormData {
+    const form = new FormData();
+    form.append("inputs_of", job.id);
+    form.append("options", JSON.stringify(this.options.values()));
+    if (this.label.value.trim()) form.append("name", this.label.value.trim());
+    return form;
+  }
+
   private form(): FormData | null {
+    if (this.kept) return null;
     const form = new FormData();
     const { region } = this.slots;
     form.append("options", JSON.stringify({ ...this.options.values(), ...(region && { region_polygon: region }) }));
@@ -167,7 +217,16 @@ export class Compose {
         for (const [name, value] of Object.entries(choice)) this.options.set(name, value);
         again();
       };
-      this.answer.replaceChildren(refusalBox(error.problem, choose));
+      this.clear();
+      const [part = "", option = ""] = (error.problem.field ?? "").split(".");
+      const placed = refusalBox(error.problem, choose, true);
+      const shown = part === "options" ? this.options.refuse(option, placed) : !this.kept && this.slots.refuse(part, placed);
+      this.answer.replaceChildren(shown ? h("p", { class: "sentence bad" }, `Not sent: see “${placeOf(part, option)}” above.`) : refusalBox(error.problem, choose));
     } else throw error;
   }
+}
+
+function placeOf(part: string, option: string): string {
+  if (part === "options") return nameOf(option);
+  return PLACES[part as Part]?.label ?? "Film";
 }

@@ -1,6 +1,7 @@
 // The page: a form, a list, and the job that the address names (#job=…), so that a reload comes back to it.
 
-import { Refusal, setToken } from "./api";
+import { AGAIN, sharedJob } from "./afterwards";
+import { Refusal, setShare, setToken } from "./api";
 import { Compose } from "./compose";
 import { Detail } from "./detail";
 import { button, h } from "./dom";
@@ -76,8 +77,12 @@ function tokenForm(): HTMLElement {
 /** Offer the example while there are no jobs. */
 function offer(): void {
   const place = document.getElementById("try") as HTMLElement;
-  place.hidden = !compose.hasExamples;
-  place.replaceChildren(button("Try it with a synthetic face", () => void compose.tryOut(), { class: "primary large" }));
+  const [tracks, film] = [compose.hasExample("tracks"), compose.hasExample("film")];
+  place.hidden = !tracks && !film;
+  place.replaceChildren(
+    ...(tracks ? [button("Try it with a synthetic face", () => void compose.tryOut("tracks"), { class: "primary large" })] : []),
+    ...(film ? [button("Try it with a film", () => void compose.tryOut("film"), { class: "large" })] : []),
+  );
 }
 
 let loaded = false;
@@ -103,7 +108,29 @@ async function watch(): Promise<void> {
   }
 }
 
-addEventListener("hashchange", () => show(named(), true));
-show(named(), false);
-await start();
-void watch();
+document.addEventListener(AGAIN, (event) => compose.again((event as CustomEvent<Job>).detail));
+
+function sharedToken(): string | null {
+  return new URLSearchParams(location.hash.slice(1)).get("share");
+}
+
+/** Show the one result that a share link opens: no form, no list, nothing that changes anything. */
+function showShared(token: string): void {
+  setShare(token);
+  document.body.classList.add("shared");
+  welcome.hidden = true;
+  detail = new Detail(sharedJob(token), { onJob: () => undefined, onDeleted: () => undefined });
+  const home = h("a", { href: location.pathname }, "About Pliant");
+  main.append(h("p", { class: "shared-note" }, "You see a shared result, read-only. ", home), detail.element);
+}
+
+const token = sharedToken();
+if (token === null) {
+  addEventListener("hashchange", () => (sharedToken() === null ? show(named(), true) : location.reload()));
+  show(named(), false);
+  await start();
+  void watch();
+} else {
+  addEventListener("hashchange", () => location.reload());
+  showShared(token);
+}

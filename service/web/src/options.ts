@@ -3,46 +3,120 @@
 import { h, uniqueId } from "./dom";
 import type { Options, Schema } from "./types";
 
-/** Shown by name at the top; the rest is folded away. */
-const FIRST = ["method", "preset"];
 /** Not in the form: the region is drawn, on the first frame. */
 const DRAWN = ["region_polygon", "region_frame"];
 
+/** The folds, by what a person wants to change. An option that is in none of them is for experts. */
+const FOLDS: [string, string[]][] = [
+  ["Files to write", ["outputs", "fps", "axes", "normals", "colours", "glb_motion", "glb_quantized"]],
+  ["Camera", ["camera", "focal", "field_of_view", "image_size", "principal_point"]],
+  ["Which frames and points", ["frames", "stride", "max_points", "min_seen", "order"]],
+  ["How the file is read", ["layout", "rows", "coordinates", "coordinate_order", "y_axis", "visibility"]],
+  ["Film", ["template_frame", "grid_step", "longest_side"]],
+  ["Surface and smoothness", ["surface", "temporal_weight", "spatial_weight", "robust_scale"]],
+];
+const EXPERTS = "For experts";
+
+/** What people call an option, and its unit. */
+const NAMES: Record<string, [string, string?]> = {
+  outputs: ["Files"],
+  fps: ["Frame rate", "frames/s"],
+  axes: ["Axes of PLY and OBJ"],
+  normals: ["Normals"],
+  colours: ["Colours"],
+  glb_motion: ["Motion in glTF"],
+  glb_quantized: ["16-bit glTF"],
+  camera: ["Camera model"],
+  focal: ["Focal length", "pixels"],
+  field_of_view: ["Angle of view", "degrees"],
+  image_size: ["Picture size", "w×h, pixels"],
+  principal_point: ["Optical centre", "x,y, pixels"],
+  frames: ["Frames", "from:to:step"],
+  stride: ["Use every n-th point"],
+  max_points: ["At most", "points"],
+  min_seen: ["Seen at least in", "frames"],
+  layout: ["Order of the axes"],
+  rows: ["Order of the rows"],
+  coordinates: ["Meaning of x and y"],
+  coordinate_order: ["Which comes first"],
+  y_axis: ["Y points"],
+  visibility: ["Visibility values"],
+  template_frame: ["Start frame"],
+  grid_step: ["Point distance", "pixels"],
+  longest_side: ["Longest side tracked", "pixels"],
+  surface: ["Surface"],
+  temporal_weight: ["Smoothness in time", "λ1"],
+  spatial_weight: ["Smoothness on surface", "λ2"],
+  robust_scale: ["Outlier threshold", "track radii"],
+  time_limit: ["Time limit", "seconds"],
+  max_reweightings: ["Most rounds"],
+  basis_size: ["Basis shapes"],
+  refine_rotations: ["Refine cameras"],
+};
+
 const LABELS: Record<string, string> = {
   pseudo_inverse: "pseudo-inverse",
-  temporal: "temporal",
   spatio_temporal: "spatio-temporal",
-  robust: "robust",
+  scaled_orthographic: "no perspective, scale per frame",
+  orthographic: "no perspective, one scale",
   auto: "automatic",
   paper: "as published",
+  glb: "glTF",
+  ply: "PLY",
+  obj: "OBJ",
+  usd: "USD",
+  mdd: "MDD",
+  mat: "MATLAB",
+  csv: "tables (csv)",
+  viewer: "y up, as in viewers",
+  tracks: "as the tracks",
+  expected_error: "expected error",
+  frames_points: "frames, points",
+  points_frames: "points, frames",
+  xy: "x, then y",
+  yx: "y, then x",
 };
+
+/** What the page calls an option. */
+export function nameOf(name: string): string {
+  return NAMES[name]?.[0] ?? sentence(name.replaceAll("_", " "));
+}
 
 interface Field {
   name: string;
   schema: Schema;
+  fold: HTMLDetailsElement;
+  answer: HTMLElement;
+  element: HTMLElement;
   read: () => unknown;
   write: (value: unknown) => void;
 }
 
 export class OptionsForm {
-  readonly first = h("div", { class: "options" });
-  readonly more = h("details", { class: "more" });
+  readonly element = h("div", { class: "folds" });
   private fields: Field[] = [];
 
   /** Build the form from the schema. Until then a job is sent with the defaults. */
   load(schema: Schema): void {
     const properties = schema.properties ?? {};
-    const names = Object.keys(properties);
-    const rest = names.filter((name) => !FIRST.includes(name) && !DRAWN.includes(name));
+    const names = Object.keys(properties).filter((name) => !DRAWN.includes(name));
+    const placed = FOLDS.flatMap(([, members]) => members);
+    const folds: [string, string[]][] = [...FOLDS, [EXPERTS, names.filter((name) => !placed.includes(name))]];
     this.fields = [];
-    this.first.replaceChildren(...FIRST.filter((name) => names.includes(name)).map((name) => this.row(name, properties)));
+    this.element.replaceChildren(
+      ...folds.map(([heading, members]) => this.fold(heading, members.filter((name) => names.includes(name)), properties)),
+    );
+  }
+
+  private fold(heading: string, names: string[], properties: Record<string, Schema>): HTMLElement {
     const changed = h("span", { class: "muted" });
-    const body = h("div", { class: "options" }, ...rest.map((name) => this.row(name, properties)));
-    this.more.replaceChildren(h("summary", {}, "More options ", changed), body);
-    body.addEventListener("change", () => {
-      const given = Object.keys(this.values()).filter((name) => !FIRST.includes(name)).length;
+    const fold = h("details", { class: "more", hidden: names.length === 0 }, h("summary", {}, `${heading} `, changed));
+    fold.append(h("div", { class: "options" }, ...names.map((name) => this.row(name, properties, fold))));
+    fold.addEventListener("change", () => {
+      const given = Object.keys(this.values()).filter((name) => names.includes(name)).length;
       changed.textContent = given > 0 ? `(${given} changed)` : "";
     });
+    return fold;
   }
 
   /** The options that differ from the defaults. */
@@ -59,31 +133,55 @@ export class OptionsForm {
   set(name: string, value: unknown): void {
     const field = this.fields.find((one) => one.name === name);
     field?.write(value);
-    this.more.dispatchEvent(new Event("change"));
+    field?.fold.dispatchEvent(new Event("change", { bubbles: true }));
   }
 
-  private row(name: string, properties: Record<string, Schema>): HTMLElement {
+  /** Take over the options of a job. */
+  fill(options: Options): void {
+    for (const field of this.fields) field.write(field.name in options ? options[field.name] : (field.schema.default ?? null));
+    for (const fold of new Set(this.fields.map((field) => field.fold))) fold.dispatchEvent(new Event("change", { bubbles: true }));
+  }
+
+  focus(): void {
+    this.element.querySelector("summary")?.focus();
+  }
+
+  /** Show a refusal below its option; false where the form has no such option. */
+  refuse(name: string, box: HTMLElement): boolean {
+    const field = this.fields.find((one) => one.name === name);
+    if (field === undefined) return false;
+    field.answer.replaceChildren(box);
+    field.fold.open = true;
+    field.element.scrollIntoView({ block: "nearest" });
+    return true;
+  }
+
+  /** Remove all refusals. */
+  clear(): void {
+    for (const { answer } of this.fields) answer.replaceChildren();
+  }
+
+  private row(name: string, properties: Record<string, Schema>, fold: HTMLDetailsElement): HTMLElement {
     const schema = properties[name] as Schema;
     const id = uniqueId("option");
     const control = controlFor(schema, id);
-    this.fields.push({ name, schema, ...control });
-    const words = describe(schema, String(control.read() ?? ""));
-    const hint = h("p", { class: "hint", id: `${id}-hint` }, words);
+    const answer = h("div", { class: "slot-answer", "aria-live": "assertive" });
+    this.fields.push({ name, schema, fold, answer, ...control });
+    const hint = h("p", { class: "hint", id: `${id}-hint` }, describe(schema, String(control.read() ?? "")));
     control.element.setAttribute("aria-describedby", hint.id);
     control.element.addEventListener("change", () => {
       hint.textContent = describe(schema, String(control.read() ?? ""));
     });
-    const title = sentence(name.replaceAll("_", " "));
+    const unit = NAMES[name]?.[1];
     const group = control.element.getAttribute("role") === "group";
-    if (group) control.element.setAttribute("aria-label", title);
-    const label = group ? h("span", {}, title) : h("label", { for: id }, title);
-    return h("div", { class: "option" }, label, control.element, hint);
+    if (group) control.element.setAttribute("aria-label", nameOf(name));
+    const words = [nameOf(name), unit ? h("span", { class: "unit" }, ` ${unit}`) : null];
+    const label = group ? h("span", { title: name }, ...words) : h("label", { for: id, title: name }, ...words);
+    return h("div", { class: "option" }, label, control.element, hint, answer);
   }
 }
 
-interface Control extends Pick<Field, "read" | "write"> {
-  element: HTMLElement;
-}
+type Control = Pick<Field, "read" | "write" | "element">;
 
 function controlFor(schema: Schema, id: string): Control {
   const kinds = schema.anyOf ?? [schema];

@@ -3,27 +3,59 @@
 import { button, h } from "./dom";
 import type { Problem } from "./types";
 
-/** Make the box that shows a problem; `choose` is called with the reading a person picks where several fit. */
-export function refusalBox(problem: Problem, choose?: (choice: Record<string, unknown>) => void): HTMLElement {
+/** Codes that the page itself gives: the service has no explanation of them. */
+const OURS = ["unreachable", "unknown", "no_events"];
+
+/**
+ * Make the box that shows a problem. `choose` is called with the reading a person picks where several fit; `inPlace` means that
+ * the box stands where the fault is, which need not be named again.
+ */
+export function refusalBox(problem: Problem, choose?: ((choice: Record<string, unknown>) => void) | null, inPlace = false): HTMLElement {
+  const detail = inPlace ? unnamed(problem) : problem.detail;
   const facts: [string, string | null | undefined][] = [
     ["Where", problem.field],
     ["Expected", problem.expected],
     ["Got", problem.got],
   ];
-  const shown = facts.filter(([, value]) => value);
+  const shown = facts.filter(([, value]) => value && !detail.includes(value));
   const hint = problem.hint && !problem.detail.includes(problem.hint) ? h("p", {}, problem.hint) : null;
   const list = h("dl", { class: "facts" }, ...shown.flatMap(([term, value]) => [h("dt", {}, term), h("dd", {}, value as string)]));
   const choices = choose ? (problem.choices ?? []).map((choice) => choiceButton(choice, choose)) : [];
   return h(
     "div",
     { class: "refusal", role: "alert" },
-    h("p", { class: "sentence" }, problem.detail),
+    h("p", { class: "sentence" }, detail),
     shown.length > 0 && list,
     hint,
     choices.length > 0 && h("div", { class: "row", role: "group", "aria-label": "Possible interpretations" }, ...choices),
-    h("p", { class: "code" }, problem.code),
+    h("p", { class: "row small" }, ...helpLinks(problem), h("span", { class: "code" }, problem.code)),
   );
 }
+
+/** The sentence without the name of the field, which is the service's word for the place where it is shown. */
+function unnamed({ detail, field }: Problem): string {
+  if (!field || !detail.startsWith(`${field}: `)) return detail;
+  const rest = detail.slice(field.length + 2);
+  return rest.charAt(0).toUpperCase() + rest.slice(1);
+}
+
+/** Where a person can read on: the guide's section on the kind of file, and the explanation of the code. */
+function helpLinks({ code, field }: Problem): HTMLElement[] {
+  const links: HTMLElement[] = [];
+  const section = GUIDE[(field ?? "").split(".")[0] ?? ""];
+  if (section) links.push(h("a", { href: `guide#${section}`, target: "_blank" }, `What ${section === "films" ? "films" : "files"} can I send?`));
+  if (!OURS.includes(code)) links.push(h("a", { href: `errors/${code}`, target: "_blank" }, "About this error"));
+  return links;
+}
+
+const GUIDE: Record<string, string> = {
+  tracks: "tracks",
+  mesh: "meshes",
+  ground_truth: "truth",
+  rotations: "truth",
+  film: "films",
+  region: "films",
+};
 
 function choiceButton(choice: Record<string, unknown>, choose: (choice: Record<string, unknown>) => void): HTMLElement {
   const { layout, evidence, options } = choice;

@@ -66,6 +66,11 @@ export interface components {
             title: string;
             /** Files */
             files: components["schemas"]["ExampleFile"][];
+            /** Region Polygon */
+            region_polygon: [
+                number,
+                number
+            ][] | null;
         };
         /**
          * ExampleFile
@@ -86,6 +91,37 @@ export interface components {
         Examples: {
             /** Examples */
             examples: components["schemas"]["Example"][];
+        };
+        /**
+         * FollowedPoints
+         * @description Some points of a film in the frame that was tracked last.
+         */
+        FollowedPoints: {
+            /**
+             * Frame
+             * @description Number of the frame in the film, from 0.
+             */
+            frame: number;
+            /**
+             * Seconds
+             * @description From the film's start.
+             */
+            seconds: number;
+            /**
+             * Width
+             * @description Of the film, pixels.
+             */
+            width: number;
+            /**
+             * Height
+             * @description Of the film, pixels.
+             */
+            height: number;
+            /**
+             * Points
+             * @description x and y of each visible point in turn, rounded to the film's pixels.
+             */
+            points: number[];
         };
         /**
          * Inspection
@@ -318,6 +354,11 @@ export interface components {
              */
             retry_of: string | null;
             /**
+             * Outputs Of
+             * @description The finished job whose result this one writes in further files, without solving again.
+             */
+            outputs_of: string | null;
+            /**
              * Place In Queue
              * @description Number of queued jobs ahead; null if not queued.
              */
@@ -549,8 +590,8 @@ export interface components {
             outputs: ("glb" | "ply" | "obj" | "usd" | "abc" | "mdd" | "mat" | "csv")[];
             /**
              * Normals
-             * @description static: those of the first shape, in shapes.glb only. animated: they move with the shape, and are also in every frame of PLY, OBJ and USD. none: viewers compute their own.
-             * @default static
+             * @description animated: they move with the shape, in shapes.glb and in every frame of PLY, OBJ and USD. static: those of the first shape, in shapes.glb only. none: viewers compute their own.
+             * @default animated
              * @enum {string}
              */
             normals: "static" | "animated" | "none";
@@ -563,17 +604,24 @@ export interface components {
             colours: "none" | "error" | "expected_error";
             /**
              * Axes
-             * @description Axes of PLY and OBJ. tracks: those of the tracks, as in shapes.npz. viewer: y up, as in shapes.glb.
-             * @default tracks
+             * @description Axes of PLY and OBJ. viewer: y up, as in shapes.glb. tracks: those of the tracks, as in shapes.npz.
+             * @default viewer
              * @enum {string}
              */
             axes: "tracks" | "viewer";
             /**
              * Glb Quantized
-             * @description Write shapes.glb with 16-bit positions (KHR_mesh_quantization): two thirds of the size, and rounded to about a 65,000th of the largest extent.
+             * @description Write shapes.glb with 16-bit positions and 8-bit normals (KHR_mesh_quantization): about half the size, and rounded to a 65,000th of the largest extent and half a degree.
              * @default false
              */
             glb_quantized: boolean;
+            /**
+             * Glb Motion
+             * @description How shapes.glb stores the motion. auto: as few modes of motion as keep every point within a thousandth of the bounding box's diagonal. frames: a morph target a frame, exact in single precision; up to 200 frames.
+             * @default auto
+             * @enum {string}
+             */
+            glb_motion: "auto" | "frames";
             /**
              * Layout
              * @description Order of the track array's axes. auto: by the names in the file and by smoothness in time; an error if several fit.
@@ -745,7 +793,7 @@ export interface components {
          * ProblemCode
          * @enum {string}
          */
-        ProblemCode: "bad_request" | "malformed_form" | "no_such_address" | "method_not_allowed" | "body_stalled" | "precondition_failed" | "body_too_large" | "text_too_large" | "unsupported_media_type" | "range_not_satisfiable" | "unknown_host" | "invalid_request" | "unknown_part" | "repeated_part" | "missing_part" | "conflicting_parts" | "not_a_file" | "not_utf8" | "name_too_long" | "invalid_limit" | "invalid_cursor" | "invalid_event_id" | "http_error" | "internal_error" | "not_ready" | "conflicting_headers" | "unauthorized" | "invalid_token" | "expired_token" | "insufficient_scope" | "cross_site_request" | "too_many_requests" | "unknown_job" | "unknown_artifact" | "unknown_example" | "not_allowed_now" | "not_finished" | "id_taken" | "idempotency_conflict" | "invalid_id" | "invalid_idempotency_key" | "too_many_queued" | "unknown_option" | "invalid_option" | "output_unavailable" | "invalid_webhook" | "invalid_webhook_secret" | "webhook_not_public" | "artifact_gone" | "timed_out" | "out_of_memory" | "worker_lost" | "storage_failed" | "interrupted" | "stale_attempt" | "store_unavailable" | "storage_full" | "quota_exceeded" | "worker_error" | "unknown_upload" | "upload_incomplete" | "upload_complete" | "upload_offset_mismatch" | "upload_busy" | "upload_taken_over" | "upload_too_large" | "inconsistent_upload_length" | "invalid_digest" | "digest_mismatch" | "too_many_uploads" | "unknown_format" | "empty_file" | "damaged_file" | "pickle_refused" | "object_array" | "unsupported_feature" | "too_large" | "too_slow" | "member_name" | "duplicate_member" | "duplicate_observation" | "missing_array" | "film_unavailable" | "unsupported_film" | "unreadable_film" | "empty_film" | "playlist" | "external_reference" | "truncated_film" | "undecodable_film" | "no_picture" | "broken_picture" | "changing_size" | "too_small" | "too_many_streams" | "too_many_pictures" | "too_many_bytes" | "too_many_pixels" | "too_many_frames" | "too_long" | "wrong_selection" | "no_such_frame" | "unreadable_region" | "wrong_region" | "wrong_region_size" | "wrong_polygon" | "empty_region" | "region_lost" | "no_texture" | "tracks_lost" | "outside_picture" | "principal_point_far" | "unwritable_film" | "stopped" | "ambiguous_layout" | "ambiguous_coordinates" | "missing_image_size" | "wrong_type" | "wrong_shape" | "out_of_range" | "not_finite" | "too_few_frames" | "too_few_points" | "no_frames_left" | "nothing_visible" | "too_little_seen" | "no_extent" | "vertex_count_mismatch" | "mesh_mismatch" | "index_out_of_range" | "degenerate_face" | "not_a_rotation" | "camera_mismatch" | "invalid_setting" | "data_directory_in_use" | "newer_data" | "bad_backup" | "server_failed" | "unknown_token" | "invalid_token_name" | "invalid_token_text" | "invalid_duration" | "no_scope";
+        ProblemCode: "bad_request" | "malformed_form" | "no_such_address" | "method_not_allowed" | "body_stalled" | "precondition_failed" | "body_too_large" | "text_too_large" | "unsupported_media_type" | "range_not_satisfiable" | "unknown_host" | "invalid_request" | "unknown_part" | "repeated_part" | "missing_part" | "conflicting_parts" | "not_a_file" | "not_utf8" | "name_too_long" | "invalid_limit" | "invalid_cursor" | "invalid_event_id" | "http_error" | "internal_error" | "not_ready" | "conflicting_headers" | "unauthorized" | "invalid_token" | "expired_token" | "invalid_share" | "expired_share" | "beyond_share" | "insufficient_scope" | "cross_site_request" | "too_many_requests" | "unknown_job" | "unknown_artifact" | "unknown_example" | "not_allowed_now" | "not_finished" | "id_taken" | "idempotency_conflict" | "invalid_id" | "invalid_idempotency_key" | "too_many_queued" | "unknown_option" | "invalid_option" | "output_unavailable" | "invalid_webhook" | "invalid_webhook_secret" | "webhook_not_public" | "artifact_gone" | "timed_out" | "out_of_memory" | "worker_lost" | "storage_failed" | "interrupted" | "stale_attempt" | "store_unavailable" | "storage_full" | "quota_exceeded" | "worker_error" | "unknown_upload" | "upload_incomplete" | "upload_complete" | "upload_offset_mismatch" | "upload_busy" | "upload_taken_over" | "upload_too_large" | "inconsistent_upload_length" | "invalid_digest" | "digest_mismatch" | "unknown_share" | "too_many_shares" | "too_many_uploads" | "unknown_format" | "empty_file" | "damaged_file" | "pickle_refused" | "object_array" | "unsupported_feature" | "too_large" | "too_slow" | "member_name" | "duplicate_member" | "duplicate_observation" | "missing_array" | "film_unavailable" | "unsupported_film" | "unreadable_film" | "empty_film" | "playlist" | "external_reference" | "truncated_film" | "undecodable_film" | "no_picture" | "broken_picture" | "changing_size" | "too_small" | "too_many_streams" | "too_many_pictures" | "too_many_bytes" | "too_many_pixels" | "too_many_frames" | "too_long" | "wrong_selection" | "no_such_frame" | "unreadable_region" | "wrong_region" | "wrong_region_size" | "wrong_polygon" | "empty_region" | "region_lost" | "no_texture" | "tracks_lost" | "outside_picture" | "principal_point_far" | "unwritable_film" | "stopped" | "ambiguous_layout" | "ambiguous_coordinates" | "missing_image_size" | "wrong_type" | "wrong_shape" | "out_of_range" | "not_finite" | "too_few_frames" | "too_few_points" | "no_frames_left" | "nothing_visible" | "too_little_seen" | "no_extent" | "vertex_count_mismatch" | "mesh_mismatch" | "index_out_of_range" | "degenerate_face" | "not_a_rotation" | "camera_mismatch" | "invalid_setting" | "data_directory_in_use" | "newer_data" | "bad_backup" | "server_failed" | "unknown_token" | "invalid_token_name" | "invalid_token_text" | "invalid_duration" | "no_scope";
         /**
          * Progress
          * @description Progress of a running job.
@@ -780,6 +828,8 @@ export interface components {
              * @description Estimate; null until one is possible.
              */
             seconds_left: number | null;
+            /** @description Points that the stage `track` tracked last. */
+            followed: components["schemas"]["FollowedPoints"] | null;
             /**
              * Updated At
              * Format: date-time
@@ -853,6 +903,34 @@ export interface components {
             requests_per_minute: number;
         };
         /**
+         * Share
+         * @description A share link of a job.
+         */
+        Share: {
+            /** Id */
+            id: string;
+            /**
+             * Created At
+             * Format: date-time
+             */
+            created_at: string;
+            /**
+             * Expires At
+             * Format: date-time
+             */
+            expires_at: string;
+            /**
+             * Token
+             * @description Bearer token that reads the job and its files, and nothing else. Only the answer that creates the link has it.
+             */
+            token: string | null;
+            /**
+             * Path
+             * @description Address of the page that shows the result, relative to the service; holds the token.
+             */
+            path: string | null;
+        };
+        /**
          * Status
          * @description Status of a job. The last three are final and never change.
          * @enum {string}
@@ -890,6 +968,65 @@ export interface components {
              * @description When it is removed unless it is used before; null: never.
              */
             expires_at: string | null;
+        };
+        /**
+         * OutputRequest
+         * @description Files to write of a stored result. Each option that is null stays as the job has it.
+         */
+        OutputRequest: {
+            /**
+             * Outputs
+             * @description Files to write: glb, ply, obj, usd, mdd, mat, csv; see the option `outputs` of a job.
+             */
+            outputs: ("glb" | "ply" | "obj" | "usd" | "abc" | "mdd" | "mat" | "csv")[];
+            /**
+             * Fps
+             * @description Frames per second of the written animation.
+             * @default null
+             */
+            fps: number | null;
+            /**
+             * Normals
+             * @description As the option of a job.
+             * @default null
+             */
+            normals: ("static" | "animated" | "none") | null;
+            /**
+             * Colours
+             * @description As the option of a job.
+             * @default null
+             */
+            colours: ("none" | "error" | "expected_error") | null;
+            /**
+             * Axes
+             * @description As the option of a job.
+             * @default null
+             */
+            axes: ("tracks" | "viewer") | null;
+            /**
+             * Glb Quantized
+             * @description As the option of a job.
+             * @default null
+             */
+            glb_quantized: boolean | null;
+            /**
+             * Glb Motion
+             * @description As the option of a job.
+             * @default null
+             */
+            glb_motion: ("auto" | "frames") | null;
+        };
+        /**
+         * ShareRequest
+         * @description How long a share link is valid.
+         */
+        ShareRequest: {
+            /**
+             * Expires In
+             * @description Seconds until the link expires.
+             * @default 604800
+             */
+            expires_in: number;
         };
     };
     responses: never;

@@ -1,5 +1,6 @@
 // The files of a new job: a film, or tracks with a mesh. Each place is filled by drop or by choice, and shows what it holds.
 
+import { CameraDialog, canRecord } from "./camera";
 import { button, h, uniqueId } from "./dom";
 import { looksLikeFilm } from "./film";
 import { Filming } from "./filming";
@@ -8,7 +9,7 @@ import type { Point } from "./region";
 import { PARTS, type Part } from "./types";
 import { bytes } from "./words";
 
-const PLACES: Record<Part, { label: string; hint: string }> = {
+export const PLACES: Record<Part, { label: string; hint: string }> = {
   film: { label: "Film", hint: "mp4, mov, webm, avi, gif, zip of pictures" },
   tracks: { label: "Tracks", hint: "npz, npy, mat, csv …" },
   mesh: { label: "Mesh", hint: "optional: obj, ply, glb, npz" },
@@ -21,6 +22,7 @@ interface Slot {
   input: HTMLInputElement;
   hint: HTMLElement;
   contents: HTMLElement;
+  answer: HTMLElement;
   remove: HTMLButtonElement;
   file: File | null;
 }
@@ -68,6 +70,25 @@ export class Slots {
     return this.slots.get(part)?.file ?? null;
   }
 
+  /** The file that a job would be named after. */
+  get main(): File | null {
+    return this.file("film") ?? this.file("tracks");
+  }
+
+  /** Show a refusal in the place of its file; false where that place is not shown. */
+  refuse(part: string, box: HTMLElement): boolean {
+    const slot = this.slots.get((part === "region" ? "film" : part) as Part);
+    if (slot === undefined || slot.row.hidden) return false;
+    slot.answer.replaceChildren(box);
+    slot.row.scrollIntoView({ block: "nearest" });
+    return true;
+  }
+
+  /** Remove all refusals. */
+  clear(): void {
+    for (const { answer } of this.slots.values()) answer.replaceChildren();
+  }
+
   focus(part: Part): void {
     this.slots.get(part)?.input.focus();
   }
@@ -76,6 +97,11 @@ export class Slots {
   async fill(files: [Part, File][]): Promise<void> {
     for (const part of PARTS) await this.show(part, files.find(([of]) => of === part)?.[1] ?? null);
     this.onChange();
+  }
+
+  /** Choose what to track in the film: corners in its pixels. */
+  async outline(corners: Point[]): Promise<void> {
+    await this.filming.take(corners);
   }
 
   /** Put dropped files where their names and contents say they belong. */
@@ -97,6 +123,7 @@ export class Slots {
       input: h("input", { type: "file", id, class: "visually-hidden", "aria-describedby": `${id}-hint` }),
       hint: h("span", { class: "hint", id: `${id}-hint` }, hint),
       contents: h("p", { class: "contents hint" }),
+      answer: h("div", { class: "slot-answer", "aria-live": "assertive" }),
       remove: button("×", () => void this.put(part, null).then(() => slot.input.focus()), {
         class: "quiet",
         hidden: true,
@@ -111,8 +138,15 @@ export class Slots {
     const pick = h("span", { class: "pick", "aria-hidden": "true" }, "Choose");
     slot.row.append(slot.input, choose, pick, slot.hint, slot.remove, slot.contents);
     if (part === "mesh") slot.row.append(h("span", { class: "grid-size" }, h("label", { for: "grid" }, "or points on a grid"), this.grid));
-    if (part === "film") slot.row.append(this.filming.element);
+    if (part === "film") slot.row.append(this.recording(), this.filming.element);
+    slot.row.append(slot.answer);
     return slot.row;
+  }
+
+  private recording(): HTMLElement | string {
+    if (!canRecord()) return "";
+    const film = (recorded: File): void => void this.put("film", recorded);
+    return h("span", { class: "record" }, button("Record with the camera", () => void new CameraDialog(film).open(), { class: "link" }));
   }
 
   private async put(part: Part, file: File | null): Promise<void> {
@@ -130,7 +164,7 @@ export class Slots {
     if (part === "mesh") (this.grid.parentElement as HTMLElement).hidden = file !== null;
     if (part === "film") {
       this.arrange();
-      void this.filming.show(file);
+      this.filming.show(file);
     }
     if (file === null) {
       slot.input.value = "";

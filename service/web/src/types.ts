@@ -24,6 +24,7 @@ interface Trust {
   trust_sentence?: string | null;
 }
 export type Job = Omit<Schemas["Job"], "options" | "error" | keyof Trust> & Trust & { options: Options; error: Problem | null };
+export type Share = Schemas["Share"];
 export type JobPage = Omit<Schemas["JobPage"], "jobs"> & { jobs: Job[] };
 
 /** The part of a JSON Schema that the options' schema uses. */

@@ -58,7 +58,8 @@ export function ago(iso: string, now = Date.now()): string {
 }
 
 export function title(job: Job): string {
-  return job.name || `Job ${job.id.slice(0, 8)}`;
+  const own = job.name || `Job ${(job.outputs_of ?? job.id).slice(0, 8)}`;
+  return job.outputs_of ? `${own}: further files` : own;
 }
 
 export const STATUS_WORDS: Record<Status, string> = {

@@ -13,7 +13,7 @@ from pliant.schemas.options import Options
 from pliant.solver import Camera
 from pliant.worker.artifacts import write_artifacts
 from pliant.worker.artifacts.geometry import viewer_scale
-from pliant.worker.artifacts.gltf.view import view_of
+from pliant.worker.artifacts.view import view_of
 from results import make_result, moving_sheet
 from scipy.spatial.transform import Rotation, Slerp
 

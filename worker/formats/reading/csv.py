@@ -6,7 +6,8 @@ import io
 from typing import IO
 
 import numpy as np
-from pliant.worker.formats.errors import damaged, refusal, too_large
+from pliant.solver import InvalidInput
+from pliant.worker.formats.errors import damaged, too_large
 from pliant.worker.formats.records import Arrays, Limits
 
 COLUMNS = ("frame", "point", "x", "y")
@@ -58,8 +59,8 @@ def read_csv(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
         )
     places = frames * len(names) + points
     if len(np.unique(places)) != len(places):
-        raise refusal(
-            "duplicate_observation", field, expected="each point once in a frame", got="a frame and point twice",
+        raise InvalidInput(
+            "duplicate_observation", field=field, expected="each point once in a frame", got="a frame and point twice",
             hint="Keep one line for each frame and point.",
         )  # fmt: skip
     tracks = np.full((count * len(names), 2), np.nan)

@@ -11,7 +11,8 @@ from typing import IO
 
 import h5py
 import numpy as np
-from pliant.worker.formats.errors import damaged, refusal, too_large
+from pliant.solver import InvalidInput
+from pliant.worker.formats.errors import damaged, too_large
 from pliant.worker.formats.records import Arrays, Limits
 
 UNREADABLE = (OSError, ValueError, KeyError, RuntimeError, TypeError, AttributeError, OverflowError, IndexError)
@@ -46,8 +47,8 @@ def read_matlab73(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
     except UNREADABLE as error:
         raise damaged(field, f"an HDF5 file that cannot be read ({str(error)[:120]})") from error
     if not found:
-        raise refusal(
-            "missing_array", field, expected="a numeric matrix such as W", got="no plain array",
+        raise InvalidInput(
+            "missing_array", field=field, expected="a numeric matrix such as W", got="no plain array",
             hint="Save the 2F × P matrix: save('tracks.mat', 'W', '-v7').",
         )  # fmt: skip
     return found
@@ -131,7 +132,7 @@ def _check_stored(item: h5py.Dataset, name: str, declared: int, field: str, limi
 
 
 def _elsewhere(field: str, what: str) -> Exception:
-    return refusal(
-        "unsupported_feature", field, expected="data inside the file itself", got=what,
+    return InvalidInput(
+        "unsupported_feature", field=field, expected="data inside the file itself", got=what,
         hint="Save the matrix itself: save('tracks.mat', 'W', '-v7').",
     )  # fmt: skip

@@ -8,7 +8,7 @@ from importlib import import_module
 from typing import IO
 
 from pliant.solver import InvalidInput
-from pliant.worker.formats.errors import refusal, too_large
+from pliant.worker.formats.errors import too_large
 from pliant.worker.formats.reading.arrays import pickle_refusal
 from pliant.worker.formats.reading.csv import looks_like_csv
 from pliant.worker.formats.records import Arrays, Limits
@@ -83,8 +83,8 @@ def unknown_format(field: str, head: bytes) -> InvalidInput:
     """Return the error for a file of an unknown format."""
     mesh = "npz, npy, OBJ, PLY, glTF, GLB or a PNG mask"
     kinds = mesh if field == "mesh" else "npz, npy, MATLAB .mat or CSV with the columns frame, point, x, y"
-    return refusal(
-        "unknown_format", field, expected=f"{kinds}, recognised by content", got=f"a file that starts with {head[:16]!r}",
+    return InvalidInput(
+        "unknown_format", field=field, expected=f"{kinds}, recognised by content", got=f"a file that starts with {head[:16]!r}",
         hint="Convert it, e.g. numpy.savez('tracks.npz', tracks=points, visibility=visible).",
     )  # fmt: skip
 

@@ -1,0 +1,35 @@
+"""The wire contract of share links: read-only access to one job's results, for a while."""
+
+from __future__ import annotations
+
+from datetime import datetime
+
+from pliant.schemas.job import Record
+from pydantic import BaseModel, ConfigDict, Field
+
+DAY = 24 * 3600
+SHARE_PREFIX = "share."
+"""How the token of a share link begins; other bearer tokens begin differently."""
+
+
+class ShareRequest(BaseModel):
+    """How long a share link is valid."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    expires_in: int = Field(7 * DAY, ge=60, le=366 * DAY, description="Seconds until the link expires.")
+
+
+class Share(Record):
+    """A share link of a job."""
+
+    id: str
+    created_at: datetime
+    expires_at: datetime
+    token: str | None = Field(
+        None,
+        description="Bearer token that reads the job and its files, and nothing else. Only the answer that creates the link has it.",
+    )
+    path: str | None = Field(
+        None, description="Address of the page that shows the result, relative to the service; holds the token."
+    )

@@ -1,0 +1,51 @@
+"""Requests that come through a share link: they read one job and its files, and nothing else."""
+
+from __future__ import annotations
+
+import re
+
+from anyio import to_thread
+from fastapi.responses import Response
+from pliant.schemas.problems import ProblemCode
+from pliant.schemas.shares import SHARE_PREFIX
+from pliant.service.problems import ProblemResponse, answer, from_error
+from pliant.worker.errors import StoreUnavailable
+from pliant.worker.jobs.sharing import recognise_share
+from pliant.worker.records import Records, utc_now
+from starlette.datastructures import Headers
+from starlette.types import Scope
+
+_READABLE = re.compile(r"/v1/jobs/(?P<id>[^/]+)(/events|/artifacts(/[^/]+)?)?")
+
+
+def share_of(scope: Scope) -> str | None:
+    """Return the token of a request's share link, None if the request carries no such token."""
+    given = Headers(scope=scope).getlist("authorization")
+    scheme, _, text = given[0].partition(" ") if len(given) == 1 else ("", "", "")
+    token = text.strip()
+    return token if scheme.lower() == "bearer" and token.startswith(SHARE_PREFIX) else None
+
+
+async def authorize_share(scope: Scope, token: str, records: Records) -> Response | None:
+    """Let a request pass that its link allows, with the job's owner in the scope; return the answer that refuses any other."""
+    try:
+        found = await to_thread.run_sync(recognise_share, records, token, utc_now())
+    except StoreUnavailable as error:
+        return ProblemResponse(from_error(error, 503), headers={"Retry-After": "2"})
+    if found is None:
+        detail = "This share link is not valid: it was revoked, or its job was deleted. Ask its sender for a new one."
+        return _refused(ProblemCode.INVALID_SHARE, detail)
+    stored, valid = found
+    if not valid:
+        return _refused(ProblemCode.EXPIRED_SHARE, "This share link has expired. Ask its sender for a new one.")
+    wanted = _READABLE.fullmatch(scope["path"])
+    if scope["method"] not in ("GET", "HEAD") or wanted is None or wanted["id"] != stored.job.id:
+        detail = "A share link reads the results of its own job and changes nothing. Use a token for anything else."
+        return answer(ProblemCode.BEYOND_SHARE, detail=detail, field="Authorization")
+    scope["pliant.owner"] = stored.owner
+    return None
+
+
+def _refused(code: ProblemCode, detail: str) -> Response:
+    challenge = 'Bearer realm="pliant", error="invalid_token"'
+    return answer(code, detail=detail, headers={"WWW-Authenticate": challenge}, field="Authorization")

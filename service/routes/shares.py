@@ -1,0 +1,53 @@
+"""Share links of a job: create, list, revoke."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from anyio import to_thread
+from fastapi import APIRouter, Path, Request
+from pliant.schemas.shares import Share, ShareRequest
+from pliant.service.dependencies import Mine
+from pliant.service.openapi import problems
+from pliant.service.routes.jobs import Id
+from pliant.service.routes.json_body import body_of, read_json
+from pliant.worker.jobs.sharing import create_share, list_shares, revoke_share
+
+router = APIRouter(prefix="/v1/jobs/{id}/shares", tags=["artifacts"])
+
+
+@router.post(
+    "",
+    status_code=201,
+    operation_id="create_share",
+    summary="Create a share link",
+    responses=problems(400, 401, 403, 404, 408, 409, 413, 415, 422, 429, 503),
+    openapi_extra=body_of(ShareRequest, required=False),
+)
+async def create(id: Id, request: Request, jobs: Mine) -> Share:
+    """Create a link that shows one job's results, read-only, until it expires or is revoked.
+
+    Whoever has the link can read the job's record and its files: no other job, no log, and nothing can be changed. The token is
+    sent as `Authorization: Bearer share.…`, also where the service requires no tokens. It is returned once; only its digest is
+    stored.
+    """
+    wanted = await read_json(request, ShareRequest)
+    return await to_thread.run_sync(lambda: create_share(jobs, id, wanted))
+
+
+@router.get("", operation_id="list_shares", summary="List share links", responses=problems(401, 403, 404, 503))
+def shares(id: Id, jobs: Mine) -> list[Share]:
+    """Return the valid links of a job, without their tokens."""
+    return list_shares(jobs, id)
+
+
+@router.delete(
+    "/{share}",
+    status_code=204,
+    operation_id="revoke_share",
+    summary="Revoke a share link",
+    responses=problems(401, 403, 404, 503),
+)
+def revoke(id: Id, share: Annotated[str, Path(description="The link's id.", max_length=64)], jobs: Mine) -> None:
+    """End a link at once."""
+    revoke_share(jobs, id, share)

@@ -1,0 +1,157 @@
+// What can be done with a finished job: further files of its result, a link to show it, its inputs with other options.
+
+import { Refusal, createShare, getJob, listShares, makeOutputs, revokeShare } from "./api";
+import { button, h, uniqueId } from "./dom";
+import { refusalBox } from "./refusal";
+import { saveLink } from "./results";
+import { type Job, isFinal } from "./types";
+import { count, standing } from "./words";
+
+const KINDS: [string, string][] = [
+  ["glb", "glTF, animated"],
+  ["usd", "USD"],
+  ["mdd", "MDD point cache"],
+  ["ply", "PLY, one a frame"],
+  ["obj", "OBJ, one a frame"],
+  ["mat", "MATLAB"],
+  ["csv", "Tables of errors (csv)"],
+];
+const DAY = 24 * 3600;
+
+/** Tells the form to use a job's inputs again; `main.ts` listens. */
+export const AGAIN = "pliant-again";
+
+export class Afterwards {
+  readonly element = h("section", { class: "afterwards", "aria-label": "Next steps", hidden: true });
+  private readonly body = h("div", {});
+  private shown: "files" | "share" | null = null;
+  private job: Job | null = null;
+
+  show(job: Job): void {
+    const known = this.job !== null;
+    this.job = job;
+    this.element.hidden = !isFinal(job.status) || job.outputs_of !== null;
+    if (known && this.element.childElementCount > 0) return;
+    const done = job.status === "succeeded";
+    const again = button("Run again with other options", () => document.dispatchEvent(new CustomEvent(AGAIN, { detail: this.job })));
+    const files = button("More files", () => this.toggle("files", files), { "aria-expanded": "false", hidden: !done });
+    const share = button("Share", () => this.toggle("share", share), { "aria-expanded": "false", hidden: !done });
+    this.element.replaceChildren(h("div", { class: "row" }, files, share, again), this.body);
+  }
+
+  private toggle(what: "files" | "share", opener: HTMLButtonElement): void {
+    this.shown = this.shown === what ? null : what;
+    for (const one of this.element.querySelectorAll("[aria-expanded]")) one.setAttribute("aria-expanded", String(this.shown === what && one === opener));
+    if (this.shown === null || this.job === null) this.body.replaceChildren();
+    else this.body.replaceChildren(what === "files" ? furtherFiles(this.job) : sharing(this.job));
+  }
+}
+
+function trouble(place: HTMLElement, error: unknown): void {
+  if (!(error instanceof Refusal)) throw error;
+  place.replaceChildren(refusalBox(error.problem));
+}
+
+/** The form that asks for further files, and the files once they are there. */
+function furtherFiles(job: Job): HTMLElement {
+  const boxes = KINDS.map(([kind, words]) => {
+    const id = uniqueId("kind");
+    const box = h("input", { type: "checkbox", id, value: kind });
+    return { box, label: h("label", { for: id, class: "tick" }, box, ` ${words}`) };
+  });
+  const rate = h("input", { type: "number", id: uniqueId("rate"), min: 1, max: 1000, step: "any", value: String(job.options["fps"]) });
+  const axes = h(
+    "select",
+    { id: uniqueId("axes") },
+    h("option", { value: "viewer" }, "y up, as in viewers"),
+    h("option", { value: "tracks" }, "as the tracks"),
+  );
+  axes.value = String(job.options["axes"]);
+  const words = h("div", { class: "answer", role: "status" });
+  const make = h("button", { type: "submit", class: "primary" }, "Make the files");
+  const form = h(
+    "form",
+    { class: "after-form" },
+    h("fieldset", {}, h("legend", {}, "Files"), ...boxes.map(({ label }) => label)),
+    h("div", { class: "row" }, h("label", { for: rate.id }, "Frames per second"), rate, h("label", { for: axes.id }, "Axes of PLY and OBJ"), axes),
+    h("div", { class: "row" }, make),
+    words,
+  );
+  form.addEventListener("submit", (event) => {
+    event.preventDefault();
+    const outputs = boxes.filter(({ box }) => box.checked).map(({ box }) => box.value);
+    if (outputs.length === 0) {
+      words.replaceChildren(h("p", { class: "sentence bad" }, "Choose at least one file."));
+      return;
+    }
+    make.disabled = true;
+    void write(job, { outputs, fps: Number(rate.value), axes: axes.value }, words).finally(() => (make.disabled = false));
+  });
+  return form;
+}
+
+/** Ask for the files and follow the job that writes them; nothing is solved again. */
+async function write(job: Job, wanted: Record<string, unknown>, words: HTMLElement): Promise<void> {
+  try {
+    let further = await makeOutputs(job.id, wanted);
+    while (!isFinal(further.status)) {
+      words.textContent = further.status === "queued" ? "Waiting for a worker…" : standing(further);
+      await new Promise((resolve) => setTimeout(resolve, 700));
+      further = await getJob(further.id);
+    }
+    const made = further;
+    if (made.error) words.replaceChildren(refusalBox(made.error));
+    else words.replaceChildren(h("ul", { class: "files" }, ...made.artifacts.filter(({ name }) => name !== "report.json").map((one) => h("li", {}, saveLink(made, one, `Save ${one.name}`), h("span", { class: "hint" }, one.description)))));
+  } catch (error) {
+    trouble(words, error);
+  }
+}
+
+/** The form that makes a link, and the links that are valid. */
+function sharing(job: Job): HTMLElement {
+  const days = h("select", { id: uniqueId("days") }, ...[1, 7, 30, 366].map((each) => h("option", { value: each }, count(each, "day"))));
+  days.value = "7";
+  const made = h("div", { class: "answer", role: "status" });
+  const valid = h("ul", { class: "files" });
+  const create = h("button", { type: "submit", class: "primary" }, "Create a link");
+  const form = h(
+    "form",
+    { class: "after-form" },
+    h("p", { class: "hint" }, "Whoever has the link sees this result and its files, and nothing else. It can be revoked at any time."),
+    h("div", { class: "row" }, h("label", { for: days.id }, "Valid for"), days, create),
+    made,
+    valid,
+  );
+  const list = async (): Promise<void> => {
+    const shares = await listShares(job.id);
+    valid.replaceChildren(
+      ...shares.map((share) => {
+        const until = new Date(share.expires_at).toLocaleString();
+        const revoke = button("Revoke", () => {
+          revokeShare(job.id, share.id).then(list, (error: unknown) => trouble(made, error));
+        });
+        return h("li", {}, h("span", {}, `Link ${share.id}, valid until ${until}`), revoke);
+      }),
+    );
+  };
+  form.addEventListener("submit", (event) => {
+    event.preventDefault();
+    createShare(job.id, Number(days.value) * DAY)
+      .then(async (share) => {
+        const link = new URL(share.path ?? "", location.href.split("#")[0]).href;
+        const field = h("input", { type: "text", readonly: true, value: link, "aria-label": "Link to this result", onfocus: () => field.select() });
+        made.replaceChildren(field, h("p", { class: "hint" }, "Copy it now: it is shown only once."));
+        field.focus();
+        await list();
+      })
+      .catch((error: unknown) => trouble(made, error));
+  });
+  list().catch((error: unknown) => trouble(made, error));
+  return form;
+}
+
+/** The job of a share link's token. */
+export function sharedJob(token: string): string {
+  return token.slice(token.indexOf(".") + 1, token.lastIndexOf("."));
+}
+

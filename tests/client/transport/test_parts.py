@@ -1,0 +1,162 @@
+"""What users hand over becomes files the service reads; what cannot become one is refused here."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from pliant.client import BadArgument, Client, NotLoaded, Options
+from pliant.client.multipart import Form, array_part, checked_options, mesh_part, tracks_file
+from pliant.service.testing import InMemoryService
+
+POINTS = np.arange(4 * 9 * 2, dtype=np.float32).reshape(4, 9, 2)
+
+
+def arrays(path: Path) -> dict[str, np.ndarray]:
+    with np.load(path, allow_pickle=False) as held:
+        return dict(held)
+
+
+class Tensor:
+    """As PyTorch's: on a device, part of a graph."""
+
+    def __init__(self, array: np.ndarray, *, attached: bool = True, remote: bool = True) -> None:
+        self.array, self.attached, self.remote = array, attached, remote
+
+    def detach(self) -> Tensor:
+        return Tensor(self.array, attached=False, remote=self.remote)
+
+    def cpu(self) -> Tensor:
+        return Tensor(self.array, attached=self.attached, remote=False)
+
+    def __array__(self, dtype: Any = None, copy: Any = None) -> np.ndarray:
+        if self.attached or self.remote:
+            raise TypeError("call detach() and cpu() first")
+        return self.array
+
+
+def test_an_array_keeps_its_type_and_gets_its_visibility(tmp_path: Path) -> None:
+    held = arrays(tracks_file(POINTS, np.ones((4, 9), bool), tmp_path))
+    np.testing.assert_array_equal(held["tracks"], POINTS)
+    assert held["tracks"].dtype == np.float32
+    assert held["visibility"].shape == (4, 9)
+    assert set(arrays(tracks_file(POINTS.tolist(), None, tmp_path))) == {"tracks"}
+
+
+def test_a_mask_is_inverted_visibility(tmp_path: Path) -> None:
+    mask = np.zeros(POINTS.shape, bool)
+    mask[1, 2, 0] = True
+    held = arrays(tracks_file(np.ma.masked_array(POINTS, mask), None, tmp_path))
+    assert np.argwhere(~held["visibility"]).tolist() == [[1, 2]]
+
+
+def test_the_dictionary_of_a_tracker_is_sent_unchanged(tmp_path: Path) -> None:
+    given = {"pred_tracks": Tensor(POINTS[None]), "pred_visibility": Tensor(np.ones((1, 4, 9), bool))}
+    held = arrays(tracks_file(given, None, tmp_path))
+    assert {name: array.shape for name, array in held.items()} == {
+        "pred_tracks": (1, 4, 9, 2),
+        "pred_visibility": (1, 4, 9),
+    }
+
+
+def test_the_same_arrays_make_the_same_bytes(tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    one, other = (tracks_file(POINTS, None, tmp_path / name).read_bytes() for name in "ab")
+    assert one == other
+
+
+def test_meshes_are_faces_files_or_words(tmp_path: Path) -> None:
+    assert mesh_part((3, 4), tmp_path) == mesh_part("3 x 4", tmp_path) == mesh_part("3X4", tmp_path) == "3x4"
+    assert mesh_part("none", tmp_path) == "none"
+    faces = mesh_part([[0, 1, 2], [0, 2, 3]], tmp_path)
+    assert arrays(Path(faces))["faces"].tolist() == [[0, 1, 2], [0, 2, 3]]
+    assert arrays(Path(mesh_part({"grid": np.zeros((2, 2), int)}, tmp_path)))["grid"].shape == (2, 2)
+    assert mesh_part(faces, tmp_path) == mesh_part(str(faces), tmp_path) == faces
+
+
+def test_truth_and_cameras_are_arrays_dictionaries_or_files(tmp_path: Path) -> None:
+    path = array_part(np.zeros((4, 9, 3)), "ground_truth", "shapes", tmp_path)
+    assert list(arrays(path)) == ["shapes"]
+    assert set(arrays(array_part({"shapes": [1.0], "rotations": [2.0]}, "ground_truth", "shapes", tmp_path))) == {
+        "shapes",
+        "rotations",
+    }
+    assert array_part(path, "ground_truth", "shapes", tmp_path) == path
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda here: tracks_file("nowhere.npz", None, here), "got no file at nowhere.npz"),
+        (lambda here: tracks_file({"tracks": POINTS}, np.ones((4, 9)), here), "contains its own visibility"),
+        (lambda here: tracks_file({"model": "cotracker3"}, None, here), "model: expected an array of numbers"),
+        (lambda here: tracks_file(np.array([None]), None, here), "got dtype object"),
+        (lambda here: tracks_file(POINTS * 1j, None, here), "got dtype complex"),
+        (lambda here: mesh_part("3by4", here), "mesh: expected a file"),
+        (lambda here: checked_options({"loss": "l3", "los": 1}), r"loss: .*'l3'.*los: there is no such option.*loss.*pliant options"),
+    ],
+)  # fmt: skip
+def test_invalid_inputs_are_rejected_before_anything_is_sent(make: Any, words: str, tmp_path: Path) -> None:
+    with pytest.raises(BadArgument, match=words):
+        make(tmp_path)
+
+
+def test_options_are_a_record_or_a_mapping() -> None:
+    assert checked_options(None) == Options()
+    assert checked_options({"loss": "huber"}) == checked_options(Options(loss="huber"))
+
+
+def test_a_body_is_streamed_counted_and_can_be_sent_again(tmp_path: Path) -> None:
+    big = tmp_path / "big.bin"
+    big.write_bytes(bytes(300_000))
+    told: list[tuple[int, int]] = []
+    form = Form(fields={"name": "ü"}, files={"tracks": big}, on_upload=lambda *now: told.append(now))
+    for _ in range(2):
+        told.clear()
+        with form.open() as files:
+            request = httpx.Client().build_request("POST", "http://x/", data=dict(form.fields), files=files)
+            pieces = list(request.stream)
+        assert max(map(len, pieces)) <= 65536
+        assert int(request.headers["content-length"]) == sum(map(len, pieces))
+        assert told[-1] == (300_000, 300_000)
+        body = b"".join(pieces)
+        assert 'name="name"\r\n\r\nü\r\n'.encode() in body
+        assert b'name="tracks"; filename="big.bin"' in body
+        assert bytes(300_000) in body
+
+
+def test_no_temporary_file_remains(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    service = InMemoryService()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    with Client("http://pliant.test", transport=service) as client:
+        result = client.submit(POINTS).wait(timeout=9)
+        assert result.shapes.shape == (4, 9, 3)
+        assert len(list(tmp_path.glob("pliant-result-*"))) == 1
+        del result
+    service.stop()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_result_that_is_not_loaded_is_an_error(tmp_path: Path) -> None:
+    with Client("http://pliant.test", transport=InMemoryService()) as client:
+        result = client.submit(POINTS).wait(timeout=9, load=False, folder=tmp_path)
+        with pytest.raises(NotLoaded, match=r"call load\(\)"):
+            _ = result.shapes
+        assert result.load().shapes.shape == (4, 9, 3)
+        assert result.metrics["reprojection_median"] < 1e-9
+        assert result.faces.shape == (0, 3)
+
+
+def test_a_plot_shows_the_requested_frames(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    with Client("http://pliant.test", transport=InMemoryService()) as client:
+        figure = client.submit(POINTS, name="a face").wait(timeout=9).plot(frames=3)
+    assert [axes.get_title() for axes in figure.axes] == ["frame 0", "frame 2", "frame 3"]
+    picture = io.BytesIO()
+    figure.savefig(picture)
+    assert picture.getvalue()[:4] == b"\x89PNG"

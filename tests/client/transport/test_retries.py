@@ -1,0 +1,279 @@
+"""When a call is repeated: never without need, never twice in effect, never for ever."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import httpx
+import numpy as np
+import pytest
+from pliant.client import (
+    BadArgument,
+    Client,
+    InvalidRequest,
+    NotAuthorized,
+    RemoteJob,
+    Retry,
+    ServiceFailed,
+    TooManyRequests,
+    UnexpectedAnswer,
+    Unreachable,
+    WaitTimeout,
+)
+from pliant.client.call import Call
+from pliant.client.errors import seconds_of
+from pliant.schemas.job import Job
+from pliant.service.testing import InMemoryService
+
+POINTS = np.random.default_rng(0).normal(size=(4, 9, 2))
+
+
+class Clock:
+    """Time that passes only when somebody pauses."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+        self.pauses: list[float] = []
+
+    def __call__(self) -> float:
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        self.pauses.append(seconds)
+        self.now += seconds
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    clock = Clock()
+    monkeypatch.setattr("pliant.client._sync.transport.sleep", clock.sleep)
+    monkeypatch.setattr("pliant.client._sync.upload.sleep", clock.sleep)
+    monkeypatch.setattr("pliant.client._sync.events.sleep", clock.sleep)
+    return clock
+
+
+class Flaky(InMemoryService):
+    """A service that misbehaves before, or after, it has done what it was asked."""
+
+    def __init__(
+        self, *faults: Callable[[httpx.Request], httpx.Response], after: bool = False, steps: float = 0
+    ) -> None:
+        super().__init__(steps=steps)
+        self.faults = list(faults)
+        self.after = after
+
+    def handle_request(self, request: httpx.Request) -> httpx.Response:
+        if len(self.faults) == 0:
+            return super().handle_request(request)
+        fault = self.faults.pop(0)
+        if self.after:
+            super().handle_request(request).close()
+        else:
+            request.read()
+            self.requests.append(request)
+        return fault(request)
+
+
+def queued(client: Client) -> RemoteJob:
+    """Submit a job behind one that runs until it is cancelled, so that this one stays queued."""
+    client.submit(POINTS + 1)
+    return client.submit(POINTS)
+
+
+def no_connection(request: httpx.Request) -> httpx.Response:
+    raise httpx.ConnectError("connection refused", request=request)
+
+
+def cut_off(request: httpx.Request) -> httpx.Response:
+    raise httpx.RemoteProtocolError("server disconnected without sending a response", request=request)
+
+
+def answer(status: int, *, retryable: bool = False, **headers: str) -> Callable[[httpx.Request], httpx.Response]:
+    problem = {"title": "t", "status": status, "code": "c", "detail": "Sentence.", "retryable": retryable}
+    media = {"content-type": "application/problem+json", **headers}
+    return lambda request: httpx.Response(status, json=problem, headers=media)
+
+
+def client_of(service: httpx.BaseTransport, clock: Clock, **policy: float) -> Client:
+    return Client("http://pliant.test", transport=service, retries=Retry(clock=clock, jitter=lambda: 1.0, **policy))
+
+
+def test_a_lost_response_to_a_submission_creates_one_job(clock: Clock) -> None:
+    service = Flaky(cut_off, cut_off, after=True)
+    client = client_of(service, clock)
+    job = client.submit(POINTS)
+    assert [other.id for other in client.list()] == [job.id]
+    keys = {request.headers["idempotency-key"] for request in service.requests if request.method == "POST"}
+    assert len(keys) == 1
+    bodies = {request.content.split(b"\r\n", 1)[1][:40] for request in service.requests[:3]}
+    assert len(bodies) == 1
+
+
+def test_a_call_that_may_have_been_carried_out_is_not_repeated(clock: Clock) -> None:
+    service = Flaky(cut_off)
+    client = client_of(service, clock)
+    call = Call(method="POST", path="/v1/jobs/x/retry")  # without a key, as a client of another making might
+    with pytest.raises(Unreachable, match="not sent again, because it may have been carried out"):
+        client._exchange(None).record(call, Job)
+    assert len(service.requests) == 1
+    assert clock.pauses == []
+
+
+def test_a_retried_job_is_created_once_despite_a_lost_response(clock: Clock) -> None:
+    service = Flaky(after=True, steps=math.inf)
+    client = client_of(service, clock)
+    job = queued(client).cancel()
+    service.faults = [cut_off, cut_off]
+    again = job.retry()
+    assert again.record.retry_of == job.id
+    assert [each.record.retry_of for each in client.list()] == [job.id, None, None]
+
+
+def test_a_post_without_side_effects_is_repeated(clock: Clock) -> None:
+    service = Flaky(cut_off, cut_off)
+    assert client_of(service, clock).inspect(POINTS).num_points == 9
+    assert [request.url.path for request in service.requests] == ["/v1/inspect"] * 3
+
+
+@pytest.mark.parametrize("fault", [no_connection, answer(429, **{"retry-after": "2"})], ids=["refused", "429"])
+def test_a_call_that_cannot_have_been_carried_out_is_repeated(clock: Clock, fault: Callable) -> None:
+    service = Flaky(steps=math.inf)
+    client = client_of(service, clock)
+    job = queued(client)
+    job.cancel()
+    service.faults = [fault]
+    job.retry()
+    assert len(clock.pauses) == 1
+
+
+def test_retry_after_is_honoured(clock: Clock) -> None:
+    client = client_of(
+        Flaky(answer(429, **{"retry-after": "7"}), answer(503, **{"retry-after": "3"})), clock, first_contact=60
+    )
+    client.options()
+    assert clock.pauses == [7.25, 3.25]
+
+
+def test_pauses_double_up_to_a_bound(clock: Clock) -> None:
+    client = client_of(Flaky(*[no_connection] * 8), clock, first_contact=100)
+    client.options()
+    assert clock.pauses == [0.25, 0.5, 1, 2, 4, 8, 10, 10]
+
+
+def test_a_wrong_address_fails_within_seconds_and_a_restart_is_waited_for(clock: Clock) -> None:
+    with pytest.raises(Unreachable, match=r"connection refused.*pliant up"):
+        client_of(Flaky(*[no_connection] * 99), clock).options()
+    assert 1 < clock.now < 6
+    service = Flaky()
+    client = client_of(service, clock)
+    client.options()
+    service.faults = [no_connection] * 10
+    client.options()
+    assert clock.now > 30
+    service.faults = [no_connection] * 99
+    with pytest.raises(Unreachable):
+        client.options()
+
+
+@pytest.mark.parametrize("status", [400, 401, 404, 409, 413, 422, 500, 501])
+def test_a_definite_rejection_is_not_repeated(clock: Clock, status: int) -> None:
+    service = Flaky(answer(status))
+    with pytest.raises(Exception, match=r"Sentence\."):
+        client_of(service, clock).options()
+    assert len(service.requests) == 1
+
+
+def test_a_retryable_error_is_retried(clock: Clock) -> None:
+    service = Flaky(answer(500, retryable=True))
+    client_of(service, clock).options()
+    assert len(service.requests) == 2
+
+
+@pytest.mark.parametrize(("status", "kind"), [(429, TooManyRequests), (503, ServiceFailed)])
+def test_a_service_that_never_recovers_raises_its_own_message(clock: Clock, status: int, kind: type) -> None:
+    with pytest.raises(kind, match=r"Sentence\.") as caught:
+        client_of(Flaky(*[answer(status)] * 99), clock).options()
+    assert caught.value.status == status
+    assert 60 < clock.now <= 90
+
+
+def test_the_overall_timeout_holds_over_all_repetitions(clock: Clock) -> None:
+    with pytest.raises(WaitTimeout, match="The timeout of 3 s passed") as caught:
+        client_of(Flaky(*[answer(503)] * 99), clock).options(timeout=3)
+    assert clock.now <= 3
+    assert isinstance(caught.value, TimeoutError)
+
+
+@pytest.mark.parametrize("on_progress", [None, lambda _: None], ids=["polling", "events"])
+def test_waiting_ends_with_the_timeout_and_the_job_continues(on_progress: Callable[[Job], None] | None) -> None:
+    service = InMemoryService(steps=math.inf)
+    with Client("http://pliant.test", transport=service, retries=Retry(poll_interval=0.01)) as client:
+        job = client.submit(POINTS)
+        with pytest.raises(WaitTimeout, match=r"0\.6 s passed during the wait for job"):
+            job.wait(timeout=0.6, on_progress=on_progress)
+        assert job.refresh().status == "running"
+
+
+def test_a_deletion_with_a_lost_response_succeeds(clock: Clock) -> None:
+    service = Flaky()
+    client = client_of(service, clock)
+    job = client.submit(POINTS)
+    job.wait(timeout=9)
+    service.faults, service.after = [cut_off], True
+    job.delete()
+    assert list(client.list()) == []
+
+
+def test_a_response_of_another_server_is_an_error(clock: Clock) -> None:
+    page = lambda request: httpx.Response(404, html="<h1>nginx</h1>")  # noqa: E731
+    with pytest.raises(UnexpectedAnswer, match=r"text/html.*nginx"):
+        client_of(Flaky(page), clock).options()
+    with pytest.raises(UnexpectedAnswer, match="Expected a Job with status 200"):
+        client_of(Flaky(lambda request: httpx.Response(200, json={"hello": 1})), clock).get("a")
+    nonsense = {"content-type": "application/problem+json"}
+    with pytest.raises(UnexpectedAnswer, match="cannot be read"):
+        client_of(Flaky(lambda request: httpx.Response(500, content=b"{", headers=nonsense)), clock).get("a")
+
+
+def test_addresses_and_ids_are_checked_before_anything_is_sent(clock: Clock) -> None:
+    for address in ("127.0.0.1:8000", "ftp://here", "http://"):
+        with pytest.raises(BadArgument, match="Expected the address of a service"):
+            Client(address)
+    service = InMemoryService()
+    with pytest.raises(BadArgument, match="Expected the id of a job"):
+        client_of(service, clock).get("../../secrets")
+    assert service.requests == []
+
+
+def test_a_token_is_only_sent_in_the_header(clock: Clock) -> None:
+    service = InMemoryService(auth="required")
+    with pytest.raises(NotAuthorized, match="token"):
+        client_of(service, clock).options()
+    token = service.create_token()
+    Client("http://pliant.test", transport=service, token=token).options()
+    assert token not in str(service.requests[-1].url)
+
+
+@pytest.mark.parametrize(
+    ("header", "seconds"),
+    [
+        (None, None),
+        ("5", 5.0),
+        ("soon", None),
+        ("-3", None),
+        ("Wed, 21 Oct 2015 07:28:00 GMT", 0.0),
+        ("Wed, 21 Oct 2015 07:28:00 -0000", 0.0),
+    ],
+)
+def test_retry_after_is_seconds_or_a_date(header: str | None, seconds: float | None) -> None:
+    assert seconds_of(header) == seconds
+
+
+def test_an_input_error_has_all_its_fields(clock: Clock) -> None:
+    with pytest.raises(InvalidRequest) as caught:
+        client_of(InMemoryService(), clock).submit(np.zeros((5, 9)))
+    problem = caught.value.problem
+    assert problem.field == "tracks"
+    assert "(frames, points, 2)" in str(problem.expected)
+    assert "(5, 9)" in str(problem.got)

@@ -1,0 +1,160 @@
+"""Large inputs are sent ahead of their job, in raw bytes, and gone on with where the connection broke."""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from pliant.client import AsyncClient, Client, InvalidRequest, NotAllowedNow, Retry, Unreachable
+from pliant.client.multipart import Remainder
+from pliant.service.testing import InMemoryService
+
+PATIENT = Retry(shortest_pause=0.01, longest_pause=0.05)
+POINTS = np.random.default_rng(0).normal(size=(6, 30_000, 2))
+
+
+@pytest.fixture(autouse=True)
+def small_is_large(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pliant.client.multipart.LARGE", 100_000)
+    monkeypatch.setattr("pliant.client.multipart.SMALL", 10_000)
+
+
+@pytest.fixture
+def breaking(monkeypatch: pytest.MonkeyPatch) -> Callable[[int, int], list[int]]:
+    """Break the connection while a body is being sent: so many times, each after so many pieces; tell where each began."""
+
+    def arm(times: int, after: int) -> list[int]:
+        began: list[int] = []
+        whole = Remainder.pieces
+
+        def pieces(self: Remainder) -> Iterator[bytes]:
+            began.append(self.offset)
+            for number, piece in enumerate(whole(self)):
+                if number == after and len(began) <= times:
+                    raise httpx.WriteError("the cable was pulled")
+                yield piece
+
+        monkeypatch.setattr(Remainder, "pieces", pieces)
+        return began
+
+    return arm
+
+
+def submit(kind: str, *args: Any, url: str, **kwargs: Any) -> Any:
+    if kind == "sync":
+        with Client(url, retries=PATIENT) as client:
+            return client.submit(*args, **kwargs)
+
+    async def run() -> Any:
+        async with AsyncClient(url, retries=PATIENT) as client:
+            return await client.submit(*args, **kwargs)
+
+    return asyncio.run(run())
+
+
+@pytest.mark.parametrize("kind", ["sync", "async"])
+def test_an_interrupted_upload_resumes(kind: str, service_url: str, breaking: Callable[[int, int], list[int]]) -> None:
+    began = breaking(3, 2)
+    told: list[int] = []
+    job = submit(kind, POINTS, url=service_url, mesh="none", on_upload=lambda done, _: told.append(done))
+    assert job.record.interpretation.num_points == 30_000
+    assert began[0] == 0
+    assert len(began) >= 4
+    assert sorted(began) == began, "no try began before the one before it"
+    assert began[-1] > 0
+    assert told[-1] == max(told) > POINTS.nbytes
+    with Client(service_url) as client, suppress(NotAllowedNow):  # it may be done already
+        client.cancel(job.id)
+
+
+def test_bytes_sent_by_an_earlier_run_are_not_sent_again(
+    service_url: str, breaking: Callable[[int, int], list[int]]
+) -> None:
+    began = breaking(10**6, 2)
+    hasty = Retry(patience=0.2, first_contact=0.2, shortest_pause=0.3, jitter=lambda: 1.0)
+    with Client(service_url, retries=hasty) as client, pytest.raises(Unreachable, match="cable"):
+        client.submit(POINTS, job_id="second-run", mesh="none")
+    first = len(began)
+    whole = breaking(0, 0)
+    with Client(service_url, retries=PATIENT) as client:
+        job = client.submit(POINTS, job_id="second-run", mesh="none")
+        with suppress(NotAllowedNow):
+            job.cancel()
+    assert first >= 1
+    assert whole[0] > 0, "it goes on where the first run was given up"
+
+
+def test_a_service_without_uploads_receives_one_request() -> None:
+    class Older(InMemoryService):
+        def handle_request(self, request: httpx.Request) -> httpx.Response:
+            if "/uploads/" not in request.url.path:
+                return super().handle_request(request)
+            self.requests.append(request)
+            problem = '{"title": "Not found", "status": 404, "code": "no_such_address", "detail": "Nothing here."}'
+            return httpx.Response(404, text=problem, headers={"Content-Type": "application/problem+json"})
+
+    older = Older()
+    assert (
+        Client("http://pliant.test", transport=older).submit(POINTS, mesh="none").record.interpretation.num_points
+        == 30_000
+    )
+    assert [request.method for request in older.requests] == ["GET", "POST"]
+
+
+def test_an_expired_upload_is_sent_again() -> None:
+    class Forgetful(InMemoryService):
+        forgets = 1
+
+        def handle_request(self, request: httpx.Request) -> httpx.Response:
+            if request.url.path == "/v1/jobs" and self.forgets > 0:
+                self.forgets -= 1
+                shutil.rmtree(self.folder / "uploads")
+            return super().handle_request(request)
+
+    once = Forgetful()
+    assert (
+        Client("http://pliant.test", transport=once).submit(POINTS, mesh="none").record.interpretation.num_points
+        == 30_000
+    )
+    assert [request.method for request in once.requests] == ["GET", "PUT", "POST", "GET", "PUT", "POST", "DELETE"]
+    assert not [path for path in (once.folder / "uploads").rglob("*") if path.is_file()]
+    always = Forgetful()
+    always.forgets = 10
+    with pytest.raises(InvalidRequest) as caught:
+        Client("http://pliant.test", transport=always).submit(POINTS, mesh="none")
+    assert caught.value.code == "unknown_upload"
+
+
+def test_after_an_offset_mismatch_the_offset_is_read_again(tmp_path: Path) -> None:
+    class Jumping(InMemoryService):
+        """Somebody else has written part of it in the meantime."""
+
+        jumped = False
+
+        def handle_request(self, request: httpx.Request) -> httpx.Response:
+            if not self.jumped and request.method == "PUT":
+                self.jumped = True
+                half = request.read()[: len(request.content) // 2]
+                headers = {name: value for name, value in request.headers.items() if name != "content-length"}
+                first = httpx.Request("PUT", request.url, headers={**headers, "Upload-Complete": "?0"}, content=half)
+                assert super().handle_request(first).status_code < 400
+                self.requests.pop()
+                request = httpx.Request("PUT", request.url, headers={"Upload-Offset": "1"}, content=b"x")
+            return super().handle_request(request)
+
+    service = Jumping()
+    (tmp_path / "mesh.obj").write_text("v 0 0 0\n")
+    with pytest.raises(InvalidRequest, match="expected 30000 vertices"):
+        Client("http://pliant.test", transport=service, retries=PATIENT).submit(POINTS, mesh=tmp_path / "mesh.obj")
+    assert [request.method for request in service.requests] == ["GET", "PUT", "GET", "PUT", "POST", "DELETE"]
+    post = service.requests[-2]
+    assert b'name="mesh"; filename="mesh.obj"' in post.content
+    assert b'name="tracks_upload"' in post.content
+    assert len(post.content) < 10_000

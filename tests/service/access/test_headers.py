@@ -1,0 +1,115 @@
+"""What is said with every answer, and for which hosts there is one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import httpx
+import pytest
+from pliant.service.middleware.security_headers import SECURITY_HEADERS
+from serving import Running, Serve, finish, submit, until
+from starlette.requests import Request
+from starlette.responses import Response
+
+CAREFUL = {
+    "content-security-policy", "x-content-type-options", "x-frame-options", "referrer-policy", "cross-origin-opener-policy",
+    "cross-origin-resource-policy", "permissions-policy", "cache-control",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def guarded(serve: Serve) -> Running:
+    return serve(auth="required")
+
+
+@pytest.fixture(scope="module")
+def user(guarded: Running) -> Iterator[httpx.Client]:
+    with guarded.client() as client:
+        yield client
+
+
+def test_every_kind_of_answer_has_the_security_headers(guarded: Running, user: httpx.Client) -> None:
+    job = submit(user)
+    finish(guarded, job.id, b"result")
+    file = f"/v1/jobs/{job.id}/artifacts/shapes.npz"
+    etag = user.head(file).headers["etag"]
+    answers = {
+        "page": user.get("/"),
+        "manual": user.get("/docs"),
+        "no such page file": user.get("/page/x.js"),
+        "json": user.get(f"/v1/jobs/{job.id}"),
+        "file": user.get(file),
+        "part": user.get(file, headers={"Range": "bytes=0-1"}),
+        "not modified": user.get(file, headers={"If-None-Match": etag}),
+        "stream": user.get(f"/v1/jobs/{job.id}/events"),
+        "log": user.get(f"/v1/jobs/{job.id}/log"),
+        "description": user.get("/openapi.json"),
+        "health": user.get("/healthz"),
+        "deleted": user.delete(f"/v1/jobs/{job.id}"),
+        "not found": user.get("/nowhere"),
+        "wrong method": user.delete("/v1/options"),
+        "wrong host": user.get("/v1/jobs", headers={"Host": "evil.example"}),
+        "no token": httpx.get(f"{guarded.url}/v1/jobs"),
+        "wrong scope": user.get("/metrics"),
+        "not a form": user.post("/v1/jobs", content=b"x"),
+        "other site": user.post("/v1/jobs", content=b"x", headers={"Origin": "https://evil.example"}),
+    }
+    assert {name.lower() for name in SECURITY_HEADERS} | {"cache-control"} == CAREFUL
+    for name, answer in answers.items():
+        assert set(answer.headers) >= CAREFUL, name
+        policy = answer.headers["content-security-policy"]
+        assert "unsafe" not in policy, name
+        assert "frame-ancestors 'none'" in policy, name
+        assert "server" not in answer.headers, name
+        assert "access-control-allow-origin" not in answer.headers, name
+    assert [answers[name].headers["cache-control"] for name in ("json", "log", "no token")] == ["no-store"] * 3
+    assert "private" in answers["file"].headers["cache-control"]
+
+
+@pytest.mark.parametrize(
+    ("host", "status"),
+    [
+        ("127.0.0.1", 200), ("localhost:1", 200), ("[::1]:8000", 200), ("LOCALHOST", 200), ("evil.example", 421),
+        ("127.0.0.1.evil.example", 421), ("localhost.evil.example", 421), ("evil.example:127.0.0.1", 421), ("", 421), ("[::2]", 421),
+        ("127.0.0.1@evil.example", 421),
+    ],
+)  # fmt: skip
+def test_on_loopback_only_its_own_names_are_answered(running: Running, host: str, status: int) -> None:
+    answer = httpx.get(f"{running.url}/v1/limits", headers={"Host": host})
+    assert answer.status_code == status
+    if status == 421:
+        assert answer.json()["code"] == "unknown_host"
+
+
+def test_a_list_of_hosts_is_complete(serve: Serve) -> None:
+    running = serve(allowed_hosts=("pliant.example",))
+    for host, status in (
+        ("pliant.example", 200),
+        ("pliant.example:443", 200),
+        ("127.0.0.1", 421),
+        ("x.pliant.example", 421),
+    ):
+        assert httpx.get(f"{running.url}/healthz", headers={"Host": host}).status_code == status
+
+
+def test_on_another_address_any_name_is_answered_unless_there_is_a_list(serve: Serve) -> None:
+    running = serve(host="0.0.0.0")  # what it is told, not what the test binds
+    assert httpx.get(f"{running.url}/healthz", headers={"Host": "anything.example"}).status_code == 200
+
+
+def test_an_internal_error_reveals_nothing_and_is_logged_and_counted(
+    serve: Serve, caplog: pytest.LogCaptureFixture
+) -> None:
+    running = serve()
+
+    async def broken(request: Request) -> Response:
+        raise RuntimeError("secret detail")
+
+    running.app.add_route("/v1/broken", broken)
+    answer = httpx.get(f"{running.url}/v1/broken")
+    assert (answer.status_code, answer.json()["code"]) == (500, "internal_error")
+    assert set(answer.headers) >= CAREFUL
+    assert "secret" not in answer.text
+    until(lambda: "secret detail" in caplog.text)
+    numbers = httpx.get(f"{running.url}/metrics").text
+    assert 'pliant_http_requests_total{method="GET",route="other",status="500"} 1' in numbers

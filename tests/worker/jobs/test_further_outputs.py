@@ -1,0 +1,139 @@
+"""Jobs that write further files: limits, races with deletion and cancellation, lost and damaged files."""
+
+from __future__ import annotations
+
+import dataclasses
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pliant.schemas.job import Job, Status
+from pliant.schemas.options import Options
+from pliant.schemas.outputs import OutputRequest
+from pliant.worker.errors import Conflict, NotAllowedNow, QuotaExceeded, TooManyQueued, UnknownJob
+from pliant.worker.execution.attempt import Attempt, work
+from pliant.worker.execution.further_outputs import read_solution, write_further
+from pliant.worker.formats import InvalidInput
+from pliant.worker.jobs import lifecycle
+from pliant.worker.jobs.further_outputs import make_outputs
+from pliant.worker.jobs.service import Jobs
+from pliant.worker.jobs.submission import Submission
+from pliant.worker.maintenance.fsck import findings
+from worker_house import make_inputs
+
+WANTED = OutputRequest(outputs=("obj",), axes="viewer")
+OPTIONS = Options(method="pseudo_inverse", outputs=("ply",), refine_rotations=False)
+
+
+def run(jobs: Jobs, job: Job, folder: Path) -> Job:
+    """Work on a queued job as a worker would."""
+    attempt_id = jobs.records.get(job.id).attempt_id
+    now = datetime.now(UTC)
+    stored = jobs.records.update(job.id, lambda held: lifecycle.claim(held, attempt_id=attempt_id, worker="w", now=now))
+    jobs.queue.remove(attempt_id)
+    folder.mkdir(parents=True)
+    attempt = Attempt(jobs=jobs, id=job.id, attempt_id=attempt_id, deadline=float("inf"))
+    attempt.conclude(work(attempt, stored, folder))
+    return jobs.get(job.id)
+
+
+@pytest.fixture
+def solved(jobs: Jobs, tmp_path: Path) -> Job:
+    read = make_inputs(tmp_path / "in.npz", frames=4, points=30).interpretation
+    job = jobs.submit(tmp_path / "in.npz", Submission(options=OPTIONS, name="face"), interpretation=read)
+    done = run(jobs, job, tmp_path / "solving")
+    assert done.status is Status.SUCCEEDED, done.error
+    return done
+
+
+def test_the_files_are_those_that_the_job_itself_would_have_written(jobs: Jobs, solved: Job, tmp_path: Path) -> None:
+    more, new = make_outputs(jobs, solved.id, OutputRequest(outputs=("ply",)))
+    assert new
+    done = run(jobs, more, tmp_path / "w")
+    assert done.status is Status.SUCCEEDED, done.error
+    ours, theirs = ({each.name: each.sha256 for each in job.artifacts} for job in (done, solved))
+    assert ours["shapes_ply.zip"] == theirs["shapes_ply.zip"]
+    assert findings(jobs, pause=0) == []
+
+
+def test_deleting_the_solved_job_does_not_end_the_other(jobs: Jobs, solved: Job, tmp_path: Path) -> None:
+    more, _ = make_outputs(jobs, solved.id, WANTED)
+    jobs.delete(solved.id)
+    assert run(jobs, more, tmp_path / "w").status is Status.SUCCEEDED
+    with pytest.raises(UnknownJob):
+        make_outputs(jobs, solved.id, WANTED)
+
+
+def test_files_that_vanish_before_they_are_copied_leave_nothing(jobs: Jobs, solved: Job) -> None:
+    stored = jobs.stored(solved.id)
+    jobs.blobs.delete(f"{stored.prefix}shapes.npz")
+    with pytest.raises(UnknownJob):
+        make_outputs(jobs, solved.id, WANTED)
+    assert jobs.count([Status.QUEUED]) == 0
+    assert {key.split("/")[1] for key, _ in jobs.blobs.list("jobs/")} == {solved.id}
+
+
+def test_a_cancelled_one_is_made_anew_and_can_be_retried(jobs: Jobs, solved: Job, tmp_path: Path) -> None:
+    more, _ = make_outputs(jobs, solved.id, WANTED)
+    assert make_outputs(jobs, solved.id, WANTED) == (jobs.get(more.id), False)
+    jobs.cancel(more.id)
+    again, new = make_outputs(jobs, solved.id, WANTED)
+    assert new
+    assert again.id != more.id
+    retried = jobs.retry(more.id)
+    assert retried.outputs_of == solved.id
+    assert run(jobs, retried, tmp_path / "w").artifacts[0].name == "shapes_obj.zip"
+    kept, _ = make_outputs(jobs, solved.id, WANTED, idempotency_key="mine")
+    jobs.cancel(kept.id)
+    assert make_outputs(jobs, solved.id, WANTED, idempotency_key="mine")[0].id == kept.id
+    with pytest.raises(Conflict):
+        make_outputs(jobs, solved.id, OutputRequest(outputs=("csv",)), idempotency_key="mine")
+
+
+def test_it_counts_against_queue_and_quota(jobs: Jobs, solved: Job) -> None:
+    one = dataclasses.replace(jobs, max_queued=1)
+    make_outputs(one, solved.id, WANTED)
+    with pytest.raises(TooManyQueued):
+        make_outputs(one, solved.id, OutputRequest(outputs=("csv",)))
+    full = dataclasses.replace(jobs, settings=dataclasses.replace(jobs.settings, disk_quota=jobs.used() + 10))
+    with pytest.raises(QuotaExceeded):
+        make_outputs(full, solved.id, OutputRequest(outputs=("csv",)))
+
+
+def test_who_and_what_is_refused(jobs: Jobs, solved: Job, tmp_path: Path) -> None:
+    with pytest.raises(UnknownJob):
+        make_outputs(jobs.of("stranger"), solved.id, WANTED)
+    more, _ = make_outputs(jobs, solved.id, WANTED)
+    with pytest.raises(NotAllowedNow, match="make them from that one"):
+        make_outputs(jobs, more.id, WANTED)
+    with pytest.raises(NotAllowedNow, match="name that one"):
+        jobs.kept_inputs(more.id, tmp_path / "kept.npz")
+
+
+def test_a_damaged_result_ends_the_job_with_a_reason(jobs: Jobs, solved: Job, tmp_path: Path) -> None:
+    more, _ = make_outputs(jobs, solved.id, WANTED)
+    key = jobs.records.get(more.id).result
+    assert key is not None
+    jobs.blobs.delete(key)
+    assert any("has lost the result that it works from" in each for each in findings(jobs, pause=0))
+    (tmp_path / "bad.npz").write_bytes(b"PK\x03\x04 cut off")
+    jobs.blobs.put(key, tmp_path / "bad.npz")
+    done = run(jobs, more, tmp_path / "w")
+    assert done.status is Status.FAILED
+    assert done.error is not None
+    assert done.error.code == "damaged_file"
+
+
+def test_files_that_do_not_belong_together_are_refused(jobs: Jobs, solved: Job, tmp_path: Path) -> None:
+    np.savez(tmp_path / "r.npz", shapes=np.zeros((2, 3, 3)))
+    with pytest.raises(InvalidInput, match=r"a shapes\.npz without"):
+        read_solution(tmp_path / "r.npz", y_up=False)
+    (tmp_path / "no.npz").write_bytes(b"no zip")
+    with pytest.raises(InvalidInput, match="cannot be read back"):
+        write_further(tmp_path / "no.npz", tmp_path / "r.npz", solved, tmp_path / "out")
+    make_inputs(tmp_path / "other.npz", frames=4, points=20)
+    stored = jobs.stored(solved.id)
+    jobs.blobs.fetch(f"{stored.prefix}shapes.npz", tmp_path / "shapes.npz")
+    with pytest.raises(InvalidInput, match="different sizes"):
+        write_further(tmp_path / "other.npz", tmp_path / "shapes.npz", solved, tmp_path / "out")

@@ -1,1 +1,0 @@
-"""Animated glTF: the mesh and its camera."""

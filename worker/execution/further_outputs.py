@@ -1,0 +1,138 @@
+"""The work of a job that writes further files of a stored result; nothing is solved."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from pliant.schemas.job import Job, Progress
+from pliant.solver import Camera, Choices, Outcome, Solution, Trace
+from pliant.worker.artifacts import kinds_for
+from pliant.worker.artifacts.result import Result
+from pliant.worker.artifacts.write import write_kinds, write_report
+from pliant.worker.execution.pipeline import Finished, Halt, silent
+from pliant.worker.execution.progress import Reporter
+from pliant.worker.films.inputs import read_tracked
+from pliant.worker.films.tracker import Tracked
+from pliant.worker.formats import Inputs, load_inputs
+from pliant.worker.formats.errors import damaged
+from pliant.worker.formats.reading.arrays import read_file
+from pliant.worker.formats.records import Limits
+
+SHARES = {"loading": (0.0, 0.1), "exporting": (0.1, 1.0)}
+_OURS = Limits(max_bytes=1 << 36)
+_NEEDED = frozenset(
+    ("shapes", "rotations", "scales", "translations", "focal", "focal_std", "principal_point", "residuals", "weights",
+     "trace_objective", "trace_residual", "trace_iterations")
+)  # fmt: skip
+
+
+def write_further(
+    inputs_file: Path,
+    result_file: Path,
+    job: Job,
+    directory: Path,
+    *,
+    on_progress: Callable[[Progress], None] | None = None,
+    should_stop: Callable[[], bool] | None = None,
+) -> Finished:
+    """Write the files that a job's options name, from a stored result.
+
+    Parameters
+    ----------
+    inputs_file : Path
+        The inputs of the job that solved: canonical, or the `tracks.npz` of a film.
+    result_file : Path
+        Its `shapes.npz`.
+    job : Job
+        The job that writes; its metrics, verdict and warnings are those of the result.
+    directory : Path
+        Where the files go; made if need be.
+    on_progress, should_stop : callable, optional
+        As in `reconstruct`.
+
+    Raises
+    ------
+    Interrupted, TimedOut
+        As `reconstruct`.
+    InvalidInput
+        Code damaged_file: a stored file cannot be read back.
+    """
+    options, halt = job.options, Halt(should_stop, job.options.time_limit)
+    reporter = Reporter(on_progress if on_progress is not None else silent, shares=SHARES)
+    reporter.part("loading", 0.0)
+    inputs = _inputs(inputs_file, job)
+    solution = read_solution(result_file, y_up=inputs.interpretation.y_axis == "up")
+    if solution.shapes.shape[:2] != (inputs.tracks.num_frames, inputs.tracks.num_points):
+        raise damaged("inputs", "tracks and shapes of different sizes")
+    directory.mkdir(parents=True, exist_ok=True)
+    result = Result(inputs, solution, options)
+    kinds = [kind for kind in kinds_for(options, textured=result.texture is not None) if kind.output is not None]
+
+    def exported(done: float) -> None:
+        reporter.part("exporting", done)
+        halt.check()
+
+    exported(0.0)
+    artifacts, told = write_kinds(result, kinds, directory, on_progress=exported)
+    report = {"outputs_of": job.outputs_of, "options": json.loads(options.model_dump_json()), "artifacts": told}
+    artifacts.append(write_report(report, directory))
+    exported(1.0)
+    return Finished(
+        metrics=job.metrics or {},
+        outcome=job.outcome or solution.outcome.value,
+        sentence=job.sentence or solution.outcome.sentence,
+        verdict=job.verdict,
+        verdict_reasons=tuple(job.verdict_reasons),
+        trust_sentence=job.trust_sentence,
+        warnings=tuple(job.warnings),
+        artifacts=tuple(artifacts),
+    )
+
+
+def read_solution(path: Path, *, y_up: bool) -> Solution:
+    """Read the arrays of a `shapes.npz` as a solution.
+
+    How the solver chose is not among them: those numbers are NaN, and no file that is written from a stored result states them.
+
+    Raises
+    ------
+    InvalidInput
+        Code damaged_file, when it is not a result of ours or was damaged.
+    """
+    arrays = read_file(path, field="result", limits=_OURS)
+    missing = sorted(_NEEDED - set(arrays))
+    if missing:
+        raise damaged("result", f"a shapes.npz without {', '.join(missing)}")
+    held = {name: np.asarray(arrays[name], dtype=np.float64) for name in _NEEDED}
+    focal, unknown = float(held["focal"]), float("nan")
+    camera = Camera(
+        held["rotations"], held["scales"], held["translations"], y_up=y_up, principal_point=held["principal_point"],
+        focal=focal if np.isfinite(focal) else None, focal_std=float(held["focal_std"]) if np.isfinite(focal) else None,
+    )  # fmt: skip
+    return Solution(
+        shapes=held["shapes"],
+        camera=camera,
+        residuals=held["residuals"],
+        weights=held["weights"],
+        trace=Trace(held["trace_objective"], held["trace_residual"], held["trace_iterations"].astype(np.int64)),
+        outcome=Outcome.CONVERGED,
+        choices=Choices(
+            basis_size=0, temporal_weight=unknown, spatial_weight=unknown, robust_scale=unknown, temporal_order=0,
+            low_rank_weight=unknown, laplacian="", unit=unknown, noise=unknown,
+        ),
+        seconds={},
+        shapes_std=np.asarray(arrays["shapes_std"], dtype=np.float64) if "shapes_std" in arrays else None,
+    )  # fmt: skip
+
+
+def _inputs(file: Path, job: Job) -> Inputs:
+    try:
+        with zipfile.ZipFile(file) as archive:
+            canonical = "interpretation.npy" in archive.namelist()
+    except zipfile.BadZipFile as error:
+        raise damaged("inputs", "inputs that cannot be read back") from error
+    return load_inputs(file) if canonical else read_tracked(file, Tracked(container="stored", warnings=()), job.options)

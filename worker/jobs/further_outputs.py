@@ -1,0 +1,111 @@
+"""Further files of a finished job: a job of its own that writes them from the stored result, without solving again."""
+
+from __future__ import annotations
+
+import hashlib
+from contextlib import suppress
+from dataclasses import replace
+
+from pliant.schemas.job import Job, Status
+from pliant.schemas.outputs import OutputRequest
+from pliant.worker.artifacts import kinds_for
+from pliant.worker.errors import NotAllowedNow, UnknownJob
+from pliant.worker.ids import new_job_id
+from pliant.worker.jobs.service import Jobs
+from pliant.worker.jobs.submission import Submission, copy_beside
+from pliant.worker.records import Stored
+
+RESULT = "shapes.npz"
+TRACKS = "tracks.npz"
+"""File of a film's job that holds what its tracks were solved from."""
+
+
+def make_outputs(
+    jobs: Jobs, id: str, request: OutputRequest, *, idempotency_key: str | None = None
+) -> tuple[Job, bool]:
+    """Queue a job that writes further files of a result.
+
+    The new job has copies of what it needs, so the first one may be deleted meanwhile; it counts against the same limits as
+    every other job. The same request again returns the same job, unless that one failed or was cancelled.
+
+    Parameters
+    ----------
+    id : str
+        A job that has succeeded.
+    request : OutputRequest
+        Which files, and how.
+    idempotency_key : str, optional
+        A repeated request with the same key returns the first new job, whatever its status.
+
+    Returns
+    -------
+    job : Job
+        The new job, or the one that the same request made before; its `outputs_of` is the id given.
+    new : bool
+        False if an earlier request made it.
+
+    Raises
+    ------
+    Conflict
+        The key belongs to a different request.
+    InvalidInput
+        A file cannot be written in this installation, or not in this size.
+    InvalidRequest
+        The key is malformed.
+    NotAllowedNow
+        The job has no result, or holds further files itself.
+    QuotaExceeded, TooManyQueued
+        As for a submission.
+    UnknownJob
+        There is no such job, or it was deleted meanwhile.
+    """
+    stored = jobs.stored(id)
+    job = stored.job
+    wish = hashlib.sha256(f"outputs of {id}: {request.model_dump_json()}".encode()).hexdigest()
+    submission = Submission(
+        options=request.applied_to(job.options), name=job.name, idempotency_key=idempotency_key or f"outputs {wish}",
+        fingerprint=wish,
+    )  # fmt: skip
+    known = jobs.known(submission)
+    if known is not None:
+        if idempotency_key is not None or known.status not in (Status.FAILED, Status.CANCELLED):
+            return known, False
+        submission = replace(submission, idempotency_key=None)
+    _check(stored, submission)
+    further = job.model_copy(
+        update={
+            "id": new_job_id(), "status": Status.QUEUED, "created_at": jobs.clock(), "started_at": None, "finished_at": None,
+            "expires_at": None, "attempt": 0, "retry_of": None, "outputs_of": id, "options": submission.options,
+            "progress": None, "artifacts": [],
+        }
+    )  # fmt: skip
+    copies = [(_inputs_of(stored), "inputs.npz"), (f"{stored.prefix}{RESULT}", "result.npz")]
+    try:
+        size = sum(jobs.blobs.get(key).size for key, _ in copies)
+        made = jobs.create(
+            further, submission, lambda key: copy_beside(jobs.blobs, copies, key), size=size, owner=stored.owner,
+            from_result=True,
+        )  # fmt: skip
+    except FileNotFoundError:  # deleted between our look and the copy
+        raise UnknownJob(id) from None
+    return made, made.id == further.id
+
+
+def _check(stored: Stored, submission: Submission) -> None:
+    """Check that there is a result, and that the files can be written of it."""
+    job = stored.job
+    if job.outputs_of is not None:
+        hint = f"It holds further files of job {job.outputs_of!r}: make them from that one."
+        raise NotAllowedNow(job.id, job.status, wanted="written in further files", hint=hint)
+    if job.status is not Status.SUCCEEDED:
+        hint = "It has no result." if job.status.final else "Wait until it has succeeded."
+        raise NotAllowedNow(job.id, job.status, wanted="written in further files", hint=hint)
+    read = job.interpretation
+    kinds_for(submission.options, size=(read.num_frames, read.num_points))
+
+
+def _inputs_of(stored: Stored) -> str:
+    """Return the blob of the tracks that were solved: of a film those that were tracked, not the film."""
+    with suppress(StopIteration):
+        return next(f"{stored.prefix}{each.name}" for each in stored.job.artifacts if each.name == TRACKS)
+    return stored.inputs
