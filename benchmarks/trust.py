@@ -165,7 +165,12 @@ def main(arguments: list[str] | None = None) -> None:
         began = time.process_time()
         solution = solve(case.tracks, case.mesh, cameras=cameras, settings=settings)
         seconds = round(time.process_time() - began, 1)
-        row = {"sequence": name, "kind": kind, **measured(case, solution, scale_free=scale_free), "cpu_seconds": seconds}
+        row = {
+            "sequence": name,
+            "kind": kind,
+            **measured(case, solution, scale_free=scale_free),
+            "cpu_seconds": seconds,
+        }
         with given.out.open("a") as file:
             file.write(json.dumps(row) + "\n")
         expected, true = (np.nan if row[key] is None else row[key] for key in ("expected", "true"))
