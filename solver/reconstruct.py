@@ -170,7 +170,7 @@ def _solved(
         problem = replace(
             problem, points=np.ascontiguousarray(normalized.points.transpose(0, 2, 1), dtype=problem.points.dtype)
         )
-    outcome = Outcome.STOPPED if monitor.stopped else outcome
+    outcome = Outcome.STOPPED if monitor() else outcome
     choices = with_camera_choice(
         choices, estimate.perspective, settings, unit=normalized.unit, given=cameras is not None
     )
