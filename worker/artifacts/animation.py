@@ -123,7 +123,7 @@ def _blocks(shapes: Floats, y_axis: str, origin: Floats | Singles) -> Iterator[t
 
 def _smallest(shapes: Floats, y_axis: str, mean: Floats, left: Floats, allowed: float) -> int:
     """Few modes whose worst point is within 90 % of what is allowed (the rest is for rounding), by bisection; at most those given."""
-    low, high = 1, left.shape[1]
+    low, high = 1, int(left.shape[1])
     while low < high:
         middle = (low + high) // 2
         if _within(0.9 * allowed, _blocks(shapes, y_axis, mean), left[:, :middle]):

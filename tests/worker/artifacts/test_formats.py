@@ -228,7 +228,7 @@ def test_meshes_stand_as_the_glb_does_if_wanted(tmp_path: Path, axes: str, y_axi
 
 
 def test_obj_colours_are_read_by_others(tmp_path: Path) -> None:
-    made = make_result(outputs="obj", axes="tracks", colours="error", hidden=True)
+    made = make_result(outputs="obj", axes="tracks", normals="static", colours="error", hidden=True)
     inputs, solution, _ = made
     files = write(tmp_path, made)
     read = trimesh.load(
