@@ -2,7 +2,7 @@
 
     python -m benchmarks.faults
 
-Prints a table. After each fault everything stored is compared with what the records say (as `pliant doctor --audit` does), the
+Prints a table. After each fault everything stored is compared with what the records say (as `pliant fsck` does), the
 list of jobs with those that were acknowledged, and the process table with what was started. Exits with 1 if anything does not fit.
 """
 

@@ -10,8 +10,9 @@ from typing import Annotated
 
 import typer
 from pliant.cli import jobs, tokens
+from pliant.cli.commands.backup import backup, restore
 from pliant.cli.demo import demo
-from pliant.cli.doctor import doctor
+from pliant.cli.doctor import doctor, fsck
 from pliant.cli.exits import Guarded
 from pliant.cli.session import Session
 from pliant.cli.solve import inspect, solve
@@ -49,7 +50,7 @@ def _begin(
 
 _COMMANDS: dict[str, dict[str, Callable[..., None]]] = {
     "On this machine": {"solve": solve, "track": track, "inspect": inspect, "demo": demo, "doctor": doctor},
-    "Run a service": {"up": up, "work": work},
+    "Run a service": {"up": up, "work": work, "fsck": fsck, "backup": backup, "restore": restore},
     "Use a service": {
         "submit": jobs.submit, "status": jobs.status, "watch": jobs.watch, "result": jobs.result, "list": jobs.list_jobs,
         "log": jobs.log, "cancel": jobs.cancel, "retry": jobs.retry, "delete": jobs.delete, "options": jobs.options,

@@ -1,4 +1,4 @@
-"""`pliant doctor`: check the installation and say what to fix."""
+"""`pliant doctor` checks the installation, `pliant fsck` the consistency of the stored data."""
 
 from __future__ import annotations
 
@@ -41,15 +41,14 @@ class Finding:
     """What to do; empty if nothing is wrong."""
 
 
+Data = Annotated[Path, typer.Option("--data", envvar="PLIANT_DATA", help="Data directory.")]
+
+
 def doctor(
     ctx: typer.Context,
-    data: Annotated[Path, typer.Option("--data", envvar="PLIANT_DATA", help="Data directory.")] = Path("pliant-data"),
+    data: Data = Path("pliant-data"),
     port: Annotated[int, typer.Option("--port", help="Port that `pliant up` would use.", min=1, max=65535)] = 8000,
     url: Url = HOME,
-    audit: Annotated[
-        bool,
-        typer.Option("--audit", help="Compare everything stored with the records; needs a running queue."),
-    ] = False,
     as_json: Json = False,
 ) -> None:
     """Check the installation; exit code 8 if something must be fixed."""
@@ -62,11 +61,24 @@ def doctor(
         *check_cores(),
         *check_storage(data),
         *check_valkey(),
+        *check_blobs(),
     ]
-    findings += [*check_port(port), *check_service(session, url)]
-    if audit:
-        require_server("pliant doctor --audit")
-        findings += check_stored(data)
+    report([*findings, *check_port(port), *check_service(session, url)], as_json=as_json)
+
+
+def fsck(ctx: typer.Context, data: Data = Path("pliant-data"), as_json: Json = False) -> None:
+    """Compare job records, queue, files, uploads and scratch directories; exit code 8 if they are inconsistent.
+
+    Needs a running queue: run it beside `pliant up`, or with PLIANT_REDIS_URL.
+    """
+    session: Session = ctx.obj
+    session.json = as_json
+    require_server("pliant fsck")
+    report(list(check_stored(data)), as_json=as_json)
+
+
+def report(findings: list[Finding], *, as_json: bool) -> None:
+    """Print the findings; raise `typer.Exit` if one of them is bad."""
     if as_json:
         print_json([asdict(finding) for finding in findings])
     else:
@@ -227,7 +239,7 @@ def check_service(session: Session, url: str) -> Iterator[Finding]:
 
 
 def check_stored(data: Path) -> Iterator[Finding]:
-    """Compare records, queue, blobs, working files, uploads and partly received bodies with each other."""
+    """Compare records, queue, blobs, scratch directories, uploads and incomplete request bodies with each other."""
     import os
     from dataclasses import replace
 
@@ -251,7 +263,7 @@ def check_stored(data: Path) -> Iterator[Finding]:
         advice = "The next start of the service removes it."
         yield Finding("stored", "bad", f"Folder incoming/{name} belongs to a process that has ended.", advice)
     if not found:
-        yield Finding("stored", "good", "everything stored matches the records")
+        yield Finding("stored", "good", "the stores are consistent with the job records")
 
 
 def show(findings: list[Finding]) -> None:
@@ -269,24 +281,42 @@ def show(findings: list[Finding]) -> None:
     out().print(table)
 
 
+def check_blobs() -> Iterator[Finding]:
+    """Check the blob store of PLIANT_BLOB_URL by listing what it holds."""
+    import os
+
+    if os.environ.get("PLIANT_BLOB_URL", "") == "" or missing_modules():
+        return
+    from pliant.worker.errors import StoreUnavailable
+    from pliant.worker.store.blobs import Blobs
+
+    url = os.environ["PLIANT_BLOB_URL"]
+    try:
+        Blobs.open(url).check()
+    except StoreUnavailable as fault:
+        advice = "Check the address, the bucket and the AWS_ variables; the line above has the store's own words."
+        yield Finding("blobs", "bad", f"{url} cannot be used ({fault.reason})", advice)
+    else:
+        yield Finding("blobs", "good", f"{url} answers")
+
+
 def _redis(address: str) -> Finding:
+    """Send a command with the password of the address, which only an authenticated connection may."""
     from urllib.parse import urlsplit
 
     parts = urlsplit(address)
     where = f"{parts.scheme}://{parts.hostname or parts.path}:{parts.port or 6379}"
-    if parts.scheme == "unix":
-        there = Path(parts.path).is_socket()
-    else:
-        try:
-            socket.create_connection((parts.hostname or "localhost", parts.port or 6379), timeout=3).close()
-            there = True
-        except OSError:
-            there = False
-    if there:
-        return Finding("queue", "good", f"{where} accepts connections")
-    return Finding(
-        "queue",
-        "bad",
-        f"{where} does not answer",
-        "Start that server, or unset PLIANT_REDIS_URL to use the embedded one.",
-    )
+    advice = "Start that server, or unset PLIANT_REDIS_URL to use the embedded one."
+    if missing_modules():
+        return Finding("queue", "note", f"{where} was not checked", "Checking it needs pip install 'pliant[server]'.")
+    from pliant.worker.errors import WorkerError
+    from pliant.worker.store.connection import check_server
+
+    try:
+        policy = check_server(address)
+    except WorkerError as fault:
+        return Finding("queue", "bad", f"{where}: {fault}", advice)
+    if policy not in ("noeviction", ""):
+        remedy = "Set maxmemory-policy to noeviction: a server that evicts keys loses jobs."
+        return Finding("queue", "bad", f"{where} has maxmemory-policy {policy}", remedy)
+    return Finding("queue", "good", f"{where} answers")

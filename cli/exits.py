@@ -33,7 +33,7 @@ class Exit(IntEnum):
     TIMEOUT = 7
     """`--timeout` passed; the job continues."""
     UNHEALTHY = 8
-    """`doctor` found a fault, or the command needs an extra that is not installed."""
+    """`doctor` or `fsck` found a fault, or the command needs an extra that is not installed."""
     INTERRUPTED = 130
     """Ctrl-C."""
 
@@ -55,6 +55,8 @@ _CODES: tuple[tuple[str, str, Exit], ...] = (
     ("pliant.worker.errors", "InvalidRequest", Exit.REFUSED),
     ("pliant.worker.errors", "UnknownToken", Exit.NOT_FOUND),
     ("pliant.worker.errors", "DataDirectoryInUse", Exit.NOT_NOW),
+    ("pliant.worker.errors", "BadBackup", Exit.REFUSED),
+    ("pliant.worker.errors", "NewerData", Exit.NOT_NOW),
     ("pliant.worker.errors", "WorkerError", Exit.UNREACHABLE),
 )
 """The first entry that matches counts. By name, so that only modules that are loaded already are looked at."""

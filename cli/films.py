@@ -11,6 +11,7 @@ from pliant.cli.show import out
 
 if TYPE_CHECKING:
     from pliant.worker.execution.pipeline import Finished
+    from pliant.worker.films.tracker import FilmFacts
 
 
 def is_film(path: Path, region: Path | None) -> bool:
@@ -36,6 +37,54 @@ def refuse_parts_of_tracks(**parts: object) -> None:
             f"{', '.join(given)}: expected tracks, got a film. Leave it out: the mesh of a film is made from it; "
             "to use other inputs, run `pliant track` and solve its tracks.npz."
         )
+
+
+def inspect_film(film: Path, *, region: Path | None, options: dict[str, Any], as_json: bool) -> None:
+    """Print what a film states, and how many points tracking it would follow in what time.
+
+    Raises
+    ------
+    InvalidInput
+        The film, the region or an option cannot be used.
+    """
+    from pliant.cli.show import print_json
+    from pliant.client.multipart import checked_options
+    from pliant.worker.films.sources import FilmSource
+    from pliant.worker.films.tracker import check_film
+    from pliant.worker.settings import usable_cores
+
+    facts = check_film(FilmSource(film, region), checked_options(options), estimate=True, threads=usable_cores())
+    if as_json:
+        print_json(facts.model_dump(mode="json"))
+        return
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table.grid(padding=(0, 2))
+    for name, words in film_rows(facts):
+        table.add_row(Text(name, "dim"), Text(words))
+    out().print(table)
+
+
+def film_rows(facts: FilmFacts) -> list[tuple[str, str]]:
+    """Describe a film as pairs of name and text."""
+    of_all = f" of {facts.stated_frames}" if facts.frames != facts.stated_frames else ""
+    rows = [
+        ("film", facts.container),
+        ("size", f"{facts.width}×{facts.height} pixels"),
+        ("frames", f"{facts.frames}{of_all}" if facts.frames else "not stated"),
+        ("rate", f"{facts.fps:.4g} frames a second"),
+        ("duration", f"{facts.seconds:.1f} s" if facts.seconds else "not stated"),
+        ("rotation", f"{facts.rotation}°, applied" if facts.rotation else "none"),
+    ]
+    if facts.pixel_aspect != 1:
+        rows.append(
+            ("pixels", f"{facts.pixel_aspect:.4g} times as wide as high; frames are stretched to the size above")
+        )
+    rows.append(("points", f"about {facts.points}" if facts.points else "none: no texture in the region"))
+    if facts.track_seconds:
+        rows.append(("tracking", f"about {facts.track_seconds:.0f} s on this machine"))
+    return rows
 
 
 def solve_film(

@@ -123,6 +123,9 @@ def understood(interpretation: Interpretation) -> list[tuple[str, str]]:
         ("mesh", f"{interpretation.mesh_source}, {interpretation.num_faces} faces"),
         ("y axis", interpretation.y_axis),
     ]
+    if interpretation.image_size is not None:
+        rate = "" if interpretation.fps is None else f", {interpretation.fps:.4g} frames a second"
+        rows.append(("film", f"{interpretation.image_size.replace('x', '×')} pixels{rate}"))
     if len(given) > 0:
         rows.append(("also given", ", ".join(given)))
     return rows + [("note", note) for note in interpretation.notes]

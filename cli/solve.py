@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from pliant.cli.films import is_film, refuse_parts_of_tracks, solve_film
+from pliant.cli.films import inspect_film, is_film, refuse_parts_of_tracks, solve_film
 from pliant.cli.paths import input_file, output_folder
 from pliant.cli.session import (
     LINE_EVERY,
@@ -63,6 +63,7 @@ def solve(
     from pliant.solver import threads_limited
     from pliant.worker.execution.pipeline import reconstruct
     from pliant.worker.formats import read_inputs
+    from pliant.worker.formats.tracks.film_tracks import tracks_options
 
     if is_film(tracks, region):
         refuse_parts_of_tracks(mesh=mesh, ground_truth=ground_truth, rotations=rotations)
@@ -74,6 +75,7 @@ def solve(
     inputs = read_inputs(
         tracks=tracks, mesh=file_or_word(mesh), ground_truth=ground_truth, rotations=rotations, options=options
     )
+    options = tracks_options(options, inputs.interpretation)
     if not as_json:
         show_understood(inputs.interpretation)
     with progress_bar(line_every=LINE_EVERY) as bar, threads_limited(threads):
@@ -83,20 +85,26 @@ def solve(
 
 def inspect(
     ctx: typer.Context,
-    file: Annotated[Path, typer.Argument(help="Track file.", show_default=False, readable=False)],
+    file: Annotated[Path, typer.Argument(help="Track file, or a film.", show_default=False, readable=False)],
     mesh: Mesh = None,
     ground_truth: GroundTruth = None,
     rotations: Rotations = None,
+    region: Region = None,
     option: OptionPairs = None,
     url: Annotated[
         str, typer.Option("--url", help="Use this service instead of this installation.", metavar="URL")
     ] = "",
     as_json: Json = False,
 ) -> None:
-    """Show how a track file is read, without solving."""
+    """Show how a track file is read, or what a film holds and what tracking it would take, without solving."""
     ctx.obj.json = as_json
-    check_inputs(file, ground_truth, rotations)
+    check_inputs(None if file.is_dir() else file, ground_truth, rotations)
+    input_file(region, "region")
     options = parse_options(option)
+    if url == "" and is_film(file, region):
+        refuse_parts_of_tracks(mesh=mesh, ground_truth=ground_truth, rotations=rotations)
+        inspect_film(file, region=region, options=options, as_json=as_json)
+        return
     if url == "":
         from pliant.client.multipart import checked_options
         from pliant.worker.formats import read_inputs

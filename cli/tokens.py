@@ -53,12 +53,21 @@ def create(
     requests_per_minute: Annotated[
         int | None, typer.Option(help="Requests per minute.", min=1, show_default="the service's")
     ] = None,
+    source: Annotated[
+        Path | None,
+        typer.Option(
+            "--from", help="File with the token itself, made by a deployment; known ones stay.", metavar="FILE"
+        ),
+    ] = None,
     data: Data = None,
     as_json: Json = False,
 ) -> None:
     """Create a token and print it, once: the service stores only its SHA-256."""
     ctx.obj.json = as_json
+    from pliant.cli.paths import input_file
     from pliant.worker.tokens import parse_duration
+
+    input_file(source, "--from")
 
     lasting = None if expires is None else parse_duration(expires)
     with store(data) as tokens:
@@ -71,7 +80,11 @@ def create(
             max_queued=max_queued,
             max_running=max_running,
             requests_per_minute=requests_per_minute,
+            text=None if source is None else source.read_text(encoding="utf-8").strip(),
         )
+    if source is not None and not as_json:
+        err().print(f"Token {token.id} for {token.name} is known.", markup=False)
+        return
     if as_json:
         print_json({**shown(token), "token": text})
         return

@@ -1,6 +1,6 @@
-"""The options of a job, as they travel: one flat record, every field with its meaning, unit, bounds and default.
+"""The options of a job: one flat record, each field with its meaning, unit, bounds and default.
 
-The solver's part mirrors `pliant.solver.Settings` field for field; a test holds the two together.
+The fields for the solver mirror `pliant.solver.Settings`; a test compares the two.
 """
 
 from __future__ import annotations
@@ -14,24 +14,24 @@ SOLVER_FIELDS = (
     "temporal_order", "loss", "laplacian", "prior", "low_rank_weight", "max_reweightings", "tolerance", "precision", "seed",
     "focal", "field_of_view", "principal_point", "image_size",
 )  # fmt: skip
-"""The fields that go to the solver; the others say how to read the input or write the result."""
+"""The fields for the solver; the others determine how inputs are read and results written."""
 
 POINT = r"^-?\d{1,7}(\.\d{1,9})?,-?\d{1,7}(\.\d{1,9})?$"
-"""Two numbers with a comma between them."""
+"""Two numbers separated by a comma."""
 
 Weight = Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
 
-Output = Literal["glb", "ply", "obj", "usd", "mdd", "mat", "csv"]
-"""A result file that is written if asked for; `shapes.npz`, `report.json` and `preview.bin` always are."""
+Output = Literal["glb", "ply", "obj", "usd", "abc", "mdd", "mat", "csv"]
+"""A result file written on request; `shapes.npz`, `report.json` and `preview.bin` are always written."""
 
 
 def _listed(given: object) -> object:
-    """Take `"glb,mat"` for `["glb", "mat"]`, as command lines and forms send it."""
+    """Accept `"glb,mat"` for `["glb", "mat"]`, as sent by command lines and forms."""
     return [word.strip() for word in given.split(",") if word.strip()] if isinstance(given, str) else given
 
 
 def _in_order(given: tuple[Output, ...]) -> tuple[Output, ...]:
-    """Each once and in one order, so that equal wishes are equal records."""
+    """Remove duplicates and sort, so that equal requests have equal records."""
     return tuple(name for name in get_args(Output) if name in given)
 
 
@@ -41,7 +41,7 @@ Outputs = Annotated[tuple[Output, ...], Field(max_length=64), BeforeValidator(_l
 
 
 class Options(BaseModel):
-    """How to reconstruct. Everything has a default; an unknown name is refused."""
+    """How to reconstruct. Every option has a default; unknown names are rejected."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -53,10 +53,10 @@ class Options(BaseModel):
     camera: Literal["auto", "perspective", "scaled_orthographic", "orthographic"] = Field(
         "auto",
         description="perspective: a pinhole camera. scaled_orthographic: no perspective, one scale per frame. orthographic: no scales. "
-        "auto: perspective where the tracks are clearly more probable with it, else scaled_orthographic.",
+        "auto: perspective if the tracks are clearly more probable with it, else scaled_orthographic.",
     )
     focal: Annotated[float, Field(gt=0, le=1e9, allow_inf_nan=False)] | None = Field(
-        None, description="Focal length in pixels of the tracks; null: estimated where the camera is perspective."
+        None, description="Focal length in pixels of the tracks; null: estimated for a perspective camera."
     )
     field_of_view: Annotated[float, Field(gt=0, lt=180, allow_inf_nan=False)] | None = Field(
         None,
@@ -69,19 +69,17 @@ class Options(BaseModel):
     surface: Literal["auto", "isometric", "free"] = Field(
         "auto",
         description="isometric: a sheet that bends without stretching, such as paper or cloth, seen in perspective. free: no such "
-        "assumption. auto: isometric where the tracks are those of a sheet and its edge lengths single out a focal length; "
+        "assumption. auto: isometric if the tracks are those of a sheet and its edge lengths determine a focal length; "
         "needs image_size or focal.",
     )
     basis_size: Annotated[int, Field(ge=1, le=100)] | None = Field(
         None,
-        description="Number K of basis shapes in the factorization that gives the rotations; null: chosen from the data.",
+        description="Number K of basis shapes in the factorization for the rotations; null: selected from the data.",
     )
-    refine_rotations: bool = Field(
-        True, description="Refine the cameras: those under which the tracks are most probable."
-    )
+    refine_rotations: bool = Field(True, description="Refine the cameras by maximising the likelihood of the tracks.")
     preset: Literal["auto", "paper"] = Field(
         "auto",
-        description="Where weights that are not given come from. auto: measured from noise and motion. paper: the published setting.",
+        description="Source of weights that are not given. auto: measured from noise and motion. paper: the published setting.",
     )
     temporal_weight: Weight | None = Field(
         None, description="λ1, weight of smoothness in time, dimensionless; null: the preset's."
@@ -91,11 +89,11 @@ class Options(BaseModel):
     )
     robust_scale: Annotated[float, Field(ge=1e-9, le=1e3, allow_inf_nan=False)] | None = Field(
         None,
-        description="Residual size where the loss turns from quadratic to linear, in RMS radii of the tracks; null: the preset's.",
+        description="Residual at which the loss changes from quadratic to linear, in RMS radii of the tracks; null: the preset's.",
     )
     temporal_order: Literal[1, 2] | None = Field(
         None,
-        description="1 penalises velocity, 2 acceleration; null: the preset's. Without effect with prior gaussian.",
+        description="1 penalises velocity, 2 acceleration; null: the preset's. No effect with prior gaussian.",
     )
     loss: Literal["l1", "l2", "huber"] = Field("l1", description="Loss of the data term when method is robust.")
     laplacian: Literal["auto", "grid8", "uniform", "cotangent"] = Field(
@@ -104,40 +102,44 @@ class Options(BaseModel):
     )
     prior: Literal["gaussian", "smooth+low_rank", "smooth"] = Field(
         "gaussian",
-        description="gaussian: one Gaussian over the frames for the positions of a point, learned from the tracks (method robust with "
+        description="gaussian: a Gaussian over the frames for the positions of each point, learned from the tracks (method robust with "
         "preset auto; else smooth); smooth: the published method; smooth+low_rank also favours shapes that few basis shapes "
         "explain (with preset paper only if low_rank_weight is given).",
     )
     low_rank_weight: Weight | None = Field(
         None,
-        description="λ3, strength of the low-rank prior, dimensionless; null: from the data. Without effect unless prior is "
+        description="λ3, weight of the low-rank prior, dimensionless; null: from the data. No effect unless prior is "
         "smooth+low_rank.",
     )
-    max_reweightings: int = Field(60, ge=1, le=1000, description="Upper bound on the reweightings of the robust loss.")
+    max_reweightings: int = Field(60, ge=1, le=1000, description="Maximum number of reweightings of the robust loss.")
     tolerance: float = Field(
-        1e-4, gt=0, lt=1, description="Converged when the objective's relative change in one reweighting is below this."
+        1e-4,
+        gt=0,
+        lt=1,
+        description="Relative change of the objective over one reweighting below which the solve has converged.",
     )
     precision: Literal["float64", "float32"] = Field(
-        "float64", description="Arithmetic of the large arrays; prior gaussian needs float64."
+        "float64", description="Precision of the large arrays; prior gaussian needs float64."
     )
-    seed: int = Field(0, ge=0, lt=2**32, description="Seed of every random choice.")
+    seed: int = Field(0, ge=0, lt=2**32, description="Seed of all random choices.")
 
     time_limit: Annotated[float, Field(gt=0, le=604_800, allow_inf_nan=False)] | None = Field(
-        None, description="Seconds the job may take before it ends as timed_out; null: the service's own limit alone."
+        None,
+        description="Time limit of the job in seconds, after which it fails with timed_out; null: only the service's own limit.",
     )
     fps: float = Field(
         25.0, gt=0, le=1000, allow_inf_nan=False, description="Frames per second of the written animation."
     )
     outputs: Outputs = Field(
         ("glb", "ply", "csv"),
-        description="Files to write besides shapes.npz, report.json and preview.bin. glb: animated glTF. ply, obj: one mesh a frame, in a "
-        "zip. usd: USD with time samples. mdd: point cache for Blender, Maya and Houdini. mat: MATLAB. "
+        description="Files to write besides shapes.npz, report.json and preview.bin. glb: animated glTF. ply, obj: a mesh per frame, in a "
+        "zip. usd: USD with time samples. abc: Alembic. mdd: point cache for Blender, Maya and Houdini. mat: MATLAB. "
         "csv: metrics of every frame and of every point.",
     )
     normals: Literal["static", "animated", "none"] = Field(
         "animated",
         description="animated: they move with the shape, in shapes.glb and in every frame of PLY, OBJ and USD. static: those of the "
-        "first shape, in shapes.glb alone. none: viewers make their own.",
+        "first shape, in shapes.glb only. none: viewers compute their own.",
     )
     colours: Literal["none", "error", "expected_error"] = Field(
         "none",
@@ -162,7 +164,7 @@ class Options(BaseModel):
 
     layout: Literal["auto", "frames_points", "points_frames"] = Field(
         "auto",
-        description="Order of the track array's axes. auto: by the names in the file and by smoothness in time; refused where two fit.",
+        description="Order of the track array's axes. auto: by the names in the file and by smoothness in time; an error if several fit.",
     )
     rows: Literal["auto", "interleaved", "stacked"] = Field(
         "auto",
@@ -170,16 +172,16 @@ class Options(BaseModel):
     )
     y_axis: Literal["auto", "down", "up"] = Field(
         "auto",
-        description="Which way y grows. auto: down (pixels), or up where coordinates are centred on zero. Turns written meshes upright.",
+        description="Direction of y. auto: down (pixels), or up if coordinates are centred on zero. Written meshes are always upright.",
     )
     coordinates: Literal["auto", "pixels", "unit", "signed"] = Field(
         "auto",
-        description="What x and y mean. pixels: taken as they are, whatever their unit. unit: from 0 to 1, divided by (width − 1, "
-        "height − 1). signed: from −1 to 1 over the same. auto: by the values; values within 0 … 1 without image_size are refused.",
+        description="Unit of x and y. pixels: used unchanged, whatever their unit. unit: from 0 to 1, divided by (width − 1, "
+        "height − 1). signed: from −1 to 1 likewise. auto: by the values; values within 0 … 1 without image_size are an error.",
     )
     image_size: Annotated[str, Field(pattern=r"^[1-9]\d{0,5}x[1-9]\d{0,5}$")] | None = Field(
         None,
-        description="WIDTHxHEIGHT of the picture in pixels, e.g. 640x480; needed where coordinates are fractions of it. Its centre is the "
+        description="WIDTHxHEIGHT of the picture in pixels, e.g. 640x480; needed if coordinates are fractions of it. Its centre is the "
         "principal point of a perspective camera.",
     )
     coordinate_order: Literal["auto", "xy", "yx"] = Field(
@@ -187,8 +189,8 @@ class Options(BaseModel):
     )
     visibility: Literal["auto", "bool", "probability", "logits"] = Field(
         "auto",
-        description="What the numbers beside the tracks mean. bool: not 0 is yes. probability: from 0 to 1. logits: of any size, 0 is "
-        "undecided. auto: by their values. Whether they say seen or hidden comes from the array's name.",
+        description="Type of the visibility array. bool: not 0 is true. probability: from 0 to 1. logits: any number, 0 is undecided. "
+        "auto: by the values. The name of the array determines whether it marks visible or hidden points.",
     )
     frames: Annotated[str, Field(pattern=r"^(-?\d{1,7})?:(-?\d{1,7})?(:([1-9]\d{0,6})?)?$")] | None = Field(
         None, description="Frames to use, start:stop:step as in Python, e.g. 10:200:2; null: all."
@@ -197,46 +199,46 @@ class Options(BaseModel):
         1,
         ge=1,
         le=1000,
-        description="Use every n-th point: every n-th row and column of a pixel grid, else every n-th of the list; of a given mesh, "
+        description="Use every n-th point: every n-th row and column of a pixel grid, else every n-th of the list; with a given mesh, "
         "one in n, spread evenly.",
     )
     max_points: Annotated[int, Field(ge=4, le=10_000_000)] | None = Field(
         None,
-        description="Use at most this many points, spread evenly, the mesh thinned along with them; null: all there are. A pixel grid "
-        "stays one: the smallest stride that fits.",
+        description="Use at most this many points, spread evenly, and decimate the mesh accordingly; null: all. A pixel grid "
+        "is decimated by the smallest stride that suffices.",
     )
     min_seen: int = Field(
         2,
         ge=1,
         le=1000,
-        description="A point seen in fewer frames than this is left out of the solve. It keeps its place in the result, where it "
+        description="A point visible in fewer frames than this is excluded from the solve. It keeps its index in the result and "
         "follows its neighbours on the mesh.",
     )
 
     template_frame: Annotated[int, Field(ge=0, le=10_000_000)] | None = Field(
         None,
-        description="Of a film: the frame whose points are followed to both ends, counted in the whole film from 0; null: the region's "
-        "frame, or a sharp one in the middle where no region is given.",
+        description="For a film: the frame whose points are tracked in both directions, counted in the complete film from 0; null: the "
+        "region's frame, or a sharp one in the middle without a region.",
     )
     grid_step: Annotated[float, Field(ge=1, le=100, allow_inf_nan=False)] | None = Field(
         None,
-        description="Of a film: distance of neighbouring points in the film's pixels; null: so that the region holds about 4,000 points.",
+        description="For a film: distance of neighbouring points in the film's pixels; null: about 4,000 points in the region.",
     )
     longest_side: int = Field(
         960,
         ge=64,
         le=4096,
-        description="Of a film: longest side of the frames that are tracked, pixels; larger films are reduced. Tracks stay in the film's "
-        "own pixels.",
+        description="For a film: maximum size of the longer side of tracked frames, pixels; larger films are scaled down. Tracks remain in "
+        "the film's own pixels.",
     )
     region_frame: int = Field(
         0,
         ge=0,
         le=10_000_000,
-        description="Of a film: the frame that the region was drawn on, counted in the whole film from 0.",
+        description="For a film: the frame on which the region was drawn, counted in the complete film from 0.",
     )
     region_polygon: Annotated[tuple[tuple[Pixel, Pixel], ...], Field(min_length=3, max_length=1000)] | None = Field(
         None,
-        description="Of a film: corners [x, y] around what is to be tracked, in the film's pixels, y down, instead of a mask picture; "
-        "null: the mask, or the whole picture.",
+        description="For a film: corners [x, y] of the region to track, in the film's pixels, y down, instead of a mask picture; "
+        "null: the mask, or the entire picture.",
     )

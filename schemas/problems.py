@@ -98,7 +98,7 @@ class ProblemCode(StrEnum):
      "Add it.")
     CONFLICTING_PARTS = ("conflicting_parts", 422, "Conflicting parts",
      "A form has parts that exclude each other: a film beside tracks, or a mask picture beside `region_polygon`.",
-     "Leave one of them out.")
+     "Omit one of them.")
     NOT_A_FILE = ("not_a_file", 422, "Part is not a file",
      "A part that must be a file was sent as text.",
      "Give the part a file name, as `curl -F tracks=@FILE` does.")
@@ -198,7 +198,7 @@ class ProblemCode(StrEnum):
      "`GET /v1/options` lists types and bounds.")
     OUTPUT_UNAVAILABLE = ("output_unavailable", 422, "Output unavailable",
      "A requested output cannot be written here: `usd` without `usd-core` installed, or `mat` for shapes of 2 GiB or more.",
-     "Leave it out of `outputs`, or install `pliant[usd]` beside service and worker.")
+     "Remove it from `outputs`, or install `pliant[usd]` beside service and worker.")
     INVALID_WEBHOOK = ("invalid_webhook", 422, "Invalid webhook",
      "`webhook` is not an http(s) URL of at most 2,000 characters without user name, or it came without a secret.",
      "Correct the URL, and send `webhook_secret` with it.")
@@ -378,7 +378,7 @@ class ProblemCode(StrEnum):
      "The film has more than 16 streams.",
      "Keep the picture: `ffmpeg -i FILM -map 0:v:0 film.mp4`.")
     TOO_MANY_PICTURES = ("too_many_pictures", 422, "Too many pictures",
-     "A zip lists more pictures than can be looked at.",
+     "A zip lists more pictures than this installation accepts.",
      "Put fewer pictures in the zip.")
     TOO_MANY_BYTES = ("too_many_bytes", 422, "Too many bytes",
      "The film, or the pictures of a zip unpacked, are larger than this installation accepts.",
@@ -409,10 +409,10 @@ class ProblemCode(StrEnum):
      "Draw the region on a frame of this film, upright as it is shown.")
     WRONG_POLYGON = ("wrong_polygon", 422, "Wrong polygon",
      "The polygon has fewer than three corners, or coordinates that are not finite.",
-     "Draw around the thing to track.")
+     "Draw around the object to track.")
     EMPTY_REGION = ("empty_region", 422, "Empty region",
      "The region holds no pixel of the film.",
-     "Draw around the thing to track.")
+     "Draw around the object to track.")
     REGION_LOST = ("region_lost", 422, "Region lost",
      "The region cannot be followed from the frame it was drawn on to the template.",
      "Draw it on the template frame (`region_frame`), or choose a nearer `template_frame`.")
@@ -424,7 +424,7 @@ class ProblemCode(StrEnum):
      "Film more slowly and with more light.")
     OUTSIDE_PICTURE = ("outside_picture", 422, "Outside the picture",
      "Half or more of the visible observations lie outside `image_size`.",
-     "Correct `image_size`, or leave it out where tracks are not in pixels from the picture's corner.")
+     "Correct `image_size`, or omit it if tracks are not in pixels from the picture's corner.")
     PRINCIPAL_POINT_FAR = ("principal_point_far", 422, "Principal point too far",
      "`principal_point`, or the centre of `image_size`, lies far from all tracks.",
      "Give x and y in the unit and axes of the tracks.")
@@ -477,7 +477,7 @@ class ProblemCode(StrEnum):
      "Check the order of the axes.")
     VERTEX_COUNT_MISMATCH = ("vertex_count_mismatch", 422, "Vertex count mismatch",
      "The mesh file has another number of vertices than the tracks have points.",
-     "Vertex i must be point i. Omit the mesh to have one made.")
+     "Vertex i must be point i. Omit the mesh to have one generated.")
     MESH_MISMATCH = ("mesh_mismatch", 422, "Mesh mismatch",
      "The mesh given to `pliant.solver.solve` has another number of vertices than the tracks have points.",
      "Vertex i must be point i.")
@@ -501,6 +501,12 @@ class ProblemCode(StrEnum):
     DATA_DIRECTORY_IN_USE = ("data_directory_in_use", None, "Data directory in use",
      "Another Pliant process owns the data directory.",
      "Stop it, or name another directory with `--data`.")
+    NEWER_DATA = ("newer_data", None, "Data of a newer version",
+     "A newer Pliant wrote the records, and this one could drop what it does not know.",
+     "Install that version, or restore a backup from before the upgrade.")
+    BAD_BACKUP = ("bad_backup", None, "Bad backup",
+     "The directory holds no backup, or a damaged one, or the installation is not empty.",
+     "Name another directory; restore into an installation without jobs and tokens.")
     SERVER_FAILED = ("server_failed", None, "Valkey did not start",
      "The embedded Valkey did not start; the message ends with its log.",
      "Run `pliant doctor`.")
@@ -510,6 +516,9 @@ class ProblemCode(StrEnum):
     INVALID_TOKEN_NAME = ("invalid_token_name", None, "Invalid token name",
      "A token's name is empty, too long, or has control characters.",
      "Choose a short printable name.")
+    INVALID_TOKEN_TEXT = ("invalid_token_text", None, "Invalid token",
+     "The file of `pliant token create --from` does not hold a token.",
+     "Write a token of the stated form to it, or leave --from out.")
     INVALID_DURATION = ("invalid_duration", None, "Invalid duration",
      "`--expires` is not a duration such as `12h`, `90d` or `52w`.",
      "Correct it, or omit it for a token without expiry.")

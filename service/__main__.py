@@ -9,15 +9,17 @@ import signal
 import socket
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 
 import uvicorn
 from fastapi import FastAPI
 from pliant.service.app import create_app
 from pliant.service.logs import configure_logging
 from pliant.service.settings import InvalidServiceSetting, ServiceSettings
-from pliant.worker.errors import InvalidSetting, StoreUnavailable
+from pliant.worker.errors import InvalidSetting, NewerData, StoreUnavailable
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.settings import Settings
+from pliant.worker.store.schema import prepare
 from pliant.worker.tokens import Tokens
 
 _log = logging.getLogger("pliant.service")
@@ -98,7 +100,9 @@ def main(arguments: Sequence[str] = ()) -> int:
         of_worker = Settings.from_environment(os.environ)
         tokens = Tokens.open(of_worker)
         check_access(settings, tokens)
-    except (InvalidServiceSetting, InvalidSetting) as error:
+        with suppress(StoreUnavailable):  # requests are answered 503 until the store is back
+            prepare(of_worker)
+    except (InvalidServiceSetting, InvalidSetting, NewerData) as error:
         sys.stderr.write(f"{error}\n")
         return 2
     app = create_app(Jobs.open(of_worker), settings, tokens=tokens)
@@ -109,6 +113,8 @@ def main(arguments: Sequence[str] = ()) -> int:
         log_config=None,
         access_log=False,
         server_header=False,
+        proxy_headers=bool(settings.trusted_proxies),
+        forwarded_allow_ips=list(settings.trusted_proxies),
         timeout_keep_alive=KEEP_ALIVE,
         timeout_graceful_shutdown=STOP_WITHIN,
     )

@@ -72,6 +72,9 @@ class ServiceSettings(BaseModel):
     other (PLIANT_AUTH)."""
     cors_origins: Listed = ()
     """Origins whose pages may call the service, separated by commas; empty: none (PLIANT_CORS_ORIGINS)."""
+    trusted_proxies: Listed = ()
+    """Addresses or networks of proxies whose `X-Forwarded-For` names the client, separated by commas; `*` for any
+    (PLIANT_TRUSTED_PROXIES). Empty: none, because any user of the machine could choose the address that is counted."""
     log_level: LogLevel = "info"
     """Least level that is logged (PLIANT_LOG_LEVEL)."""
     log_format: LogFormat = "console"

@@ -19,6 +19,7 @@ from pliant.worker.errors import Conflict, UnknownUpload
 from pliant.worker.films.sources import FilmBounds, FilmSource, is_source, open_source, save_source
 from pliant.worker.films.tracker import check_film, described, film_options
 from pliant.worker.formats import Limits, store_inputs
+from pliant.worker.formats.tracks.film_tracks import tracks_options
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.jobs.submission import Submission
 from pliant.worker.uploads.service import Uploads
@@ -119,7 +120,8 @@ def accept(
         read = kept.job.interpretation
         kinds_for(options, size=(read.num_frames, read.num_points))
         return jobs.submit(kept.canonical, submission, interpretation=read), True
-    interpretation, options = read_form(form, options, limits, target=canonical)
+    films = FilmBounds.of(jobs.settings, max_bytes=limits.max_bytes)
+    interpretation, options = read_form(form, options, limits, films=films, target=canonical)
     job = jobs.submit(canonical, replace(submission, options=options), interpretation=interpretation)
     return job, True
 
@@ -217,7 +219,9 @@ def with_uploads(form: Form, folder: Path, uploads: Uploads) -> Form:
     return Form(files=files, texts=texts)
 
 
-def read_form(form: Form, options: Options, limits: Limits, *, target: Path | None) -> tuple[Interpretation, Options]:
+def read_form(
+    form: Form, options: Options, limits: Limits, *, films: FilmBounds, target: Path | None
+) -> tuple[Interpretation, Options]:
     """Read, check and interpret the files of a form, and store them if a target is given. Blocks; call it on a thread.
 
     A film is only opened, not tracked.
@@ -227,7 +231,7 @@ def read_form(form: Form, options: Options, limits: Limits, *, target: Path | No
     interpretation : Interpretation
         How the files were read.
     options : Options
-        Those given, completed by what a film states.
+        Those given, completed by what a film or its tracks state.
 
     Raises
     ------
@@ -241,11 +245,12 @@ def read_form(form: Form, options: Options, limits: Limits, *, target: Path | No
         raise missing("tracks")
     kinds_for(options)  # refuses outputs that this installation cannot write
     if is_film:
-        return _read_film(form, options, limits, target)
+        return _read_film(form, options, films, target)
     files: dict[str, Path | str | None] = {part: file.path for part, file in form.files.items()}
     if form.texts.get("mesh", "").strip():
         files["mesh"] = form.texts["mesh"].strip()
-    return store_inputs(**files, options=options, limits=limits, target=target), options  # type: ignore[arg-type]
+    interpretation = store_inputs(**files, options=options, limits=limits, target=target)  # type: ignore[arg-type]
+    return interpretation, tracks_options(options, interpretation)
 
 
 def _check_film_parts(form: Form) -> None:
@@ -263,10 +268,10 @@ def _check_film_parts(form: Form) -> None:
         )
 
 
-def _read_film(form: Form, options: Options, limits: Limits, target: Path | None) -> tuple[Interpretation, Options]:
+def _read_film(form: Form, options: Options, bounds: FilmBounds, target: Path | None) -> tuple[Interpretation, Options]:
     region = form.files.get("region")
     source = FilmSource(form.files["film"].path, None if region is None else region.path)
-    facts = check_film(source, options, FilmBounds(max_bytes=limits.max_bytes))
+    facts = check_film(source, options, bounds)
     options = film_options(options, facts)
     interpretation = described(facts, options)
     if target is not None:

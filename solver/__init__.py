@@ -1,7 +1,7 @@
-"""Dense non-rigid structure from motion: tracks in, a shape for every frame out.
+"""Dense non-rigid structure from motion: 2-D tracks in, a 3-D shape for every frame out.
 
-Numerics alone: no files, no environment, no logging set-up, no network. Names are looked up when first used, so that whoever
-needs only a record or an error loads no solver.
+Numerics only: no files, environment variables, logging set-up or network. Names are imported on first access, so that
+importing a record or an error does not load the solver.
 """
 
 if __name__ != "pliant.solver":

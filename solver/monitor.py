@@ -1,4 +1,4 @@
-"""Progress and cancellation of one solve: every call of `should_stop` also counts one unit of work."""
+"""Progress and cancellation of one solve: each call of `should_stop` also counts one unit of work."""
 
 from __future__ import annotations
 
@@ -8,11 +8,10 @@ from dataclasses import replace
 from pliant.solver.records import Step
 
 MIN_FRACTION_STEP = 0.002
-"""Least increase of the fraction that is reported on its own: at most 500 calls of `on_step` besides those of the
-stages."""
+"""Minimum increase of the fraction between reports: at most 500 calls of `on_step` besides those of the stages."""
 
 REWEIGHTING_UNITS = 100
-"""Typical number of conjugate-gradient iterations per reweighting; 20 to 300 occur."""
+"""Typical number of conjugate gradient iterations per reweighting; 20 to 300 occur."""
 
 EXPECTED_SHARE = 0.9
 """Share of a stage's span that its expected units fill; further units approach its end."""
@@ -21,18 +20,18 @@ EXPECTED_SHARE = 0.9
 class Monitor:
     """Reports steps with a fraction that never decreases, and remembers a request to stop.
 
-    A call counts one unit of work and returns whether to stop; pass it on as `should_stop`. Once it returned True it
-    keeps doing so.
+    A call counts one unit of work and returns whether to stop; pass the monitor on as `should_stop`. Once it has
+    returned True it always does.
 
     Parameters
     ----------
     on_step, should_stop : callable, optional
-        The user's.
+        The callbacks given to `solve`.
     camera_share : float
-        Share of the whole that the cameras take. Fractions of steps of stage `cameras` are of the whole, those of later steps of what is
-        left after the cameras.
+        Estimated share of the solve spent on the cameras. Fractions of steps of stage `cameras` refer to the whole solve,
+        those of later steps to the remainder.
     camera_units : int
-        Units of work that the cameras take, about.
+        Estimated units of work of the cameras.
     """
 
     def __init__(
@@ -44,7 +43,7 @@ class Monitor:
         camera_units: int = 1000,
     ) -> None:
         self.stopped = False
-        """Whether a stop was requested when somebody looked."""
+        """Whether a stop was requested at the last call."""
         self._on_step, self._should_stop = on_step, should_stop
         self._share = camera_share
         self._last = Step("cameras", 0.0)
@@ -61,7 +60,7 @@ class Monitor:
         return self.stopped
 
     def report(self, step: Step) -> None:
-        """Report a step, its fraction raised to that of the step before if it is lower."""
+        """Report a step; its fraction never falls below that of the previous step."""
         share = self._share
         fraction = step.fraction if step.stage == "cameras" else share + (1 - share) * step.fraction
         self._emit(replace(step, fraction=max(fraction, self._last.fraction)))

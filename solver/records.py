@@ -1,4 +1,4 @@
-"""The records that flow through a solve: Tracks → State … → Solution. Arrays are read-only from the door on."""
+"""Records of a solve, from Tracks to Solution. Their arrays are read-only."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Ints = NDArray[np.int32]
 
 
 def read_only(array: NDArray[np.generic]) -> None:
-    """Switch off writing, so that a record handed around cannot be changed behind its reader's back."""
+    """Make the array read-only and return it."""
     array.flags.writeable = False
 
 
@@ -30,15 +30,15 @@ class Tracks:
     """Dense 2-D point tracks: the paper's W, kept as points."""
 
     points: Floats
-    """Image positions, shape `(F, P, 2)`, the input's unit (pixels unless told), x right, y down unless told.
-    Entries that were not seen hold 0 and carry weight 0; never NaN."""
+    """Image positions, shape `(F, P, 2)`, any unit, usually pixels; x right, y down unless the settings have `y_up`.
+    Hidden entries are 0 and have weight 0; never NaN."""
 
     visible: Floats
-    """Confidence in [0, 1] that the point was seen, shape `(F, P)`; 0 means hidden."""
+    """Confidence in [0, 1] that the point is visible, shape `(F, P)`; 0 means hidden."""
 
     @classmethod
     def from_arrays(cls, points: ArrayLike, visible: ArrayLike | None = None) -> Tracks:
-        """Check and copy arrays as users have them.
+        """Validate and copy arrays.
 
         Parameters
         ----------
@@ -66,7 +66,7 @@ class Tracks:
             )
         if count < MIN_POINTS:
             raise _wrong("tracks", "too_few_points", f"at least {MIN_POINTS} points", f"{count}", "Track more points.")
-        positions = np.array(given, dtype=np.float64, order="C")  # the same bits however they lay in memory
+        positions = np.array(given, dtype=np.float64, order="C")  # results must not depend on the memory layout
         confidence = _confidence(visible, (frames, count))
         confidence[~np.isfinite(positions).all(axis=2)] = 0.0
         if not confidence.any():
@@ -91,13 +91,13 @@ class Tracks:
 
     @property
     def all_visible(self) -> bool:
-        """True if every observation carries full weight."""
+        """Whether every observation has confidence 1."""
         return bool((self.visible == 1).all())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mesh:
-    """Which points are neighbours. Vertex i is point i; the order is never changed."""
+    """Faces that connect the points. Vertex i is point i; the order is never changed."""
 
     num_points: int
     """P."""
@@ -106,11 +106,11 @@ class Mesh:
     """Triangles `(T, 3)` or quads `(T, 4)`, counter-clockwise, indices into the points; T may be 0."""
 
     grid: Ints | None = None
-    """For points that lie on a pixel grid: point index of every cell, −1 where the grid has a hole, shape `(rows, columns)`."""
+    """Point index of every cell of a pixel grid, −1 for holes, shape `(rows, columns)`; None without a grid."""
 
     @classmethod
     def from_faces(cls, faces: ArrayLike, num_points: int) -> Mesh:
-        """Check faces against the number of points.
+        """Validate and copy faces.
 
         Raises
         ------
@@ -145,7 +145,7 @@ class Mesh:
 
     @classmethod
     def from_grid(cls, grid: ArrayLike) -> Mesh:
-        """Quads between the cells of a pixel grid, which may have holes.
+        """Return the mesh of quads between the cells of a pixel grid, which may have holes.
 
         Parameters
         ----------
@@ -185,16 +185,16 @@ class Mesh:
         low, high = np.minimum(self.faces, following), np.maximum(self.faces, following)
         keys = np.unique(
             low.astype(np.int64) * self.num_points + high
-        )  # of single numbers: ten times as fast as of pairs
+        )  # unique of scalars is ten times as fast as unique of rows
         return np.stack([keys // self.num_points, keys % self.num_points], axis=1).astype(self.faces.dtype)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Camera:
-    """The estimated camera of every frame; `project` states how it maps shapes to the image."""
+    """The camera of every frame; `project` maps shapes to the image."""
 
     rotations: Floats
-    """Camera from world, shape `(F, 3, 3)`; the third axis points away from the camera, or to it if `y_up`."""
+    """Camera from world, shape `(F, 3, 3)`; the third axis points away from the camera, or towards it if `y_up`."""
 
     scales: Floats
     """Image units per world unit at the shape's origin, shape `(F,)`; mean of the logarithm 0 unless given or perspective; all 1 for
@@ -230,7 +230,7 @@ class Camera:
         return np.asarray(self.principal_point + (image - self.principal_point) / nearer[..., None])
 
     def at(self, frames: slice) -> Camera:
-        """Return the cameras of some frames."""
+        """Return the cameras of the given frames."""
         return replace(
             self, rotations=self.rotations[frames], scales=self.scales[frames], translations=self.translations[frames]
         )
@@ -246,7 +246,7 @@ class Camera:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KnownCamera:
-    """Cameras that the user gives instead of having them estimated."""
+    """Cameras given by the user instead of estimated ones."""
 
     rotations: Floats
     """Shape `(F, 3, 3)`, camera from world."""
@@ -256,10 +256,10 @@ class KnownCamera:
     origin."""
 
     focal: float | None = None
-    """φ, the tracks' unit; None: as the settings say."""
+    """φ, the tracks' unit; None: as in the settings."""
 
     principal_point: tuple[float, float] | None = None
-    """(x, y), the tracks' unit; None: as the settings say."""
+    """(x, y), the tracks' unit; None: as in the settings."""
 
     @classmethod
     def from_arrays(
@@ -270,7 +270,7 @@ class KnownCamera:
         focal: float | None = None,
         principal_point: tuple[float, float] | None = None,
     ) -> KnownCamera:
-        """Check cameras as users have them: `(F, 3, 3)`, or `(F, 2, 3)`, completed by the cross product.
+        """Validate and copy cameras, `(F, 3, 3)`, or `(F, 2, 3)` to be completed by the cross product.
 
         Raises
         ------
@@ -317,7 +317,7 @@ class KnownCamera:
 
 
 class Outcome(StrEnum):
-    """How a solve ended. Every member has a sentence for the user."""
+    """How a solve ended; `sentence` explains each member."""
 
     CONVERGED = "converged"
     MAX_REWEIGHTINGS = "max_reweightings"
@@ -333,11 +333,11 @@ class Outcome(StrEnum):
 _SENTENCES = {
     Outcome.CONVERGED: "Converged.",
     Outcome.MAX_REWEIGHTINGS: (
-        "Stopped at the largest number of reweightings before the objective settled. The result is usable; "
-        "raise max_reweightings or tolerance if it must settle."
+        "Stopped at the maximum number of reweightings before the objective converged. The result is usable; "
+        "raise max_reweightings or tolerance if it must converge."
     ),
     Outcome.REJECTED: (
-        "The last step would have raised the objective by more than the tolerance and was rejected; the shapes are those before it. "
+        "The last step increased the objective by more than the tolerance and was rejected; the shapes are those before it. "
         "Try precision float64 or weaker weights if they are not good enough."
     ),
     Outcome.STOPPED: "Stopped on request; the shapes are those of the last finished step.",
@@ -346,7 +346,7 @@ _SENTENCES = {
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """What `on_step` is told after each unit of work."""
+    """Argument of `on_step`, called after each unit of work."""
 
     stage: str
     """`cameras`, `initialise`, `reweight` or `finish`."""
@@ -372,7 +372,7 @@ class Trace:
     """Per-reweighting history, arrays of equal length; entry 0 is the initialisation."""
 
     objective: Floats
-    """E, normalized units; never rises, but where tracks are corrected anew for perspective."""
+    """E, normalized units; never increases, except when the tracks are corrected again for perspective."""
 
     residual: Floats
     """Median visible reprojection residual, the tracks' unit."""
@@ -383,7 +383,7 @@ class Trace:
 
 @dataclass(frozen=True, slots=True)
 class FocalCandidate:
-    """One focal length that was compared."""
+    """A focal length that was compared with others."""
 
     focal: float | None
     """Focal length, the tracks' unit; None: orthography."""
@@ -397,7 +397,7 @@ class FocalCandidate:
 
 @dataclass(frozen=True, slots=True)
 class Choices:
-    """What was chosen automatically, with the reasons, so that a report can say it."""
+    """Automatic choices with their reasons, for the report."""
 
     basis_size: int
     temporal_weight: float
@@ -413,20 +413,20 @@ class Choices:
     camera: str = "scaled_orthographic"
     """Camera model used: `perspective`, `scaled_orthographic` or `orthographic`."""
     depth_sign: Literal["settled", "ambiguous"] = "ambiguous"
-    """Whether the sign of depth is known: from given cameras, or by evidence under perspective. Orthography leaves it open."""
+    """Whether the sign of depth is known, from given cameras or from perspective. Orthography leaves it undetermined."""
     focal_candidates: tuple[FocalCandidate, ...] = ()
     """Focal lengths that were compared; empty where perspective was not considered."""
     reasons: dict[str, str] = field(default_factory=dict)
     """One sentence for each automatic choice, by name."""
     warnings: tuple[str, ...] = ()
-    """Sentences the user should read, e.g. that the camera hardly moved."""
+    """Warnings for the user, e.g. that the camera hardly moved."""
     focal_lengths: tuple[tuple[float, float], ...] = ()
     """Focal lengths that were compared for an isometric surface, pixels, each with its isometric inconsistency I; empty if none were."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """The answer."""
+    """Result of a solve."""
 
     shapes: Floats
     """Shape `(F, P, 3)`, world axes, the tracks' unit, centred per frame."""
@@ -438,7 +438,7 @@ class Solution:
     """Length of the reprojection residual, shape `(F, P)`, the tracks' unit; 0 where hidden."""
 
     weights: Floats
-    """Final IRLS weight over its largest possible value, in [0, 1], shape `(F, P)`; 0 where hidden, small for outliers."""
+    """Final IRLS weight relative to its largest possible value, in [0, 1], shape `(F, P)`; 0 where hidden, small for outliers."""
 
     trace: Trace
     outcome: Outcome

@@ -1,13 +1,13 @@
-"""The one record of settings; every field is explained by its formula.
+"""Settings of a solve, each explained by its formula.
 
-The energy that these settings shape, in normalized units (per-frame centroid of the visible points removed, then
-divided by the RMS of what is left; λ is therefore dimensionless)::
+The energy, in normalized units (the centroid of each frame's visible points is subtracted and the result divided by its
+RMS, so λ is dimensionless)::
 
     E(S) = Σ_fp v_fp ρ(w_fp − s_f R_f S_fp)  +  λ1 ‖H S‖_F²  +  λ2 ‖A vec(S)‖²  (+ λ3 Σ_i log-det-like rank penalty)
 
 Dai, Deng, He (2017), eq. 7; the scale s_f, the weight v_fp and the rank term are ours. With the Gaussian prior λ1 Σ_p x_pᵀ Σ⁻¹ x_p
-stands where λ1 ‖H S‖² does, Σ the learned covariance of a point's positions x_p; λ2 then acts in the axes in which deformation varies
-alike, and neither H nor λ3 has a part in it.
+replaces λ1 ‖H S‖², with Σ the learned covariance of a point's positions x_p; λ2 then acts in the axes in which the
+deformation is isotropic, and H and λ3 are not used.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Laplacian = Literal["auto", "grid8", "uniform", "cotangent"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
-    """How to solve. The defaults are meant to need no change."""
+    """Settings of a solve. The defaults suit most sequences."""
 
     method: Method = "robust"
     """`pseudo_inverse` R†W; `temporal` closed form (eq. 5); `spatio_temporal` eq. 7 with L2; `robust` eq. 7 with `loss`."""
@@ -56,21 +56,21 @@ class Settings:
     """True: y of the tracks grows upwards. The third axis of the camera then points to the viewer instead of away."""
 
     surface: Surface = "auto"
-    """`isometric`: a sheet that bends without stretching, seen in perspective; `free`: none of that; `auto`: isometric where the tracks
-    are those of a sheet and its edge lengths single out a focal length; tried only where `image_size` or the focal length is given, with
-    the default camera model, method and prior."""
+    """`isometric`: a sheet that bends without stretching, seen in perspective; `free`: any surface; `auto`: isometric if the tracks
+    are those of a sheet and its edge lengths determine a focal length. `auto` tests this only if `image_size` or the focal length is
+    given, with the default camera model, method and prior."""
 
     basis_size: int | None = None
-    """K of the rank-3K factorization; None chooses it from the data and reports why."""
+    """K of the rank-3K factorization; None selects it from the data and reports the reason."""
 
     refine_rotations: bool = True
-    """Refine the cameras by variable projection on the likelihood of the tracks; with the Gaussian prior, together with it."""
+    """Refine the cameras by variable projection on the likelihood of the tracks; with the Gaussian prior, jointly with it."""
 
     preset: Preset = "auto"
     """`paper`: λ1 = 1e-3, λ2 = 1, L1 with ε = 1e-3, first order; `auto`: weights from the noise and motion measured in the data."""
 
     temporal_weight: float | None = None
-    """λ1, dimensionless; None takes the preset's. 0 leaves depth to nothing but the start."""
+    """λ1, dimensionless; None takes the preset's. With 0, depth is determined by the starting point only."""
 
     spatial_weight: float | None = None
     """λ2, dimensionless; None takes the preset's. Unused without a mesh."""
@@ -79,7 +79,7 @@ class Settings:
     """ε of the smoothed L1 (r ↦ √(r² + ε²)) or δ of Huber, in normalized units; None takes the preset's."""
 
     temporal_order: Literal[1, 2] | None = None
-    """Order of the difference operator H; None takes the preset's. Without effect, and said so, with the Gaussian prior."""
+    """Order of the difference operator H; None takes the preset's. With the Gaussian prior it has no effect, which is reported."""
 
     loss: Loss = "l1"
     """ρ of the data term when `method` is `robust`."""
@@ -89,26 +89,26 @@ class Settings:
     else uniform."""
 
     prior: Prior = "gaussian"
-    """Of method `robust` with preset `auto`. `gaussian`: one Gaussian over all frames for the positions of a point, its covariance
-    learned from the tracks (modes and a random walk, by expectation maximisation), estimated cameras refined with it; λ1 weighs
-    it. `smooth`: the paper's method exactly; `smooth+low_rank` adds a reweighted nuclear norm on the F×3P shape matrix (with preset
-    `paper` only if `low_rank_weight` is given). With other methods or preset `paper`, `gaussian` means `smooth`."""
+    """Prior of method `robust` with preset `auto`. `gaussian`: a Gaussian over all frames for the positions of each point, with a
+    covariance learned from the tracks (modes and a random walk, by expectation maximisation) and weight λ1; estimated cameras are
+    refined with it. `smooth`: the paper's method; `smooth+low_rank` adds a reweighted nuclear norm on the F×3P shape matrix (with
+    preset `paper` only if `low_rank_weight` is given). With other methods or preset `paper`, `gaussian` means `smooth`."""
 
     low_rank_weight: float | None = None
-    """λ3, dimensionless, strength of the low-rank prior; None takes it from the data. Without effect, and said so, unless `prior` is
-    `smooth+low_rank`."""
+    """λ3, dimensionless, weight of the low-rank prior; None takes it from the data. Unless `prior` is `smooth+low_rank` it has no
+    effect, which is reported."""
 
     max_reweightings: int = 60
-    """Upper bound on the outer IRLS steps."""
+    """Maximum number of reweightings, the outer IRLS iterations."""
 
     tolerance: float = 1e-4
-    """Converged when the relative change of the objective over one reweighting falls below this."""
+    """Relative change of the objective over one reweighting below which the solve has converged."""
 
     precision: Literal["float64", "float32"] = "float64"
-    """Arithmetic of the large arrays. With the Gaussian prior always double, for its equations span ten magnitudes."""
+    """Precision of the large arrays. The Gaussian prior always uses float64, because its equations span ten orders of magnitude."""
 
     seed: int = 0
-    """Seed of every random choice (restarts, sampled points). The same seed and thread count give the same bits."""
+    """Seed of all random choices (restarts, sampled points). The same seed and thread count give bit-identical results."""
 
     @property
     def focal_length(self) -> float | None:
@@ -119,12 +119,12 @@ class Settings:
 
     @property
     def gaussian(self) -> bool:
-        """True if the shapes get the Gaussian prior."""
+        """Whether the shapes have the Gaussian prior."""
         return self.prior == "gaussian" and self.method == "robust" and self.preset == "auto"
 
     @property
     def estimates_scales(self) -> bool:
-        """True if every frame may have its own scale."""
+        """Whether every frame may have its own scale."""
         return self.camera != "orthographic"
 
     def __post_init__(self) -> None:
@@ -156,17 +156,17 @@ class Settings:
 
 
 FARTHEST = 10.0
-"""Pictures that the principal point may lie beyond the border: what a crop leaves may be a tenth of the picture."""
+"""Maximum distance of the principal point from the picture, in picture sizes: a crop may keep a tenth of a picture."""
 
 
 def check_pinhole(settings: Settings) -> None:
-    """Check what is given about a pinhole camera.
+    """Validate the settings of a pinhole camera.
 
     Raises
     ------
     InvalidSettings
         A focal length or size that is not positive and finite, both `focal` and `field_of_view`, an angle without `image_size` or outside
-        0 to 180 degrees, or a principal point that is not finite or outside any picture.
+        0 to 180 degrees, or a principal point that is not finite or too far outside the picture.
     """
     focal, angle, centre, size = settings.focal, settings.field_of_view, settings.principal_point, settings.image_size
     if focal is not None and not (math.isfinite(focal) and focal > 0):

@@ -1,4 +1,4 @@
-"""Frames in parallel: NumPy and SciPy release the interpreter lock, so plain threads are enough."""
+"""Threads over frames or points: NumPy and SciPy release the interpreter lock."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 
 SMALLEST = 200_000
-"""Numbers a thread should have to work on, at least: below, starting it costs more than it saves."""
+"""Minimum number of array elements per thread; below it, starting the thread costs more than it saves."""
 
 _LIMIT: ContextVar[int | None] = ContextVar("threads", default=None)
 
 
 @contextmanager
 def threads_limited(count: int | None) -> Iterator[None]:
-    """Let solves inside the `with` block start at most `count` threads; None leaves it to the cores there are.
+    """Limit solves inside the `with` block to `count` threads; None uses all available cores.
 
-    The limit belongs to the calling thread (or task), so that two solves in one process can have different ones. It does not
-    reach the threads of the linear-algebra library, which reads its own variables when it is loaded.
+    The limit applies to the calling thread or task, so two solves in one process can have different limits. It does not
+    affect the threads of BLAS, which reads its own environment variables when it is loaded.
 
     Raises
     ------
@@ -37,17 +37,17 @@ def threads_limited(count: int | None) -> Iterator[None]:
 
 
 def available_cores() -> int:
-    """Return how many threads a solve may use: the cores the process may run on, or fewer if `threads_limited` says so."""
+    """Return the number of threads for a solve: the cores available to the process, or the limit of `threads_limited`."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     limit = _LIMIT.get()
     return max(1, cores if limit is None else min(cores, limit))
 
 
 def over_ranges(work: Callable[[int, int], None], count: int, *, smallest: int = 1) -> None:
-    """Call `work(start, stop)` on contiguous ranges that cover 0 … count, one range a core.
+    """Call `work(start, stop)` on contiguous ranges that cover 0 … count, one range per core.
 
-    Every index is worked on by the same arithmetic whatever the number of cores, so results do not depend on it as long as
-    `work` writes to its own range alone.
+    Results do not depend on the number of cores as long as `work` treats indices independently and writes only to its
+    own range.
     """
     cores = min(available_cores(), max(count // smallest, 1))
     if cores == 1:

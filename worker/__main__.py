@@ -9,9 +9,10 @@ import os
 import secrets
 import signal
 import sys
+from contextlib import suppress
 from types import FrameType
 
-from pliant.worker.errors import WorkerError
+from pliant.worker.errors import StoreUnavailable, WorkerError
 from pliant.worker.execution.rq_worker import PliantWorker
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.maintenance.fsck import findings
@@ -21,6 +22,7 @@ from pliant.worker.settings import NUMERICAL_THREADS, Settings
 from pliant.worker.store.connection import BLOCK_WITHIN, connect
 from pliant.worker.store.queue import RedisQueue
 from pliant.worker.store.redis import RedisRecords
+from pliant.worker.store.schema import prepare
 from pliant.worker.webhooks.sender import WebhookSender
 
 USAGE = "usage: python -m pliant.worker [work|reconcile|fsck]"
@@ -28,21 +30,21 @@ USAGE = "usage: python -m pliant.worker [work|reconcile|fsck]"
 PRELOADED = ("pliant.worker.formats.canonical", "pliant.worker.execution.pipeline")
 
 WATCH_ANSWERS_WITHIN = 2.0
-"""Seconds a sign of life may take: the watcher must go on watching when the store hangs."""
+"""Time limit of a heartbeat, seconds: supervision of the job must continue when the store hangs."""
 
 
 def work(settings: Settings) -> int:
-    """Take jobs until told to stop.
+    """Run jobs until a signal.
 
-    What a job needs is loaded before the first fork, once for all of them. That is safe as long as this process
-    computes nothing: the numerical library shuts its threads down in the fork and starts them anew in the job process.
+    The modules of a job are loaded once, before the first fork. That is safe as long as this process computes nothing:
+    the numerical library stops its threads in the fork and restarts them in the job process.
     """
     for variable in NUMERICAL_THREADS:
         os.environ.setdefault(variable, "1")
     for module in PRELOADED:
         importlib.import_module(module)
     gc.collect()
-    gc.freeze()  # or every job process's first collection would copy all the pages it shares with us
+    gc.freeze()  # otherwise the first garbage collection of every job process would copy all shared pages
     make_data_directory(settings.data)
     quick = connect(settings.redis, decode=True, retries=0, answer_within=WATCH_ANSWERS_WITHIN)
     connection = connect(settings.redis, decode=False, answer_within=BLOCK_WITHIN)
@@ -69,15 +71,15 @@ def reconcile(settings: Settings) -> int:
     jobs = Jobs.open(settings)
     sender = WebhookSender.open(settings, jobs.records)
     sender.start()
-    Reconciler(jobs=jobs).run(lambda: stopping or not sender.alive)  # without its sender it ends and is restarted
+    Reconciler(jobs=jobs).run(lambda: stopping or not sender.alive)  # the supervisor restarts it
     sender.stop()
     return 0
 
 
 def fsck(settings: Settings) -> int:
-    """Print what does not fit the records; return 1 if there is anything."""
+    """Print inconsistencies between stores and records; return 1 if there are any."""
     found = findings(Jobs.open(settings))
-    sys.stdout.writelines(f"{finding}\n" for finding in found or ["Everything stored is as the records state."])
+    sys.stdout.writelines(f"{finding}\n" for finding in found or ["The stores are consistent with the job records."])
     return 1 if found else 0
 
 
@@ -91,7 +93,10 @@ def main(arguments: list[str]) -> int:
         sys.stderr.write(f"{USAGE}\n")
         return 2
     try:
-        return task(Settings.from_environment(os.environ))
+        settings = Settings.from_environment(os.environ)
+        with suppress(StoreUnavailable):  # each task deals with a store that is away
+            prepare(settings)
+        return task(settings)
     except WorkerError as error:
         sys.stderr.write(f"{error}\n")
         return 1

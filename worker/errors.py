@@ -1,26 +1,26 @@
-"""Errors of the jobs' machinery.
+"""Errors of the worker package.
 
     WorkerError                 base: catch this one
     ├── UnknownJob              no job of that id (or not yours)
     ├── UnknownArtifact         the job has no such file
-    ├── UnknownExample          there is no such made-up sequence, or it has no such file
+    ├── UnknownExample          no such example, or it has no such file
     ├── UnknownShare            the job has no such share link
     ├── UnknownToken            there is no token of that id
     ├── UnknownUpload           no upload of that id (or not yours)
     ├── NotAllowedNow           the job's status does not allow it
-    ├── Conflict                an id or idempotency key is already used for something else
-    │   └── OffsetMismatch      bytes that do not belong where the upload stands
-    ├── InvalidRequest          an id or cursor that cannot be one
-    │   └── UploadTooLarge      more bytes than one upload may have
-    ├── TooManyShares           more share links than one job may have
-    ├── TooManyUploads          more uploads than one owner may have
-    ├── InvalidSetting          a setting does not parse or is out of its range
-    ├── TooManyQueued           as many jobs of yours wait as may
-    ├── QuotaExceeded           the jobs together hold as many bytes as they may
+    ├── Conflict                an id or idempotency key is used by a different request
+    │   └── OffsetMismatch      the offset of the bytes is not the size of the upload
+    ├── InvalidRequest          a malformed id or cursor
+    │   └── UploadTooLarge      an upload exceeds its maximum size
+    ├── TooManyShares           the limit of share links of a job is reached
+    ├── TooManyUploads          the owner's limit of uploads is reached
+    ├── InvalidSetting          a setting does not parse or is out of range
+    ├── TooManyQueued           the owner's limit of queued jobs is reached
+    ├── QuotaExceeded           the disk quota is reached
     ├── StoreUnavailable        Redis or the blob store does not answer, or is full
     ├── DataDirectoryInUse      another Pliant runs on the data directory
     ├── ServerFailed            the embedded Valkey does not start
-    ├── Interrupted             a reconstruction was asked to stop, and did
+    ├── Interrupted             a reconstruction was stopped on request
     ├── TimedOut                a reconstruction took longer than its options allow
     └── StaleAttempt            an attempt that no longer owns its job tried to write
 
@@ -33,7 +33,7 @@ from pliant.schemas.job import Status
 
 
 class WorkerError(Exception):
-    """Something the jobs' machinery cannot do.
+    """Base class of the errors of the worker package.
 
     Attributes
     ----------
@@ -42,7 +42,7 @@ class WorkerError(Exception):
     retryable : bool
         True if the same request may succeed later.
     retry_after : int or None
-        Seconds after which it may.
+        Seconds to wait before the next attempt.
     """
 
     code = "worker_error"
@@ -51,12 +51,12 @@ class WorkerError(Exception):
 
 
 class UnknownJob(WorkerError):
-    """There is no job of that id, or it belongs to somebody else."""
+    """There is no job of that id, or it belongs to another owner."""
 
     code = "unknown_job"
 
     def __init__(self, id: str) -> None:
-        super().__init__(f"There is no job {id!r}. List the jobs to see which there are; expired ones are removed.")
+        super().__init__(f"There is no job {id!r}. List your jobs to see which exist; expired ones are removed.")
         self.id = id
 
 
@@ -99,12 +99,12 @@ class UnknownToken(WorkerError):
     code = "unknown_token"
 
     def __init__(self, id: str) -> None:
-        super().__init__(f"There is no token {id!r}. `pliant token list` shows which there are.")
+        super().__init__(f"There is no token {id!r}. `pliant token list` lists all tokens.")
         self.id = id
 
 
 class UnknownUpload(WorkerError):
-    """There is no upload of that id, or it belongs to somebody else."""
+    """There is no upload of that id, or it belongs to another owner."""
 
     code = "unknown_upload"
 
@@ -114,7 +114,7 @@ class UnknownUpload(WorkerError):
 
 
 class NotAllowedNow(WorkerError):
-    """The job's status does not allow what was asked."""
+    """The operation is not possible in the job's status."""
 
     code = "not_allowed_now"
 
@@ -133,17 +133,17 @@ class Conflict(WorkerError):
 
 
 class OffsetMismatch(Conflict):
-    """Bytes were sent that do not belong where the upload stands."""
+    """The offset of the bytes is not the current size of the upload."""
 
     def __init__(self, id: str, *, expected: int, got: int) -> None:
-        sentence = f"Upload {id!r} holds {expected} bytes, and what was sent begins at {got}. Go on at {expected}."
+        sentence = f"Upload {id!r} has {expected} bytes, but the data sent starts at {got}. Continue at {expected}."
         super().__init__("upload_offset_mismatch", id=id, sentence=sentence)
         self.field, self.offset = "Upload-Offset", expected
         self.expected, self.got = str(expected), str(got)
 
 
 class InvalidRequest(WorkerError):
-    """An id, cursor or key that cannot be one."""
+    """A malformed id, cursor or key."""
 
     def __init__(self, code: str, *, field: str, expected: str, got: str, hint: str) -> None:
         super().__init__(f"{field}: expected {expected}, got {got}. {hint}")
@@ -151,23 +151,25 @@ class InvalidRequest(WorkerError):
 
 
 class UploadTooLarge(InvalidRequest):
-    """An upload has more bytes than it may have."""
+    """An upload exceeds its maximum size."""
 
     def __init__(self, most: int, got: int) -> None:
         super().__init__(
             "upload_too_large", field="body", expected=f"at most {most} bytes", got=f"{got} or more",
-            hint="Take fewer frames or points, or store float32; see /v1/limits.",
+            hint="Send fewer frames or points, or store float32; see /v1/limits.",
         )  # fmt: skip
 
 
 class TooManyUploads(WorkerError):
-    """An owner has as many uploads as he may have."""
+    """The owner's limit of uploads is reached."""
 
     code = "too_many_uploads"
     retryable = True
 
     def __init__(self, most: int) -> None:
-        super().__init__(f"There are {most} uploads already. Delete some, or wait until they expire.")
+        super().__init__(
+            f"Upload limit reached: there are already {most} uploads. Delete some, or wait until they expire."
+        )
 
 
 class TooManyShares(WorkerError):
@@ -181,7 +183,7 @@ class TooManyShares(WorkerError):
 
 
 class InvalidSetting(WorkerError):
-    """A setting does not parse or is out of its range."""
+    """A setting does not parse or is out of range."""
 
     code = "invalid_setting"
 
@@ -191,7 +193,7 @@ class InvalidSetting(WorkerError):
 
 
 class TooManyQueued(WorkerError):
-    """As many jobs of one owner wait as may."""
+    """The owner's limit of queued jobs is reached."""
 
     code = "too_many_queued"
     retryable = True
@@ -199,20 +201,20 @@ class TooManyQueued(WorkerError):
 
     def __init__(self, limit: int) -> None:
         super().__init__(
-            f"{limit} of your jobs wait already, and no more may. Send the next one when one of them has begun, or cancel one."
+            f"Queue limit reached: {limit} jobs are already queued. Submit again when one of them has started, or cancel one."
         )
         self.limit = limit
 
 
 class QuotaExceeded(WorkerError):
-    """The jobs together hold as many bytes as they may."""
+    """The disk quota is reached."""
 
     code = "quota_exceeded"
     retryable = True
 
     def __init__(self, *, used: int, quota: int) -> None:
         super().__init__(
-            f"The jobs hold {used:,} bytes and may hold {quota:,}. Delete jobs, wait until old ones expire, or raise PLIANT_DISK_QUOTA."
+            f"Disk quota reached: {used:,} of {quota:,} bytes are used. Delete jobs, wait until they expire, or raise PLIANT_DISK_QUOTA."
         )
         self.used, self.quota = used, quota
 
@@ -225,7 +227,7 @@ class StoreUnavailable(WorkerError):
     retry_after = 2
 
     def __init__(self, what: str, *, reason: str) -> None:
-        super().__init__(f"{what} cannot be used now ({reason}). Nothing was lost; try again in a few seconds.")
+        super().__init__(f"{what} is unavailable ({reason}). No data was lost; try again in a few seconds.")
         self.what, self.reason = what, reason
 
 
@@ -235,10 +237,27 @@ class DataDirectoryInUse(WorkerError):
     code = "data_directory_in_use"
 
     def __init__(self, data: str, *, holder: str) -> None:
-        super().__init__(
-            f"{data} is already used by {holder}. Stop that one first, or give another directory (--data)."
-        )
+        super().__init__(f"{data} is already used by {holder}. Stop it first, or choose another directory (--data).")
         self.data, self.holder = data, holder
+
+
+class NewerData(WorkerError):
+    """A newer version wrote what is stored."""
+
+    code = "newer_data"
+
+    def __init__(self, *, found: int, known: int) -> None:
+        super().__init__(
+            f"The records were written by a newer Pliant (version {found} of their form; this one reads up to {known}). "
+            "Install that Pliant, or restore a backup that was made before the upgrade."
+        )
+        self.found, self.known = found, known
+
+
+class BadBackup(WorkerError):
+    """A backup cannot be written or restored."""
+
+    code = "bad_backup"
 
 
 class ServerFailed(WorkerError):
@@ -252,7 +271,7 @@ class ServerFailed(WorkerError):
 
 
 class Interrupted(WorkerError):
-    """A reconstruction was asked to stop, and did."""
+    """A reconstruction was stopped on request."""
 
     code = "interrupted"
 
@@ -268,7 +287,7 @@ class TimedOut(WorkerError):
 
     def __init__(self, limit: float) -> None:
         super().__init__(
-            f"The job took longer than the {limit:g} s of its option time_limit. Give it more, send fewer points or frames, "
+            f"The job exceeded its option time_limit of {limit:g} s. Raise it, send fewer points or frames, "
             "or lower max_reweightings."
         )
         self.limit = limit

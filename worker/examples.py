@@ -1,4 +1,4 @@
-"""Made-up sequences that a newcomer can reconstruct at once: input files in the formats that the readers take."""
+"""Synthetic example sequences, as input files in the formats of the readers."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Write = Callable[[Sequence], bytes]
 
 @dataclass(frozen=True, slots=True)
 class Example:
-    """One example: what it is called, how it is made, and its files by the form part they belong to."""
+    """One example: its title, how it is generated, and its files by form part."""
 
     name: str
     title: str
@@ -50,11 +50,11 @@ EXAMPLES = {
         Example("sphere", "breathing sphere", lambda: sphere(30, 500)),
     )
 }
-"""Small enough for a result within seconds, and with something wrong in each (noise, outliers, hidden points)."""
+"""Examples that are solved within seconds, each with a defect: noise, outliers or hidden points."""
 
 
 def example_file(name: str, file: str) -> bytes:
-    """Make one input file of an example; the same bytes every time.
+    """Return one input file of an example, with identical bytes on every call.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The data directory, and where its embedded Valkey lives."""
+"""Paths of the data directory and of its embedded Valkey."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ LONGEST_SOCKET_PATH = 100
 
 
 def make_data_directory(data: Path) -> None:
-    """Make the data directory and its folders, readable by their owner alone: they hold everybody's inputs and results.
+    """Create the data directory and its folders, readable by their owner only, since they contain all inputs and results.
 
-    A directory that exists keeps its mode, for it may be anything; the folders of ours inside it are closed to others.
+    An existing data directory keeps its mode; the folders inside it are closed to other users.
     """
     data.mkdir(parents=True, exist_ok=True, mode=0o700)
     for name in FOLDERS:
@@ -33,10 +33,10 @@ def valkey_directory(data: Path) -> Path:
 
 
 def socket_path(data: Path) -> Path:
-    """Return the server's Unix socket: inside the data directory, or in the temporary one when that lies too deep.
+    """Return the server's Unix socket: in the data directory, or in the temporary directory if that path is too long.
 
-    The short name is a hash of the long one and of the user, so that everybody who is given the same data
-    directory finds the same socket.
+    The short name is a hash of the long one and of the user, so that all processes with the same data directory find
+    the same socket.
     """
     plain = valkey_directory(data) / "valkey.sock"
     if len(os.fsencode(plain)) <= LONGEST_SOCKET_PATH:

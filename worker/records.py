@@ -1,8 +1,8 @@
-"""Job records: what is stored of a job, and the interface of the store that keeps it.
+"""Job records, and the interface of their store.
 
 The record is the authority on a job; RQ only carries its attempt id to a worker. Every change is a compare-and-set on the
-record's version, and every change that an attempt makes checks the attempt id first (`pliant.worker.jobs.lifecycle`). An attempt
-whose job was given to another attempt can therefore write nothing.
+record's version, and changes by an attempt also check the attempt id (`pliant.worker.jobs.lifecycle`). An attempt whose job
+was requeued can therefore write nothing.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ from pliant.schemas.job import Job, Status
 from pydantic import BaseModel, ConfigDict, Field
 
 EVENTS_KEPT = 256
-"""Events of one job that can be read again; older ones are dropped."""
+"""Maximum number of events kept per job; older ones are dropped."""
 
 EVENTS_KEPT_AT_LAST = 16
-"""Events that are kept of a finished job: whoever follows it needs the last ones, and finished jobs are many."""
+"""Maximum number of events kept per finished job: followers need the last ones only."""
 
 LOG_KEPT = 2000
-"""Lines of one job's log; older ones are dropped."""
+"""Maximum number of lines of a job's log; older ones are dropped."""
 
 
 RUN_SECONDS = (1.0, 2.5, 5.0, 10.0, 30.0, 60.0, 120.0, 300.0, 600.0, 1800.0, 3600.0)
-"""Upper bounds of the histogram of how long jobs ran, in seconds."""
+"""Upper bounds of the histogram of job durations, seconds."""
 
 
 class Webhook(BaseModel):
-    """The address that is called when a job ends, and the secret that signs the message. Never returned to a client."""
+    """Address called when a job ends, and the secret for its signature. Never returned to clients."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -51,7 +51,7 @@ class StoredShare(BaseModel):
 
 
 class Stored(BaseModel):
-    """A job with what only the worker package needs."""
+    """A job with the internal fields of the worker package."""
 
     model_config = ConfigDict(
         frozen=True, extra="ignore", validate_by_name=True, validate_by_alias=True, serialize_by_alias=True
@@ -59,10 +59,10 @@ class Stored(BaseModel):
 
     job: Job
     owner: str = ""
-    """Whose job it is, empty where there are no owners."""
+    """Owner of the job, empty without authentication."""
 
     attempt_id: str = Field(validation_alias="token", serialization_alias="token")
-    """The one attempt that may write: the id under which RQ carries the job. Every requeue changes it.
+    """The only attempt that may write; RQ carries this id. Every requeue changes it.
     Stored under the name `token`."""
 
     inputs: str
@@ -72,31 +72,34 @@ class Stored(BaseModel):
     """Blob of the arrays of a stored result, for a job that writes further files of it instead of solving."""
 
     bytes: int = 0
-    """Size of everything kept for the job."""
+    """Total size of the job's files, bytes."""
 
     prefix: str | None = None
-    """Where the published artifacts lie among the blobs; None until the job has succeeded."""
+    """Blob prefix of the published artifacts; None until the job has succeeded."""
 
     worker: str | None = None
-    """Name of the worker that has it."""
+    """Name of the worker that runs the job."""
 
     key: str | None = None
     """Digest of owner and idempotency key."""
 
     fingerprint: str | None = None
-    """Digest of the request, to tell a repeated request from a different one under the same key or id."""
+    """Digest of the request, which distinguishes a repeated request from a different one with the same key or id."""
 
     webhook: Webhook | None = None
     """Called once the job has ended."""
 
     max_running: int | None = None
-    """How many jobs of its owner may run at once, as the owner's token stated at submission; None: `Settings.max_running`."""
+    """Limit of concurrently running jobs of the owner, from the token at submission; None: `Settings.max_running`."""
 
     shares: tuple[StoredShare, ...] = ()
     """Links that read the job's results without a token of its owner."""
 
     version: int = 0
-    """Counts the changes; the compare-and-set compares it."""
+    """Number of changes, for the compare-and-set."""
+
+    record_schema: int = Field(2, validation_alias="schema", serialization_alias="schema")
+    """Version of the record's own form; see `pliant.worker.store.schema`."""
 
     @property
     def sort_key(self) -> str:
@@ -105,10 +108,10 @@ class Stored(BaseModel):
 
 
 class Event(NamedTuple):
-    """One change of a job, for those who follow it."""
+    """One change of a job, for followers."""
 
     id: str
-    """Ascending; pass the last one as `after`."""
+    """Increasing; pass the last one as `after`."""
 
     name: str
     """`job` when anything but the progress changed, else `progress`."""
@@ -118,7 +121,7 @@ class Event(NamedTuple):
 
 
 class Beat(NamedTuple):
-    """The heartbeat count of a job, with what the reconciler needs besides."""
+    """The heartbeat count of a job, with further fields for the reconciler."""
 
     attempt_id: str
     beats: int
@@ -131,7 +134,7 @@ Change = Callable[[Stored], Stored]
 
 
 def event_of(before: Stored | None, after: Stored) -> tuple[str, str]:
-    """Return name and data of the event that this change is."""
+    """Return name and data of the event for this change."""
     if before is not None and after.job.progress is not None:
         still = {"progress": None}
         if before.job.model_copy(update=still) == after.job.model_copy(update=still):
@@ -140,10 +143,10 @@ def event_of(before: Stored | None, after: Stored) -> tuple[str, str]:
 
 
 def counted(before: Stored, after: Stored) -> dict[str, float]:
-    """Return what to add to which tally because of this change: nothing, unless it ends the job.
+    """Return the increments of the counters for this change: none, unless it ends the job.
 
-    ``ended:<status>`` counts jobs, ``failed:<code>`` their reasons, ``ran:<status>:<bound>`` how many ran up to so many
-    seconds and longer than the bound before, ``ran:<status>:sum`` the seconds of all.
+    ``ended:<status>`` counts jobs, ``failed:<code>`` their errors, ``ran:<status>:<bound>`` the jobs of a histogram bin with
+    this upper bound in seconds, ``ran:<status>:sum`` the seconds of all.
     """
     job = after.job
     if before.job.status.final or not job.status.final:
@@ -167,7 +170,7 @@ def webhook_due(before: Stored, after: Stored) -> int | None:
 
 
 def events_kept(after: Stored) -> int:
-    """Return how many events to keep of a job that stands like this."""
+    """Return the maximum number of events to keep for a job in this state."""
     return EVENTS_KEPT_AT_LAST if after.job.status.final else EVENTS_KEPT
 
 
@@ -186,7 +189,7 @@ class Changes(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """End the subscription."""
+        """Close the subscription."""
 
 
 class Records(ABC):
@@ -200,14 +203,14 @@ class Records(ABC):
 
     @abstractmethod
     def create(self, stored: Stored, *, max_queued: int = 0, max_bytes: int = 0) -> Stored:
-        """Write a new record, unless its idempotency key or its id is taken: then return the record that has it.
+        """Write a new record; if its idempotency key or id is taken, return the existing record instead.
 
         Parameters
         ----------
         max_queued : int
-            Jobs of this owner that may be queued at once, the new one among them; 0: any number.
+            Maximum number of queued jobs of this owner, including the new one; 0: no limit.
         max_bytes : int
-            Bytes that all jobs may hold together, the new one among them; 0: any number.
+            Maximum total bytes of all jobs, including the new one; 0: no limit.
 
         Raises
         ------
@@ -231,22 +234,22 @@ class Records(ABC):
 
     @abstractmethod
     def replace(self, before: Stored, after: Stored) -> bool:
-        """Write `after` if the stored version is still `before`'s; tell whether it was."""
+        """Write `after` if the stored version is still that of `before`; return whether it was."""
 
     @abstractmethod
     def delete(self, id: str, *, at: datetime) -> None:
-        """Remove a record, its events, its log and its idempotency key, and note that its files are to be removed.
+        """Remove a record with its events, log and idempotency key, and mark its files for removal.
 
         Nothing happens if there is no such record.
         """
 
     @abstractmethod
     def deleted(self) -> dict[str, datetime]:
-        """Return when each deleted job was deleted whose files are still to be removed."""
+        """Return the deletion times of deleted jobs whose files are not removed yet."""
 
     @abstractmethod
     def forget_deleted(self, id: str) -> None:
-        """Note that the files of a deleted job are removed."""
+        """Remove the mark of a deleted job whose files are removed."""
 
     @abstractmethod
     def page(
@@ -260,31 +263,31 @@ class Records(ABC):
 
     @abstractmethod
     def count(self, statuses: Sequence[Status], *, owner: str | None = None) -> int:
-        """Return how many jobs have one of these statuses."""
+        """Return the number of jobs with one of these statuses."""
 
     @abstractmethod
     def oldest(self, status: Status) -> datetime | None:
-        """Return when the oldest job of one status was made, None if there is none."""
+        """Return the creation time of the oldest job of one status, None if there is none."""
 
     @abstractmethod
     def tallies(self) -> dict[str, float]:
-        """Return what has been counted since the installation began; see `counted` and `worker.outbox`."""
+        """Return the counters since the installation was created; see `counted` and `worker.outbox`."""
 
     @abstractmethod
     def used(self) -> int:
-        """Return the bytes that all jobs hold together."""
+        """Return the total bytes of all jobs."""
 
     @abstractmethod
     def beat(self, id: str, attempt_id: str) -> Status | None:
-        """Give a sign of life for an attempt; return the job's status, None if the attempt no longer owns the job."""
+        """Write a heartbeat for an attempt; return the job's status, None if the attempt no longer owns the job."""
 
     @abstractmethod
     def look(self, id: str, attempt_id: str) -> Status | None:
-        """Return the job's status, None if the attempt no longer owns the job; no sign of life."""
+        """Return the job's status without a heartbeat, None if the attempt no longer owns the job."""
 
     @abstractmethod
     def beats(self, ids: Iterable[str]) -> dict[str, Beat]:
-        """Return the count of signs of life of every job that is there."""
+        """Return the heartbeat counts of the jobs that exist."""
 
     @abstractmethod
     def events(self, id: str, *, after: str | None) -> list[Event]:
@@ -296,7 +299,7 @@ class Records(ABC):
 
     @abstractmethod
     def append_log(self, id: str, lines: Sequence[str]) -> None:
-        """Add lines to a job's log; a job that is gone gets none."""
+        """Append lines to a job's log; nothing happens if the job was deleted."""
 
     @abstractmethod
     def log(self, id: str) -> list[str]:
@@ -304,16 +307,16 @@ class Records(ABC):
 
     @abstractmethod
     def ping(self) -> None:
-        """Return if the store answers."""
+        """Return normally if the store answers."""
 
     def update(self, id: str, change: Change) -> Stored:
-        """Apply a change to a record, again on the newer record whenever somebody else was quicker.
+        """Apply a change to a record; repeat on the newer record after a concurrent write.
 
         Parameters
         ----------
         change : callable
-            Pure function of the stored record; its exceptions pass through, and nothing is written then. Returning
-            the record it was given means that there is nothing to write.
+            Pure function of the stored record. Its exceptions pass through without a write; returning its argument
+            means no change.
 
         Raises
         ------
@@ -336,10 +339,10 @@ def utc_now() -> datetime:
 
 
 def milliseconds(moment: datetime) -> int:
-    """Return a moment as whole milliseconds since 1970."""
+    """Return a time as whole milliseconds since 1970."""
     return int(moment.timestamp() * 1000)
 
 
 def moment(since: int) -> datetime:
-    """Return the moment that is so many milliseconds after 1970 began."""
+    """Return the time from milliseconds since 1970."""
     return datetime.fromtimestamp(since / 1000, UTC)

@@ -1,4 +1,4 @@
-"""How the jobs' machinery is set up: one frozen record, read from the environment once and handed down by hand."""
+"""Settings of the worker package: one frozen record, read from the environment once and passed explicitly."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from pliant.worker.errors import InvalidSetting
 from pliant.worker.paths import socket_path
 
 NUMERICAL_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
-"""What the numerical libraries read when they are loaded. Jobs set them to 1: the solver shares work among threads of its own, and
-those of a linear-algebra library wait spinning, which ruins everybody on a busy machine (`benchmarks/README.md`)."""
+"""Environment variables of the numerical libraries. Jobs set them to 1: the solver uses its own threads, and those of BLAS busy-wait,
+which slows down all processes on a loaded machine (`benchmarks/README.md`)."""
 
 
 CPU_QUOTA = Path("/sys/fs/cgroup/cpu.max")
-"""Where a container's share of the processors stands: `quota period` in microseconds, or `max period` (cgroup v2)."""
+"""File with a container's processor quota: `quota period` in microseconds, or `max period` (cgroup v2)."""
 
 
 def usable_cores(quota: Path = CPU_QUOTA) -> int:
-    """Cores this process may use: the affinity mask, where the system has one, and no more than its container's share."""
+    """Return the number of cores this process may use, by its affinity mask and its container's quota."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     try:
         share, period = map(float, quota.read_text().split())
@@ -35,10 +35,10 @@ def usable_cores(quota: Path = CPU_QUOTA) -> int:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
-    """Where things are kept, how many work at once, and how patient everybody is. All durations in seconds, sizes in bytes."""
+    """Locations, concurrency and limits. Durations in seconds, sizes in bytes."""
 
     data: Path = Path("pliant-data")
-    """Directory of everything that must survive: the embedded queue's log, blobs, working files."""
+    """Directory of all persistent data: the embedded queue's log, blobs, working files."""
 
     redis_url: str | None = None
     """`redis://`, `rediss://` or `unix://` URL; None: the embedded Valkey of `data`."""
@@ -50,57 +50,68 @@ class Settings:
     """Name of the queue and prefix of every Redis key, so that two installations can share a server."""
 
     workers: int = 1
-    """Jobs worked on at once."""
+    """Number of jobs that run at once."""
 
     threads: int | None = None
     """Threads of the numerical libraries in one job; None: the usable cores shared evenly among the workers."""
 
     time_limit: float = 3600.0
-    """Longest time one attempt may take; 0: no limit."""
+    """Time limit of one attempt; 0: no limit."""
 
     memory_limit: int = 0
-    """Address space one job may take; 0: no limit but the machine's. The libraries alone need half a gigabyte."""
+    """Limit of a job's address space; 0: no limit. The libraries alone need half a gigabyte."""
 
     cancel_grace: float = 10.0
-    """After a cancel or a passed time limit: how long the job may take to stop by itself before it is killed."""
+    """Time for a job to stop by itself after a cancellation or its time limit, before it is killed."""
 
     stop_grace: float = 10.0
-    """After SIGTERM: how long a running job may go on before it is put back into the queue."""
+    """Time for a running job to finish after SIGTERM, before it is requeued."""
 
     lost_after: float = 10.0
-    """A running job whose worker gave no sign of life for this long is taken from it."""
+    """Time without heartbeats after which a running job is requeued."""
 
     max_attempts: int = 3
-    """How often a job is begun anew when workers vanish under it."""
+    """Maximum number of attempts at a job whose workers are lost."""
 
     webhook_networks: str = ""
     """Networks (CIDR, commas between them) whose addresses webhooks may be sent to although they are private, link-local,
     loopback or otherwise not of the public internet."""
 
     max_running: int = 0
-    """Jobs of one owner that are worked on at once, the others wait; 0: as many as there are workers. Where tokens are off,
-    all jobs have one owner."""
+    """Maximum number of running jobs per owner, the others wait; 0: no limit. Without tokens, all jobs have one owner."""
 
     retention: float = 30 * 86400.0
-    """How long a finished job and its files are kept; 0: for ever."""
+    """Time for which a finished job and its files are kept; 0: indefinitely."""
 
     disk_quota: int = 0
-    """Bytes all jobs together may hold before new ones are refused; 0: no quota."""
+    """Total bytes of all jobs above which new ones are rejected; 0: no quota."""
 
     read_memory: int = 8 << 30
-    """Address space of the process that reads large inputs; what needs more is refused as too_large."""
+    """Limit of the address space of the process that reads large inputs; inputs that need more are rejected as too_large."""
+
+    film_memory: int = 4 << 30
+    """Address space of the process that decodes and tracks a film; what needs more is refused as too_large."""
+
+    film_frames: int = 3600
+    """Frames of one film that may be tracked."""
+
+    film_pixels: int = 4096 * 2304
+    """Width times height of a film."""
+
+    film_seconds: float = 600.0
+    """Playing time of a film up to the last frame that is tracked."""
 
     upload_expiry: float = 86400.0
-    """How long an upload is kept after its last byte, or after the last job that used it; 0: for ever."""
+    """Time for which an upload is kept after its last byte or its last use by a job; 0: indefinitely."""
 
     @classmethod
     def from_environment(cls, environment: Mapping[str, str]) -> Settings:
-        """Read the `PLIANT_…` variables; one that is absent or empty leaves the default.
+        """Read the `PLIANT_…` variables; absent or empty ones keep the default.
 
         Raises
         ------
         InvalidSetting
-            A variable does not parse or is out of its range.
+            A variable does not parse or is out of range.
         """
         given: dict[str, Any] = {}
         for name, (variable, expected, parse) in VARIABLES.items():
@@ -114,18 +125,18 @@ class Settings:
         return cls(**given)
 
     def to_environment(self) -> dict[str, str]:
-        """Return the variables that `from_environment` reads back as this record: how child processes are told."""
+        """Return the variables from which `from_environment` restores this record, for child processes."""
         values = {variable: getattr(self, name) for name, (variable, _, _) in VARIABLES.items()}
         return {variable: str(value) for variable, value in values.items() if value is not None}
 
     @property
     def redis(self) -> str:
-        """URL of the Redis to use, the embedded one's when none is given."""
+        """URL of Redis: the given one, else that of the embedded server."""
         return self.redis_url or f"unix://{quote(str(socket_path(self.data)))}"
 
     @property
     def blobs(self) -> str:
-        """URL of the blob store to use, a directory inside `data` when none is given."""
+        """URL of the blob store: the given one, else a directory inside `data`."""
         return self.blob_url or (self.data.absolute() / "blobs").as_uri()
 
     @property
@@ -135,7 +146,7 @@ class Settings:
 
     @property
     def uploads(self) -> Path:
-        """Directory of large inputs that no job has taken yet."""
+        """Directory of uploads."""
         return self.data.absolute() / "uploads"
 
     @property
@@ -180,6 +191,10 @@ VARIABLES: dict[str, tuple[str, str, Callable[[str], Any]]] = {
     "retention": ("PLIANT_RETENTION", *_SECONDS),
     "disk_quota": ("PLIANT_DISK_QUOTA", *_BYTES),
     "read_memory": ("PLIANT_READ_MEMORY", "a whole number of bytes, at least 1 GiB", _at_least(1 << 30, int)),
+    "film_memory": ("PLIANT_FILM_MEMORY", "a whole number of bytes, at least 512 MiB", _at_least(512 << 20, int)),
+    "film_frames": ("PLIANT_FILM_FRAMES", "a whole number, at least 3", _at_least(3, int)),
+    "film_pixels": ("PLIANT_FILM_PIXELS", "a whole number, at least 256", _at_least(256, int)),
+    "film_seconds": ("PLIANT_FILM_SECONDS", "a number of seconds, at least 1", _at_least(1, float)),
     "upload_expiry": ("PLIANT_UPLOAD_EXPIRY", *_SECONDS),
 }
 """Field, its environment variable, what is expected, how it is read."""

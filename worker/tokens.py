@@ -1,7 +1,7 @@
-"""Bearer tokens: made, kept as digests, recognised, revoked.
+"""Bearer tokens: create, verify, revoke.
 
-A token reads ``pliant_<id>_<secret>``. The id finds the record; of the secret, 256 random bits, only the SHA-256 of the whole
-token is kept, so whoever reads the store cannot use what he finds. A slow hash would add nothing: there is no password to guess.
+A token has the form ``pliant_<id>_<secret>``. The id selects the record, which contains only the SHA-256 of the complete token,
+so that the store reveals no usable token. The secret has 256 random bits; a slow hash is unnecessary, as it cannot be guessed.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from pliant.worker.store.connection import connect, reachable
 from pydantic import BaseModel, ConfigDict
 
 PREFIX = "pliant_"
-"""What every token begins with, so that scanners for leaked secrets can know one."""
+"""Prefix of every token, for scanners of leaked secrets."""
 
 LONGEST_NAME = 100
 
@@ -33,18 +33,18 @@ _UNITS = {"s": "seconds", "m": "minutes", "h": "hours", "d": "days", "w": "weeks
 
 
 class Scope(StrEnum):
-    """What a token may do. They do not contain each other, except that `admin` may do everything."""
+    """Permissions of a token. `admin` includes the others; `read` and `submit` are independent."""
 
     READ = "read"
-    """Look at its own jobs and download their files."""
+    """Read jobs of its owner and download their files."""
     SUBMIT = "submit"
-    """Submit jobs; cancel, retry and delete its own."""
+    """Submit jobs; cancel, retry and delete those of its owner."""
     ADMIN = "admin"
-    """Both, with everybody's jobs; read the metrics."""
+    """All scopes on all owners' jobs; read the metrics."""
 
 
 class Token(BaseModel):
-    """What is kept of a token."""
+    """The stored record of a token."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
@@ -52,31 +52,31 @@ class Token(BaseModel):
     name: str
     scopes: tuple[Scope, ...]
     owner: str
-    """Whose jobs it works with: its own id, or that of the token whose jobs it shares."""
+    """Owner of its jobs: its own id, or that of the token whose jobs it shares."""
     sha256: str
-    """Digest of the whole token, in hex."""
+    """SHA-256 of the complete token, in hex."""
     created_at: datetime
     expires_at: datetime | None = None
     """None: never."""
     max_body_bytes: int | None = None
-    """Largest body of one request; None, here and below: what the service allows everybody."""
+    """Largest body of one request; None, here and below: the service's own limit."""
     max_queued: int | None = None
-    """Jobs that may wait at once."""
+    """Maximum number of queued jobs."""
     max_running: int | None = None
-    """Jobs that are worked on at once; the others wait."""
+    """Maximum number of running jobs; the others wait."""
     requests_per_minute: int | None = None
 
     def may(self, scope: Scope) -> bool:
-        """Tell whether the token has a scope."""
+        """Whether the token has a scope."""
         return scope in self.scopes or Scope.ADMIN in self.scopes
 
     @property
     def sees_all(self) -> bool:
-        """True if everybody's jobs are its own."""
+        """Whether it has access to all owners' jobs."""
         return Scope.ADMIN in self.scopes
 
     def expired(self, now: datetime) -> bool:
-        """Tell whether its time is over."""
+        """Whether it has expired."""
         return self.expires_at is not None and self.expires_at <= now
 
 
@@ -90,7 +90,7 @@ class Tokens:
 
     @classmethod
     def open(cls, settings: Settings) -> Tokens:
-        """Connect to the store that the settings name; nothing is sent before it is needed."""
+        """Return the tokens in the store of the settings; the connection is made on first use."""
         return cls(connect(settings.redis, decode=True), prefix=settings.queue)
 
     def create(
@@ -104,33 +104,37 @@ class Tokens:
         max_queued: int | None = None,
         max_running: int | None = None,
         requests_per_minute: int | None = None,
+        text: str | None = None,
     ) -> tuple[Token, str]:
-        """Make a token.
+        """Create a token.
 
         Parameters
         ----------
         name : str
-            For people: who has it, or what for.
+            User or purpose of the token.
         scopes : sequence of Scope
-            What it may do.
+            Its permissions.
         expires : timedelta, optional
-            From now; None: never.
+            Lifetime from now; None: unlimited.
         sharing : str, optional
             Id of a token whose jobs the new one shares, e.g. to replace it.
         max_body_bytes, max_queued, max_running, requests_per_minute : int, optional
-            Limits of its own.
+            Limits of this token.
+        text : str, optional
+            The token itself, where it was made elsewhere, e.g. by a deployment; None: a new one. One that is known already stays as
+            it is.
 
         Returns
         -------
         token : Token
-            What is kept.
+            The stored record.
         text : str
-            The token itself. It is kept nowhere and cannot be shown again.
+            The token itself. It is not stored and cannot be shown again.
 
         Raises
         ------
         InvalidRequest
-            The name is empty or too long, or there is no scope.
+            The name is empty or too long, there is no scope, or the text is no token.
         UnknownToken
             There is no token to share jobs with.
         """
@@ -138,14 +142,17 @@ class Tokens:
         if not 1 <= len(label) <= LONGEST_NAME or not label.isprintable():
             raise InvalidRequest(
                 "invalid_token_name", field="name", expected=f"1–{LONGEST_NAME} printable characters", got=repr(name)[:80],
-                hint="Say who will use the token.",
+                hint="Give the user or the purpose of the token.",
             )  # fmt: skip
         if not scopes:
             expected = "at least one of " + ", ".join(Scope)
             raise InvalidRequest("no_scope", field="scope", expected=expected, got="none", hint="Give --scope read.")
         owner = None if sharing is None else self.get(sharing).owner
-        id = secrets.token_hex(6)
-        text = f"{PREFIX}{id}_{secrets.token_urlsafe(32)}"
+        known = None if text is None else self._checked(text)
+        if text is not None and known is not None:
+            return known, text
+        text = text or f"{PREFIX}{secrets.token_hex(6)}_{secrets.token_urlsafe(32)}"
+        id = text.removeprefix(PREFIX)[:12]
         now = self._clock()
         token = Token(
             id=id, name=label, scopes=tuple(dict.fromkeys(scopes)), owner=owner or id, sha256=_digest(text),
@@ -156,8 +163,17 @@ class Tokens:
             self._redis.hset(self._key, id, token.model_dump_json())
         return token, text
 
+    def _checked(self, text: str) -> Token | None:
+        """Return what is kept of a token that was made elsewhere, None if it is new; refuse a text that is none."""
+        if _FORM.fullmatch(text) is None:
+            raise InvalidRequest(
+                "invalid_token_text", field="from", expected=f"{PREFIX}, 12 hexadecimal digits, _, 43 letters or digits",
+                got=f"{len(text)} characters", hint="`pliant token create` without it makes a token.",
+            )  # fmt: skip
+        return self.recognise(text)
+
     def recognise(self, text: str) -> Token | None:
-        """Return what is kept of a token, its time over or not; None if it is none of ours, or was revoked."""
+        """Return the record of a token, expired or not; None if it is unknown or revoked."""
         form = _FORM.fullmatch(text)
         if form is None:
             return None
@@ -174,7 +190,7 @@ class Tokens:
         Raises
         ------
         UnknownToken
-            There is none of that id.
+            There is no token of that id.
         """
         with reachable():
             body = self._redis.hget(self._key, id)
@@ -189,17 +205,17 @@ class Tokens:
         return sorted(map(Token.model_validate_json, bodies), key=lambda token: (token.created_at, token.id))
 
     def usable(self) -> bool:
-        """Tell whether there is a token whose time is not over."""
+        """Whether any token has not expired."""
         now = self._clock()
         return any(not token.expired(now) for token in self.all())
 
     def revoke(self, id: str) -> Token:
-        """Remove a token; from the next request on nobody knows it. Its jobs stay.
+        """Remove a token, effective from the next request on. Its jobs are kept.
 
         Raises
         ------
         UnknownToken
-            There is none of that id.
+            There is no token of that id.
         """
         token = self.get(id)
         with reachable():
@@ -213,13 +229,13 @@ def parse_duration(text: str) -> timedelta:
     Raises
     ------
     InvalidRequest
-        It is none.
+        The duration is malformed.
     """
     form = _DURATION.fullmatch(text.strip())
     if form is None:
         raise InvalidRequest(
             "invalid_duration", field="expires", expected="a duration such as 12h, 90d or 52w", got=repr(text)[:80],
-            hint="Leave it out for a token that never expires.",
+            hint="Omit it for a token that never expires.",
         )  # fmt: skip
     return timedelta(**{_UNITS[form[2]]: int(form[1])})
 

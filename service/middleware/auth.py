@@ -32,10 +32,13 @@ _READS = frozenset({"GET", "HEAD", "OPTIONS"})
 
 
 def needed(method: str, path: str) -> Scope | None:
-    """Return the scope that a request needs; None if any valid token will do."""
+    """Return the scope that a request needs; None if any valid token will do.
+
+    The state of an upload belongs to sending it: a token that may only submit reads where to resume.
+    """
     if path == "/metrics":
         return Scope.ADMIN
-    if method not in _READS:
+    if method not in _READS or path.startswith("/v1/uploads/"):
         return Scope.SUBMIT
     if any(path == each or path.startswith(f"{each}/") for each in ANY_SCOPE):
         return None

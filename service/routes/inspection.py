@@ -8,11 +8,12 @@ import numpy as np
 from fastapi import APIRouter, Request
 from numpy.typing import NDArray
 from pliant.schemas.job import Inspection
-from pliant.service.dependencies import Bound, Core, MyUploads
+from pliant.service.dependencies import Bound, Core, MyUploads, Service
 from pliant.service.multipart import Form, receive_form
 from pliant.service.openapi import SUBMIT_BODY, problems
 from pliant.service.submission import form_rules, parse_options, read_form, with_uploads
-from pliant.worker.formats import Inputs, Limits, load_inputs
+from pliant.worker.films.sources import FilmBounds
+from pliant.worker.formats import Inputs, load_inputs
 from pliant.worker.formats.isolated_reader import LARGE
 from pliant.worker.uploads.service import Uploads
 
@@ -40,13 +41,15 @@ async def inspect(request: Request, core: Core, bounds: Bound, uploads: MyUpload
     rules = form_rules(core.settings, max_body_bytes=bounds.max_body_bytes)
     with core.incoming.scratch() as folder:
         form = await receive_form(request, folder, rules=rules)
-        return await core.parsing.run(uploads.owner, lambda: interpret(form, folder, uploads, core.limits))
+        return await core.parsing.run(uploads.owner, lambda: interpret(form, folder, uploads, core))
 
 
-def interpret(form: Form, folder: Path, uploads: Uploads, limits: Limits) -> Inspection:
+def interpret(form: Form, folder: Path, uploads: Uploads, core: Service) -> Inspection:
     """Read a form as for a job, and return the interpretation with a sample. Blocks; call it on a thread."""
     whole, canonical = with_uploads(form, folder, uploads), folder / "canonical.npz"
-    found, _ = read_form(whole, parse_options(whole.texts.get("options", "")), limits, target=canonical)
+    films = FilmBounds.of(core.jobs.settings, max_bytes=core.limits.max_bytes)
+    options = parse_options(whole.texts.get("options", ""))
+    found, _ = read_form(whole, options, core.limits, films=films, target=canonical)
     # Inputs too large to be parsed in this process are too large to be sampled in it.
     tracked = "film" not in whole.files and canonical.stat().st_size <= LARGE
     sample = sample_of(load_inputs(canonical)) if tracked else []

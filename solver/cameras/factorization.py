@@ -1,13 +1,13 @@
-"""From the Gram matrix of the tracks to rotations: the prior-free factorization.
+"""Rotations from the Gram matrix of the tracks, by prior-free factorization.
 
-A rank-3K factor of W, W ≈ Π B with Π (2F×3K), is fixed only up to an invertible matrix. Three columns G (3K×3) of it are
-enough for the cameras: Π_f G = c_f R_f, two rows of a rotation times a coefficient. Hence, with Q = G Gᵀ,
+A rank-3K factorization W ≈ Π B with Π (2F×3K) is unique up to an invertible matrix. Three columns G (3K×3) of that
+matrix determine the cameras: Π_f G = c_f R_f, two rows of a rotation times a coefficient. With Q = G Gᵀ therefore
 
     π_f1ᵀ Q π_f1 = π_f2ᵀ Q π_f2,    π_f1ᵀ Q π_f2 = 0        for every frame f,
 
-linear in Q. Many Q satisfy them when K > 1; the one of least trace on the cone of positive semidefinite matrices has rank 3
-in practice (Dai, Li, He, "A simple prior-free method for non-rigid structure-from-motion factorization", 2012). K = 1 is
-Tomasi and Kanade's metric upgrade. The factor of Q is then refined on the constraints themselves, which are nonlinear in G.
+which is linear in Q. For K > 1 many Q satisfy these equations; the positive semidefinite one of least trace has rank 3
+in practice (Dai, Li, He, "A simple prior-free method for non-rigid structure-from-motion factorization", 2012). K = 1
+is the metric upgrade of Tomasi and Kanade. The factor G is then refined on the constraints, which are nonlinear in G.
 """
 
 from __future__ import annotations
@@ -23,34 +23,34 @@ from scipy.optimize import minimize
 Upper = tuple[NDArray[np.intp], NDArray[np.intp]]
 
 TRACE_WEIGHT = 1e-3
-"""μ of ½‖A(Q) − b‖²/F + μ tr Q; small, for the constraints come first."""
+"""μ of ½‖A(Q) − b‖²/F + μ tr Q, dimensionless; small, because the constraints take precedence over the trace."""
 
 TRACE_ITERATIONS = 300
-"""Rounds of the alternating direction method; the factor's refinement makes more of them useless."""
+"""Iterations of the alternating direction method (ADMM); the refinement of G makes further ones unnecessary."""
 
 SOFTENING = 0.05
-"""Keeps frames whose coefficient c_f passes through zero from dominating the scale-free residual."""
+"""ε of the scale-free residual: bounds the influence of frames whose coefficient c_f passes through zero."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Upgrade:
-    """What a factorization with one K says about the cameras."""
+    """Cameras from a factorization with one K."""
 
     basis_size: int
     """K."""
 
     rotations: Floats
-    """Shape `(F, 3, 3)`, first one the identity."""
+    """Shape `(F, 3, 3)`; the first is the identity."""
 
     scales: Floats
-    """|c_f|, shape `(F,)`, mean of the logarithm 0; the camera's scale only as far as the first basis shape is constant."""
+    """|c_f|, shape `(F,)`, mean logarithm 0; equals the camera's scale if the first basis shape is constant."""
 
     residual: float
-    """Root mean square departure of c_f R_f from orthonormal rows of equal length, relative to c_f²."""
+    """Root mean square deviation of c_f R_f from orthogonal rows of equal length, relative to c_f²."""
 
 
 def upgrade(gram: Floats, basis_size: int) -> Upgrade:
-    """Return the cameras that a rank-3K factorization of the tracks gives.
+    """Return the cameras of a rank-3K factorization of the tracks.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ def upgrade(gram: Floats, basis_size: int) -> Upgrade:
         K, with 3K ≤ 2F.
     """
     factor = leading_factor(gram, 3 * basis_size)
-    if basis_size == 1:  # the answer is unique: columns of equal length, so that little rotation is not shrunk to none
+    if basis_size == 1:  # Q is unique: columns of equal length keep the trace term from shrinking a small rotation
         factor = factor / np.maximum(np.sqrt((factor**2).mean(axis=(0, 1))), 1e-6)
     corrective = refine_factor(factor, least_trace_factor(factor, 0.0 if basis_size == 1 else TRACE_WEIGHT))
     rows = continue_signs(factor @ corrective)
@@ -71,7 +71,7 @@ def upgrade(gram: Floats, basis_size: int) -> Upgrade:
 
 
 def leading_factor(gram: Floats, rank: int) -> Floats:
-    """Return Π of rank at most `rank` with Π Πᵀ ≈ gram, per frame: shape `(F, 2, rank)`, mean row length 1."""
+    """Return Π with Π Πᵀ ≈ gram and rank at most `rank`, shape `(F, 2, rank)`, mean row length 1."""
     values, vectors = np.linalg.eigh(gram)
     rank = min(rank, len(gram))
     positive = np.maximum(values[::-1][:rank], 1e-14 * max(float(values[-1]), np.finfo(float).tiny))
@@ -80,10 +80,10 @@ def leading_factor(gram: Floats, rank: int) -> Floats:
 
 
 def least_trace_factor(factor: Floats, trace_weight: float = TRACE_WEIGHT) -> Floats:
-    """Return G (n×3) of the Q ⪰ 0 of least trace that meets the orthonormality constraints, by ADMM.
+    """Return G (n×3) with G Gᵀ ≈ Q, the Q ⪰ 0 of least trace that satisfies the orthonormality constraints, by ADMM.
 
-    Minimises ½‖A(Q) − b‖²/F + μ tr Q over symmetric Q ⪰ 0: the quadratic part by a solve in the n(n+1)/2 coordinates of Q
-    with a matrix inverted once, the rest by shrinking eigenvalues. The last row of A fixes the mean of c_f² at 1.
+    Minimises ½‖A(Q) − b‖²/F + μ tr Q over symmetric Q ⪰ 0. The quadratic step solves for the n(n+1)/2 coordinates of Q
+    with a matrix inverted once; the other step shrinks eigenvalues. The last row of A fixes the mean of c_f² at 1.
     """
     size = factor.shape[2]
     rows, columns = np.triu_indices(size)
@@ -116,7 +116,7 @@ def _normal_equations(factor: Floats, upper: Upper, stretch: Floats) -> tuple[Fl
     rows = np.concatenate([along - across, 2 * outer(first, second)])
     mean = (along + across).mean(axis=0) / 2
     frames = len(factor)
-    gauge = 25.0  # stiff enough that the mean of c_f² is 1 to a fraction of a percent
+    gauge = 25.0  # weight at which the mean of c_f² is 1 to a fraction of a percent
     return rows.T @ rows / frames + gauge * np.outer(mean, mean), gauge * mean
 
 
@@ -127,7 +127,7 @@ def _unfold(coordinates: Floats, upper: Upper, stretch: Floats, size: int) -> Fl
 
 
 def refine_factor(factor: Floats, start: Floats) -> Floats:
-    """Return G that minimises the scale-free departure from orthonormality, from `start`, by L-BFGS."""
+    """Return the G that minimises the scale-free deviation from orthonormality, by L-BFGS from `start`."""
     found = minimize(
         _orthonormality, start.ravel(), args=(factor,), jac=True, method="L-BFGS-B", options={"maxiter": 500}
     )
@@ -137,7 +137,8 @@ def refine_factor(factor: Floats, start: Floats) -> Floats:
 def _orthonormality(flat: Floats, factor: Floats) -> tuple[float, Floats]:
     """Return mean_f ((a−b)² + 4c²) / ((a+b)² + ε m²) and its gradient in G.
 
-    a, b, c are the entries of the 2×2 Gram matrix of Π_f G, and m the mean of a + b. It does not change when G is scaled.
+    a, b, c are the entries of the 2×2 Gram matrix of Π_f G, and m is the mean of a + b. The value is invariant to the
+    scale of G.
     """
     corrective = flat.reshape(-1, 3)
     rows = factor @ corrective
@@ -162,10 +163,10 @@ def _orthonormality(flat: Floats, factor: Floats) -> tuple[float, Floats]:
 
 
 def continue_signs(rows: Floats) -> Floats:
-    """Return the rows with the sign of each frame that turns least from the frame before.
+    """Return the rows with each frame's sign chosen for the smallest rotation from the previous frame.
 
-    c_f R_f and (−c_f)(−R_f) are the same rows, so a factorization leaves one sign a frame open; −R_f differs from R_f by half
-    a turn about the viewing direction, which no camera makes between two frames.
+    c_f R_f and (−c_f)(−R_f) have the same rows, so a factorization leaves one sign per frame undetermined. The wrong
+    sign is a rotation by 180° about the viewing direction.
     """
     agree = np.sign((rows[1:] * rows[:-1]).sum(axis=(1, 2)))
     agree[agree == 0] = 1.0

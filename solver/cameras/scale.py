@@ -1,8 +1,9 @@
-"""The scale of every frame: a camera that zooms, or moves in depth.
+"""The scale of every frame, for a camera that zooms or moves in depth.
 
-Shrinking and growing is a deformation like any other, so that scales which explain more prove nothing by themselves. Two things do:
-where one rigid shape explains all but nothing of the tracks, its scales are measured; and where the likelihood of the tracks, which
-pays for every mode of deformation, is clearly higher with scales (`pliant.solver.cameras.joint_refinement`).
+A uniform change of size is also a deformation, so scales that reduce the residual are no evidence by themselves. Scales
+are adopted in two cases: if one rigid shape explains almost all of the tracks (this module), or if the likelihood of
+the tracks, which penalises each mode of deformation, is clearly higher with scales
+(`pliant.solver.cameras.joint_refinement`).
 """
 
 from __future__ import annotations
@@ -13,19 +14,19 @@ from pliant.solver.records import Floats
 from pliant.solver.settings import Settings
 
 SCALE_SHARE = 0.85
-"""Scales are adopted where they explain at least this share of what one rigid shape under orthography leaves, an affine camera's
-share apart. Measured: .98 on a rigid real scene; but .76 on real bending paper and .78 on faces whose camera has no scale, which
-this cannot tell apart: between them, no scale is the smaller mistake."""
+"""Minimum share of the residual of a rigid shape under orthography, beyond that of an affine camera, that scales must
+explain to be adopted. Measured: .98 on a rigid real scene, .76 on real bending paper (true scales vary) and .78 on
+faces (true scales are constant). The last two cannot be separated; above both, errors keep the scales constant."""
 
 RIGID_ENOUGH = 0.01
-"""And where the rest, relative to the tracks' variance, is below this: only then can one shape measure them."""
+"""Maximum residual of the scaled rigid shape, relative to the variance of the tracks, for scales to be adopted."""
 
 WIDEST = 0.3
-"""And where the standard deviation of their logarithm is below this: no camera zooms more by accident."""
+"""Maximum standard deviation of the logarithm of the scales for them to be adopted."""
 
 
 def rigid_evidence(gram: Floats, settings: Settings) -> tuple[Floats, str]:
-    """Return the scales where the tracks show them beyond doubt, else 1; deformation must not pass for a zooming camera."""
+    """Return the scales, `(F,)`, if a rigid shape determines them, else ones; and a sentence with the reason."""
     frames = len(gram) // 2
     none = np.ones(frames)
     if settings.camera == "orthographic":
@@ -39,11 +40,11 @@ def rigid_evidence(gram: Floats, settings: Settings) -> tuple[Floats, str]:
     if share > SCALE_SHARE and with_them < RIGID_ENOUGH and np.log(scales).std() < WIDEST:
         return (
             scales,
-            f"Scales from {scales.min():.3f} to {scales.max():.3f} explain {share:.0%} of what orthography leaves.",
+            f"Scales from {scales.min():.3f} to {scales.max():.3f} explain {share:.0%} of the residual of orthography.",
         )
     return (
         none,
-        f"Every scale is 1: scales explain {max(share, 0):.0%} of what orthography leaves, too little to tell from deformation.",
+        f"Every scale is 1: scales explain {max(share, 0):.0%} of the residual of orthography, which deformation explains as well.",
     )
 
 
@@ -64,7 +65,7 @@ def rigid_scales(gram: Floats, rotations: Floats, *, rounds: int = 30) -> Floats
         hit = np.einsum("fij,fij->f", pair, cross)
         size = np.einsum("fij,jk,fik->f", pair, shape_gram, pair)
         scales = np.maximum(hit, 1e-3 * size) / np.maximum(size, np.finfo(float).tiny)
-        typical = np.median(scales)  # a frame that shows nothing has no scale
+        typical = np.median(scales)  # a frame without visible points has no scale
         scales = np.clip(scales, 1e-2 * typical + 1e-12, 1e2 * typical + 1e-12)
         scales = np.asarray(scales / np.exp(np.log(scales).mean()))
     return scales

@@ -1,12 +1,12 @@
-"""The low-rank prior: shapes of all frames should be mixtures of few.
+"""The low-rank prior: the shapes of all frames are combinations of few basis shapes.
 
 With G = X Xᵀ / P the F×F Gram matrix of the frames (X as F×3P) and g_i its eigenvalues, the penalty is
 
     λ3 P Σ_i φ(g_i),    φ(g) = g/δ  for g ≤ δ,   1 + log(g/δ)  above,
 
-a reweighted nuclear norm in one formula: φ is concave and smooth, so that tr φ(G) lies below its tangent tr φ'(G₀) G, a
-quadratic in X with the F×F matrix φ'(G₀). Below the floor δ all modes cost the same, so the quadratic is a multiple of the
-identity minus one term for each mode above it: an eigenproblem of size F and no more work per point than the kept modes.
+a reweighted nuclear norm. φ is concave and smooth, so tr φ(G) lies below its tangent tr φ'(G₀) G, a quadratic in X with
+the F×F matrix φ'(G₀). Below the floor δ all modes have the same weight, so this matrix is a multiple of the identity
+minus one term per mode above δ: one eigenproblem of size F, and a cost per point proportional to the kept modes.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def rank_penalty(shapes: Array, weight: float, floor: float) -> float:
 
 
 def rank_term(shapes: Array, weight: float, floor: float) -> RankTerm | None:
-    """Return the quadratic that touches the penalty at these shapes and lies above it elsewhere."""
+    """Return the quadratic that equals the penalty at these shapes and majorises it elsewhere; None if `weight` is 0."""
     if weight == 0:
         return None
     values, vectors = linalg.eigh(frame_gram(shapes))

@@ -1,4 +1,4 @@
-"""The energy of a state, evaluated in full: loss, smoothness in time and space, rank."""
+"""The energy of a state: loss, temporal and spatial smoothness, rank penalty."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def residuals_of(problem: Problem, shapes: Array, translations: Floats, frame: i
 
 
 def objective(problem: Problem, shapes: Array, residual: Array) -> float:
-    """Return E = Σ v ρ(r) + λ1 ‖HX‖² + λ2 ‖AX‖² + rank penalty (Dai, Deng, He 2017, eq. 7, and ours)."""
+    """Return E = Σ v ρ(r) + λ1 ‖HX‖² + λ2 ‖AX‖² (Dai, Deng, He 2017, eq. 7) + rank penalty."""
     parts = np.zeros(len(shapes))
 
     def work(start: int, stop: int) -> None:

@@ -1,4 +1,4 @@
-"""One energy to minimise: the record that a solve starts from."""
+"""The energy to minimise, as a record."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Array = NDArray[np.floating]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Weights:
-    """Every number of the energy, chosen; dimensionless, in normalized units."""
+    """Weights and scales of the energy, in normalized units."""
 
     temporal: float
     """λ1."""
@@ -33,7 +33,7 @@ class Weights:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Problem:
-    """One energy to minimise, normalized units."""
+    """The energy to minimise, normalized units."""
 
     points: Array
     """Centred tracks, shape `(F, 2, P)`."""
@@ -44,9 +44,9 @@ class Problem:
     loss: str
     weights: Weights
     bands: Floats
-    """λ1 times the bands of HᵀH, shape `(order + 1, F)`; 0 with a Gaussian prior, which has its own."""
+    """λ1 times the bands of HᵀH, shape `(order + 1, F)`; 0 with a Gaussian prior, which replaces them."""
     laplacian: Laplacian | None
     axes: Floats
-    """B (3×3): shapes are B X in the world. The identity but for the Gaussian prior, which has axes of its own."""
+    """B (3×3): world shapes are B X. The identity unless the prior is Gaussian; its coordinates are independent along B."""
     quadratic: PathPrior | None = None
     """λ1 times the inverse covariance over frames of each coordinate: the Gaussian prior."""

@@ -1,7 +1,7 @@
-"""Losses of the data term and the weights that majorise them.
+"""Losses of the data term and the weights of their majorising quadratics.
 
-Iteratively reweighted least squares is majorise–minimise: with ω(r) = ρ'(r) / 2r every one of these losses, being concave
-in r², lies below its tangent ω(r₀) r² + constant, so that solving (or only improving) the weighted problem never raises the loss.
+Iteratively reweighted least squares is majorise–minimise: each loss is concave in r² and so lies below its tangent
+ω(r₀) r² + constant with ω(r) = ρ'(r) / 2r. Any decrease of the weighted problem therefore decreases the loss.
 """
 
 from __future__ import annotations
@@ -22,14 +22,15 @@ def loss_value(residual: Array, confidence: Array, *, loss: str, scale: float) -
     confidence : array, shape (F, P)
         v in [0, 1].
     loss : {"l1", "l2", "huber"}
-        l1, on each coordinate as in the paper: √(r² + ε²) − ε. l2: r². huber, on the length of both: r² up to δ, then 2δr − δ².
+        `l1`, per coordinate as in the paper: √(r² + ε²) − ε. `l2`: r². `huber`, on the length of the residual: r² up to
+        δ, then 2δr − δ².
     scale : float
         ε or δ, normalized units.
     """
     if loss == "l2":
         return float(np.einsum("fcp,fcp,fp->", residual, residual, confidence, dtype=np.float64))
     if loss == "l1":
-        # Rationalised: √(r² + ε²) − ε loses all digits of small residuals.
+        # Rationalised, because √(r² + ε²) − ε cancels for small residuals.
         squared = residual * residual
         value = squared / (np.sqrt(squared + scale * scale) + scale)
         return float(np.einsum("fcp,fp->", value, confidence, dtype=np.float64))
@@ -39,7 +40,7 @@ def loss_value(residual: Array, confidence: Array, *, loss: str, scale: float) -
 
 
 def loss_weights(residual: Array, confidence: Array, *, loss: str, scale: float) -> Array:
-    """Return v ω(r), shape of the residual: what multiplies r² in the majorising problem."""
+    """Return v ω(r), the factors of r² in the majorising problem, in the shape of the residual."""
     spread = np.broadcast_to(confidence[:, None, :], residual.shape)
     if loss == "l2":
         return np.array(spread)
@@ -52,5 +53,5 @@ def loss_weights(residual: Array, confidence: Array, *, loss: str, scale: float)
 
 
 def largest_weight(loss: str, scale: float) -> float:
-    """Return ω(0), the weight of an observation that fits perfectly."""
+    """Return ω(0), the weight of an observation with zero residual."""
     return 1 / (2 * scale) if loss == "l1" else 1.0

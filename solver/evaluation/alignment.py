@@ -1,4 +1,4 @@
-"""Bring a reconstruction into the axes of the truth, in the ways that the literature's error metrics ask for.
+"""Alignment of a reconstruction with the ground truth, as the error metrics of the literature require.
 
 Each is an orthogonal Procrustes problem (Schönemann 1966): with both shapes centred, `Q = U Vᵀ` from the singular value
 decomposition of the 3×3 matrix `Gᵀ S` minimises `‖S Qᵀ − G‖_F` over O(3); for a rotation the smallest singular
@@ -18,12 +18,12 @@ from pliant.solver.records import Floats
 Kind = Literal["sequence", "frame", "frame_scaled", "frame_similarity"]
 
 MIRROR = np.diag([1.0, 1.0, -1.0])
-"""The one mirror that orthographic views leave open: depth changes sign (the bas-relief flip)."""
+"""The reflection that orthographic views leave undetermined: the sign of depth (bas-relief ambiguity)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Aligned:
-    """A reconstruction in the truth's axes, and the truth it is compared with. Both are centred in every frame."""
+    """An aligned reconstruction and its ground truth, both centred in every frame."""
 
     shapes: Floats
     """`scales_f · S_f · transforms_fᵀ`, shape `(F, P, 3)`, the truth's unit."""
@@ -32,14 +32,14 @@ class Aligned:
     """Centred ground truth, shape `(F, P, 3)`, its own unit."""
 
     transforms: Floats
-    """Orthogonal matrices that were applied, shape `(F, 3, 3)`; the same in every frame for `sequence`."""
+    """Applied orthogonal matrices, shape `(F, 3, 3)`; the same in every frame for `sequence`."""
 
     scales: Floats
     """Shape `(F,)`; 1 unless the alignment is `frame_scaled` or `frame_similarity`."""
 
     @property
     def distances(self) -> Floats:
-        """Distance of every point of every frame from its true place, shape `(F, P)`, the truth's unit."""
+        """Distance of every point from its true position, shape `(F, P)`, the truth's unit."""
         return np.asarray(np.linalg.norm(self.shapes - self.truth, axis=2))
 
     @property
@@ -49,7 +49,7 @@ class Aligned:
 
 
 def align(shapes: ArrayLike, truth: ArrayLike, *, kind: Kind = "frame") -> Aligned:
-    """Centre both per frame and bring `shapes` as near to `truth` as `kind` allows.
+    """Centre both per frame and align `shapes` with `truth` by the transformations of `kind`.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ def align(shapes: ArrayLike, truth: ArrayLike, *, kind: Kind = "frame") -> Align
 
 
 def procrustes(products: Floats, *, proper: bool = False) -> Floats:
-    """Orthogonal Q that maximises `tr(Qᵀ M)` for every 3×3 matrix M, shape `(…, 3, 3)`.
+    """Return the orthogonal Q that maximises `tr(Qᵀ M)` for every 3×3 matrix M, shape `(…, 3, 3)`.
 
     Parameters
     ----------
@@ -103,12 +103,12 @@ def procrustes(products: Floats, *, proper: bool = False) -> Floats:
 
 
 def centred(shapes: Floats) -> Floats:
-    """Subtract every frame's mean point."""
+    """Return the points minus each frame's mean point."""
     return np.asarray(shapes - shapes.mean(axis=1, keepdims=True))
 
 
 def frobenius(shapes: Floats) -> Floats:
-    """Frobenius norm of every frame, shape `(F,)`."""
+    """Return the Frobenius norm of every frame, shape `(F,)`."""
     return np.asarray(np.sqrt(np.einsum("fpi,fpi->f", shapes, shapes)))
 
 
@@ -119,7 +119,7 @@ def _rotate_frames(moved: Floats, fixed: Floats, *, mirror: Floats) -> Aligned:
 
 
 def _scaled(aligned: Aligned) -> Aligned:
-    """Return the same with the one scale that fits the sequence best in the least-squares sense."""
+    """Return the alignment with the scale that minimises the squared error over the sequence."""
     energy = float(np.vdot(aligned.shapes, aligned.shapes))
     scale = float(np.vdot(aligned.shapes, aligned.truth)) / energy if energy > 0 else 0.0
     return Aligned(

@@ -1,4 +1,4 @@
-"""Error metrics, each under one exact name, because the literature mixes them and the numbers do not compare.
+"""Error metrics. Each variant has its own name, because values of different variants in the literature do not compare.
 
 With S the reconstruction and G the ground truth, both centred in every frame:
 
@@ -18,7 +18,7 @@ With S the reconstruction and G the ground truth, both centred in every frame:
 `focal_error`              |φ − φ*| / φ* of the estimated φ and the true φ*; infinite where φ is infinite (orthography)
 =========================  =============================================================================================
 
-A low `e3d_frame_similarity` beside a high `e3d_sequence` means frames that flip or drift: look at both.
+A low `e3d_frame_similarity` with a high `e3d_sequence` indicates frames that flip or drift: check both.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from pliant.solver.records import Camera, Floats, Solution, Tracks
 
 
 class Reprojection(NamedTuple):
-    """How far the projected shapes lie from the visible tracks, the tracks' unit."""
+    """Distance of the projected shapes from the visible tracks, the tracks' unit."""
 
     median: float
     """Median length of the residual."""
@@ -89,15 +89,15 @@ def frame_errors(shapes: ArrayLike, truth: ArrayLike, *, kind: Kind = "frame") -
 
 
 def point_errors(shapes: ArrayLike, truth: ArrayLike, *, kind: Kind = "frame") -> Floats:
-    """Distance of every point from its true place, shape `(F, P)`, the truth's unit."""
+    """Distance of every point from its true position, shape `(F, P)`, the truth's unit."""
     return align(shapes, truth, kind=kind).distances
 
 
 def reprojection(tracks: Tracks, solution: Solution) -> Reprojection:
     """Residual of the visible observations.
 
-    Recomputed from shapes and camera, so that it checks `Solution.residuals` instead of repeating them. Frames or
-    points that nobody saw do not count; with nothing visible both values would have no meaning, which `Tracks` refuses.
+    Recomputed from shapes and camera, independently of `Solution.residuals`. Frames and points that are never visible do
+    not count; `Tracks` guarantees at least one visible observation.
     """
     squared = np.square(tracks.points - solution.camera.project(solution.shapes)).sum(axis=2)
     median = np.median(np.sqrt(squared[tracks.visible > 0]))
@@ -105,10 +105,10 @@ def reprojection(tracks: Tracks, solution: Solution) -> Reprojection:
 
 
 def rotation_degrees(rotations: ArrayLike, truth: ArrayLike) -> float:
-    """Mean angle between two camera paths, degrees, after the world axes of one are turned onto the other's.
+    """Mean angle between two camera paths, degrees, after alignment of their world axes.
 
-    Orthographic views do not fix the sign of depth: a path `R_f` and its mirror `J R_f J`, `J = diag(1, 1, −1)`, fit
-    equally well, so the better of the two counts.
+    Orthographic views do not determine the sign of depth: a path `R_f` and its mirror `J R_f J`, `J = diag(1, 1, −1)`,
+    fit equally well, so the smaller of both angles is returned.
 
     Parameters
     ----------
@@ -136,15 +136,15 @@ def evaluate(
     true_rotations: ArrayLike | None = None,
     true_focal: float | None = None,
 ) -> dict[str, float]:
-    """Every metric that the inputs allow, by its documented name.
+    """Return every metric for which the inputs suffice, by its documented name.
 
     Parameters
     ----------
     solution, tracks
-        What came out, and what went in.
+        Result and input of the solve.
     truth : array_like, shape (F, P, 3), optional
-        Ground truth shapes, the tracks' unit, in the axes of one world. Where truth is known only in each frame's own
-        camera axes, the metrics per frame hold and the two for the whole sequence mean nothing.
+        Ground truth shapes, the tracks' unit, in one world frame. If the truth is in each frame's camera axes, only the
+        per-frame metrics are meaningful, not the two of the whole sequence.
     true_rotations : array_like, shape (F, 3, 3), optional
         Ground truth cameras.
     true_focal : float, optional

@@ -1,4 +1,4 @@
-"""Noise, gross outliers and hidden points, as the literature's experiments add them."""
+"""Noise, gross outliers and hidden points, added as in the experiments of the literature."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pliant.solver.records import Tracks
 def corrupt(
     sequence: Sequence, *, noise: float = 0.0, outliers: float = 0.0, hidden: float = 0.0, seed: int = 0
 ) -> Sequence:
-    """Spoil the tracks of a sequence, see `corrupt_tracks`; the truth stays, and `outliers` says where they are.
+    """Corrupt the tracks of a sequence as `corrupt_tracks` does; the truth is unchanged and `outliers` marks the outliers.
 
     Raises
     ------
@@ -27,7 +27,7 @@ def corrupt(
 def corrupt_tracks(
     tracks: Tracks, *, noise: float = 0.0, outliers: float = 0.0, hidden: float = 0.0, seed: int = 0
 ) -> tuple[Tracks, NDArray[np.bool_]]:
-    """Spoil tracks.
+    """Add noise, outliers and hidden observations to tracks.
 
     Parameters
     ----------
@@ -37,16 +37,16 @@ def corrupt_tracks(
         r: Gaussian noise of standard deviation `σ = r · max |W|` on every coordinate, W the tracks with every frame's
         centroid removed (Dai, Deng, He 2017, section 5; their r goes to .05).
     outliers : float
-        Share of the F·P observations put at random: uniform over the box that holds the whole centred sequence.
+        Share of the F·P observations moved to random positions, uniform over the bounding box of the centred sequence.
     hidden : float
-        Share of the F·P observations hidden, in addition to those hidden already, each chosen at random.
+        Share of the F·P observations to hide, chosen at random, in addition to those already hidden.
     seed : int
-        The same seed spoils the same observations in the same way.
+        Seed of noise, outliers and hidden observations.
 
     Returns
     -------
     tracks, outliers
-        Corrupted tracks, and which observations were put at random places, `(F, P)`.
+        Corrupted tracks, and a mask of the outliers, `(F, P)`.
 
     Raises
     ------
@@ -74,7 +74,7 @@ def corrupt_tracks(
 
 
 def _pick(shape: tuple[int, ...], share: float, random: np.random.Generator) -> NDArray[np.bool_]:
-    """Choose exactly round(share · F · P) entries."""
+    """Return a mask with exactly round(share · F · P) entries set."""
     size = int(np.prod(shape))
     mask = np.zeros(size, dtype=bool)
     mask[random.choice(size, round(share * size), replace=False)] = True

@@ -1,4 +1,4 @@
-"""A face that smiles, talks, raises its brows and blinks."""
+"""A synthetic face that smiles, talks, raises its brows and blinks."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MOUTH = -0.42
 
 @dataclass(frozen=True, slots=True)
 class Expression:
-    """What the face does at one moment; each in [0, 1]."""
+    """Strength of each facial movement at one time, in [0, 1]."""
 
     smile: float
     jaw: float
@@ -36,11 +36,11 @@ def face(
     self_occlusion: bool = False,
     seed: int = 0,
 ) -> Sequence:
-    """Let a face move.
+    """Return a sequence of a moving face.
 
-    The neutral face is a bent oval with brows, sockets, lids, nose, cheeks, lips and chin as relief. On it act five
-    expressions, of which the jaw is a rotation, the lids slide over the eyes and the lips part: the shapes are not a
-    linear model, and no small number of basis shapes explains them exactly.
+    The neutral face is a bent oval with brows, sockets, lids, nose, cheeks, lips and chin as relief, deformed by five
+    expressions. The jaw rotates, the lids slide over the eyes and the lips part, so the shapes are not a linear model:
+    no small number of basis shapes explains them exactly.
 
     Parameters
     ----------
@@ -53,9 +53,9 @@ def face(
     mesh
         "grid": a pixel grid cut to an oval; "triangles": an irregular triangulation.
     self_occlusion
-        Hide what is turned away from the camera (shadows that the nose casts on the cheek are not hidden).
+        Hide points whose surface faces away from the camera; occlusion of the cheek by the nose is not modelled.
     seed
-        Of the order and strength of the expressions.
+        Seed of the order and strength of the expressions.
 
     Raises
     ------
@@ -74,7 +74,7 @@ def face(
 
 
 def _act(script: Floats, time: float) -> Expression:
-    """Smooth waves of different periods, begun where the seed says; blinks are short."""
+    """Return smooth waves of different periods with seeded phases; blinks are short."""
     periods = np.array([1.0, 3.0, 1.5, 2.0, 1.0])
     waves = 0.5 - 0.5 * np.cos(2 * np.pi * (periods * time + script[:, 0]))
     strength = 0.75 + 0.25 * script[:, 1]
@@ -83,14 +83,14 @@ def _act(script: Floats, time: float) -> Expression:
 
 
 def express(rest: Floats, expression: Expression) -> Floats:
-    """Move the neutral face.
+    """Return the face with an expression.
 
     Parameters
     ----------
     rest : array, shape (P, 3)
         Neutral face; model units, x right, y up, z towards the viewer.
     expression
-        How strongly each movement acts.
+        Strength of each movement.
     """
     moved = rest.copy()
     _blink(moved, rest, expression.blink)
@@ -142,7 +142,7 @@ def _pucker(moved: Floats, rest: Floats, strength: float) -> None:
 def _jaw(moved: Floats, rest: Floats, strength: float) -> None:
     """Turn the lower face about the axis through the ears; between the lips the surface sinks in."""
     x, y = np.abs(rest[:, 0]), rest[:, 1]
-    # Sharp between the lips, soft from the corners of the mouth over the cheeks.
+    # Sharp between the lips, smooth from the corners of the mouth to the cheeks.
     inner = rise(0.24 - x, 0.10)
     below = inner * rise(MOUTH - y, 0.035) + (1 - inner) * rise(MOUTH + 0.14 - y, 0.30)
     angle = 0.34 * strength * below

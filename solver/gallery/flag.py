@@ -1,4 +1,4 @@
-"""A flag in the wind: cloth that bends and does not stretch."""
+"""A synthetic flag in the wind: cloth that bends without stretching."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pliant.solver.records import Floats
 
 ASPECT = 1.5
 QUADRATURE = 32
-"""Gauss–Legendre nodes along the cloth; enough for the waves below that no chord comes out longer than its arc by more than 2e-6."""
+"""Gauss–Legendre nodes along the cloth; with these, chords exceed their arcs by less than 2e-6 for the waves below."""
 
 
 def flag(
@@ -23,11 +23,11 @@ def flag(
     self_occlusion: bool = False,
     seed: int = 0,
 ) -> Sequence:
-    """Let a flag wave.
+    """Return a sequence of a waving flag.
 
-    Every thread that runs from the pole is a curve given by the angle of its tangent, `θ(s, v, t)`, a wave that travels
-    from the pole and grows with the distance s from it; the points follow by integration, `x = ∫cos θ ds`,
-    `z = ∫sin θ ds`, so that no thread stretches. The threads are not in step (v enters the phase), which shears the cloth.
+    Each thread that starts at the pole is a curve with tangent angle `θ(s, v, t)`, a travelling wave whose amplitude
+    grows with the distance s from the pole. Points follow by integration, `x = ∫cos θ ds`, `z = ∫sin θ ds`, so no thread
+    stretches. The phase depends on v, which shears the cloth.
 
     Parameters
     ----------
@@ -40,9 +40,9 @@ def flag(
     mesh
         "grid" or "triangles".
     self_occlusion
-        Hide what is turned away from the camera.
+        Hide points whose surface faces away from the camera.
     seed
-        Of the wind.
+        Seed of the wind.
 
     Raises
     ------
@@ -67,7 +67,7 @@ def flag(
 
 
 def _slope(along: Floats, height: Floats, time: float, phases: Floats) -> Floats:
-    """Angle of the cloth's tangent against the image plane, radians."""
+    """Return the angle between the cloth's tangent and the image plane, radians."""
     growth = 0.25 + 0.75 * (1 - np.exp(-along / 0.8))
     main = 0.85 * np.sin(3.6 * along - 4 * np.pi * time + 0.5 * height + phases[0])
     fold = 0.35 * np.sin(7.1 * along - 6 * np.pi * time - 1.1 * height + phases[1])

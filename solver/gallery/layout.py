@@ -1,7 +1,7 @@
-"""Where the points of an open surface lie in its parameter plane, and who neighbours whom.
+"""Layout of the points of an open surface in its parameter plane, with their mesh.
 
-Parameters are (u, v) in [−1, 1]², u right, v down; "grid" gives a pixel grid that may have holes, "triangles" an
-irregular triangulation. Both hold exactly as many points as asked for.
+Parameters are (u, v) in [−1, 1]², u right, v down. "grid" gives a pixel grid that may have holes, "triangles" an
+irregular triangulation; both have exactly the requested number of points.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ Kind = Literal["grid", "triangles"]
 
 
 def disc(num_points: int, mesh: Kind) -> tuple[Floats, Mesh]:
-    """Points in the unit disc, `(P, 2)`, and their mesh.
+    """Return points in the unit disc, `(P, 2)`, and their mesh.
 
-    The grid keeps the P cells of the smallest radius out of a square that is just large enough; the triangles are the
-    Delaunay triangulation of a sunflower spiral (Vogel 1979), which spreads any number of points evenly.
+    The grid consists of the P cells of smallest radius in a square; the triangles are the Delaunay triangulation of a
+    sunflower spiral (Vogel 1979), which distributes any number of points evenly.
     """
     _check(num_points, mesh)
     if mesh == "triangles":
@@ -37,9 +37,9 @@ def disc(num_points: int, mesh: Kind) -> tuple[Floats, Mesh]:
 
 
 def rectangle(num_points: int, mesh: Kind, *, aspect: float) -> tuple[Floats, Mesh]:
-    """Points in [−1, 1]², `(P, 2)`, and their mesh, for a sheet that is `aspect` times as wide as it is high.
+    """Return points in [−1, 1]², `(P, 2)`, and their mesh, for a sheet `aspect` times as wide as it is high.
 
-    The last column of the grid may be incomplete, so that any P is possible.
+    The last column of the grid may be incomplete, so any P is possible.
     """
     _check(num_points, mesh)
     rows = max(2, round(np.sqrt(num_points / aspect)))
@@ -49,7 +49,7 @@ def rectangle(num_points: int, mesh: Kind, *, aspect: float) -> tuple[Floats, Me
     flat, grid = _numbered(plane, inside)
     if mesh == "grid":
         return flat, grid
-    # Jitter inside the sheet makes the valences uneven; the border stays straight.
+    # Jitter in the interior makes the valences uneven; the border stays straight.
     spread = np.array([2 / max(columns - 1, 1), 2 / max(rows - 1, 1)])
     jitter = np.random.default_rng(0).uniform(-0.35, 0.35, flat.shape) * spread
     flat = np.where(np.abs(flat) < 1 - 1e-9, flat + jitter, flat)
@@ -57,7 +57,7 @@ def rectangle(num_points: int, mesh: Kind, *, aspect: float) -> tuple[Floats, Me
 
 
 def _numbered(plane: Floats, inside: NDArray[np.int64]) -> tuple[Floats, Mesh]:
-    """Give the chosen cells numbers row by row; drop rows and columns that hold none."""
+    """Assign numbers to the chosen cells row by row; drop empty rows and columns."""
     grid = np.full(plane.shape[:2], -1, dtype=np.int32)
     grid.ravel()[np.sort(inside)] = np.arange(len(inside))
     kept = np.ix_((grid >= 0).any(axis=1), (grid >= 0).any(axis=0))
@@ -65,11 +65,11 @@ def _numbered(plane: Floats, inside: NDArray[np.int64]) -> tuple[Floats, Mesh]:
 
 
 def _triangulate(flat: Floats) -> Ints:
-    """Delaunay triangles, counter-clockwise for a viewer to whom v points down, without slivers on the border."""
+    """Return Delaunay triangles, counter-clockwise when v points down, without slivers on the border."""
     triangles = Delaunay(flat).simplices.astype(np.int32)
     first, second = flat[triangles[:, 1]] - flat[triangles[:, 0]], flat[triangles[:, 2]] - flat[triangles[:, 0]]
     area = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
-    # With v down, a positive area runs clockwise to the eye.
+    # With v pointing down, a positive area means clockwise order in the image.
     triangles[area > 0] = triangles[area > 0][:, ::-1]
     return np.asarray(triangles[np.abs(area) > 0.02 * np.median(np.abs(area))])
 

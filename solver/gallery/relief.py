@@ -7,18 +7,18 @@ from pliant.solver.records import Floats
 
 
 def spot(x: Floats, y: Floats, *, at: tuple[float, float], size: tuple[float, float], slant: float = 0.0) -> Floats:
-    """Gaussian bump of height 1; `slant` shears it: its centre moves by −slant in x per unit of y."""
+    """Return a Gaussian bump of height 1; `slant` shears it, moving its centre by −slant in x per unit of y."""
     across = x - at[0] + slant * (y - at[1])
     return np.asarray(np.exp(-0.5 * ((across / size[0]) ** 2 + ((y - at[1]) / size[1]) ** 2)))
 
 
 def rise(value: Floats, width: float) -> Floats:
-    """Smooth step from 0 to 1 around `value = 0`."""
+    """Return a smooth step from 0 to 1 around `value = 0`."""
     return np.asarray(0.5 + 0.5 * np.tanh(value / (0.5 * width)))
 
 
 def neutral(plane: Floats) -> Floats:
-    """Bend the unit disc into an oval and put the features of a face on it.
+    """Return the unit disc bent into an oval, with the features of a face.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ def _eyes(x: Floats, y: Floats) -> Floats:
     crease = (
         -0.016 * np.exp(-0.5 * ((y - 0.335 + 1.6 * (x - 0.29) ** 2) / 0.012) ** 2) * rise(0.13 - np.abs(x - 0.29), 0.05)
     )
-    # The open eye lies a little behind the rims of the lids, in an almond.
+    # The open eye is almond-shaped and slightly recessed behind the lids.
     almond = 0.052 * np.maximum(1 - ((x - 0.29) / 0.125) ** 2, 0)
     opening = -0.030 * rise(almond - np.abs(y - 0.250 - 0.02 * (x - 0.29)), 0.022) * (almond > 0)
     return np.asarray(brow + socket + inner_corner + ball + crease + opening)
@@ -63,7 +63,7 @@ def _nose(x: Floats, y: Floats) -> Floats:
     along = np.clip((0.33 - y) / 0.45, 0, 1)
     height = 0.05 * rise(0.50 - y, 0.2) + 0.21 * along**1.3
     width = 0.050 + 0.022 * along
-    # The underside is rounded: it begins higher beside the tip than under it.
+    # The underside is rounded: it starts higher beside the tip than below it.
     underside = rise(y + 0.145 - 4.0 * x**2, 0.085)
     bridge = height * underside * np.exp(-0.5 * (x / width) ** 2)
     tip = 0.065 * spot(x, y, at=(0.0, -0.075), size=(0.055, 0.055))

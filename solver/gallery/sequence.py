@@ -1,4 +1,4 @@
-"""What every gallery surface is turned into: tracks of a moving orthographic camera, with the truth beside them."""
+"""A synthetic sequence: tracks of a moving surface from a moving orthographic camera, with ground truth."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ PIXELS = 200.0
 
 IMAGE_CENTRE = (320.0, 240.0)
 GRAZING = 0.05
-"""A vertex is seen if its normal turns at least this far (sine of the angle) towards the viewer."""
+"""Minimum sine of the angle between a visible vertex's surface and the viewing direction."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sequence:
-    """A synthetic sequence: `tracks = scales · shapes · rotations[:, :2]ᵀ + translation`, exactly, until corrupted."""
+    """A synthetic sequence: `tracks = scales · shapes · rotations[:, :2]ᵀ + translation` exactly, unless corrupted."""
 
     tracks: Tracks
     mesh: Mesh
@@ -35,13 +35,13 @@ class Sequence:
 
     name: str
     outliers: NDArray[np.bool_]
-    """Observations that `corrupt` put at random places, `(F, P)`."""
+    """Mask of the observations that `corrupt` replaced by outliers, `(F, P)`."""
 
 
 def sweep(num_frames: int, degrees: float, *, tilt: float) -> Floats:
-    """Cameras that turn at an even pace from −`degrees` to +`degrees` about the vertical, nodding by ±`tilt` degrees.
+    """Return cameras that rotate uniformly from −`degrees` to +`degrees` about the vertical and nod by ±`tilt` degrees.
 
-    The nod (one period) and a roll of a third of it keep the motion off a single axis.
+    The nod (one period) and a roll of a third of it avoid rotation about a single axis.
 
     Returns
     -------
@@ -64,20 +64,20 @@ def film(
     scale_change: float,
     self_occlusion: bool,
 ) -> Sequence:
-    """Let the cameras watch a surface that moves with time.
+    """Return the sequence of a moving surface seen by the given cameras.
 
     Parameters
     ----------
     name
         Name of the sequence.
     surface
-        From time in [0, 1] to the points, `(P, 3)`, model units, image axes.
+        Function of the time in [0, 1] that returns the points, `(P, 3)`, model units, image axes.
     mesh, rotations
-        Neighbours of the points; cameras, `(F, 3, 3)`.
+        Mesh of the points; cameras, `(F, 3, 3)`.
     scale_change
         Amplitude c of one sinusoidal period in the logarithm of the scale: image size varies by e^±c.
     self_occlusion
-        Hide the points whose surface is turned away from the camera. Exact for a convex body, without cast occlusion.
+        Hide points whose surface faces away from the camera. Exact for a convex body; occlusion by other parts is ignored.
 
     Raises
     ------
@@ -101,13 +101,13 @@ def film(
 
 
 def facing(shapes: Floats, mesh: Mesh, rotations: Floats) -> NDArray[np.bool_]:
-    """Which points' surface is turned towards the camera, shape `(F, P)`; the viewer looks along +z."""
+    """Return which points face the camera, shape `(F, P)`; the viewing direction is +z."""
     depth = np.stack([vertex_normals(shape, mesh) @ turn[2] for shape, turn in zip(shapes, rotations, strict=True)])
     return np.asarray(depth < -GRAZING)
 
 
 def vertex_normals(points: Floats, mesh: Mesh) -> Floats:
-    """Average the faces around each vertex, weighted with area: unit normals, `(P, 3)`, outward where faces run counter-clockwise."""
+    """Return area-weighted unit vertex normals, `(P, 3)`, outward for counter-clockwise faces."""
     corners = points[mesh.faces]
     across = (corners[:, 1] - corners[:, -1], corners[:, 2] - corners[:, 0])
     normals = np.cross(*across) if mesh.faces.shape[1] == 4 else np.cross(corners[:, 1] - corners[:, 0], across[1])
@@ -123,12 +123,12 @@ def vertex_normals(points: Floats, mesh: Mesh) -> Floats:
 
 
 def refusal(name: str, expected: str, got: object) -> InvalidInput:
-    """Build the error for an argument of the gallery that is out of its range."""
+    """Return the error for an argument that is out of range."""
     return InvalidInput("out_of_range", field=name, expected=expected, got=repr(got), hint="Correct the argument.")
 
 
 def _about(axis: int, angles: Floats) -> Floats:
-    """Rotations about one axis, shape `(F, 3, 3)`."""
+    """Return rotations about one axis, shape `(F, 3, 3)`."""
     first, second = (axis + 1) % 3, (axis + 2) % 3
     matrices = np.tile(np.eye(3), (len(angles), 1, 1))
     matrices[:, first, first] = matrices[:, second, second] = np.cos(angles)

@@ -1,4 +1,4 @@
-"""A breathing sphere: a closed body, so that the side away from the camera is always hidden."""
+"""A pulsating sphere: a closed body, half of which is always hidden from the camera."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ def sphere(
     self_occlusion: bool = True,
     seed: int = 0,
 ) -> Sequence:
-    """Let a sphere breathe: it swells as a whole, and five lobes of its surface rise and sink in their own time.
+    """Return a sequence of a pulsating sphere: its radius varies, and five lobes rise and sink with their own periods.
 
-    Points are a Fibonacci lattice, triangles its convex hull. The camera goes right round by default; with
-    `self_occlusion` every point is hidden while it is turned away, about half of the time.
+    Points form a Fibonacci lattice, triangles its convex hull. By default the camera makes a full turn; with
+    `self_occlusion` each point is hidden while it faces away, about half of the time.
 
     Parameters
     ----------
@@ -34,9 +34,9 @@ def sphere(
     scale_change
         Amplitude of the change of the logarithm of the scale.
     self_occlusion
-        Hide what is turned away from the camera.
+        Hide points whose surface faces away from the camera.
     seed
-        Of the lobes.
+        Seed of the lobes.
 
     Raises
     ------
@@ -64,7 +64,7 @@ def sphere(
 
 
 def _lattice(num_points: int) -> Floats:
-    """Spread points evenly over the unit sphere, `(P, 3)`."""
+    """Return points distributed evenly over the unit sphere, `(P, 3)`."""
     index = np.arange(num_points) + 0.5
     height = 1 - 2 * index / num_points
     angle = np.pi * (1 + np.sqrt(5)) * index
@@ -73,7 +73,7 @@ def _lattice(num_points: int) -> Floats:
 
 
 def _outward(points: Floats) -> Ints:
-    """Faces of the convex hull, counter-clockwise seen from outside."""
+    """Return the faces of the convex hull, counter-clockwise seen from outside."""
     hull = ConvexHull(points)
     faces = hull.simplices.astype(np.int32)
     corners = points[faces]

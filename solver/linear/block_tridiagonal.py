@@ -1,13 +1,13 @@
-"""A preconditioner that takes every observation's own weight: point by point, the path over frames is solved exactly.
+"""Block-tridiagonal preconditioner: the exact solution over frames for each point, with every observation's own weight.
 
-Without the coupling of neighbours, what is left of 𝒜 for one point is block-tridiagonal over frames,
+Without the coupling between neighbouring points, 𝒜 restricted to one point is block tridiagonal over frames,
 
     D_f = s²Rᵀ diag(ω_fp) R + (λ1 [HᵀH]_ff + λ2 [AᵀA]_pp) I,        off-diagonal blocks λ1 [HᵀH]_f,f+1 I,
 
-3×3 blocks, the neighbours' own stiffness kept on the diagonal. Block elimination (Golub and Van Loan, Matrix Computations, 4.5.1) costs
-the same for every frame and point: six numbers to keep, no product over frames. IRLS weights of inliers and outliers lie two orders of
-magnitude apart, so that a mean weight for a whole frame, as the cosine preconditioner has to take it, is wrong for both; in return this
-one knows nothing of smoothness along the surface, for which there is `pliant.solver.linear.multigrid`.
+with 3×3 blocks; the diagonal of the spatial term is kept. Block elimination (Golub and Van Loan, Matrix Computations,
+4.5.1) has constant cost per frame and point and stores six numbers for each. The IRLS weights of inliers and outliers
+differ by two orders of magnitude, so one mean weight per frame, as in the cosine preconditioner, fits neither. The
+spatial coupling that is missing here is added by `pliant.solver.linear.multigrid`.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ from pliant.solver.threads import over_ranges
 
 Array = NDArray[np.floating]
 
-BLOCK = 8192
-"""Points worked on at a time: what one frame needs of them stays in the processor's cache. Measured, 99 × 29,000, milliseconds for one
-application with 2,048, 4,096, 8,192 points at a time: 59, 41, 35 in double precision, 41, 27, 20 in single."""
+POINTS_PER_BLOCK = 8192
+"""Points eliminated together, so that one frame of them fits in the processor's cache. Milliseconds per application, 99 ×
+29,000, with 2,048, 4,096, 8,192 points: 59, 41, 35 in double precision; 41, 27, 20 in single."""
 
-RIDGE = 1e-9
-"""Added to every diagonal, as a share of λ1: a point that is never seen, with nothing but its path, has a singular system."""
+DIAGONAL_RIDGE = 1e-9
+"""Ridge on every diagonal, relative to λ1: without it the system of a point that is never visible is singular."""
 
 ROUNDING = 64.0
-"""Times the rounding of the arithmetic, where that is more: what elimination along a path can get wrong."""
+"""Lower bound of the ridge in units of machine epsilon: bounds the rounding error of the elimination."""
 
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-"""Where the six numbers of a symmetric 3×3 block stand."""
+"""Row and column indices of the six distinct entries of a symmetric 3×3 block."""
 
 
 def fits(operator: Operator) -> bool:
-    """Return whether elimination along paths can be part of the preconditioner."""
+    """Whether the operator couples only neighbouring frames, so that block elimination applies."""
     return operator.rank is None and len(operator.stencil) == 2 and float(operator.stencil[0].max()) > 0
 
 
@@ -50,11 +50,14 @@ def stiffness_of_neighbours(operator: Operator) -> Floats:
 
 
 def build(operator: Operator, stiffness: Floats | None = None) -> Linear:
-    """Factor once a reweighting; returns r ↦ M⁻¹ r. The neighbours' stiffness, shape `(P,)`, is the operator's own if not given."""
+    """Factor the preconditioner for one reweighting and return r ↦ M⁻¹ r.
+
+    `stiffness` is the diagonal of the spatial term, shape `(P,)`; by default that of the operator.
+    """
     stiffness = stiffness_of_neighbours(operator) if stiffness is None else stiffness
     kind = operator.weights.dtype
     inverses = np.zeros((len(operator.projections), 6, operator.weights.shape[2]), dtype=kind)
-    ridge = max(RIDGE, ROUNDING * float(np.finfo(kind).eps)) * operator.stencil[0].max()
+    ridge = max(DIAGONAL_RIDGE, ROUNDING * float(np.finfo(kind).eps)) * operator.stencil[0].max()
     shift = (stiffness + ridge).astype(kind)
     coupling = operator.stencil[1].astype(kind)
 
@@ -62,7 +65,7 @@ def build(operator: Operator, stiffness: Floats | None = None) -> Linear:
         for first, last in _blocks(start, stop):
             _eliminate(operator, shift[first:last], coupling, inverses[:, :, first:last], slice(first, last))
 
-    over_ranges(eliminate, inverses.shape[2], smallest=BLOCK // 2)
+    over_ranges(eliminate, inverses.shape[2], smallest=POINTS_PER_BLOCK // 2)
 
     def apply(r: Array, /, out: Array | None = None) -> Array:
         result = np.empty_like(r) if out is None else out
@@ -71,14 +74,14 @@ def build(operator: Operator, stiffness: Floats | None = None) -> Linear:
             for first, last in _blocks(start, stop):
                 _substitute(inverses[:, :, first:last], coupling, r[:, :, first:last], result[:, :, first:last])
 
-        over_ranges(substitute, r.shape[2], smallest=BLOCK // 2)
+        over_ranges(substitute, r.shape[2], smallest=POINTS_PER_BLOCK // 2)
         return result
 
     return apply
 
 
 def _blocks(start: int, stop: int) -> list[tuple[int, int]]:
-    return [(first, min(first + BLOCK, stop)) for first in range(start, stop, BLOCK)]
+    return [(first, min(first + POINTS_PER_BLOCK, stop)) for first in range(start, stop, POINTS_PER_BLOCK)]
 
 
 def _eliminate(operator: Operator, shift: Array, coupling: Array, inverses: Array, points: slice) -> None:
@@ -124,7 +127,7 @@ def _substitute(inverses: Array, coupling: Array, r: Array, out: Array) -> None:
 
 
 def _product(block: Array, x: Array, out: Array, spare: Array) -> None:
-    """Multiply symmetric 3×3 blocks, `(6, P)`, with vectors, `(3, P)`; nothing is allocated."""
+    """Multiply symmetric 3×3 blocks, `(6, P)`, by vectors, `(3, P)`, without allocating."""
     np.multiply(block[:3], x[0], out=out)  # first column: a, b, c
     np.multiply(block[1], x[1], out=spare[0])
     np.multiply(block[3:5], x[1], out=spare[1:])

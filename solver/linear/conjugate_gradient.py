@@ -1,4 +1,4 @@
-"""Preconditioned conjugate gradients on arrays of any layout, first axis the one that threads share."""
+"""Preconditioned conjugate gradients on arrays of any shape; threads split the first axis."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ class Linear(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solved:
-    """Where conjugate gradients stopped."""
+    """Result of conjugate gradients."""
 
     x: Array
     iterations: int
     relative: float
-    """Preconditioned residual norm √(rᵀM⁻¹r) at the end over that at the start."""
+    """Final over initial preconditioned residual norm √(rᵀM⁻¹r)."""
 
 
 def conjugate_gradient(
@@ -42,13 +42,12 @@ def conjugate_gradient(
 ) -> Solved:
     """Improve x, or 0, towards 𝒜 x = b for a symmetric positive (semi)definite 𝒜.
 
-    Every iteration lowers ½ xᵀ𝒜x − bᵀx, so stopping early is always safe: an inexact inner solve inside
-    majorise–minimise still descends. Stops when √(rᵀM⁻¹r) has
-    fallen to `reduction` times its first value, or to rounding level beside √(bᵀM⁻¹b).
+    Every iteration decreases ½ xᵀ𝒜x − bᵀx, so majorise–minimise descends even when the inner solve is stopped early.
+    Stops when √(rᵀM⁻¹r) has fallen to `reduction` times its initial value, or to rounding level relative to √(bᵀM⁻¹b).
     Saad, Iterative Methods for Sparse Linear Systems (2003), algorithm 9.1.
 
-    Five arrays of the size of x are all that is ever held: fresh ones in every iteration would cost more in page faults than
-    in arithmetic.
+    Five arrays of the size of x are allocated once and reused; allocating them in every iteration would cost more in
+    page faults than in arithmetic.
     """
     if x is None:
         x, residual, image = np.zeros_like(b), b.copy(), np.empty_like(b)
@@ -69,7 +68,7 @@ def conjugate_gradient(
             break
         image = apply(direction, out=image)
         curvature = dot(direction, image)
-        if not curvature > 0:  # a null direction: nothing more to gain along it
+        if not curvature > 0:  # null direction: no further decrease along it
             break
         _advance(rz / curvature, direction, image, x=x, residual=residual)
         z = precondition(residual, out=z)
@@ -106,9 +105,9 @@ def _turn(factor: float, z: Array, direction: Array) -> None:
 
 
 def dot(one: Array, two: Array) -> float:
-    """Inner product, slice by slice and then summed in double precision, which float32 needs.
+    """Inner product, computed slice by slice and summed in double precision, as float32 requires.
 
-    Not by the linear-algebra library: its threads wait for each other in a loop, which on a busy machine takes longer than the sum.
+    BLAS is avoided: its threads synchronise by busy waiting, which on a loaded machine takes longer than the sum.
     """
     parts = np.zeros(len(one))
 

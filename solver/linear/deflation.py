@@ -1,13 +1,13 @@
-"""A coarse correction for points that are not like the others: few modes, every point's own weights.
+"""Coarse-space correction for points whose weights differ from the mean of their frame: few modes, individual weights.
 
-A preconditioner with one weight a frame believes that every point was seen as well as the mean one. Where a point is hidden,
-or an outlier has lost its weight, only the prior holds it, and the Gaussian prior hardly holds the modes of large variance: along
-them the mean weights are wrong by orders of magnitude, and conjugate gradients would crawl. These modes are few. On their span
-U (per coordinate, F×m) the equations are solved exactly for every point by itself,
+A preconditioner with one weight per frame treats all points as equally visible. A hidden or down-weighted point is
+determined by the prior only, and the Gaussian prior is weak along modes of large variance. Along these the mean weights
+are wrong by orders of magnitude, which slows conjugate gradients down. Such modes are few, so on their span U (F×m per
+coordinate) the equations are solved exactly for each point,
 
     N_p = Σ_fi ω_fip u_fi u_fiᵀ + λ1 UᵀQU,    u_fi = U_fᵀ R_fiᵀ,
 
-and the result is added to what the mean weights give.
+and the result is added to that of the mean weights.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from pliant.solver.threads import over_ranges
 Array = NDArray[np.floating]
 
 MAX_FREE_MODES = 12
-"""Modes of a coordinate at most: memory grows with the square."""
+"""Maximum number of modes per coordinate; memory grows with its square."""
 
 HELD = 0.05
-"""A mode belongs to the coarse space where the prior's precision is below this times the mean weight."""
+"""Ratio of the prior's precision to the mean weight below which a mode belongs to the coarse space."""
 
 UNLIKE = 0.1
-"""A weight below this times its frame's mean is unlike the others."""
+"""Ratio of a weight to its frame's mean below which the weight counts as deviating."""
 
 ENOUGH = 0.002
-"""Share of unlike weights below which the mean weights do."""
+"""Share of deviating weights below which no correction is built."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,7 +60,7 @@ class Coarse:
 
 
 def build_coarse(operator: Operator) -> Coarse | None:
-    """Return the correction for this reweighting, or None where the mean weights do."""
+    """Return the correction for this reweighting, or None if the mean weights are accurate enough."""
     if operator.quadratic is None:
         return None
     mean = operator.weights.mean(axis=2, dtype=np.float64)
@@ -93,11 +93,11 @@ def build_coarse(operator: Operator) -> Coarse | None:
 
 
 MODE_BLOCK = 256
-"""Points worked on at once."""
+"""Points inverted together."""
 
 
 def _free_modes(operator: Operator, limit: float) -> tuple[tuple[Floats, Floats, Floats], list[Floats]]:
-    """Return for each coordinate the modes that the prior holds least, and how much it holds them."""
+    """Return, for each coordinate, the modes of least prior precision and their precision."""
     assert operator.quadratic is not None
     modes, held = [], []
     for directions, values in operator.quadratic.loosest(MAX_FREE_MODES):
@@ -108,6 +108,6 @@ def _free_modes(operator: Operator, limit: float) -> tuple[tuple[Floats, Floats,
 
 
 def _seen(operator: Operator, modes: tuple[Floats, Floats, Floats]) -> Floats:
-    """Return u, the modes as the camera sees them, shape `(F, 2, m)`."""
+    """Return u, the modes projected to the image, shape `(F, 2, m)`."""
     cameras = operator.projections.astype(np.float64)
     return np.concatenate([cameras[:, :, c, None] * modes[c][:, None, :] for c in range(3)], axis=2)

@@ -1,4 +1,4 @@
-"""The sum of block elimination on the points and on every coarser level: paths in time, smoothness along the surface."""
+"""Additive multilevel preconditioner: block elimination over frames on the points and on every coarser level."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pliant.solver.linear import block_tridiagonal
 from pliant.solver.linear.conjugate_gradient import Linear
 from pliant.solver.operators.aggregation import Level, Matrix
-from pliant.solver.operators.bending import frames_together, turned, turned_back
+from pliant.solver.operators.bending import add_transposed, frames_together, transposed
 from pliant.solver.operators.normal_equations import Operator
 from pliant.solver.threads import SMALLEST, over_ranges
 
@@ -17,7 +17,7 @@ Array = NDArray[np.floating]
 
 
 def build(operator: Operator) -> Linear:
-    """Factor every level once a reweighting; returns r ↦ Σ_l Π_l M_l⁻¹ Π_lᵀ r."""
+    """Factor every level for one reweighting and return r ↦ Σ_l Π_l M_l⁻¹ Π_lᵀ r."""
     assert operator.laplacian is not None
     fine = block_tridiagonal.build(operator)
     coarse: list[Coarser] = []
@@ -38,14 +38,14 @@ def build(operator: Operator) -> Linear:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Coarser:
-    """A level and what inverts its blocks."""
+    """A coarse level and the inverse of its blocks."""
 
     level: Level
     inverse: Linear
 
 
 def _correct(coarse: list[Coarser], r: Array, out: Array) -> None:
-    """Add to `out` what the levels make of the residual r."""
+    """Add the corrections of all levels for the residual r to `out`."""
     if not coarse:
         return
     first, *rest = coarse
@@ -56,7 +56,7 @@ def _correct(coarse: list[Coarser], r: Array, out: Array) -> None:
 
 
 def _carried(matrix: Matrix, array: Array, onto: Array | None = None) -> Array:
-    """Return the matrix times every row of `(F, k, P)`, or add it to `onto`."""
+    """Return the product of the matrix with every row of `(F, k, P)`, or add it to `onto`."""
     frames, rows, points = array.shape
     result = np.zeros((frames, rows, matrix.shape[0]), dtype=array.dtype) if onto is None else onto
     together = frames_together(frames)
@@ -64,8 +64,8 @@ def _carried(matrix: Matrix, array: Array, onto: Array | None = None) -> Array:
     def work(start: int, stop: int) -> None:
         for low in range(start * together, min(stop * together, frames), together):
             part = slice(low, min(low + together, frames))
-            product = matrix @ turned(array[part].reshape(-1, points))
-            turned_back(product, result[part].reshape(-1, matrix.shape[0]))
+            product = matrix @ transposed(array[part].reshape(-1, points))
+            add_transposed(product, result[part].reshape(-1, matrix.shape[0]))
 
     over_ranges(work, -(-frames // together), smallest=max(1, SMALLEST // (together * rows * points)))
     return result

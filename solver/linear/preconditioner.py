@@ -1,10 +1,11 @@
-"""Preconditioners: sums of what inverts parts of the equations, in the frames and in the points no dearer than the equations.
+"""Choice of the preconditioner; its cost is linear in frames and points, like that of the equations.
 
-Where a frame is coupled to the next alone, every point's own path is inverted (`linear.block_tridiagonal`), with coarser surfaces
-beside it where bending counts (`linear.multigrid`), and with the modes of a Gaussian prior (`linear.woodbury`,
-`linear.deflation`). Elsewhere, which is with a rank term, second differences or no smoothness in time, one weight a frame has to do:
-then 𝒜 is the Sylvester operator X ↦ T X + λ2 X K, T the 3F×3F temporal part, diagonalised once a reweighting, K = AᵀA over points,
-nearly diagonal in the cosine basis on a grid.
+If each frame is coupled to its neighbours only, the equations over frames are inverted for each point
+(`linear.block_tridiagonal`). Coarser levels are added where the spatial term matters (`linear.multigrid`), and the modes
+of a Gaussian prior where there is one (`linear.woodbury`, `linear.deflation`). Otherwise (a rank term, second differences
+or no temporal smoothness) each frame gets one mean weight. 𝒜 then is the Sylvester operator X ↦ T X + λ2 X K with T the
+3F×3F temporal part, diagonalised once per reweighting, and K = AᵀA over points, nearly diagonal in the cosine basis of a
+grid.
 """
 
 from __future__ import annotations
@@ -24,13 +25,13 @@ from scipy import fft, linalg
 
 Array = NDArray[np.floating]
 POINTS_PER_BLOCK = 1024
-"""Points a thread should have to work on, at least."""
+"""Minimum number of points per thread."""
 BENDS = 1.0
-"""Coarser levels are taken where bending is this much beside the slowest smoothness in time."""
+"""Ratio of the spatial term to the smallest eigenvalue of the temporal term above which coarser levels are added."""
 
 
 def temporal_matrix(operator: Operator) -> Floats:
-    """Return T, dense `(3F, 3F)`: every frame's data term with its mean weights, the stencil over frames, the rank term."""
+    """Return T, dense `(3F, 3F)`: data term with each frame's mean weights, stencil over frames, rank term."""
     frames = len(operator.projections)
     cameras = operator.projections.astype(np.float64)
     mean = operator.weights.mean(axis=2, dtype=np.float64)
@@ -59,7 +60,7 @@ class Diagonalised:
 
     @classmethod
     def of(cls, operator: Operator, kind: np.dtype[np.floating]) -> Diagonalised:
-        """Diagonalise the temporal part; directions that nothing holds get a tiny positive value."""
+        """Diagonalise the temporal part; null directions get a tiny positive eigenvalue."""
         values, vectors = linalg.eigh(temporal_matrix(operator))
         return cls(vectors.astype(kind), np.maximum(values, 1e-10 * values[-1]))
 
@@ -88,7 +89,7 @@ def build_preconditioner(operator: Operator) -> Linear:
 
 
 def bends(operator: Operator) -> bool:
-    """Return whether bending counts beside what holds a path that moves slowly, which is its stiffness over F²."""
+    """Whether the spatial term matters beside the temporal stiffness of slow motion, which is λ1/F²."""
     if operator.laplacian is None or operator.spatial_weight == 0:
         return False
     slow = float(operator.stencil[0].max()) / len(operator.projections) ** 2
@@ -96,7 +97,7 @@ def bends(operator: Operator) -> bool:
 
 
 def _alike(operator: Operator) -> Linear:
-    """Return the inverse for one weight a frame."""
+    """Return the inverse for one weight per frame."""
     kind = operator.weights.dtype
     laplacian = operator.laplacian
     if laplacian is None or operator.spatial_weight == 0:
@@ -111,7 +112,7 @@ def _alike(operator: Operator) -> Linear:
 
 
 def _by_inverse(temporal: Floats, kind: np.dtype[np.floating]) -> Linear:
-    """Return the solution of T x_p = r_p for every point p: one product where a diagonalisation would need two."""
+    """Return the solution of T x_p = r_p for every point p by one product with T⁻¹."""
     size = len(temporal)
     temporal[np.diag_indices(size)] += 1e-12 * temporal.diagonal().max()
     inverse = linalg.cho_solve(linalg.cho_factor(temporal, lower=True), np.eye(size))

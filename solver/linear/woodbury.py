@@ -1,9 +1,9 @@
-"""The modes of the Gaussian prior inside the preconditioner, with one weight a frame.
+"""The modes of the Gaussian prior in the preconditioner, with one weight per frame.
 
-Block elimination (`linear.block_tridiagonal`) inverts the chain of neighbours with every observation's own weight, N. The modes
-are missing: by Woodbury's identity (N − V Vᵀ)⁻¹ = N⁻¹ + N⁻¹V (I − VᵀN⁻¹V)⁻¹ VᵀN⁻¹. The second summand has one matrix Z Zᵀ for all points
-if the weights of a frame are their mean, and is added as such. Where they are not, `linear.deflation` mends it. Everything here is
-linear in the number of frames, but for the square of the modes.
+Block elimination (`linear.block_tridiagonal`) inverts N, the part that couples neighbouring frames, with every
+observation's own weight. The modes are added by Woodbury's identity, (N − V Vᵀ)⁻¹ = N⁻¹ + N⁻¹V (I − VᵀN⁻¹V)⁻¹ VᵀN⁻¹.
+With the mean weight of each frame, the second term is one matrix Z Zᵀ for all points; `linear.deflation` corrects it
+where weights differ. The cost is linear in the frames and quadratic in the modes.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pliant.solver.operators.normal_equations import Operator
 Array = NDArray[np.floating]
 
 LEAST = 1e-12
-"""Smallest eigenvalue of I − VᵀN⁻¹V that is believed: it is about the noise over the variance of a mode that nothing shows."""
+"""Floor of the eigenvalues of I − VᵀN⁻¹V, about the ratio of the noise to the variance of an unobserved mode."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,7 +30,7 @@ class MeanModes:
 
     @classmethod
     def of(cls, operator: Operator) -> MeanModes:
-        """Take the modes of an operator with a Gaussian prior."""
+        """Compute Z for an operator with a Gaussian prior."""
         assert operator.quadratic is not None
         frames, sizes = len(operator.projections), [each.shape[1] for each in operator.quadratic.modes]
         cuts = np.cumsum([0, *sizes])

@@ -27,7 +27,7 @@ from pliant.solver.model.shape_covariance import (
     scratch,
 )
 from pliant.solver.records import Floats
-from pliant.solver.tracks.completion import SAMPLE
+from pliant.solver.tracks.completion import MAX_SAMPLE_POINTS
 
 FOLDS = 3
 """Folds of the cross-validation over points."""
@@ -70,7 +70,7 @@ def learn_with_early_stopping(
         Called between rounds; once it returns True, scoring ends.
     """
     frames, count = sample.shape[:2]
-    if MIN_JUDGED_POINTS <= count < min(2 * frames, SAMPLE):
+    if MIN_JUDGED_POINTS <= count < min(2 * frames, MAX_SAMPLE_POINTS):
         points = sample.transpose(0, 2, 1).reshape(2 * frames, count)
         ways = [
             (each, floors)

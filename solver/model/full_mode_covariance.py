@@ -42,7 +42,7 @@ MAX_STEPS, MAX_FRAME_STEPS, MAX_BASIS_FRAMES = 2400, 240_000, 160
 """Maximum L-BFGS iterations, maximum product of iterations and frames, and maximum number of frames: bounds on the
 time."""
 
-ENERGY_TOLERANCE = 1e-7
+LBFGS_TOLERANCE = 1e-7
 """Relative decrease of the energy per iteration below which the refinement ends."""
 
 
@@ -161,13 +161,13 @@ def refined(
         value, gradient = energy(scene, covariance.axis_covariance, Basis.unflat(flat, frames, size))
         return value, gradient.flat()
 
-    def asked(xk: Floats) -> None:  # noqa: ARG001 - SciPy calls it by this name
+    def stop_check(xk: Floats) -> None:  # noqa: ARG001 - SciPy calls it by this name
         if should_stop is not None and should_stop():
             raise StopIteration
 
     steps = min(MAX_STEPS, MAX_FRAME_STEPS // frames)
     found = minimize(
-        objective, start.flat(), jac=True, method="L-BFGS-B", callback=asked,
-        options={"maxiter": steps, "maxfun": 2 * steps, "maxcor": 20, "ftol": ENERGY_TOLERANCE},
+        objective, start.flat(), jac=True, method="L-BFGS-B", callback=stop_check,
+        options={"maxiter": steps, "maxfun": 2 * steps, "maxcor": 20, "ftol": LBFGS_TOLERANCE},
     )  # fmt: skip
     return cameras_of(scene, Basis.unflat(np.asarray(found.x), frames, size))

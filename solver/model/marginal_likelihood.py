@@ -255,12 +255,12 @@ def fit(
         value, gradient = energy(scene, Motion.unflat(np.concatenate([given[:held], free]), frames))
         return value, gradient.flat()[held:]
 
-    def asked(xk: Floats) -> None:  # noqa: ARG001 - SciPy calls it by this name
+    def stop_check(xk: Floats) -> None:  # noqa: ARG001 - SciPy calls it by this name
         if should_stop is not None and should_stop():
             raise StopIteration
 
     found = minimize(
-        objective, given[held:], jac=True, method="L-BFGS-B", callback=asked,
+        objective, given[held:], jac=True, method="L-BFGS-B", callback=stop_check,
         options={"maxiter": iterations, "maxcor": 20},
     )  # fmt: skip
     return Motion.unflat(np.concatenate([given[:held], np.asarray(found.x)]), frames), float(found.fun)

@@ -1,11 +1,11 @@
-"""Coarser and coarser surfaces, for the preconditioner: what a point alone cannot see of its surroundings.
+"""Hierarchy of coarser surfaces for the multilevel preconditioner, by smoothed aggregation.
 
-A block for each point knows nothing of its neighbours, and bending couples them over any distance: a smooth dent costs next to nothing,
-so that conjugate gradients would take as many steps as the surface is wide. On a surface of few points the same dent is rough. Every
-level joins points with their neighbours round a set of centres, no two of which share a neighbour (Luby, 1986: all at once that
-have the largest random number around), and smooths the result once over the graph, as in smoothed aggregation (Vaněk, Mandel,
-Brezina 1996). Corrections of all levels are added (Bramble, Pasciak, Xu 1990), so that nothing but the levels' own blocks is solved.
-Columns of every Π_l are of unit length, so that the smoothness in time looks the same on all levels.
+Blocks per point ignore the spatial term, which couples points over any distance: smooth deformations cost almost nothing
+in it, so conjugate gradients would need as many iterations as the surface is wide. On coarser levels the same
+deformations are rough. Each level aggregates points around centres, no two of which share a neighbour (chosen in
+parallel by largest random number: Luby, 1986), and smooths the aggregates once over the graph (Vaněk, Mandel, Brezina
+1996). The corrections of all levels are added (Bramble, Pasciak, Xu 1990), so only the blocks of each level are solved.
+The columns of every Π_l have unit length, so the temporal term is the same on all levels.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from scipy import sparse
 Matrix = sparse.csr_array[Any]
 
 COARSEST = 8
-"""No further level below this many points."""
+"""Number of points below which no further level is built."""
 
 SMOOTHING = 0.6
-"""Share of the neighbours' mean in one smoothing."""
+"""Weight of the neighbours' mean in the smoothing step."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Level:
-    """From one level to the next coarser."""
+    """Transfer from one level to the next coarser one."""
 
     down: Matrix
     """Restriction of residuals, shape `(P_l, P_l−1)`: the transpose of `up`."""
@@ -38,7 +38,7 @@ class Level:
     """Prolongation of corrections."""
 
     mean: Matrix
-    """How weights are averaged: rows of sum 1, shape `(P_l, P_l−1)`."""
+    """Averaging of weights, rows of sum 1, shape `(P_l, P_l−1)`."""
 
     bending: Floats
     """Diagonal of ΠᵀAᵀAΠ, shape `(P_l,)`."""
@@ -56,7 +56,7 @@ def build_levels(laplacian: Matrix) -> tuple[Level, ...]:
     levels: list[Level] = []
     while graph.shape[0] > COARSEST:
         joined = _aggregates(graph)
-        if joined.shape[1] > 0.7 * joined.shape[0]:  # nothing but isolated points is left
+        if joined.shape[1] > 0.7 * joined.shape[0]:  # only isolated points remain
             break
         smooth = _smoothed(graph, joined)
         whole = sparse.csr_array(whole @ smooth)
@@ -78,13 +78,13 @@ def build_levels(laplacian: Matrix) -> tuple[Level, ...]:
 
 
 def _aggregates(graph: Matrix) -> Matrix:
-    """Return which centre every point belongs to, zeros and ones, shape `(P, centres)`."""
+    """Return the centre of each point as a 0/1 matrix, shape `(P, centres)`."""
     size = graph.shape[0]
     near = _joined(graph @ graph + graph)
     centre = _independent(near)
     owner = np.full(size, -1)
     owner[centre] = np.arange(len(centre))
-    for _ in range(2):  # neighbours of centres, then what is left: a neighbour's neighbour
+    for _ in range(2):  # neighbours of centres first, then the remaining points through a neighbour's centre
         owner = np.where(owner >= 0, owner, _largest(graph, owner))
     left = owner < 0
     owner[left] = len(centre) + np.arange(int(left.sum()))
@@ -92,7 +92,7 @@ def _aggregates(graph: Matrix) -> Matrix:
 
 
 def _independent(graph: Matrix) -> NDArray[np.intp]:
-    """Return points no two of which are joined, to which none can be added."""
+    """Return the indices of a maximal independent set of the graph."""
     size = graph.shape[0]
     rank = np.random.default_rng(0).permutation(size)
     open_, chosen = np.ones(size, dtype=bool), np.zeros(size, dtype=bool)

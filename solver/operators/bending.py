@@ -1,9 +1,10 @@
-"""Products along the surface: A and AᵀA for many frames at once.
+"""Products with A and AᵀA over the points, for several frames at once.
 
-A sparse matrix times one vector waits for the matrix: every number of it is fetched for one multiplication, and what it is multiplied
-with lies anywhere. With the points first and some frames beside each other, `(P, k)`, every fetched number meets k numbers that lie
-together. Turning the shapes round for that costs less than it saves. Measured for 29,000 points of a triangle mesh, microseconds for
-AᵀA of one coordinate of one frame: alone 162, eight frames together 86 + 38 for turning; in single precision 156, and 52 + 22.
+The product of a sparse matrix with one vector is limited by memory bandwidth: every entry is loaded for one
+multiplication with a value at an arbitrary address. With points first and k vectors side by side, `(P, k)`, each entry
+is used for k contiguous values; this saves more than the transposition costs. Microseconds for AᵀA, one coordinate of
+one frame, 29,000 points of a triangle mesh: 162 alone, 86 + 38 for transposing with eight frames; 156 and 52 + 22 in
+single precision.
 """
 
 from __future__ import annotations
@@ -15,38 +16,38 @@ from pliant.solver.operators.mesh_laplacian import Laplacian
 Array = NDArray[np.floating]
 
 TOGETHER = 8
-"""Frames worked on together at most: 24 vectors."""
+"""Maximum number of frames multiplied together, 24 vectors."""
 
 TILE = 2048
-"""Points turned round at a time, so that they stay in the processor's cache."""
+"""Points transposed at a time, so that they stay in the processor's cache."""
 
 
 def bends_of(laplacian: Laplacian, rows: Array) -> Array:
-    """Return A x for every row x, points first, shape `(P, k)` for rows of shape `(k, P)`."""
-    bends: Array = laplacian.matrix @ turned(rows)
+    """Return A times the rows, points first: shape `(P, k)` for rows of shape `(k, P)`."""
+    bends: Array = laplacian.matrix @ transposed(rows)
     return bends
 
 
 def add_bending(laplacian: Laplacian, weight: float, rows: Array, out: Array) -> None:
     """Add weight · AᵀA x to the rows of `out`, both of shape `(k, P)`."""
-    back = laplacian.adjoint @ (laplacian.matrix @ turned(rows, weight))
-    turned_back(back, out)
+    back = laplacian.adjoint @ (laplacian.matrix @ transposed(rows, weight))
+    add_transposed(back, out)
 
 
 def frames_together(num_frames: int) -> int:
-    """Return how many frames to take together: a quarter of them at most, so that threads can share them."""
+    """Return the number of frames to multiply together: at most a quarter of all, to leave work for other threads."""
     return min(TOGETHER, -(-num_frames // 4))
 
 
-def turned(rows: Array, weight: float = 1.0) -> Array:
-    """Return weight times the transpose of rows `(k, P)`, laid out anew."""
+def transposed(rows: Array, weight: float = 1.0) -> Array:
+    """Return weight times the transpose of rows `(k, P)`, contiguous."""
     result = np.zeros(rows.shape[::-1], dtype=rows.dtype)
     for low in range(0, len(result), TILE):
         np.multiply(rows[:, low : low + TILE].T, rows.dtype.type(weight), out=result[low : low + TILE])
     return result
 
 
-def turned_back(columns: Array, out: Array) -> None:
+def add_transposed(columns: Array, out: Array) -> None:
     """Add the transpose of columns `(P, k)` to `out`."""
     for low in range(0, len(columns), TILE):
         out[:, low : low + TILE] += columns[low : low + TILE].T

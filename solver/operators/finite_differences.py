@@ -1,4 +1,4 @@
-"""Smoothness in time: the difference operator H of eq. 3 and the bands of HᵀH."""
+"""Temporal smoothness: the difference operator H and the bands of HᵀH."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ def difference_bands(num_frames: int, order: int) -> Floats:
     """Return the upper bands of HᵀH, shape `(order + 1, F)`: `bands[k, f]` couples frames f and f + k (0 beyond the end).
 
     H takes differences over frames: first order x[f+1] − x[f] (Dai, Deng, He 2017, eq. 3), second order
-    x[f+2] − 2x[f+1] + x[f]. A clip shorter than the stencil takes the longest difference it can hold.
+    x[f+2] − 2x[f+1] + x[f]. A sequence shorter than the stencil uses the highest order that fits.
     """
     order = min(order, num_frames - 1)
     stencil = np.array([(-1.0) ** (order - k) * math.comb(order, k) for k in range(order + 1)])

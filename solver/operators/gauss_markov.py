@@ -1,11 +1,11 @@
-"""The Gaussian prior over frames as a chain of neighbours minus a few modes: products linear in F.
+"""The inverse covariance of the Gaussian prior over frames, tridiagonal minus few modes: products linear in F.
 
 For each coordinate c the covariance over frames is C_c = B⁻¹ + U_c U_cᵀ: a random walk, whose inverse B is tridiagonal, and modes. By
 Woodbury's identity
 
     C_c⁻¹ = B − V_c V_cᵀ,    V_c = B U_c K⁻ᵀ,    K Kᵀ = I + U_cᵀ B U_c,
 
-two numbers a frame and as many columns as modes instead of F². Golub and Van Loan, Matrix Computations, 2.1.4.
+two numbers per frame and one column per mode instead of F² numbers. Golub and Van Loan, Matrix Computations, 2.1.4.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from scipy import linalg
 Array = NDArray[np.floating]
 
 POINT_BLOCK = 1024
-"""Points worked on at a time."""
+"""Points per unit of parallel work."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,14 +30,14 @@ class PathPrior:
     """Q_c = B − V_c V_cᵀ over frames."""
 
     bands: Floats
-    """Upper bands of B, shape `(2, F)`: the diagonal, then what couples frames f and f + 1 (0 at the end)."""
+    """Upper bands of B, shape `(2, F)`: the diagonal, then the coupling of frames f and f + 1 (0 at the end)."""
 
     modes: tuple[Array, Array, Array]
     """V_c of each coordinate, shape `(F, m_c)`."""
 
     @classmethod
     def of(cls, bands: Floats, roots: tuple[Floats, Floats, Floats]) -> PathPrior:
-        """Take B and the U_c of the covariances B⁻¹ + U_c U_cᵀ."""
+        """Build Q_c from B and the roots U_c of the covariances B⁻¹ + U_c U_cᵀ."""
         modes = []
         for root in roots:
             pushed = _chained(bands, root)
@@ -62,7 +62,7 @@ class PathPrior:
         return np.stack([chain - each.astype(np.float64) @ each.T.astype(np.float64) for each in self.modes])
 
     def subtract_modes(self, shapes: Array, result: Array) -> None:
-        """Subtract V_c V_cᵀ X_c from every coordinate c of the result; the chain itself is the operator's stencil."""
+        """Subtract V_c V_cᵀ X_c from each coordinate c of the result; B is applied by the operator's stencil."""
 
         def work(span: slice) -> None:
             for axis, modes in enumerate(self.modes):
@@ -71,7 +71,7 @@ class PathPrior:
         over_blocks(work, shapes.shape[2], rows=3 * len(shapes))
 
     def value(self, shapes: Array) -> float:
-        """Return Σ_c tr X_cᵀ Q_c X_c, in double precision: for smooth paths it is a small difference of large numbers."""
+        """Return Σ_c tr X_cᵀ Q_c X_c in double precision; for smooth paths it is a small difference of large numbers."""
         parts = np.zeros(-(-shapes.shape[2] // POINT_BLOCK))
         diagonal, beside = self.bands[0], self.bands[1, :-1]
         modes = [each.astype(np.float64) for each in self.modes]
@@ -90,13 +90,13 @@ class PathPrior:
         return float(parts.sum())
 
     def loosest(self, count: int) -> list[tuple[Floats, Floats]]:
-        """Return for each coordinate the directions over frames that Q_c holds least, `(F, k)`, and how much it holds them, `(k,)`.
+        """Return, for each coordinate, the directions of least precision under Q_c, `(F, k)`, and their precision, `(k,)`.
 
-        They are looked for in the span of U_c = B⁻¹ V_c K, where all that varies much more than the random walk lies (Rayleigh and Ritz).
+        Rayleigh–Ritz in the span of U_c = B⁻¹ V_c K, which contains all directions of much more variance than the random walk.
         """
         found = []
         banded = np.stack([self.bands[0], self.bands[1]])[::-1].copy()
-        banded[0] = np.roll(banded[0], 1)  # as SciPy has upper bands
+        banded[0] = np.roll(banded[0], 1)  # SciPy's layout of upper bands
         for each in self.modes:
             along = each.astype(np.float64)
             span, _ = np.linalg.qr(linalg.solveh_banded(banded, along))
@@ -107,7 +107,7 @@ class PathPrior:
 
 
 def over_blocks(work: Callable[[slice], None], points: int, *, rows: int) -> None:
-    """Call `work` on blocks of points, the same whatever the number of threads that share them."""
+    """Call `work` on blocks of points; the blocks do not depend on the number of threads."""
 
     def blocks(start: int, stop: int) -> None:
         for first in range(start * POINT_BLOCK, min(stop * POINT_BLOCK, points), POINT_BLOCK):

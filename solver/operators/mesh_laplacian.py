@@ -1,9 +1,9 @@
-"""Smoothness along the surface: the sparse Laplacian A of eq. 7, on a pixel grid or on any triangle or quad mesh.
+"""Spatial smoothness: the sparse Laplacian A of eq. 7 on a pixel grid or a triangle or quad mesh.
 
-Every kind is scaled to approximate 3 h² ∇² with h the distance between neighbours, which is what the paper's sum of four
-second differences on a grid amounts to; λ2 therefore means the same whatever the mesh. No row pulls the rim of an open
-surface inwards: on a grid only whole second differences are used, on a mesh the rows of rim vertices are left out (a
-vertex that no other row would touch keeps its plain row, so that it still hangs on its neighbours).
+Every kind approximates 3 h² ∇² with h the distance between neighbours, as the paper's sum of four second differences on a
+grid does, so λ2 has the same meaning on all meshes. No row contracts the boundary of an open surface: a grid uses only
+complete second differences, a mesh omits the rows of boundary vertices. A boundary vertex that appears in no other row
+keeps its first-difference row and so stays connected.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from scipy import sparse
 
 Matrix = sparse.csr_array[Any]
 STRENGTH = 12.0
-"""Mean of the neighbours minus the vertex is h²∇²/4 for neighbours in all directions; times 12 it is 3 h²∇²."""
+"""Factor from the mean of the neighbours minus the vertex, h²∇²/4 for neighbours in all directions, to 3 h²∇²."""
 
 DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
 """The paper's four second-difference filters: along a row, along a column, along both diagonals."""
@@ -31,19 +31,19 @@ class Laplacian:
     """The spatial smoothness operator of one frame and coordinate."""
 
     matrix: Matrix
-    """A, sparse, shape `(P, P)`; rows that would pull the rim inwards are empty."""
+    """A, sparse, shape `(P, P)`; rows of boundary vertices are empty."""
 
     name: str
     """`grid8`, `uniform` or `cotangent`."""
 
     adjoint: Matrix
-    """Aᵀ, with rows as quick to walk as those of A."""
+    """Aᵀ in compressed row form."""
 
     grid: Ints | None = None
-    """Point index of each grid cell, −1 for holes, when the points lie on a grid: the preconditioner's short cut."""
+    """Point index of each grid cell, −1 for holes; None without a grid. Used by the cosine preconditioner."""
 
     levels: tuple[Level, ...] = ()
-    """Coarser surfaces, finest first, for the preconditioner."""
+    """Coarser levels, finest first, for the preconditioner."""
 
     def rounded(self, kind: np.dtype[np.floating]) -> Laplacian:
         """Return the same in another precision."""
@@ -58,7 +58,7 @@ class Laplacian:
 
 
 def build_laplacian(mesh: Mesh | None, kind: str, reference: Floats | None = None) -> Laplacian | None:
-    """Return the Laplacian that the settings name, or None if no point has a neighbour.
+    """Return the Laplacian of the given kind, or None if no point has a neighbour.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def build_laplacian(mesh: Mesh | None, kind: str, reference: Floats | None = Non
     kind : {"auto", "grid8", "uniform", "cotangent"}
         `auto` is `grid8` on a grid, else `uniform`.
     reference : array, shape (P, 3), optional
-        A typical shape, any unit; needed for `cotangent` alone.
+        A typical shape, any unit; required for `cotangent` only.
 
     Raises
     ------
@@ -92,7 +92,7 @@ def build_laplacian(mesh: Mesh | None, kind: str, reference: Floats | None = Non
 
 
 def _grid_matrix(grid: Ints, num_points: int) -> Matrix:
-    """Sum of the whole second differences through each cell; plain differences for a cell that none touches."""
+    """Return the sum of the complete second differences through each cell; first differences where there are none."""
     rows, columns, values = [], [], []
     edges = []
     for down, right in DIRECTIONS:
@@ -106,28 +106,28 @@ def _grid_matrix(grid: Ints, num_points: int) -> Matrix:
         edges.append(np.stack([middle[pair], after[pair]], axis=1))
     matrix = _assemble(np.concatenate(rows), np.concatenate(columns), np.concatenate(values), num_points)
     pairs = np.concatenate(edges)
-    return _with_untouched_hung_on(matrix, pairs, np.ones(len(pairs)))
+    return _with_all_connected(matrix, pairs, np.ones(len(pairs)))
 
 
 def _shifted(grid: Ints, down: int, right: int) -> Ints:
-    """Return for every cell the index that stands `down` rows and `right` columns further, −1 outside."""
+    """Return, for each cell, the point index `down` rows below and `right` columns to the right; −1 outside."""
     padded = np.pad(grid, 1, constant_values=-1)
     height, width = grid.shape
     return padded[1 + down : 1 + down + height, 1 + right : 1 + right + width]
 
 
 def _mesh_matrix(mesh: Mesh, weights: Floats) -> Matrix:
-    """Weighted mean of the neighbours minus the vertex, times `STRENGTH`, for vertices off the rim."""
+    """Return `STRENGTH` times the weighted mean of the neighbours minus the vertex, for interior vertices."""
     edges = mesh.edges
-    plain = _plain_rows(edges, weights, mesh.num_points)
+    plain = _first_difference_rows(edges, weights, mesh.num_points)
     keep = np.ones(mesh.num_points)
-    keep[_rim(mesh)] = 0.0
+    keep[_boundary(mesh)] = 0.0
     matrix = sparse.csr_array(sparse.diags_array(keep) @ plain)
     matrix.eliminate_zeros()
-    return _with_untouched_hung_on(matrix, edges, weights)
+    return _with_all_connected(matrix, edges, weights)
 
 
-def _plain_rows(edges: Ints, weights: Floats, num_points: int) -> Matrix:
+def _first_difference_rows(edges: Ints, weights: Floats, num_points: int) -> Matrix:
     one, two = edges[:, 0], edges[:, 1]
     total = np.bincount(one, weights, num_points) + np.bincount(two, weights, num_points)
     share = np.divide(STRENGTH, total, out=np.zeros(num_points), where=total > 0)
@@ -138,20 +138,20 @@ def _plain_rows(edges: Ints, weights: Floats, num_points: int) -> Matrix:
     return _assemble(rows, columns, values, num_points)
 
 
-def _with_untouched_hung_on(matrix: Matrix, edges: Ints, weights: Floats) -> Matrix:
-    """Give points that no row touches, but that have neighbours, their plain row."""
+def _with_all_connected(matrix: Matrix, edges: Ints, weights: Floats) -> Matrix:
+    """Return the matrix with first-difference rows for connected points that appear in no other row."""
     num_points = matrix.shape[1]
     touched = np.bincount(matrix.indices, minlength=num_points) > 0
     if touched.all() or len(edges) == 0:
         return matrix
     pick = sparse.diags_array(np.where(touched, 0.0, 1.0))
-    result = sparse.csr_array(matrix + pick @ _plain_rows(edges, weights, num_points))
+    result = sparse.csr_array(matrix + pick @ _first_difference_rows(edges, weights, num_points))
     result.eliminate_zeros()
     return result
 
 
-def _rim(mesh: Mesh) -> NDArray[np.intp]:
-    """Vertices of edges that belong to one face only."""
+def _boundary(mesh: Mesh) -> NDArray[np.intp]:
+    """Return the boundary vertices: those of edges that belong to one face only."""
     following = np.roll(mesh.faces, -1, axis=1)
     low, high = np.minimum(mesh.faces, following), np.maximum(mesh.faces, following)
     keys, count = np.unique(low.astype(np.int64) * mesh.num_points + high, return_counts=True)
@@ -160,9 +160,9 @@ def _rim(mesh: Mesh) -> NDArray[np.intp]:
 
 
 def _cotangent_weights(mesh: Mesh, reference: Floats) -> Floats:
-    """(cot α + cot β)/2 of each edge of `mesh.edges` on the reference shape, at least 1 % of the typical weight.
+    """Return (cot α + cot β)/2 of each edge of `mesh.edges` on the reference shape, at least 1 % of the typical weight.
 
-    Quads are cut along both diagonals with half weight each; the diagonals themselves get no weight.
+    Quads are split along both diagonals with half weight each; the diagonals themselves get no weight.
     """
     faces = mesh.faces
     triangles = faces if faces.shape[1] == 3 else np.concatenate([np.roll(faces, -turn, 1)[:, :3] for turn in range(4)])
@@ -178,13 +178,13 @@ def _cotangent_weights(mesh: Mesh, reference: Floats) -> Floats:
         place[place == len(keys)] = 0
         known = keys[place] == edge
         np.add.at(total, place[known], cotangent[known] / 2)
-    # Negative or vanishing weights (obtuse, flat or collapsed triangles) would turn smoothing into its opposite.
+    # Obtuse or degenerate triangles have negative or vanishing weights, which would amplify roughness.
     typical = float(np.median(np.abs(total))) or 1.0
     return np.clip(np.nan_to_num(total, nan=typical), 0.01 * typical, 100 * typical)
 
 
 def _assemble(rows: NDArray[Any], columns: NDArray[Any], values: Floats, num_points: int) -> Matrix:
-    places = rows.astype(np.int32), columns.astype(np.int32)  # half the memory to fetch in every product
+    places = rows.astype(np.int32), columns.astype(np.int32)  # 32-bit indices halve the memory traffic of each product
     matrix = sparse.csr_array(sparse.coo_array((values, places), shape=(num_points, num_points)))
     matrix.sum_duplicates()
     return matrix

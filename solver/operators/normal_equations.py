@@ -1,12 +1,12 @@
-"""The normal equations of one reweighting, applied without ever being formed.
+"""The normal equations of one reweighting, as a matrix-free operator.
 
 For shapes X of layout `(F, 3, P)` the operator is
 
     𝒜 X = s² Rᵀ(ω ∘ (R X))  +  λ1 (HᵀH) X  +  λ2 X (AᵀA)  +  Q X
 
-frame by frame: a 2×3 projection, a stencil over frames, a sparse product along the surface, and the F×F matrix Q of the
-low-rank prior, kept as a multiple of the identity minus a few modes. With the Gaussian prior stencil and modes are its own.
-The weights stand in 𝒜 and in the right-hand side alike (the paper's printed eq. 9 has them in the first only).
+with a 2×3 projection per frame, a stencil over frames, a sparse product over points, and the F×F matrix Q of the
+low-rank prior, stored as a multiple of the identity minus a few modes. The Gaussian prior supplies its own stencil and
+modes. The weights ω occur in 𝒜 and in the right-hand side (the paper's printed eq. 9 has them in 𝒜 only).
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ class RankTerm:
     """Q = level · I − U diag(drop) Uᵀ over frames: the quadratic that majorises the low-rank prior."""
 
     level: float
-    """Weight of everything outside the kept modes, λ included."""
+    """Weight of all directions outside the kept modes, λ included."""
 
     modes: Floats
     """U, orthonormal columns, shape `(F, k)`."""
 
     drop: Floats
-    """How much less than `level` each mode is penalised, shape `(k,)`, in [0, level)."""
+    """Reduction of the penalty of each mode below `level`, shape `(k,)`, in [0, level)."""
 
     def matrix(self) -> Floats:
         """Return Q, dense `(F, F)`."""
@@ -44,7 +44,7 @@ class RankTerm:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Operator:
-    """Everything that 𝒜 is made of; `weights` and `rank` change with every reweighting."""
+    """The parts of 𝒜; `weights` and `rank` change with every reweighting."""
 
     projections: Array
     """s_f times the first two rows of R_f, shape `(F, 2, 3)`."""
@@ -62,11 +62,11 @@ class Operator:
     rank: RankTerm | None = None
 
     quadratic: PathPrior | None = None
-    """The Gaussian prior over frames of each coordinate; it has a stencil of its own."""
+    """The Gaussian prior over frames of each coordinate, which brings its own stencil."""
 
     @property
     def stencil(self) -> Floats:
-        """Upper bands over frames of whichever prior there is, shape `(order + 1, F)`."""
+        """Upper bands over frames of the prior in use, shape `(order + 1, F)`."""
         return self.bands if self.quadratic is None else self.quadratic.bands
 
     def apply(self, shapes: Array, /, out: Array | None = None) -> Array:
@@ -74,7 +74,7 @@ class Operator:
         return self._apply(shapes, None, np.empty_like(shapes) if out is None else out)
 
     def gradient(self, shapes: Array, target: Array) -> Array:
-        """Return 𝒜 X − b for centred tracks W of shape `(F, 2, P)`: half the gradient of the energy that this majorises."""
+        """Return 𝒜 X − b for centred tracks W of shape `(F, 2, P)`: half the gradient of the majorised energy."""
         return self._apply(shapes, target, np.empty_like(shapes))
 
     def _apply(self, shapes: Array, target: Array | None, result: Array) -> Array:
@@ -145,5 +145,5 @@ class Operator:
 
 
 def rows_of(shapes: Array) -> Array:
-    """Return every frame and coordinate as a row, shape `(3F, P)`, without copying."""
+    """Return frames and coordinates as rows, shape `(3F, P)`, without copying."""
     return shapes.reshape(-1, shapes.shape[2])

@@ -1,4 +1,4 @@
-"""Shapes without iterations: the pseudo-inverse, and the smooth shapes for uniform weights."""
+"""Initial shapes: the pseudo-inverse, and least squares with uniform weights."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from pliant.solver.records import Floats
 from pliant.solver.shapes.irls import inner_precision
 
 EXACT, ROUGH, MOST = 1e-4, 0.1, 200
-"""Reduction of the residual where least squares are the answer, where they are but a start, and iterations at most."""
+"""Reduction of the residual for a final least-squares result, for a starting point, and maximum number of iterations."""
 
-DOUBT = 0.1
-"""Standard deviation of an image coordinate, normalized units, that the start assumes with a Gaussian prior."""
+START_NOISE_STD = 0.1
+"""Noise standard deviation, normalized units, assumed for the starting point with a Gaussian prior."""
 
 
 def pseudo_inverse(problem: Problem, translations: Floats) -> Array:
-    """Return R†(W − t), frame by frame: flat shapes, each in its own image plane; hidden points at the centre.
+    """Return R†(W − t) per frame: flat shapes in the image plane of their frame, hidden points at the centre.
 
-    Dai, Deng, He (2017), Fig. 1, first column: the shapes of least norm that explain the tracks.
+    These are the shapes of least norm that explain the tracks (Dai, Deng, He 2017, Fig. 1, first column).
     """
     target = (problem.points - translations[:, :, None]) * (problem.confidence > 0)[:, None]
     inverse = np.linalg.pinv(problem.projections.astype(np.float64))
@@ -29,15 +29,15 @@ def pseudo_inverse(problem: Problem, translations: Floats) -> Array:
 
 
 def uniform_solution(problem: Problem, translations: Floats) -> Array:
-    """Return the least-squares shapes if every observation weighed the same (eq. 5 when λ2 is 0).
+    """Return the least-squares shapes with equal weights for all observations (eq. 5 if λ2 is 0).
 
-    min_S ‖W − R S‖² + λ1 ‖H S‖² + λ2 ‖A S‖²: the answer for least squares, and roughly a start for robust losses. With a
-    Gaussian prior the tracks are doubted first: shapes that followed an outlier would give it full weight, and the reweighting would
-    take long to leave it.
+    Minimises ‖W − R S‖² + λ1 ‖H S‖² + λ2 ‖A S‖²: the result for least squares, and a starting point for robust losses.
+    With a Gaussian prior the starting point assumes large noise (`START_NOISE_STD`), because shapes that follow an
+    outlier would give it full weight and the reweighting would be slow to reject it.
     """
     weights = np.array(np.broadcast_to(problem.confidence[:, None, :], problem.points.shape))
     if problem.quadratic is not None and problem.weights.temporal > 0:
-        weights *= weights.dtype.type(problem.weights.temporal / DOUBT**2)
+        weights *= weights.dtype.type(problem.weights.temporal / START_NOISE_STD**2)
     operator = Operator(
         problem.projections, weights, problem.bands, problem.laplacian, problem.weights.spatial, None, problem.quadratic
     )

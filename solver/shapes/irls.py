@@ -1,7 +1,7 @@
-"""The minimisation, as four pure functions on a State: init → step → terminate → finish.
+"""Iteratively reweighted least squares, as pure functions on a State: init → step → terminate.
 
-Majorise–minimise: the loss and the rank prior are replaced by the quadratics that touch them from above, and conjugate
-gradients, warm-started, lower the sum for a few iterations. Whatever they reach, the energy itself cannot have risen.
+Majorise–minimise: the loss and the rank prior are replaced by quadratics that majorise them, and a few warm-started
+conjugate gradient iterations decrease the sum. The energy cannot increase, however few iterations are run.
 """
 
 from __future__ import annotations
@@ -23,18 +23,19 @@ from pliant.solver.shapes.state import State
 from pliant.solver.threads import SMALLEST, over_ranges
 
 INNER_REDUCTION = 0.2
-"""Inner solves reduce the residual by this factor: more is wasted on weights that are about to change. Measured, 99 × 29,000 with
-outliers, CPU seconds to within 1 % and to the end: 0.1 8.0, 10.3; 0.2 6.4, 9.0; 0.3 7.2, 10.2; 0.5 9.9, 12.4."""
+"""Factor by which an inner solve reduces the residual; the weights change next, so more is wasted. CPU seconds to within
+1 % of the final energy and to the end, 99 × 29,000 with outliers: 0.1: 8.0, 10.3; 0.2: 6.4, 9.0; 0.3: 7.2, 10.2; 0.5:
+9.9, 12.4."""
 MAX_INNER = 60
-"""Upper bound on conjugate-gradient iterations in one reweighting."""
+"""Maximum number of conjugate gradient iterations per reweighting."""
 SINGLE_REDUCTION = 1e-3
-"""Smallest reduction that is left to single precision."""
+"""Smallest reduction of the residual for which single precision is used."""
 SINGLE_SPAN = 1e5
-"""So many times the stiffness of a path at most may an observation weigh in single precision."""
+"""Maximum ratio of an observation's weight to the stiffness of a path for which single precision is used."""
 
 
 def init(problem: Problem, shapes: Array, translations: Floats) -> State:
-    """Evaluate the start."""
+    """Return the state at the starting shapes."""
     return _evaluated(problem, shapes.copy(), translations, None, reweighting=0, iterations=0)
 
 
@@ -46,10 +47,10 @@ def step(
     max_inner: int = MAX_INNER,
     should_stop: Callable[[], bool] | None = None,
 ) -> State:
-    """Lower the energy once: shapes for the weights of `state`, then translations, then new weights.
+    """Do one reweighting: shapes for the weights of `state`, then translations, then new weights.
 
-    What conjugate gradients solve for is the correction to the shapes: small, and wanted to a digit or two, for which single
-    precision does. The gradient that it has to undo, the sum, and the energy keep the problem's precision.
+    Conjugate gradients solve for the correction to the shapes, which needs one or two digits only, so single precision
+    is enough where `inner_precision` allows it. Gradient, sum and energy keep the problem's precision.
     """
     operator = operator_at(problem, state)
     target = problem.points - state.translations[:, :, None].astype(problem.points.dtype)
@@ -71,10 +72,10 @@ def step(
 
 
 def inner_precision(operator: Operator, reduction: float) -> np.dtype[np.floating]:
-    """Return single precision where it reaches the reduction and the equations do not span too many magnitudes for it.
+    """Return single precision if it attains the reduction and the equations are well enough conditioned, else double.
 
-    The Gaussian prior spans ten: its chain is as stiff as the random walk is short, and its modes are the small rest that is left when
-    they are subtracted from it.
+    The Gaussian prior spans ten orders of magnitude: its tridiagonal part is very stiff, and the precision of its modes
+    is a small difference from it.
     """
     if operator.quadratic is not None:
         return operator.weights.dtype
@@ -99,9 +100,10 @@ def operator_at(problem: Problem, state: State) -> Operator:
 
 
 def terminate(before: State, after: State, *, tolerance: float, max_reweightings: int) -> Outcome | None:
-    """Return how the solve ended, or None to go on; `after` is the step as computed, before `no_higher`.
+    """Return the outcome of the solve, or None to continue; `after` is the step before `no_higher`.
 
-    Converged when the objective's relative change over one reweighting is below `tolerance`, rejected when it rises by more.
+    Converged if the relative change of the objective over one reweighting is below `tolerance`, rejected if it rises by
+    more.
     """
     if after.objective - before.objective > tolerance * abs(before.objective):
         return Outcome.REJECTED
@@ -113,7 +115,7 @@ def terminate(before: State, after: State, *, tolerance: float, max_reweightings
 
 
 def no_higher(before: State, after: State) -> State:
-    """Return `after`, unless rounding at the very end let its energy rise: then the shapes of `before` stand."""
+    """Return `after`, or the shapes of `before` if rounding near convergence raised the energy."""
     if after.objective <= before.objective:
         return after
     return replace(before, reweighting=after.reweighting, iterations=after.iterations)
@@ -122,10 +124,10 @@ def no_higher(before: State, after: State) -> State:
 def _evaluated(
     problem: Problem, shapes: Array, translations: Floats, omega: Array | None, *, reweighting: int, iterations: int
 ) -> State:
-    """Move every frame's shape to its centroid, in place, and return the state there.
+    """Centre every frame's shape, in place, and return the state there.
 
-    The translation takes up what the camera sees of the move: the data term does not notice, AX neither (rows of A sum to 0), and
-    ‖HX‖ and the rank penalty cannot grow by it. With weights ω given, translations first follow the residuals.
+    The translation compensates the shift: the data term and AX are unchanged (rows of A sum to 0), and ‖HX‖ and the rank
+    penalty cannot increase. With weights ω, the translations are first fitted to the residuals.
     """
     frames, kind = len(shapes), shapes.dtype.type
     translations, losses = translations.copy(), np.full(frames, np.inf)
@@ -168,7 +170,7 @@ def _evaluated(
 
 
 def _mean(left: Array, weights: Array) -> Floats:
-    """Return the weighted mean residual of a frame, shape `(2,)`; 0 where nothing is seen."""
+    """Return the weighted mean residual of a frame, shape `(2,)`; 0 where nothing is visible."""
     total = weights.sum(axis=1, dtype=np.float64)
     shift = np.einsum("cp,cp->c", weights, left, dtype=np.float64)
     return np.asarray(np.divide(shift, total, out=np.zeros_like(shift), where=total > 0))

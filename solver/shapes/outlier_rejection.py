@@ -18,19 +18,19 @@ from pliant.solver.shapes.irls import init, no_higher, step
 from pliant.solver.shapes.state import State
 
 STIFFNESS_PER_OUTLIER_SHARE = 0.5
-"""λ1 of the stiff fit over the share of outliers: with 10 % outliers on faces and animals, λ1 from .01 to .1 gives
-about the same error, least at .05."""
+"""λ1 of the stiff fit divided by the share of outliers. With 10 % outliers on faces and animals, λ1 from .01 to .1 gives
+about the same error, lowest at .05."""
 
 MAX_STIFF_REWEIGHTINGS = 12
 """Maximum number of reweightings of the stiff fit."""
 
-ENERGY_TOLERANCE = 1e-3
+STIFF_FIT_TOLERANCE = 1e-3
 """Relative decrease of the energy below which the stiff fit ends."""
 
 MIN_OUTLIER_DISTANCE = 0.05
 """Residual, normalized units, below which an observation is never rejected."""
 
-OUTLIER_SIGMAS = 8.0
+MIN_REJECTED_STDS = 8.0
 """Residual, in robust standard deviations, below which an observation is never rejected."""
 
 
@@ -66,14 +66,14 @@ def reject_outliers(
         if should_stop is not None and should_stop():
             return problem, state
         after = no_higher(before, step(stiff, before, should_stop=should_stop))
-        settled = before.objective - after.objective <= ENERGY_TOLERANCE * before.objective
+        settled = before.objective - after.objective <= STIFF_FIT_TOLERANCE * before.objective
         before = after
         if settled:
             break
     left = residuals(problem, before.shapes, before.translations)
     length = np.hypot(left[:, 0], left[:, 1])
     typical = float(np.median(length[problem.confidence > 0])) / 1.1774
-    kept = np.where(length <= max(MIN_OUTLIER_DISTANCE, OUTLIER_SIGMAS * typical), problem.confidence, 0).astype(
+    kept = np.where(length <= max(MIN_OUTLIER_DISTANCE, MIN_REJECTED_STDS * typical), problem.confidence, 0).astype(
         problem.confidence.dtype
     )
     rejected_problem = replace(problem, confidence=kept)

@@ -1,4 +1,4 @@
-"""From normalized tracks, cameras, mesh and settings to the one energy that is minimised."""
+"""Build the energy from normalized tracks, cameras, mesh and settings."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ def build_problem(
     settings: Settings,
     covariance: ShapeCovariance | None = None,
 ) -> tuple[Problem, Choices]:
-    """Choose what the settings leave open, and put the energy together; a covariance makes the prior Gaussian."""
-    # The Gaussian prior is a small difference of large numbers: single precision loses it where a fit is stiff.
+    """Return the energy and the choices for settings that are automatic; a covariance makes the prior Gaussian."""
+    # The Gaussian prior is a small difference of large numbers, which single precision cannot represent in stiff fits.
     kind = np.dtype(settings.precision if covariance is None else "float64")
     laplacian = _laplacian(normalized, mesh, settings)
     weights, noise, reasons = choose_weights(normalized, covariance, laplacian, settings)
@@ -67,7 +67,7 @@ def build_problem(
 def with_bending(
     problem: Problem, choices: Choices, state: State, settings: Settings
 ) -> tuple[Problem, Choices, State]:
-    """Return the same with λ2 from the shapes so far, if the prior is Gaussian and nobody set it."""
+    """Return problem and choices with λ2 from the current shapes, if the prior is Gaussian and λ2 is automatic."""
     if problem.quadratic is None or problem.laplacian is None or settings.spatial_weight is not None:
         return problem, choices, state
     modes = problem.quadratic.modes[0].shape[1]
@@ -85,7 +85,7 @@ def _laplacian(normalized: Normalized, mesh: Mesh | None, settings: Settings) ->
 
 
 def _reference(normalized: Normalized) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-    """Return each point's mean image position with depth 0, shape `(P, 3)`: geometry enough for cotangents."""
+    """Return each point's mean image position with depth 0, shape `(P, 3)`, as the reference for cotangent weights."""
     total = np.maximum(normalized.visible.sum(axis=0), np.finfo(float).tiny)
     mean = np.einsum("fp,fpc->pc", normalized.visible, normalized.points) / total[:, None]
     return np.concatenate([mean, np.zeros((len(mean), 1))], axis=1)

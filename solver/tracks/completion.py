@@ -1,10 +1,10 @@
-"""Complete, clean tracks out of hidden and wrong ones: a robust low-rank factor with missing entries.
+"""Robust low-rank completion: fill hidden entries of the tracks and replace gross outliers.
 
-The cameras are computed from the Gram matrix W Wᵀ, which one gross outlier spoils and which hidden entries leave undefined.
-Tracks of a moving thing are nearly of low rank, so W ≈ M B + t 1ᵀ is fitted to the entries that were seen, by alternating
-least squares whose weights fall with the residual and whose coefficients B have a Gaussian prior, its covariance fitted too.
-The basis M (2F×r) and the translations t come from a sample of points:
-the cost does not depend on P; one pass then carries every point onto the basis.
+Cameras are computed from the Gram matrix W Wᵀ, which hidden entries leave undefined and a single gross outlier can
+dominate. Tracks of a moving object have approximately low rank, so W ≈ M B + t 1ᵀ is fitted to the visible entries by
+alternating robust least squares, with a Gaussian prior on the coefficients B whose covariance is estimated as well.
+The basis M (2F×r) and the translations t are fitted to a sample of points, so the cost of the fit does not depend on
+P; all points are then projected onto the basis in one pass.
 """
 
 from __future__ import annotations
@@ -18,45 +18,46 @@ from pliant.solver.errors import InvalidInput
 from pliant.solver.records import MIN_POINTS, Floats
 from pliant.solver.tracks.normalization import Normalized
 
-SAMPLE = 600
-"""Points that the basis is fitted to."""
+MAX_SAMPLE_POINTS = 600
+"""Maximum number of points to which the basis is fitted."""
 
 RANKS = (4, 7, 10, 16, 25, 40)
-"""Columns tried, translation included; each rank starts from the one before. Measured without the last: a dancer half of whom is hidden
-.134 instead of .123; 60 gains no more."""
+"""Numbers of basis columns that are compared, translation included; each fit starts from the previous one. On a dancer
+with half of the points hidden, the error is .123 with 40 and .134 without; 60 gives no further gain."""
 
-SWEEPS = 8
-"""Alternations at each rank."""
+ALTERNATIONS = 8
+"""Alternations per rank."""
 
 HELD_OUT_SHARE = 0.05
-"""Share of the seen entries of the sample that is hidden to choose the rank by predicting it."""
+"""Share of the visible entries of the sample that is held out to select the rank."""
 
 MIN_OUTLIER_RESIDUAL = 0.15
-"""Normalized units below which a residual is never called an outlier, however well the others fit."""
+"""Residual, normalized units, below which an entry is never replaced as an outlier."""
 
-OUTLIER_SIGMAS = 6.0
-"""Residuals beyond this many robust standard deviations are outliers."""
+MIN_REPLACED_STDS = 6.0
+"""Residual, in robust standard deviations, below which an entry is never replaced as an outlier."""
 
-CHUNK = 4096
-"""Points carried onto the basis at once; bounds the memory at CHUNK·(6F + r²) numbers."""
+POINTS_PER_CHUNK = 4096
+"""Points projected onto the basis at once; bounds the memory at POINTS_PER_CHUNK·(6F + r²) numbers."""
 
 MIN_RESIDUAL_SCALE = 0.01
-"""Normalized units: smallest residual scale of the weights, so that clean tracks are fitted by plain least squares, and of the
-prior on coefficients: measured on turning bodies, of which no point is always seen, a finer one extrapolates, a coarser one blurs."""
+"""Floor of the residual scale, normalized units, in the robust weights (clean tracks get plain least squares) and in the
+prior on the coefficients. On rotating bodies, where no point is always visible, a lower floor extrapolates and a higher
+one blurs."""
 
 DAMPING = 1e-2
-"""The same, before the spread of the coefficients is known."""
+"""Ridge on the normal equations relative to their mean diagonal, before the covariance of the coefficients is known."""
 
-RIDGE = 1e-6
-"""Regularises coefficients of points that were seen too seldom."""
+COEFFICIENT_RIDGE = 1e-6
+"""Ridge relative to the mean diagonal; keeps the coefficients of sparsely observed points determined."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Filling:
-    """The low-rank factor that fills holes."""
+    """The low-rank factor from which hidden entries are predicted."""
 
     basis: Floats
-    """Shape `(F, 2, r)`, last column the translation."""
+    """Shape `(F, 2, r)`; the last column is the translation."""
 
     spread: Floats
     """Covariance of the coefficients, shape `(r − 1, r − 1)`."""
@@ -67,25 +68,25 @@ class Filling:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Completed:
-    """Tracks with every entry filled, centred per frame."""
+    """Completed tracks, centred per frame."""
 
     gram: Floats
     """W Wᵀ / P over all points, shape `(2F, 2F)`."""
 
     sample: Floats
-    """Some of the points, shape `(F, S, 2)`, normalized units."""
+    """Sampled points, shape `(F, S, 2)`, normalized units."""
 
     translations: Floats
-    """Mean of the completed points of each frame, shape `(F, 2)`: what the centroid of the visible ones missed."""
+    """Centroid of the completed points minus centroid of the visible points, per frame, shape `(F, 2)`."""
 
     rank: int
-    """Columns of the basis that filled the holes, translation included; 0 when nothing was filled."""
+    """Columns of the basis, translation included; 0 if nothing was filled."""
 
     outliers: float
-    """Share of the seen entries of the sample that was replaced."""
+    """Share of the visible entries of the sample that was replaced as outliers."""
 
     filling: Filling | None = None
-    """How hidden entries and outliers were replaced; None: nothing was."""
+    """The factor that replaced hidden entries and outliers; None if none were replaced."""
 
 
 def complete(normalized: Normalized, *, seed: int = 0, rank: int = 0) -> Completed:
@@ -96,14 +97,14 @@ def complete(normalized: Normalized, *, seed: int = 0, rank: int = 0) -> Complet
     normalized : Normalized
         Points (F, P, 2) in normalized units with their visibility.
     seed : int
-        Of the sample of points and of the held-out entries.
+        Seed of the sample of points and of the held-out entries.
     rank : int
-        Columns of the basis as an earlier completion of these tracks chose them; 0 chooses them.
+        Number of basis columns, from an earlier completion of these tracks; 0 selects it.
 
     Raises
     ------
     InvalidInput
-        Hardly any point is seen in two frames.
+        Fewer than `MIN_POINTS` points are visible in two or more frames.
     """
     most = float(normalized.visible.max())
     if 0 < most < 1:  # only the ratios of confidences count
@@ -113,7 +114,7 @@ def complete(normalized: Normalized, *, seed: int = 0, rank: int = 0) -> Complet
     again = seen_again(normalized.visible)
     if again < MIN_POINTS:
         raise InvalidInput(
-            "too_little_seen", field="visibility", expected=f"at least {MIN_POINTS} points that are seen in two frames or more",
+            "too_little_seen", field="visibility", expected=f"at least {MIN_POINTS} points that are visible in two or more frames",
             got=f"{again}", hint="Check that the visibility is not inverted, and that a point keeps its place from frame to frame.",
         )  # fmt: skip
     points, weight = normalized.points[:, chosen], normalized.visible[:, chosen]
@@ -126,28 +127,28 @@ def complete(normalized: Normalized, *, seed: int = 0, rank: int = 0) -> Complet
 
 
 def seen_again(visible: Floats) -> int:
-    """Return how many points are seen in two frames or more."""
+    """Return the number of points that are visible in two or more frames."""
     return int(((visible > 0).sum(axis=0) >= 2).sum())
 
 
 def choose_points(visible: Floats, random: np.random.Generator) -> NDArray[np.intp]:
-    """Return the sorted indices of at most `SAMPLE` points, preferring those seen more often than the median."""
+    """Return the sorted indices of at most `MAX_SAMPLE_POINTS` points, half of them visible more often than the median."""
     seen = (visible > 0).sum(axis=0)
     usable = np.flatnonzero(seen >= min(2, int(seen.max())))
-    if len(usable) <= SAMPLE:
+    if len(usable) <= MAX_SAMPLE_POINTS:
         return usable
     often = usable[seen[usable] >= np.median(seen[usable])]
-    half = random.choice(often, min(SAMPLE // 2, len(often)), replace=False)
-    rest = random.choice(np.setdiff1d(usable, half), SAMPLE - len(half), replace=False)
+    half = random.choice(often, min(MAX_SAMPLE_POINTS // 2, len(often)), replace=False)
+    rest = random.choice(np.setdiff1d(usable, half), MAX_SAMPLE_POINTS - len(half), replace=False)
     return np.sort(np.concatenate([half, rest]))
 
 
 def fit_basis(
     points: Floats, weight: Floats, random: np.random.Generator, given: int = 0
 ) -> tuple[Floats, Floats, float]:
-    """Return the basis (F, 2, r), last column the translation, the spread of its coefficients, and that of the residuals.
+    """Return the basis (F, 2, r) with the translation last, the covariance of its coefficients, and the residual scale.
 
-    The rank is the one that is given, or that predicts held-out entries best; a larger one must do so by more than 2 %.
+    Without a given rank, the one with the lowest held-out error is selected; a larger one must be better by 2 %.
     """
     frames, count = weight.shape
     held = (random.random(weight.shape) < HELD_OUT_SHARE) & (weight > 0)
@@ -159,7 +160,7 @@ def fit_basis(
         if rank > min(2 * frames, count) - 1 or rank * (2 * frames + count) > 0.7 * 2 * (kept > 0).sum():
             break
         basis = _widen(basis, points, kept, start, rank)
-        basis, coefficients, spread, scale = alternate(points, kept, basis, sweeps=SWEEPS)
+        basis, coefficients, spread, scale = alternate(points, kept, basis, sweeps=ALTERNATIONS)
         if not hidden and not gross(points, weight, predict(basis, coefficients), scale).any():
             return basis, spread, scale
         error = _typical(_lengths(points - predict(basis, coefficients)), held & (weight > 0))
@@ -171,14 +172,14 @@ def fit_basis(
             break
     if not np.isfinite(best_error):
         best = _widen(np.zeros((frames, 2, 0)), points, weight, start, min(3, min(2 * frames, count) - 1))
-    basis, _, spread, scale = alternate(points, weight, best, sweeps=2 * SWEEPS)
+    basis, _, spread, scale = alternate(points, weight, best, sweeps=2 * ALTERNATIONS)
     return basis, spread, scale
 
 
 def alternate(points: Floats, weight: Floats, basis: Floats, *, sweeps: int) -> tuple[Floats, Floats, Floats, float]:
-    """Return basis, coefficients (S, r−1), their spread and the residual scale after `sweeps` robust alternations.
+    """Return basis, coefficients (S, r−1), their covariance and the residual scale after `sweeps` robust alternations.
 
-    Weights are those of the Cauchy loss, whose scale follows three times the median residual.
+    Weights are those of the Cauchy loss with a scale of three times the median residual.
     """
     coefficients, spread = coefficients_of(points, weight, basis, None, 1.0, sweeps=3)
     scale = MIN_RESIDUAL_SCALE
@@ -199,11 +200,11 @@ def alternate(points: Floats, weight: Floats, basis: Floats, *, sweeps: int) -> 
 def coefficients_of(
     points: Floats, weight: Floats, basis: Floats, spread: Floats | None, scale: float, *, sweeps: int
 ) -> tuple[Floats, Floats]:
-    """Return each point's coefficients on the basis, shape (S, r−1), and their spread, shape (r−1, r−1).
+    """Return each point's coefficients on the basis, shape (S, r−1), and their covariance, shape (r−1, r−1).
 
-    Reweighted least squares with a Gaussian prior: a point that was seen in few frames shows few of its coefficients, and least
-    squares alone sends the others, and with them the hidden positions, anywhere. The spread is the points' second moment,
-    posterior variance included (one EM step); without one, a first spread comes from strongly damped least squares.
+    Reweighted least squares with a Gaussian prior. A point visible in few frames determines few of its coefficients;
+    without a prior the others, and with them the hidden positions, are unbounded. The covariance is the second moment
+    over the points, posterior variance included (one EM step); the first estimate comes from damped least squares.
     """
     columns, shift = basis[:, :, :-1], basis[:, :, -1]
     products = np.einsum("fci,fcj->fij", columns, columns).reshape(len(basis), -1)
@@ -231,10 +232,10 @@ def predict(basis: Floats, coefficients: Floats) -> Floats:
 
 
 def fill(points: Floats, weight: Floats, basis: Floats, spread: Floats, scale: float) -> tuple[Floats, float]:
-    """Return points with hidden entries predicted and outliers replaced, and the share of seen entries replaced.
+    """Return points with hidden entries predicted and outliers replaced, and the share of visible entries replaced.
 
-    An entry of confidence c in between is drawn to its prediction, c times itself and 1 − c times that: expectation maximisation's
-    completion of an observation whose noise variance is 1/c times as large.
+    An entry with confidence 0 < c < 1 becomes c times itself plus 1 − c times its prediction: the EM completion of an
+    observation whose noise variance is larger by 1/c.
     """
     coefficients, _ = coefficients_of(points, weight, basis, spread, scale, sweeps=4)
     predicted = predict(basis, coefficients)
@@ -245,15 +246,17 @@ def fill(points: Floats, weight: Floats, basis: Floats, spread: Floats, scale: f
 
 
 def gross(points: Floats, weight: Floats, predicted: Floats, scale: float) -> NDArray[np.bool_]:
-    """Return which seen entries lie too far from their prediction to be believed, shape `(F, S)`."""
-    return np.asarray((weight > 0) & (_lengths(points - predicted) > max(OUTLIER_SIGMAS * scale, MIN_OUTLIER_RESIDUAL)))
+    """Return which visible entries are gross outliers given their prediction, shape `(F, S)`."""
+    return np.asarray(
+        (weight > 0) & (_lengths(points - predicted) > max(MIN_REPLACED_STDS * scale, MIN_OUTLIER_RESIDUAL))
+    )
 
 
 def spans(normalized: Normalized, filling: Filling | None) -> Iterator[tuple[NDArray[np.intp], Floats]]:
-    """Yield the points that are seen at all, completed, a chunk at a time: their indices, and positions `(F, n, 2)`."""
+    """Yield the completed points in chunks, as indices and positions `(F, n, 2)`; points that are never visible are skipped."""
     count = normalized.visible.shape[1]
-    for start in range(0, count, CHUNK):
-        span = slice(start, min(start + CHUNK, count))
+    for start in range(0, count, POINTS_PER_CHUNK):
+        span = slice(start, min(start + POINTS_PER_CHUNK, count))
         points, weight = normalized.points[:, span], normalized.visible[:, span]
         shown = (weight > 0).any(axis=0)
         points, weight = points[:, shown], weight[:, shown]
@@ -263,7 +266,7 @@ def spans(normalized: Normalized, filling: Filling | None) -> Iterator[tuple[NDA
 
 
 def _carry(normalized: Normalized, filling: Filling | None, chosen: NDArray[np.intp]) -> tuple[Floats, Floats, Floats]:
-    """Return Gram matrix, translations and centred sample, filling all points chunk by chunk."""
+    """Return the Gram matrix, translations and centred sample of all points, completed chunk by chunk."""
     frames = len(normalized.points)
     gram, total = np.zeros((2 * frames, 2 * frames)), np.zeros((frames, 2))
     sample = np.zeros((frames, len(chosen), 2))
@@ -281,7 +284,7 @@ def _carry(normalized: Normalized, filling: Filling | None, chosen: NDArray[np.i
 
 
 def _interpolated(points: Floats, weight: Floats) -> Floats:
-    """Return points with hidden entries interpolated in time, and far ones pulled in: only a start."""
+    """Return the starting points: hidden entries interpolated in time, distant ones clipped."""
     filled = points.copy()
     frames = np.arange(len(points))
     for index in np.flatnonzero((weight == 0).any(axis=0)):
@@ -292,7 +295,7 @@ def _interpolated(points: Floats, weight: Floats) -> Floats:
 
 
 def _widen(basis: Floats, points: Floats, weight: Floats, start: Floats, rank: int) -> Floats:
-    """Return a basis of `rank` columns: the old ones, then the leading directions of what they leave."""
+    """Return a basis of `rank` columns: the given ones, then the leading directions of their residual."""
     frames = len(points)
     if basis.shape[2] == 0:
         left, shift = start, start.mean(axis=1)
@@ -310,7 +313,7 @@ def _widen(basis: Floats, points: Floats, weight: Floats, start: Floats, rank: i
 
 
 def _orthonormal(basis: Floats) -> tuple[Floats, Floats]:
-    """Return the basis with orthonormal columns, and the matrix that takes the old coefficients to the new."""
+    """Return the basis with orthonormal columns, and the matrix that maps old coefficients to new ones."""
     columns = basis[:, :, :-1]
     frames, _, rank = columns.shape
     unit, change = np.linalg.qr(columns.reshape(2 * frames, rank))
@@ -318,13 +321,13 @@ def _orthonormal(basis: Floats) -> tuple[Floats, Floats]:
 
 
 def _prior(spread: Floats, scale: float) -> Floats:
-    """Return σ² Σ⁻¹, Σ the spread; directions in which no point was seen to move stay nearly still."""
+    """Return σ² Σ⁻¹ for the covariance Σ; directions of vanishing variance get a large, finite precision."""
     size = len(spread)
     floor = 1e-8 * max(float(np.trace(spread)), 1e-12) / max(size, 1)
     return np.asarray(scale**2 * np.linalg.inv(spread + floor * np.eye(size)))
 
 
-def _ridge(normal: Floats, share: float = RIDGE) -> Floats:
+def _ridge(normal: Floats, share: float = COEFFICIENT_RIDGE) -> Floats:
     size = normal.shape[-1]
     mean = float(np.trace(normal.mean(axis=0))) / size
     return np.asarray(share * max(mean, 1e-12) * np.eye(size))

@@ -8,21 +8,21 @@ import numpy as np
 from pliant.solver.records import Floats
 
 MIN_EIGENVALUE_RATIO = 1e-9
-"""Ratio of the median to the largest eigenvalue above which there are more points than rows of W."""
+"""Minimum ratio of the median to the largest eigenvalue of the Gram matrix; below it P < 2F and the matrix is singular."""
 
 OUTLIER_SHARE = 0.005
 """Share of gross outliers in the completion of the tracks above which outliers are rejected."""
 
 
 def magnified(order: int) -> float:
-    """Return the factor by which differences of that order over frames amplify the standard deviation of white noise."""
+    """Return the factor by which differences of this order over frames amplify the standard deviation of white noise."""
     return float(np.sqrt(comb(2 * order, order)))
 
 
 def roughness(gram: Floats) -> float:
-    """Return the variance of white noise that would explain the median over frames of the mean squared third difference.
+    """Return the variance of white noise with the same median, over frames, of the mean squared third difference.
 
-    It is an upper estimate, since jerky motion counts as noise. Short sequences use lower differences.
+    This is an upper estimate, because jerky motion counts as noise. Short sequences use lower differences.
     """
     frames = len(gram) // 2
     order = min(3, frames - 1)
@@ -34,9 +34,9 @@ def roughness(gram: Floats) -> float:
 
 
 def typical_roughness(points: Floats) -> float:
-    """Return the standard deviation of white noise that would explain the median third difference of complete tracks `(F, P, 2)`.
+    """Return the standard deviation of white noise with the same median third difference as complete tracks `(F, P, 2)`.
 
-    Unlike `roughness` it is robust to a few wrong points.
+    Unlike `roughness`, it is robust to a few wrong points.
     """
     order = min(3, len(points) - 1)
     size = np.abs(np.diff(points, n=order, axis=0))
@@ -44,9 +44,9 @@ def typical_roughness(points: Floats) -> float:
 
 
 def white_noise(gram: Floats) -> float:
-    """Return σ² from the median eigenvalue of W Wᵀ / P `(2F, 2F)`, which noise raises and low-rank motion does not.
+    """Return σ², the median eigenvalue of W Wᵀ / P `(2F, 2F)`: low-rank motion leaves it at 0, noise raises it.
 
-    With too few points it is 0 for any noise; the roughness is returned instead.
+    With too few points the median is 0 whatever the noise; the roughness is returned instead.
     """
     values = np.linalg.eigvalsh(gram)
     median = float(values[len(values) // 2])

@@ -1,4 +1,4 @@
-"""Normalization: every frame's centroid removed, then divided by the RMS radius; all weights are dimensionless."""
+"""Normalization: subtract each frame's centroid and divide by the RMS radius, so that all weights are dimensionless."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ MAX_MEDIAN_RADII = 10.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Normalized:
-    """Tracks without position and unit: `tracks.points = unit · points + centroid` wherever visible."""
+    """Centred, dimensionless tracks: `tracks.points = unit · points + centroid` wherever visible."""
 
     points: Floats
     """Shape `(F, P, 2)`, RMS radius 1; 0 where hidden."""
@@ -24,7 +24,7 @@ class Normalized:
     """Confidence in [0, 1], shape `(F, P)`, as in the tracks."""
 
     centroid: Floats
-    """Mean of each frame's visible points, shape `(F, 2)`, the tracks' unit; interpolated in frames that show nothing."""
+    """Mean of each frame's visible points, shape `(F, 2)`, the tracks' unit; interpolated in frames without any."""
 
     unit: float
     """One normalized unit: RMS radius of the centred tracks, the tracks' unit."""
@@ -34,13 +34,13 @@ def normalize(tracks: Tracks) -> Normalized:
     """Remove the centroid of each frame and divide by the RMS radius of the centred points.
 
     Both are confidence-weighted means. Observations further than `MAX_MEDIAN_RADII` median radii from their frame's
-    median are excluded from the means, because a single one could shrink the object to a dot; they stay in the
+    median are excluded from the means, because a single one can make the object arbitrarily small; they stay in the
     tracks, where the robust loss handles them.
 
     Raises
     ------
     InvalidInput
-        Every visible point of every frame lies at the frame's centroid: there is nothing to reconstruct.
+        Every visible point lies at its frame's centroid.
     """
     seen = tracks.visible > 0
     weight = np.where(_near(tracks, seen), tracks.visible, 0.0)

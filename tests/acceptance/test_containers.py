@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import configparser
 import importlib.metadata
-import importlib.util
 import os
 import re
 import subprocess
@@ -16,12 +15,10 @@ from typing import Any
 import pytest
 import redis
 import yaml
-from pliant.cli import app
-from pliant.service.settings import _Environment
+from deployments import read_variables, starts
 from pliant.worker.processes.valkey import Valkey
-from pliant.worker.settings import VARIABLES, Settings
+from pliant.worker.settings import Settings
 from pliant.worker.store.queue import alive_key
-from typer.main import get_command
 
 ROOT = Path(__file__).parent.parent.parent
 COMPOSE: dict[str, Any] = yaml.safe_load((ROOT / "docker-compose.yml").read_text())
@@ -47,16 +44,6 @@ def valkey(tmp_path: Path) -> Iterator[Settings]:
     held.release()
 
 
-def starts(command: list[str]) -> bool:
-    """Return True if the command is one of ours and takes the options given."""
-    if command[:2] == ["python", "-m"]:
-        return importlib.util.find_spec(f"{command[2]}.__main__") is not None
-    assert command[0] == "pliant"
-    known = get_command(app).commands[command[1]]  # type: ignore[attr-defined]
-    options = {name for parameter in known.params for name in parameter.opts}
-    return {word for word in command[2:] if word.startswith("--")} <= options
-
-
 @pytest.mark.parametrize("name", ["api", "worker"])
 def test_the_services_start_what_exists(name: str) -> None:
     assert starts(COMPOSE["services"][name]["command"])
@@ -65,15 +52,6 @@ def test_the_services_start_what_exists(name: str) -> None:
 def test_the_image_alone_starts_the_whole_service() -> None:
     (command,) = re.findall(r"^CMD (\[.*\])$", DOCKERFILE, flags=re.MULTILINE)
     assert starts(yaml.safe_load(command))
-
-
-def read_variables() -> set[str]:
-    """Return every variable that service or worker reads."""
-    of_service = {f"PLIANT_{name.upper()}" for name in _Environment.model_fields} - {
-        "PLIANT_MAX_BODY_BYTES",
-        "PLIANT_INCOMING",
-    }
-    return {variable for variable, _, _ in VARIABLES.values()} | of_service
 
 
 def test_every_variable_that_is_set_is_one_that_is_read() -> None:

@@ -219,26 +219,25 @@ def test_the_doctor_finds_a_healthy_house_and_says_what_is_wrong_with_another(tm
     assert "unset PLIANT_REDIS_URL" in " ".join(ran.stdout.split())
 
 
-def test_the_doctor_audits_what_is_stored(tmp_path: Path) -> None:
+def test_fsck_compares_the_stores_with_the_records(tmp_path: Path) -> None:
     data = tmp_path / "data"
 
-    def audit() -> tuple[int, list[tuple[str, str]]]:
-        ran = pliant("doctor", "--audit", "--data", data, "--url", "http://127.0.0.1:9", "--json", folder=tmp_path)
-        found = [finding for finding in json.loads(ran.stdout) if finding["what"] == "stored"]
-        return ran.returncode, [(finding["verdict"], finding["found"]) for finding in found]
+    def fsck() -> tuple[int, list[tuple[str, str]]]:
+        ran = pliant("fsck", "--data", data, "--json", folder=tmp_path)
+        return ran.returncode, [(finding["verdict"], finding["found"]) for finding in json.loads(ran.stdout)]
 
-    code, ((verdict, said),) = audit()
-    assert (code, verdict, "cannot be used now" in said) == (8, "bad", True)
+    code, ((verdict, found),) = fsck()
+    assert (code, verdict, "is unavailable" in found) == (8, "bad", True)
     valkey = Valkey.claim(data)
     server = valkey.start()
     try:
-        assert audit() == (0, [("good", "everything stored matches the records")])
+        assert fsck() == (0, [("good", "the stores are consistent with the job records")])
         (data / "incoming" / "dead").mkdir(parents=True)
         (data / "incoming" / "dead.lock").touch()
         (data / "uploads" / "somebody" / "half").mkdir(parents=True)
-        code, found = audit()
+        code, findings = fsck()
         assert code == 8
-        assert found == [
+        assert findings == [
             ("bad", "Upload half holds nothing, not one file."),
             ("bad", "Folder incoming/dead belongs to a process that has ended."),
         ]

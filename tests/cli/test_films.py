@@ -41,7 +41,7 @@ def test_a_film_is_solved_and_its_tracks_lie_beside_the_shapes(film: Path, tmp_p
     options = json.loads(Path(files["report.json"]).read_text())["options"]
     assert (options["fps"], options["image_size"]) == (30.0, "96x72")
     words = solve(film, "-o", tmp_path, "--force", "-O", "frames=:5", *QUICK).output
-    assert "A film of 96×72 pixels, 5 of 10 frames, 30 frames a second." in words
+    assert "A film of 96×72 pixels, 5 of 10 frames, 30 frames per second." in words
     assert "No region was given" in words
 
 
@@ -56,3 +56,35 @@ def test_wrong_films_and_parts_are_refused_in_a_sentence(film: Path, tmp_path: P
     ran = solve(tmp_path / "list.mp4", "-o", tmp_path)
     assert ran.exit_code == Exit.REFUSED
     assert "other files and addresses are never opened" in " ".join(ran.output.split())
+
+
+def test_inspect_describes_a_film(film: Path, tmp_path: Path) -> None:
+    def inspect(*arguments: object) -> Result:
+        return CliRunner().invoke(app, ["inspect", *map(str, arguments)], env={"COLUMNS": "200"})
+
+    ran = inspect(film, "--region", film.with_name("mask.png"), "--json")
+    assert ran.exit_code == 0, ran.output
+    facts = json.loads(ran.stdout)
+    assert (facts["width"], facts["height"], facts["frames"], facts["fps"], facts["rotation"]) == (96, 72, 10, 30.0, 0)
+    assert facts["seconds"] == pytest.approx(1 / 3)
+    assert 0 < facts["track_seconds"] < 60
+    everything = json.loads(inspect(film, "--json").stdout)
+    assert 0 < facts["points"] < 0.5 * everything["points"]
+    words = " ".join(inspect(films.turned_by_90(copied(film, tmp_path)), "-O", "frames=::2").output.split())
+    for each in (
+        "size 72×96 pixels",
+        "frames 5 of 10",
+        "rate 15 frames a second",
+        "rotation 90°, applied",
+        "tracking about",
+    ):
+        assert each in words
+    refused = inspect(film, "--mesh", "3x4")
+    assert refused.exit_code == Exit.REFUSED
+    assert "--mesh: expected tracks, got a film" in refused.output
+
+
+def copied(film: Path, folder: Path) -> Path:
+    copy = folder / film.name
+    copy.write_bytes(film.read_bytes())
+    return copy

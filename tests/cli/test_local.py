@@ -12,12 +12,15 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import pytest
+import redis
 from pliant.cli.demo import GOOD, announced, judge
 from pliant.cli.session import Session, parse_options
 from pliant.cli.solve import file_or_word
 from pliant.client import BadArgument, Unreachable
 from pliant.service.testing import InMemoryService
+from pliant.worker.processes.valkey import find_binary
 from pliant.worker.settings import NUMERICAL_THREADS
+from serving import free_port, until
 
 doctor = importlib.import_module("pliant.cli.doctor")  # the name in the package is the command's
 up = importlib.import_module("pliant.cli.up")
@@ -152,21 +155,49 @@ def test_the_doctor_tries_the_storage(tmp_path: Path, monkeypatch: pytest.Monkey
 def test_the_doctor_looks_for_the_queue(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("PLIANT_REDIS_URL", raising=False)
     assert verdicts(doctor.check_valkey()) == {"queue": "good"}
-    with socket.socket() as server:
-        server.bind(("127.0.0.1", 0))
-        server.listen()
-        port = server.getsockname()[1]
+    port = free_port()
+    server = subprocess.Popen(
+        [str(find_binary()), "--port", str(port), "--bind", "127.0.0.1", "--requirepass", "secret", "--save", ""],
+        stdout=subprocess.DEVNULL, cwd=tmp_path,
+    )  # fmt: skip
+    try:
         monkeypatch.setenv("PLIANT_REDIS_URL", f"redis://:secret@127.0.0.1:{port}/0")
+        until(lambda: verdicts(doctor.check_valkey()) == {"queue": "good"})
         (found,) = doctor.check_valkey()
-        assert found.verdict == "good"
         assert "secret" not in found.found
         assert verdicts(doctor.check_port(port)) == {"port": "note"}
+        for wrong in (f"redis://:wrong@127.0.0.1:{port}/0", f"redis://127.0.0.1:{port}/0", "http://nothing"):
+            monkeypatch.setenv("PLIANT_REDIS_URL", wrong)
+            (found,) = doctor.check_valkey()
+            assert found.verdict == "bad", wrong
+            assert "wrong" not in found.found
+        client = redis.Redis(port=port, password="secret")
+        client.config_set("maxmemory-policy", "allkeys-lru")
+        client.close()
+        monkeypatch.setenv("PLIANT_REDIS_URL", f"redis://:secret@127.0.0.1:{port}/0")
+        (found,) = doctor.check_valkey()
+        assert (found.verdict, "noeviction" in found.advice) == ("bad", True)
+    finally:
+        server.terminate()
+        server.wait(10)
     monkeypatch.setenv("PLIANT_REDIS_URL", f"unix://{tmp_path}/none.sock")
     assert verdicts(doctor.check_valkey()) == {"queue": "bad"}
     monkeypatch.delenv("PLIANT_REDIS_URL")
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     monkeypatch.setenv("PATH", str(tmp_path))
     assert verdicts(doctor.check_valkey()) == {"queue": "bad"}
+
+
+def test_the_doctor_looks_into_the_blob_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("PLIANT_BLOB_URL", raising=False)
+    assert list(doctor.check_blobs()) == []
+    monkeypatch.setenv("PLIANT_BLOB_URL", (tmp_path / "blobs").as_uri())
+    assert verdicts(doctor.check_blobs()) == {"blobs": "good"}
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("PLIANT_BLOB_URL", (tmp_path / "file" / "below").as_uri())
+    (found,) = doctor.check_blobs()
+    assert found.verdict == "bad"
+    assert "AWS_" in found.advice
 
 
 def test_the_doctor_checks_the_service() -> None:

@@ -190,9 +190,7 @@ def test_a_line_is_printed_regularly_without_a_terminal(
     assert any("loading" in line or "reweight" in line or "running" in line for line in lines)
 
 
-@pytest.mark.parametrize(
-    "command", [["up"], ["work"], ["token", "list"], ["demo"], ["doctor", "--audit"]], ids=" ".join
-)
+@pytest.mark.parametrize("command", [["up"], ["work"], ["token", "list"], ["demo"], ["fsck"]], ids=" ".join)
 def test_commands_of_the_server_say_what_to_install(
     command: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -33,6 +33,6 @@ def test_a_principal_point_is_two_numbers_with_a_comma_between() -> None:
 
 
 def test_an_unknown_output_is_refused_by_the_names_there_are() -> None:
-    with pytest.raises(ValueError, match="'glb', 'ply', 'obj', 'usd', 'mdd', 'mat' or 'csv'"):
+    with pytest.raises(ValueError, match="'glb', 'ply', 'obj', 'usd', 'abc', 'mdd', 'mat' or 'csv'"):
         Options(outputs="glb,fbx")
     assert Options(outputs="").outputs == ()

@@ -140,6 +140,19 @@ def test_which_scope_is_needed() -> None:
     assert [needed(method, "/v1/jobs/x") for method in ("GET", "HEAD", "PUT", "DELETE", "PATCH", "BREW")] == (
         [Scope.READ] * 2 + [Scope.SUBMIT] * 4
     )
+    assert [needed(method, "/v1/uploads/x") for method in ("GET", "HEAD", "PUT", "PATCH", "DELETE")] == [
+        Scope.SUBMIT
+    ] * 5
+
+
+def test_a_token_that_may_only_submit_sends_large_files(guarded: Running, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pliant.client.multipart.LARGE", 1000)
+    monkeypatch.setattr("pliant.client.multipart.SMALL", 1000)
+    _, text = guarded.tokens.create("sender", scopes=(Scope.SUBMIT,))
+    with Client(guarded.url, token=text) as client:
+        job = client.submit(np.random.default_rng(0).normal(size=(6, 200, 2)) * 100)
+    assert guarded.jobs.get(job.id).status == "queued"
+    assert guarded.jobs.records.get(job.id).bytes > 1000
 
 
 def test_to_another_token_a_job_is_not_there_on_any_route(

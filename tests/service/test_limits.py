@@ -7,8 +7,10 @@ import time
 
 import httpx
 import pytest
+import uvicorn
 from pliant.client import Client, TooManyRequests
 from pliant.client.retry import Retry
+from pliant.service import __main__ as main
 from pliant.service.middleware.rate_limit import MOST_CLIENTS, Rates, _client
 from pliant.service.settings import USUAL_RATE, InvalidServiceSetting
 from pliant.worker.tokens import Scope
@@ -122,7 +124,7 @@ def test_no_more_jobs_wait_than_may(serve: Serve) -> None:
             "too_many_queued",
             "10",
         )
-        assert "2 of your jobs wait" in refused.json()["detail"]
+        assert "2 jobs are already queued" in refused.json()["detail"]
         assert http.put("/v1/jobs/third", files=form()).status_code == 429
         assert http.post("/v1/jobs", files=body, headers=key).json()["id"] == second.json()["id"], "no new job"
         assert running.waiting == 2
@@ -200,3 +202,25 @@ def test_jobs_of_an_admin_count_for_no_owner(serve: Serve) -> None:
         submit(ada)
         submit(admin)
         assert admin.post("/v1/jobs", files=form()).status_code == 429
+
+
+def test_the_address_of_a_client_is_its_own_unless_a_proxy_is_trusted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Any user of the machine could otherwise choose the address that is counted, and so pass the limit."""
+    configured: list[uvicorn.Config] = []
+
+    class Recorded(main.Server):
+        def __init__(self, config: uvicorn.Config, **more: object) -> None:
+            configured.append(config)
+            super().__init__(config, **more)  # type: ignore[arg-type]
+
+        def run(self, sockets: object = None) -> None:
+            self.started = True
+
+    monkeypatch.setattr(main, "Server", Recorded)
+    monkeypatch.setattr(main.signal, "signal", lambda *_: None)
+    monkeypatch.setattr(main, "configure_logging", lambda *_: None)
+    assert main.main() == 0
+    monkeypatch.setenv("PLIANT_TRUSTED_PROXIES", "127.0.0.1, 10.0.0.0/8")
+    assert main.main() == 0
+    assert [config.proxy_headers for config in configured] == [False, True]
+    assert configured[1].forwarded_allow_ips == ["127.0.0.1", "10.0.0.0/8"]

@@ -77,6 +77,14 @@ def until(holds: Callable[[], Any], *, seconds: float = 10.0) -> None:
         time.sleep(0.01)
 
 
+def free_port() -> int:
+    """Return a TCP port that nobody listens on now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+    return port
+
+
 def heard(connection: socket.socket, words: bytes) -> bytes:
     """Read an answer until these words have come, in however many pieces; fail if it ends without them."""
     answer = b""

@@ -154,6 +154,6 @@ def running(pid: int) -> bool:
 
 
 def settled(house: House) -> None:
-    """No job process runs, no working file is left, and everything stored is as the records state."""
+    """No job process runs, no working files are left, and the stores are consistent with the job records."""
     house.until(lambda: not house.job_processes() and not house.files_at_work(), "nothing is left behind")
     assert findings(house.jobs, pause=0.5) == []

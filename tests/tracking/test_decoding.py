@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import struct
 import zipfile
 from pathlib import Path
 
+import cv2
 import films
 import numpy as np
 import pytest
@@ -164,3 +166,29 @@ def test_a_zip_with_an_immense_directory_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FilmError) as caught:
         open_film(path)
     assert caught.value.code == "too_many_pictures"
+
+
+def with_displayed_width(path: Path, width: int) -> Path:
+    """Set the width that an MP4 film is displayed with: FFmpeg takes the ratio to the stored one for the shape of a pixel."""
+    return films.patched(path, b"tkhd", 80, struct.pack(">I", width << 16))
+
+
+def test_pixels_that_are_not_square_are_stretched(tmp_path: Path) -> None:
+    path = films.write_film(tmp_path / "film.mp4", PICTURES)
+    plain = read(open_film(path))
+    wide = open_film(with_displayed_width(path, 96))
+    assert (wide.size, wide.pixel_aspect, wide.rotation) == ((96, 48), 1.5, 0)
+    np.testing.assert_array_equal(read(wide)[3], cv2.resize(plain[3], (96, 48), interpolation=cv2.INTER_LINEAR))
+    high = open_film(with_displayed_width(path, 32))
+    assert (high.size, high.pixel_aspect) == ((64, 96), 0.5)
+    assert read(high).shape == (8, 96, 64, 3)
+    turned = open_film(films.turned_by_90(with_displayed_width(path, 96)))
+    assert (turned.size, turned.rotation) == ((48, 96), 90)
+    assert read(turned).shape == (8, 96, 48, 3)
+
+
+def test_absurd_pixels_are_refused(tmp_path: Path) -> None:
+    path = with_displayed_width(films.write_film(tmp_path / "film.mp4", PICTURES), 640)
+    with pytest.raises(FilmError, match="setsar=1") as caught:
+        open_film(path)
+    assert caught.value.code == "unsupported_film"

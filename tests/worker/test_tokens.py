@@ -8,7 +8,7 @@ import pytest
 from pliant.worker.errors import InvalidRequest, StoreUnavailable, UnknownToken
 from pliant.worker.settings import Settings
 from pliant.worker.store.connection import connect
-from pliant.worker.tokens import Scope, Token, Tokens, parse_duration
+from pliant.worker.tokens import PREFIX, Scope, Token, Tokens, parse_duration
 
 
 @pytest.fixture
@@ -128,3 +128,17 @@ def test_a_store_that_is_away_is_said_so(tmp_path: object) -> None:
         tokens.recognise(f"pliant_{'0' * 12}_{secrets.token_urlsafe(32)}")
     with pytest.raises(StoreUnavailable):
         tokens.usable()
+
+
+def test_a_token_that_a_deployment_made_is_taken_over_once(tokens: Tokens) -> None:
+    text = f"{PREFIX}0123456789ab_{'x' * 43}"
+    first, same = tokens.create("first", scopes=(Scope.ADMIN,), text=text)
+    assert (same, first.id, first.scopes) == (text, "0123456789ab", (Scope.ADMIN,))
+    again, _ = tokens.create("another name", scopes=(Scope.READ,), text=text)
+    assert again == first
+    assert tokens.recognise(text) == first
+    assert tokens.all() == [first]
+    with pytest.raises(InvalidRequest) as caught:
+        tokens.create("first", text="pliant_short")
+    assert caught.value.code == "invalid_token_text"
+    assert "short" not in str(caught.value)

@@ -6,8 +6,9 @@ import os
 import threading
 from collections.abc import Generator, Iterator
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypedDict
 
 import cv2
 import numpy as np
@@ -19,6 +20,9 @@ from pliant.tracking.errors import FilmError
 
 PICTURE_RATE = 30.0
 """Frames a second that are assumed of pictures, which carry no times."""
+
+WIDEST_PIXEL = 4.0
+"""Largest ratio of a pixel's sides; anamorphic and broadcast formats stay below 2."""
 
 DEMUXERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi"
 _OPENING = threading.Lock()
@@ -52,6 +56,12 @@ class Film:
 
     stated_frames: int
     """Number of frames as the file states it; may be wrong. 0 if it states none."""
+
+    rotation: int
+    """Degrees clockwise by which the stored frames are turned to be upright: 0, 90, 180 or 270."""
+
+    pixel_aspect: float
+    """Width of a stored pixel, upright, over its height; frames of other than square pixels are stretched to `size`."""
 
     selection: tuple[int, int | None, int]
     """Start, stop and step of the frames that are used."""
@@ -105,7 +115,14 @@ class Film:
                 name, read = listed[index]
                 yield Frame(index, index / PICTURE_RATE, read_picture(read(), name, self.limits))
         else:
-            yield from _decode_video(self.path, self.fps, start, stop, step)
+            for frame in _decode_video(self.path, self.fps, start, stop, step):
+                yield frame if self.pixel_aspect == 1 else self._stretched(frame)
+
+    def _stretched(self, frame: Frame) -> Frame:
+        """Give a frame square pixels."""
+        size = _square((frame.image.shape[1], frame.image.shape[0]), self.pixel_aspect)
+        image = cv2.resize(frame.image, size, interpolation=cv2.INTER_LINEAR)
+        return Frame(frame.index, frame.time, np.asarray(image, dtype=np.uint8))
 
 
 def open_film(path: Path | str, *, frames: int | slice | str | None = None, limits: FilmLimits | None = None) -> Film:
@@ -133,21 +150,30 @@ def open_film(path: Path | str, *, frames: int | slice | str | None = None, limi
             "too_many_bytes", field="film", expected=f"at most {limits.bytes:,} bytes",
             got=f"{source.name} of {source.stat().st_size:,}", hint="Cut the film, or compress it more.",
         )  # fmt: skip
-    size, fps, stated = _facts(source, container, limits)
-    film = Film(source, container, size, fps, stated, (0, None, 1), limits)
-    return Film(source, container, size, fps, stated, _selection(film, frames), limits)
+    facts = _facts(source, container, limits)
+    film = Film(source, container, **facts, selection=(0, None, 1), limits=limits)
+    return replace(film, selection=_selection(film, frames))
 
 
-def _facts(path: Path, container: Container, limits: FilmLimits) -> tuple[tuple[int, int], float, int]:
-    """Read size, rate and stated number of frames."""
+class _Facts(TypedDict):
+    """Fields of `Film` that the file states."""
+
+    size: tuple[int, int]
+    fps: float
+    stated_frames: int
+    rotation: int
+    pixel_aspect: float
+
+
+def _facts(path: Path, container: Container, limits: FilmLimits) -> _Facts:
     if container == "gif":
         height, width = next(gif_frames(path, limits))[1].shape[:2]
-        return (width, height), PICTURE_RATE, 0
+        return _pictures((width, height), 0)
     if container in ("zip", "folder"):
         listed = (zip_pictures if container == "zip" else folder_pictures)(path, limits)
         name, read = listed[0]
         height, width = read_picture(read(), name, limits).shape[:2]
-        return checked((width, height), name, limits), PICTURE_RATE, len(listed)
+        return _pictures(checked((width, height), name, limits), len(listed))
     capture = _open_capture(path)
     try:
         width, height = (int(capture.get(key)) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
@@ -155,10 +181,39 @@ def _facts(path: Path, container: Container, limits: FilmLimits) -> tuple[tuple[
             raise _undecodable(path)
         rate = capture.get(cv2.CAP_PROP_FPS)
         stated = capture.get(cv2.CAP_PROP_FRAME_COUNT)
+        rotation = round(capture.get(cv2.CAP_PROP_ORIENTATION_META)) % 360
+        aspect = _pixel_aspect(capture, rotation, path)
     finally:
         capture.release()
     fps = rate if np.isfinite(rate) and 0.1 <= rate <= 1000 else PICTURE_RATE
-    return checked((width, height), path.name, limits), fps, int(stated) if 0 < stated < 1e9 else 0
+    return _Facts(
+        size=checked(_square((width, height), aspect), path.name, limits), fps=fps,
+        stated_frames=int(stated) if 0 < stated < 1e9 else 0, rotation=rotation, pixel_aspect=aspect,
+    )  # fmt: skip
+
+
+def _pictures(size: tuple[int, int], count: int) -> _Facts:
+    return _Facts(size=size, fps=PICTURE_RATE, stated_frames=count, rotation=0, pixel_aspect=1.0)
+
+
+def _pixel_aspect(capture: cv2.VideoCapture, rotation: int, path: Path) -> float:
+    """Width over height of an upright pixel (FFmpeg's sample aspect ratio); 1 where the film states none."""
+    across, down = (capture.get(key) for key in (cv2.CAP_PROP_SAR_NUM, cv2.CAP_PROP_SAR_DEN))
+    if not (across > 0 and down > 0):
+        return 1.0
+    aspect = float(across / down if rotation % 180 == 0 else down / across)
+    if not 1 / WIDEST_PIXEL <= aspect <= WIDEST_PIXEL:
+        raise FilmError(
+            "unsupported_film", field="film", expected=f"pixels at most {WIDEST_PIXEL:g} times as wide as high, or as high as wide",
+            got=f"{path.name} with pixels of {across:g}:{down:g}", hint="Convert it: ffmpeg -i FILM -vf setsar=1 film.mp4",
+        )  # fmt: skip
+    return aspect
+
+
+def _square(size: tuple[int, int], aspect: float) -> tuple[int, int]:
+    """Size of a picture in square pixels: the shorter side of a pixel is stretched, as browsers do."""
+    width, height = size
+    return (round(width * aspect), height) if aspect >= 1 else (width, round(height / aspect))
 
 
 def _selection(film: Film, frames: int | slice | str | None) -> tuple[int, int | None, int]:

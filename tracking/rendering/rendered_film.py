@@ -10,7 +10,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pliant.solver.gallery import Sequence
 from pliant.tracking.errors import FilmError
 from pliant.tracking.rendering.rasterising import Floats, Ints, Surface, rasterise, triangulate
@@ -23,6 +23,9 @@ WAVES = 80
 
 FINEST, COARSEST = 6.0, 0.35
 """Wavelengths of a texture: the finest in pixels, which sampling and blur leave visible, the coarsest in image heights."""
+
+FRECKLES, DIM = 0.32, 0.45
+"""With paint: how much the texture changes its brightness, and the background's brightness, both as shares."""
 
 LAYER = 0.04
 """A point is visible if it lies at most this far behind the nearest surface, in radii of the object. The facets of a gallery
@@ -57,6 +60,9 @@ class RenderedFilm:
     noise: float
     """Standard deviation of the noise in grey levels (0–255), drawn anew for each frame."""
 
+    paint: Floats | None
+    """Colour of every vertex, shape `(P, 3)`, grey levels; the texture then changes only its brightness. None: the texture alone."""
+
     occluder: bool
     """Whether a textured bar passes in front of the object once."""
 
@@ -86,6 +92,12 @@ class RenderedFilm:
         covered = surface.triangle >= 0
         corners = self.rest[self.triangles[surface.triangle[covered]]]
         image[covered] = _texture(np.einsum("nk,nkc->nc", surface.weights[covered], corners), self.size[1], self.seed)
+        if self.paint is not None:
+            image[~covered] = DIM * image[~covered]
+            colour = np.einsum(
+                "nk,nkc->nc", surface.weights[covered], self.paint[self.triangles[surface.triangle[covered]]]
+            )
+            image[covered] = colour * (1 + FRECKLES * (image[covered].mean(axis=1, keepdims=True) / 127.5 - 1))
         if self.occluder:
             left, right = self._bar(index)
             behind = (x >= left) & (x <= right)
@@ -216,6 +228,7 @@ def render_film(
     distance: float = 6.0,
     blur: float = 0.6,
     noise: float = 2.0,
+    paint: ArrayLike | None = None,
     occluder: bool = False,
     seed: int = 0,
 ) -> RenderedFilm:
@@ -231,8 +244,8 @@ def render_film(
         Share of the image's width or height that the object spans at most.
     distance
         From the camera to the object's centre, in half heights of the object.
-    blur, noise, occluder, seed
-        See `RenderedFilm`.
+    blur, noise, paint, occluder, seed
+        See `RenderedFilm`; `paint.face_paint` colours the gallery's face.
     """
     turned = sequence.shapes @ sequence.rotations.transpose(0, 2, 1)
     radius = np.abs(turned[..., 1]).max()
@@ -240,7 +253,10 @@ def render_film(
     slopes = np.abs(shapes[..., :2] / shapes[..., 2:]).max(axis=(0, 1))
     focal = float((fill * np.array(size) / 2 / slopes).min())
     rest = sequence.shapes[0] * (focal / (distance * radius))
-    return RenderedFilm(size, focal, shapes, triangulate(sequence.mesh.faces), rest, blur, noise, occluder, seed)
+    colours = None if paint is None else np.asarray(paint, dtype=np.float64)
+    return RenderedFilm(
+        size, focal, shapes, triangulate(sequence.mesh.faces), rest, blur, noise, colours, occluder, seed
+    )
 
 
 def _texture(points: Floats, height: int, seed: int) -> Floats:

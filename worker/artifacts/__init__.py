@@ -1,4 +1,4 @@
-"""Writers: a solution in, result files out; each written aside and renamed when whole."""
+"""Writers of result files. Each file is written under a temporary name and renamed when complete."""
 
 from pliant.worker.artifacts.kinds import kinds_for
 from pliant.worker.artifacts.report import build_report

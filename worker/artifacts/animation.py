@@ -1,12 +1,12 @@
-"""A moving shape as morph targets: modes of motion, or one a frame.
+"""A moving shape as morph targets: modes of motion, or one target per frame.
 
-The frames minus their mean are expanded in principal components (SVD); the weights are the coefficients, shifted and scaled into [0, 1]
-because viewers clamp weights to the slider's range (others come out wrong in Blender). As many modes are kept as bring every point of
-every frame within a bound, always fewer than frames. On request each frame is its own target instead, with one-hot weights, exact in
-single precision. Viewers are right up to about 256 targets and slow beyond, so more than 200 frames always become modes.
+The frames minus their mean are expanded in principal components (SVD); the weights are the coefficients, shifted and scaled to [0, 1]
+because viewers clamp weights to the range of their sliders (Blender does). The fewest modes are kept that bring every point of every frame
+within a bound, always fewer than frames. On request each frame is its own target instead, with one-hot weights, exact in single
+precision. Viewers handle about 256 targets correctly and slow down beyond, so more than 200 frames always become modes.
 
-Targets are made when they are asked for, and everything over all frames goes through a block of points at a time: what is held
-beside the shapes is a frame, or the modes, never another copy of the sequence.
+Targets are generated on demand, and operations over all frames process blocks of points, so that the memory beside the shapes is one
+frame or the modes, never a copy of the sequence.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from pliant.worker.artifacts.geometry import Floats, Singles, upright
 MAX_FRAME_TARGETS = 200
 MAX_MODES = 200
 BLOCK = 1 << 21
-"""Numbers (16 MB) of a block of points over all frames."""
+"""Numbers in a block of points over all frames (16 MB)."""
 
 ERROR_BOUND = 1e-3
-"""Largest distance between a point and its place in the file that is allowed to modes, as a share of the bounding box's diagonal."""
+"""Maximum error of a point's position due to modes, as a share of the bounding box's diagonal."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,7 +33,7 @@ class Animation:
     """Points of frame f = base + Σ_k weights[f, k] · target(k)."""
 
     base: Singles
-    """Shape `(P, 3)`, what a viewer shows that does not animate."""
+    """Shape `(P, 3)`, shown by viewers without animation."""
 
     target: Callable[[int], Singles]
     """Displacements `(P, 3)` of target k."""
@@ -42,10 +42,10 @@ class Animation:
     """Shape `(F, K)`, in [0, 1]."""
 
     names: list[str]
-    """One for each target."""
+    """Names of the targets."""
 
     extras: dict[str, Any]
-    """What the file says of itself: encoding and error bound, in the tracks' unit."""
+    """Metadata for the file: encoding and error bound, in the tracks' unit."""
 
 
 def animate(shapes: Floats, *, y_axis: str = "up", motion: str = "auto") -> Animation:
@@ -122,7 +122,7 @@ def _blocks(shapes: Floats, y_axis: str, origin: Floats | Singles) -> Iterator[t
 
 
 def _smallest(shapes: Floats, y_axis: str, mean: Floats, left: Floats, allowed: float) -> int:
-    """Few modes whose worst point is within 90 % of what is allowed (the rest is for rounding), by bisection; at most those given."""
+    """Return the fewest modes, at most those given, whose maximum error is within 90 % of the bound, by bisection (10 % for rounding)."""
     low, high = 1, int(left.shape[1])
     while low < high:
         middle = (low + high) // 2
@@ -134,7 +134,7 @@ def _smallest(shapes: Floats, y_axis: str, mean: Floats, left: Floats, allowed: 
 
 
 def _within(distance: float, blocks: Iterator[tuple[slice, Floats]], left: Floats) -> bool:
-    """Whether every point of every frame is that near to its projection on the modes."""
+    """Whether every point of every frame is within a distance of its projection on the modes."""
     for _, moved in blocks:
         rest = moved - left @ (left.T @ moved)
         if (rest.reshape(len(rest), -1, 3) ** 2).sum(axis=2).max() > distance**2:
@@ -145,7 +145,7 @@ def _within(distance: float, blocks: Iterator[tuple[slice, Floats]], left: Float
 def _rounded_errors(
     shapes: Floats, y_axis: str, base: Singles, targets: Singles, weights: Singles
 ) -> tuple[float, float]:
-    """Worst and root mean square distance of a point from where a viewer puts it, which computes with the rounded numbers."""
+    """Return the maximum and RMS distance between points and their positions in a viewer, which uses the rounded numbers."""
     worst, total = 0.0, 0.0
     for some, moved in _blocks(shapes, y_axis, base):
         modes = targets[:, some].reshape(len(targets), -1).astype(np.float64)

@@ -1,4 +1,4 @@
-"""Errors as colours: one scale for the whole sequence, the web page's."""
+"""Errors as colours, on one scale for the whole sequence, the same as in the web page."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from numpy.typing import NDArray
 from pliant.worker.artifacts.geometry import Floats
 
 SCALE = ("2b2f77", "28608f", "1f8f8a", "58b96d", "b5d44a", "fbe94b")
-"""Six colours (sRGB), evenly spaced, rising in lightness all the way, so that they also read in grey and without red or green."""
+"""Six evenly spaced colours (sRGB) of increasing lightness, readable in greyscale and with colour blindness."""
 
 STOPS = np.array([[int(text[i : i + 2], 16) / 255 for i in (0, 2, 4)] for text in SCALE])
 TOP_SHARE = 0.99
 UNKNOWN = 0.5
-"""Grey of positions that were not seen, except where the colour is the distance from the truth."""
+"""Grey of hidden positions, except where the colour is the distance from the truth."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Painting:
-    """Values to be shown as colours."""
+    """Values to show as colours."""
 
     quantity: str
-    """What they are, in words."""
+    """Name of the quantity."""
 
     values: Floats
     """Shape `(F, P)`, not negative, in `unit`."""
@@ -35,7 +35,7 @@ class Painting:
     """Unit of the values."""
 
     top: float
-    """The value that gets the brightest colour: the 99th percentile, so that a few outliers do not make all else dark."""
+    """The value of the brightest colour: the 99th percentile, so that a few outliers do not darken all others."""
 
     @classmethod
     def of(
@@ -68,8 +68,8 @@ class Painting:
         colours[count == 0] = UNKNOWN
         return colours
 
-    def said(self) -> dict[str, Any]:
-        """Say for the report and the files what the colours mean."""
+    def legend(self) -> dict[str, Any]:
+        """Return the legend of the colours for the report and the files."""
         scale = ["#" + text for text in SCALE]
         return {"colours": {"quantity": self.quantity, "unit": self.unit, "top": self.top, "scale": scale}}
 

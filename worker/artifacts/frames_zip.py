@@ -1,4 +1,4 @@
-"""One mesh file a frame in a zip, as programs for captured motion read them: PLY or OBJ."""
+"""A zip with one PLY or OBJ file per frame, as read by motion capture programs."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def write_ply_zip(result: Result, file: IO[bytes], on_progress: OnProgress) -> N
         for _, name, column in fields:
             table[name] = column
         head = [
-            "ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in _said(result)),
+            "ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in _header_lines(result)),
             f"element vertex {len(points)}", *(f"property {kind} {name}" for kind, name, _ in fields),
             f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header\n",
         ]  # fmt: skip
@@ -50,11 +50,11 @@ def write_ply_zip(result: Result, file: IO[bytes], on_progress: OnProgress) -> N
 def write_obj_zip(result: Result, file: IO[bytes], on_progress: OnProgress) -> None:
     """Wavefront OBJ of every frame, `frame_00000.obj` …; nine digits, which is single precision, unit of the tracks.
 
-    Colours, if there are any, stand behind the coordinates, as MeshLab, Blender and Open3D read them. With a texture, the archive also
-    holds `shapes.mtl` and `texture.jpg`; v of `vt` points up.
+    Colours follow the coordinates, as MeshLab, Blender and Open3D expect. With a texture, the archive also contains `shapes.mtl` and
+    `texture.jpg`; v of `vt` points up.
     """
     texture = result.texture
-    head = "".join(f"# {line}\n" for line in _said(result)) + (MATERIAL_HEAD if texture is not None else "")
+    head = "".join(f"# {line}\n" for line in _header_lines(result)) + (MATERIAL_HEAD if texture is not None else "")
     moving = result.options.normals == "animated" and len(result.faces) > 0
     places = "" if texture is None else _lines("vt", np.column_stack([texture.uv[:, 0], 1 - texture.uv[:, 1]]), "%.6f")
     corner = _corner(textured=texture is not None, moving=moving)
@@ -74,14 +74,14 @@ def write_obj_zip(result: Result, file: IO[bytes], on_progress: OnProgress) -> N
 
 
 def _corner(*, textured: bool, moving: bool) -> str:
-    """How a face names vertex, texture coordinate and normal of one number."""
+    """Return how a face refers to vertex, texture coordinate and normal of the same index."""
     if textured:
         return "{0}/{0}/{0}" if moving else "{0}/{0}"
     return "{0}//{0}" if moving else "{0}"
 
 
 def _frame(result: Result, frame: int) -> tuple[Floats, Floats | None, Floats | None]:
-    """Points, normals and sRGB colours `(P, 3)` of one frame; None for what is not wanted."""
+    """Return points, normals and sRGB colours `(P, 3)` of one frame; None for those not requested."""
     shape = result.standing(frame) if result.options.axes == "viewer" else result.solution.shapes[frame]
     points = shape.astype(np.float32).astype(np.float64)
     moving = result.options.normals == "animated" and len(result.faces) > 0
@@ -89,20 +89,22 @@ def _frame(result: Result, frame: int) -> tuple[Floats, Floats | None, Floats | 
     return points, normals, result.picture_colours if result.painting is None else result.painting.frame(frame)
 
 
-def _said(result: Result) -> list[str]:
+def _header_lines(result: Result) -> list[str]:
     y_axis = "up" if result.options.axes == "viewer" else result.y_axis
     depth = "away from" if y_axis == "down" else "towards"
-    said = [f"x right, y {y_axis}, z {depth} the first camera; unit of the tracks"]
+    lines = [f"x right, y {y_axis}, z {depth} the first camera; unit of the tracks"]
     if result.painting is not None:
         painting = result.painting
-        said.append(f"colour: {painting.quantity}, dark at 0, bright at {painting.top:.6g} ({painting.unit}) and above")
+        lines.append(
+            f"colour: {painting.quantity}, dark at 0, bright at {painting.top:.6g} ({painting.unit}) and above"
+        )
     elif result.picture_colours is not None:
-        said.append("colour: the film's template frame")
-    return said
+        lines.append("colour: the film's template frame")
+    return lines
 
 
 def _lines(word: str, rows: Floats, number: str) -> str:
-    """Rows `(N, width)` as lines that begin with a word."""
+    """Return rows `(N, width)` as lines that start with a keyword."""
     line = " ".join([word] + [number] * rows.shape[1]) + "\n"
     return (line * len(rows)) % tuple(rows.ravel().tolist())
 
@@ -115,7 +117,7 @@ def _write_members(
         for name, whole in (beside or {}).items():
             archive.writestr(zipfile.ZipInfo(name, FIRST_DAY), whole, zipfile.ZIP_STORED)
         for index in range(count):
-            # A fixed date, so that equal results are equal files.
+            # A fixed date, so that equal results give identical files.
             archive.writestr(
                 zipfile.ZipInfo(f"frame_{index:05d}.{suffix}", FIRST_DAY), content(index), zipfile.ZIP_DEFLATED, 1
             )

@@ -1,4 +1,4 @@
-"""What several writers need of a surface: triangles, normals, axes, a sensible size for viewers."""
+"""Geometry shared by writers: triangles, normals, axes, and a suitable scale for viewers."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ def vertex_normals(points: Floats | Singles, triangles: Ints) -> Singles:
 
 
 def size_of(shapes: Floats) -> float:
-    """Root mean square distance of the points from the centre of their frame: the size that errors are shares of."""
+    """Return the RMS distance of the points from the centre of their frame, the reference size of relative errors."""
     centred = shapes - shapes.mean(axis=1, keepdims=True)
     return max(float(np.sqrt(np.square(centred).sum(axis=2).mean())), float(np.finfo(float).tiny))
 
 
 def viewer_scale(shapes: Floats) -> float:
-    """Power of ten that brings the bounding box's diagonal between 1 and 10, for viewers that take units for metres."""
+    """Return the power of ten that scales the bounding box's diagonal to 1 … 10, for viewers that assume metres."""
     low, high = shapes.min(axis=(0, 1)), shapes.max(axis=(0, 1))
     diagonal = float(np.linalg.norm(high - low))
     return 1.0 if diagonal == 0 or not np.isfinite(diagonal) else float(10.0 ** -np.floor(np.log10(diagonal)))

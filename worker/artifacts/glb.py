@@ -1,6 +1,6 @@
 """Write an animated binary glTF 2.0 (.glb): one mesh, morph targets, one animation of their weights.
 
-The file is streamed: the JSON comes first, so sizes, offsets, minima and maxima are settled before any array is written.
+The file is streamed: the JSON comes first, so sizes, offsets, minima and maxima are computed before any array is written.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ Make = Callable[[], Array]
 
 
 class Buffer:
-    """Arrays in the order they will be written, and the glTF objects that point at them.
+    """Arrays in the order of writing, and the glTF objects that refer to them.
 
-    An array given as a function is made twice, once to be described and once to be written, and not held in between.
+    An array given as a function is generated twice, once for its bounds and once for writing, and not kept in between.
     """
 
     def __init__(self) -> None:
@@ -45,7 +45,7 @@ class Buffer:
     def add(
         self, given: Array | Make, *, target: int | None = None, bounds: bool = False, normalised: bool = False
     ) -> int:
-        """Append an array `(N,)` or `(N, width)` as a view of its own; returns the accessor's index.
+        """Append an array `(N,)` or `(N, width)` as a buffer view; return the index of its accessor.
 
         Rows of vertex data start at multiples of four bytes, so rows of other lengths are padded with zeros.
         """
@@ -76,7 +76,7 @@ class Buffer:
         return len(self.accessors) - 1
 
     def attach(self, content: bytes) -> int:
-        """Append a file as a view of its own; returns the view's index."""
+        """Append a file as a buffer view; return the view's index."""
         self.views.append({"buffer": 0, "byteOffset": self.bytes, "byteLength": len(content)})
         self.parts.append((lambda: np.frombuffer(content, dtype=np.uint8), 1))
         self.bytes += -(-len(content) // 4) * 4
@@ -102,7 +102,7 @@ def write_glb(
     Parameters
     ----------
     file : binary file
-        Written from its position on, not closed.
+        Written from its current position, not closed.
     animation : Animation
         y up, right-handed.
     triangles : array of int, shape (T, 3)
@@ -110,7 +110,7 @@ def write_glb(
     fps : float
         Frames per second; frame f is at f / fps seconds, with linear interpolation between.
     node : dict
-        What the node carries besides the mesh, e.g. `scale`.
+        Properties of the node besides the mesh, e.g. `scale`.
     normals : str
         `static`: of the base shape; `animated`: displaced with every target; `none`.
     quantized : bool
@@ -196,7 +196,7 @@ def _targets(
     base: Singles | None,
 ) -> list[dict[str, int]]:
     def turned(index: int) -> Singles:
-        # A mode's normals are those of the base moved by the whole mode: first order in the motion, as viewers blend them.
+        # A mode's normals are those of the base displaced by the full mode: first order in the motion, as viewers blend them.
         assert base is not None
         return vertex_normals(animation.base + animation.target(index), triangles) - base
 
@@ -216,7 +216,7 @@ def _in_bytes(normals: Singles) -> NDArray[np.int8]:
 
 
 def _quantize(animation: Animation, node: dict[str, Any]) -> tuple[Array, Callable[[int], Array], dict[str, Any]]:
-    """Positions and displacements as 16-bit fractions of one common size, which the node's scale undoes."""
+    """Return positions and displacements as 16-bit fractions of one size, which the node's scale restores."""
     low, high = animation.base.min(axis=0), animation.base.max(axis=0)
     centre = ((low + high) / 2).astype(np.float64)
     moved = max(float(np.abs(animation.target(index)).max()) for index in range(len(animation.names)))

@@ -1,4 +1,4 @@
-"""The result files there are: their names, what they are, which option asks for them, and who writes them."""
+"""The kinds of result files: name, description, option that requests them, and writer."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.schemas.options import Options, Output
 from pliant.solver import InvalidInput
-from pliant.worker.artifacts import matlab, preview, usd
+from pliant.worker.artifacts import alembic, matlab, preview, usd
 from pliant.worker.artifacts.animation import animate
 from pliant.worker.artifacts.colours import linear
 from pliant.worker.artifacts.frames_zip import OnProgress, write_obj_zip, write_ply_zip
@@ -27,43 +27,47 @@ class Kind:
 
     name: str
     output: Output | None
-    """The word of the option `outputs` that asks for it; None if it is always written."""
+    """Value of the option `outputs` that requests it; None if it is always written."""
 
     media_type: str
     description: str
     share: float
-    """Time it takes, in an arbitrary unit."""
+    """Relative time of writing."""
 
     write: Callable[[Result, IO[bytes], OnProgress], dict[str, Any]]
-    """Writes the file; returns what the report should say of it."""
+    """Writes the file; returns its entry for the report."""
 
     textured: bool | None = None
-    """Whether it is written only with, or only without, a picture on the surface; None: either way."""
+    """Whether it is written only with, or only without, a texture; None: in both cases."""
 
 
 def kinds_for(options: Options, *, size: tuple[int, int] = (0, 0), textured: bool = False) -> list[Kind]:
-    """Return what a job's options ask for, in the order of writing.
+    """Return the kinds that a job's options request, in the order of writing.
 
     Parameters
     ----------
     options : Options
         Of the job.
     size : tuple of int
-        Frames and points, as far as they are known.
+        Frames and points, if known.
     textured : bool
-        There is a picture to put on the surface.
+        Whether there is a texture.
 
     Raises
     ------
     InvalidInput
-        A file is asked for that cannot be written in this installation, or not in this size.
+        A requested file cannot be written in this installation or in this size.
     """
-    if "usd" in options.outputs and not usd.available():
-        raise InvalidInput(
-            "output_unavailable", field="options.outputs", expected="outputs that this installation can write",
-            got="usd, which needs the package usd-core", hint="Install it beside the worker and the service "
-            "(pip install 'pliant[usd]'), or leave usd out.",
-        )  # fmt: skip
+    for output, there, package, extra in (
+        ("usd", usd.available, "usd-core", "usd"),
+        ("abc", alembic.available, "alembic3d", "alembic"),
+    ):
+        if output in options.outputs and not there():
+            raise InvalidInput(
+                "output_unavailable", field="options.outputs", expected="outputs that this installation can write",
+                got=f"{output}, which needs the package {package}", hint="Install it beside the worker and the service "
+                f"(pip install 'pliant[{extra}]'), or leave {output} out.",
+            )  # fmt: skip
     if "mat" in options.outputs and not matlab.fits(*size):
         raise InvalidInput(
             "output_unavailable", field="options.outputs", expected="less than 2 GiB of shapes for mat",
@@ -106,7 +110,7 @@ def _glb(result: Result, file: IO[bytes], on_progress: OnProgress) -> dict[str, 
     animation = animate(shapes, y_axis=result.y_axis, motion=options.glb_motion)
     colours = None
     if painted is not None:
-        animation.extras.update(painted.said())
+        animation.extras.update(painted.legend())
         colours = _rgba(painted.mean())
     elif result.texture is None and result.picture_colours is not None:
         colours = _rgba(result.picture_colours)
@@ -128,7 +132,7 @@ def _rgba(colours: Floats) -> NDArray[np.uint16]:
 def _painted(write: Callable[[Result, IO[bytes], OnProgress], None]) -> Callable[..., dict[str, Any]]:
     def written(result: Result, file: IO[bytes], on_progress: OnProgress) -> dict[str, Any]:
         write(result, file, on_progress)
-        return {} if result.painting is None else result.painting.said()
+        return {} if result.painting is None else result.painting.legend()
 
     return written
 
@@ -162,6 +166,7 @@ KINDS = (
     Kind("shapes_obj.zip", "obj", "application/zip", "One OBJ for each frame.", 30, _painted(write_obj_zip)),
     Kind("shapes.usdc", "usd", "application/octet-stream", "The moving mesh as USD, y up.", 3, _painted(usd.write_usd), textured=False),
     Kind("shapes.usdz", "usd", "model/vnd.usdz+zip", "USD, y up, with its picture.", 3, _painted(usd.write_usdz), textured=True),
+    Kind("shapes.abc", "abc", "application/octet-stream", "The moving mesh as Alembic, y up.", 3, _painted(alembic.write_alembic)),
     Kind("shapes.mat", "mat", "application/x-matlab-data", "The same arrays for MATLAB; faces from 1.", 2, _at_once(matlab.write_mat)),
     Kind("shapes.mdd", "mdd", "application/octet-stream", "Point cache for Blender, Maya and Houdini, y up.", 2, _painted(write_mdd)),
     Kind("metrics_frames.csv", "csv", "text/csv", "Metrics of every frame.", 2, _at_once(write_frames_csv)),

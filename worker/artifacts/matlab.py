@@ -10,10 +10,10 @@ from pliant.worker.artifacts.result import Result
 
 HEADER = b"MATLAB 5.0 MAT-file, written by Pliant"
 TEXT_BYTES = 116
-"""Length of the text that a file begins with; what follows it are the version and the byte order."""
+"""Length of the text at the start of a file; version and byte order follow."""
 
 MOST_BYTES = 2**31
-"""A variable of the format is smaller."""
+"""Upper bound of the size of a variable in this format, bytes."""
 
 
 def fits(num_frames: int, num_points: int) -> bool:

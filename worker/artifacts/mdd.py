@@ -15,7 +15,7 @@ from pliant.worker.artifacts.result import Result
 
 
 def write_mdd(result: Result, file: IO[bytes], on_progress: Callable[[float], None]) -> None:
-    """Write every frame; y up, right-handed and unscaled, point p being vertex p of the mesh in the other files."""
+    """Write every frame; y up, right-handed, unscaled; point p is vertex p of the mesh in the other files."""
     frames, points, _ = result.solution.shapes.shape
     file.write(struct.pack(">ii", frames, points))
     file.write((np.arange(frames) / result.options.fps).astype(">f4").tobytes())

@@ -1,13 +1,12 @@
 """A compact copy of a result for the web page: `preview.bin`.
 
-The page plays a result of 99 frames and 29,000 points in a browser, on a telephone too. `shapes.glb` with a morph target
-a frame is twice the bytes and keeps every target on the graphics card, where the shader walks through them for every vertex;
-`shapes.npz` is four times the bytes and comes whole or not at all. This file holds int16 coordinates frame after frame, so
-that drawing starts when the first frame has arrived, and puts what is not always looked at (residuals, ground truth) where
-a byte range finds it.
+The page plays a result of 99 frames and 29,000 points in a browser, also on a phone. `shapes.glb` with one morph target per
+frame is twice as large and keeps all targets in graphics memory, where the shader evaluates them for every vertex;
+`shapes.npz` is four times as large and cannot be streamed. This file stores int16 coordinates frame by frame, so that
+drawing starts with the first frame, and optional data (residuals, ground truth) at offsets for range requests.
 
 Layout, little-endian: `b"PLIANTPV"`, uint32 version, uint32 length of the header, the header as JSON in UTF-8, then sections at
-the offsets that the header gives, each a multiple of 8.
+the offsets given in the header, each a multiple of 8.
 
 =========  ==================  ===================================================================================
 section    type and shape      meaning
@@ -16,7 +15,7 @@ faces      uint32 (T, 3)       triangles; quads are split
 cameras    float32 (F, 10)     rotation row by row, camera from world; then the scale
 positions  int16 (F, P, 3)     world = origin + step · value
 residuals  int16 (F, P, 2)     track − projection = residual_step · value; both −32768 where hidden
-truth      int16 (F, P, 3)     as positions; turned onto the result as `e3d_frame` does. Only with ground truth
+truth      int16 (F, P, 3)     as positions, aligned with the result as for `e3d_frame`; only with ground truth
 =========  ==================  ===================================================================================
 """
 
@@ -41,27 +40,27 @@ VERSION = 1
 LARGEST = 32767
 HIDDEN = -32768
 MOST_OBSERVATIONS = 16_000_000
-"""Beyond this many points × frames (96 MB of positions) only every n-th frame is written."""
+"""Number of points × frames (96 MB of positions) above which only every n-th frame is written."""
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """The uniform grid on which coordinates are rounded: `world = origin + step · value`."""
+    """The uniform grid to which coordinates are rounded: `world = origin + step · value`."""
 
     origin: Floats
     step: float
 
     @classmethod
     def around(cls, *clouds: Floats) -> Box:
-        """Return the grid that just holds every point of the clouds, each `(F, P, 3)`."""
+        """Return the smallest grid that contains all points of the clouds, each `(F, P, 3)`."""
         low = np.min([cloud.min(axis=(0, 1)) for cloud in clouds], axis=0)
         high = np.max([cloud.max(axis=(0, 1)) for cloud in clouds], axis=0)
         return cls((low + high) / 2, float((high - low).max() / 2 / LARGEST) or 1.0)
 
     def rounded(self, frame: Floats) -> NDArray[np.int16]:
-        """Round one frame's points `(P, 3)`; off by at most half a step."""
+        """Round one frame's points `(P, 3)`, with an error of at most half a step."""
         return np.rint((frame - self.origin) / self.step).clip(-LARGEST, LARGEST).astype("<i2")
 
 
@@ -80,15 +79,15 @@ def write_preview(
     Parameters
     ----------
     file : binary file
-        Open for writing, at its beginning.
+        Open for writing, at its start.
     tracks, mesh, solution
-        What went in, and what came out.
+        Input and result of the solve.
     truth : array, shape (F, P, 3), optional
         Ground truth in any axes, the tracks' unit; NaN where unknown.
     y_axis : {'down', 'up'}
-        Where the image's y points.
+        Direction of the image's y axis.
     fps : float
-        Frames per second of the animation, before frames are left out.
+        Frames per second of the animation, before frames are skipped.
     """
     stride = max(1, -(-solution.shapes[..., 0].size // MOST_OBSERVATIONS))
     kept = range(0, len(solution.shapes), stride)
@@ -129,7 +128,7 @@ def write_preview(
 
 
 def triangles(mesh: Mesh | None) -> NDArray[np.uint32]:
-    """Faces as triangles `(T, 3)`; a quad becomes two, in the same sense of rotation."""
+    """Return faces as triangles `(T, 3)`; quads are split, keeping their orientation."""
     if mesh is None or len(mesh.faces) == 0:
         return np.zeros((0, 3), dtype="<u4")
     faces = mesh.faces
@@ -139,16 +138,16 @@ def triangles(mesh: Mesh | None) -> NDArray[np.uint32]:
 
 
 def _onto(shapes: Floats, truth: Floats) -> tuple[Floats | None, bool]:
-    """Turn the truth onto the result frame by frame, and say whether the result's depth has the other sign.
+    """Return the truth aligned with the result per frame, and whether the result's depth has the opposite sign.
 
-    Points without truth are left out of the alignment and stand where the result has them.
+    Points without truth are excluded from the alignment and take the position of the result.
     """
     known = np.isfinite(truth).all(axis=(0, 2))
     if known.sum() < 3:
         return None, False
     aligned = align(shapes[:, known], truth[:, known], kind="frame")
     turned = shapes.copy()
-    # aligned.shapes = (S − centre) Tᵀ ≈ G, so G T + centre lies on S.
+    # aligned.shapes = (S − centre) Tᵀ ≈ G, so G T + centre ≈ S.
     turned[:, known] = aligned.truth @ aligned.transforms + shapes[:, known].mean(axis=1, keepdims=True)
     return turned, bool(np.linalg.det(aligned.transforms[0]) < 0)
 
@@ -172,7 +171,7 @@ def _residuals(tracks: Tracks, solution: Solution, frame: int, step: float) -> N
 
 
 def _begin(file: IO[bytes], header: dict[str, object], sizes: dict[str, int]) -> None:
-    """Write magic, version and header; the offsets in it depend on its own length, so it is padded to a fixed one."""
+    """Write magic, version and header, padded to a fixed length because its offsets depend on its length."""
     room = 1024
     offset = 16 + room
     sections = {}

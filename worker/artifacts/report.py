@@ -1,4 +1,4 @@
-"""report.json: everything known about how a result came to be."""
+"""report.json: how a result was computed."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ def build_report(
     metrics: Mapping[str, float],
     seconds: Mapping[str, float] | None = None,
 ) -> dict[str, Any]:
-    """Gather what `report.json` says; plain values, ready for JSON.
+    """Return the content of `report.json` as plain values for JSON.
 
     Parameters
     ----------
     inputs, solution, options
         Of the job.
     metrics : mapping
-        By documented name; a number that is not finite is written as null.
+        By documented name; numbers that are not finite are written as null.
     seconds : mapping, optional
-        Wall time of stages outside the solver, e.g. `loading`; the solver's own come with the solution.
+        Wall time of stages outside the solver, e.g. `loading`; those of the solver are part of the solution.
     """
     choices = asdict(solution.choices)
     reasons, warnings = choices.pop("reasons"), choices.pop("warnings")
@@ -71,7 +71,7 @@ def build_report(
 
 
 def _camera(solution: Solution) -> dict[str, Any]:
-    """Return what is the same in all frames: model, focal length in the tracks' unit, principal point, and how they were chosen."""
+    """Return what all frames share: camera model, focal length in the tracks' unit, principal point, and how they were chosen."""
     camera, choices = solution.camera, solution.choices
     return {
         "model": choices.camera,
@@ -85,7 +85,7 @@ def _camera(solution: Solution) -> dict[str, Any]:
 
 
 def _trust(trust: Trust | None) -> dict[str, Any]:
-    """Describe how far the result can be trusted; nulls where the solver did not judge it."""
+    """Return the verdict on the result with its reasons; nulls if the solver gave none."""
     if trust is None:
         trust_fields = ("verdict", "expected_error", "expected_error_interval", "trust_sentence")
         return {**dict.fromkeys(trust_fields), "verdict_reasons": []}
@@ -99,19 +99,19 @@ def _trust(trust: Trust | None) -> dict[str, Any]:
 
 
 def peak_memory() -> int:
-    """Largest resident size of this process so far, bytes."""
+    """Return the peak resident size of this process, bytes."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024
 
 
 def versions() -> dict[str, str]:
-    """Versions of what computed the numbers."""
+    """Return the versions of the software used."""
     libraries = {name: version(name) for name in ("pliant", "numpy", "scipy")}
     return {**libraries, "python": platform.python_version(), "system": f"{platform.system()} {platform.machine()}"}
 
 
 def _plain(value: Any) -> Any:
-    """JSON has no NaN and no infinity: they become null."""
+    """Return None for NaN and infinity, which JSON lacks."""
     if isinstance(value, Mapping):
         return {str(name): _plain(item) for name, item in value.items()}
     if isinstance(value, list | tuple):

@@ -1,4 +1,4 @@
-"""What the writers work from: a job's inputs and solution, and what several of them need computed once."""
+"""Input of the writers: inputs and solution of a job, with shared quantities computed once."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Result:
 
     @property
     def y_axis(self) -> str:
-        """Where y of the tracks points: `down` or `up`."""
+        """Direction of the tracks' y axis: `down` or `up`."""
         return self.inputs.interpretation.y_axis
 
     @cached_property
@@ -42,7 +42,7 @@ class Result:
     def painting(self) -> Painting | None:
         """Colours, if the options request them: the distance from the truth (the residual without truth), or the expected error.
 
-        None, too, for the expected error of a prior that has no posterior.
+        Also None for the expected error with a prior that has no posterior.
         """
         if self.options.colours == "none":
             return None
@@ -58,12 +58,12 @@ class Result:
 
     @property
     def texture(self) -> Texture | None:
-        """The picture to put on the surface; None without one, without a surface, and where colours mean something else."""
+        """The texture; None without one, without faces, and if colours show a metric."""
         return self.inputs.texture if self.painting is None and len(self.faces) else None
 
     @cached_property
     def picture_colours(self) -> Floats | None:
-        """Colours `(P, 3)` of the points in the picture, sRGB in [0, 1]; None without one or where colours mean something else."""
+        """Colours `(P, 3)` of the points in the texture, sRGB in [0, 1]; None without one or if colours show a metric."""
         return None if self.inputs.texture is None or self.painting is not None else self.inputs.texture.colours()
 
     def standing(self, frame: int) -> Floats:

@@ -18,7 +18,7 @@ Column = NDArray[np.floating] | NDArray[np.integer] | Iterable[float]
 
 
 def write_frames_csv(result: Result, file: IO[bytes]) -> None:
-    """One row a frame; columns with truth only where there is truth, empty cells where nothing was visible."""
+    """Write one row per frame; truth columns only with ground truth, empty cells where nothing was visible."""
     residuals, seen = result.solution.residuals, result.inputs.tracks.visible
     columns: dict[str, Column] = {
         "frame": np.arange(len(residuals)),
@@ -39,7 +39,7 @@ def write_frames_csv(result: Result, file: IO[bytes]) -> None:
 
 
 def write_points_csv(result: Result, file: IO[bytes]) -> None:
-    """One row a point; as `write_frames_csv`."""
+    """Write one row per point, otherwise as `write_frames_csv`."""
     residuals, seen = result.solution.residuals.T, result.inputs.tracks.visible.T
     columns: dict[str, Column] = {
         "point": np.arange(len(residuals)),
@@ -54,7 +54,7 @@ def write_points_csv(result: Result, file: IO[bytes]) -> None:
 
 
 def _residuals(residuals: Floats, seen: Floats) -> dict[str, Column]:
-    """Median of the visible residuals of each row, and their root mean square, weighted with the confidence."""
+    """Return the median of each row's visible residuals, and their RMS weighted with the confidence."""
     median = [
         float(np.median(row[some])) if some.any() else np.nan for row, some in zip(residuals, seen > 0, strict=True)
     ]
@@ -62,14 +62,14 @@ def _residuals(residuals: Floats, seen: Floats) -> dict[str, Column]:
 
 
 def _mean(values: Floats, weights: Floats | NDArray[np.bool_]) -> Floats:
-    """Weighted mean of each row; NaN where no weight is."""
+    """Return the weighted mean of each row; NaN where all weights are 0."""
     total = np.einsum("nk,nk->n", values, weights)
     count = weights.sum(axis=1, dtype=np.float64)
     return np.asarray(np.divide(total, count, out=np.full(len(total), np.nan), where=count > 0))
 
 
 def _write(file: IO[bytes], columns: Mapping[str, Column]) -> None:
-    """Numbers in the fewest digits that give them back exactly."""
+    """Return numbers in the shortest form that restores them exactly."""
     text = io.TextIOWrapper(file, encoding="ascii", newline="")
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)

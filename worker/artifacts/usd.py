@@ -16,7 +16,7 @@ from pliant.worker.artifacts.result import Result
 from pliant.worker.formats import Texture
 
 PICTURE = "texture.jpg"
-"""Name of the picture in the package."""
+"""Name of the texture in the package."""
 
 
 def available() -> bool:
@@ -25,9 +25,9 @@ def available() -> bool:
 
 
 def write_usd(result: Result, file: IO[bytes], on_progress: Callable[[float], None]) -> None:
-    """Write `/shape` with a time sample a frame; y up, right-handed, as in the glTF file.
+    """Write `/shape` with one time sample per frame; y up, right-handed, as in the glTF file.
 
-    The library wants a path with its own suffix, so it writes beside the file, into one that goes.
+    The library requires a path with its own suffix, so a temporary file beside the target is used.
     """
     path = Path(f"{file.name}.usdc")
     path.unlink(missing_ok=True)
@@ -40,7 +40,7 @@ def write_usd(result: Result, file: IO[bytes], on_progress: Callable[[float], No
 
 
 def write_usdz(result: Result, file: IO[bytes], on_progress: Callable[[float], None]) -> None:
-    """Write what `write_usd` does, in a package together with the picture on the surface."""
+    """Write the content of `write_usd` in a package together with the texture."""
     from pxr import UsdUtils
 
     with tempfile.TemporaryDirectory(dir=Path(file.name).parent, prefix=".usdz-") as folder:
@@ -85,7 +85,7 @@ def _describe_stage(stage: Any, result: Result) -> None:
     from pxr import UsdGeom
 
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
-    # How large the thing is nobody knows; its scale brings it to a few units, which are taken for metres as in glTF.
+    # The real size is unknown; the object is scaled to a few units, interpreted as metres as in glTF.
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     stage.SetTimeCodesPerSecond(result.options.fps)
     stage.SetFramesPerSecond(result.options.fps)
@@ -94,7 +94,7 @@ def _describe_stage(stage: Any, result: Result) -> None:
 
 
 def _define(stage: Any, result: Result) -> Any:
-    """Make the prim without what moves: a mesh with its faces, or points; scaled to a size that viewers like."""
+    """Return the static prim: a mesh with faces, or points, scaled to a suitable size for viewers."""
     from pxr import Gf, UsdGeom, Vt
 
     scale = viewer_scale(result.solution.shapes)
@@ -109,7 +109,7 @@ def _define(stage: Any, result: Result) -> Any:
         return shape
     shape.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), faces.shape[1], np.int32)))
     shape.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.ascontiguousarray(faces.reshape(-1))))
-    # Subdivision would move the surface away from the points.
+    # Subdivision would move the surface off the points.
     shape.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     shape.CreateDoubleSidedAttr(True)
     if result.texture is not None:
@@ -118,7 +118,7 @@ def _define(stage: Any, result: Result) -> Any:
 
 
 def _put_picture(stage: Any, shape: Any, texture: Texture) -> None:
-    """Bind a material that shows the picture: a UsdPreviewSurface with texture coordinates `st`, whose t points up."""
+    """Bind a material with the texture: a UsdPreviewSurface with texture coordinates `st`, whose t points up."""
     from pxr import Sdf, UsdGeom, UsdShade, Vt
 
     places = np.column_stack([texture.uv[:, 0], 1 - texture.uv[:, 1]]).astype(np.float32)

@@ -1,4 +1,4 @@
-"""All result files of a job. Each is written under another name and renamed when whole, so a reader never sees half of one."""
+"""Write all result files of a job. Each is written under a temporary name and renamed, so readers see complete files only."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ def write_artifacts(
     inputs, solution, options
         Of the job.
     report : dict
-        From `build_report`; what was written is added to it under `artifacts`, and `seconds.exporting`.
+        From `build_report`; `artifacts` and `seconds.exporting` are added to it.
     directory : Path
         Where the files go; files of the same names are replaced.
     on_progress : callable, optional
-        Told the share that is done, in [0, 1].
+        Called with the share that is done, in [0, 1].
 
     Returns
     -------
@@ -45,16 +45,16 @@ def write_artifacts(
     Raises
     ------
     InvalidInput
-        A file is asked for that cannot be written in this installation.
+        A requested file cannot be written in this installation.
     """
     began = time.perf_counter()
     result = Result(inputs, solution, options)
-    tell: OnProgress = on_progress or (lambda _: None)
+    report_share: OnProgress = on_progress or (lambda _: None)
     kinds = kinds_for(options, textured=result.texture is not None)
-    written, told = write_kinds(result, kinds, directory, on_progress=tell)
+    written, entries = write_kinds(result, kinds, directory, on_progress=report_share)
     seconds = {**report.get("seconds", {}), "exporting": time.perf_counter() - began}
-    written.append(write_report({**report, "seconds": seconds, "artifacts": told}, directory))
-    tell(1.0)
+    written.append(write_report({**report, "seconds": seconds, "artifacts": entries}, directory))
+    report_share(1.0)
     return written
 
 
@@ -76,26 +76,30 @@ def write_kinds(
     -------
     written : list of Artifact
         In the order of `kinds`.
-    stated : dict
+    entries : dict
         What the report states of each, by file name.
     """
     written: list[Artifact] = []
-    told: dict[str, Any] = {}
+    entries: dict[str, Any] = {}
     done, total = 0.0, sum(kind.share for kind in kinds)
     for kind in kinds:
         start, share = done / total, kind.share / total
-        said: dict[str, Any] = {}
+        extra: dict[str, Any] = {}
 
         def put(
-            file: IO[bytes], kind: Kind = kind, start: float = start, share: float = share, said: dict[str, Any] = said
+            file: IO[bytes],
+            kind: Kind = kind,
+            start: float = start,
+            share: float = share,
+            extra: dict[str, Any] = extra,
         ) -> None:
-            said.update(kind.write(result, file, lambda part: on_progress(start + share * part)))
+            extra.update(kind.write(result, file, lambda part: on_progress(start + share * part)))
 
         artifact = _written(directory, kind.name, kind.media_type, kind.description, put)
         written.append(artifact)
-        told[kind.name] = {"bytes": artifact.bytes, "sha256": artifact.sha256, **said}
+        entries[kind.name] = {"bytes": artifact.bytes, "sha256": artifact.sha256, **extra}
         done += kind.share
-    return written, told
+    return written, entries
 
 
 def write_report(report: dict[str, Any], directory: Path) -> Artifact:
@@ -120,7 +124,7 @@ def _written(
 
 
 def described(file: Path, media_type: str, description: str) -> Artifact:
-    """Return the record of a result file that is whole."""
+    """Return the record of a complete result file."""
     with file.open("rb") as stream:
         digest = hashlib.file_digest(stream, "sha256").hexdigest()
     return Artifact(

@@ -1,7 +1,7 @@
-"""What a job process does with one delivery: claim the job, run it, publish the result or the reason why there is none.
+"""One attempt at a job, in the job process: claim the job, run it, publish the result or the failure.
 
-What computes is imported inside the functions, so that who only asks after jobs does not load it; a worker loads it before
-it forks.
+Numerical modules are imported inside functions, so that processes that only read records do not load them; a worker
+loads them before it forks.
 """
 
 from __future__ import annotations
@@ -34,18 +34,18 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-TELL_EVERY = 0.5
-"""Least seconds between two progress writes."""
+PROGRESS_INTERVAL = 0.5
+"""Minimum seconds between two writes of the progress."""
 
-ASK_EVERY = 0.25
-"""Least seconds between two looks at whether the job is still wanted."""
+STATUS_INTERVAL = 0.25
+"""Minimum seconds between two reads of the job's status."""
 
 PATIENCE = 60.0
-"""Seconds that a job waits for a store that does not answer, before it computes and once it has its result."""
+"""Seconds to wait for an unavailable store, before computing and when publishing the result."""
 
 
 def run(id: str, attempt_id: str, *, settings: Settings, worker: str) -> None:
-    """Work on one delivered attempt. Returns when the record has the last word, or belongs to somebody else."""
+    """Run one delivered attempt; return when its outcome is recorded, or when the job belongs to another attempt."""
     jobs = Jobs.open(settings)
     try:
         stored = jobs.records.update(
@@ -69,26 +69,27 @@ def run(id: str, attempt_id: str, *, settings: Settings, worker: str) -> None:
 
 @dataclass(slots=True, kw_only=True)
 class Attempt:
-    """One try at a job, seen from inside: what it tells the record, and what the record tells it."""
+    """One attempt at a job, as seen by the job process: writes progress and outcome, reads the status."""
 
     jobs: Jobs
     id: str
     attempt_id: str
     deadline: float
-    """Monotonic time after which the job has taken too long."""
+    """Monotonic time at which the time limit is reached."""
     unwanted: bool = False
-    """True once the job was cancelled, has taken too long, or belongs to another attempt."""
+    """Whether the job was cancelled, timed out, or belongs to another attempt."""
     _parent: int = field(default_factory=os.getppid)
-    _next_tell: float = 0.0
-    _next_ask: float = 0.0
+    _next_report: float = 0.0
+    _stage: str = ""
+    _next_look: float = 0.0
     _lines: list[str] = field(default_factory=list)
 
-    def tell(self, progress: Progress) -> None:
-        """Write the progress, at most twice a second; a store that does not answer is no reason to stop."""
+    def report(self, progress: Progress) -> None:
+        """Write the progress: each new stage, else at most every `PROGRESS_INTERVAL` seconds. An unavailable store is ignored."""
         now = time.monotonic()
-        if now < self._next_tell:
+        if now < self._next_report and progress.stage == self._stage:
             return
-        self._next_tell = now + TELL_EVERY
+        self._next_report, self._stage = now + PROGRESS_INTERVAL, progress.stage
         try:
             self.jobs.records.update(
                 self.id, lambda held: lifecycle.report(held, attempt_id=self.attempt_id, progress=progress)
@@ -100,29 +101,29 @@ class Attempt:
             logger.warning("progress not written: %s", error)
 
     def should_stop(self) -> bool:
-        """Tell the solver whether the job is unwanted; asks the record at most four times a second."""
+        """Whether the job is unwanted; reads the record at most every `STATUS_INTERVAL` seconds."""
         now = time.monotonic()
-        if not self.unwanted and now >= self._next_ask:
-            self._next_ask = now + ASK_EVERY
+        if not self.unwanted and now >= self._next_look:
+            self._next_look = now + STATUS_INTERVAL
             if os.getppid() != self._parent:
-                os._exit(1)  # where the kernel does not end an orphan; the reconciler gives its job to another
+                os._exit(1)  # orphaned, on systems whose kernel does not end orphans; the reconciler requeues the job
             self.unwanted = now >= self.deadline or self._status() is not Status.RUNNING
         return self.unwanted
 
     def log(self, text: str) -> None:
-        """Add to the job's log; written with the next progress."""
+        """Append to the job's log; written with the next progress."""
         moment = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
         self._lines += [f"{moment} {line}" for line in text.splitlines()]
 
     def conclude(self, end: Finished | Problem | None) -> None:
-        """Give the record its last word: the result, the reason why there is none, or None for a stop on request.
+        """Write the final record: the result, the failure, or None for a stop on request.
 
         Raises
         ------
         StaleAttempt
             The job belongs to another attempt.
         StoreUnavailable
-            The store does not answer for a minute.
+            The store has not answered for `PATIENCE` seconds.
         """
         settings, now = self.jobs.settings, datetime.now(UTC)
 
@@ -142,12 +143,12 @@ class Attempt:
 
         with contextlib.suppress(StoreUnavailable):
             self._flush()
-        kept = Patience(PATIENCE).ask(lambda: self.jobs.records.update(self.id, change))
+        kept = Patience(PATIENCE).retry(lambda: self.jobs.records.update(self.id, change))
         if kept.prefix is None:
             self.jobs.blobs.delete(self.prefix)
 
     def store(self, finished: Finished, results: Path) -> None:
-        """Store the result files, waiting for a blob store that does not answer.
+        """Store the result files, retrying while the blob store is unavailable.
 
         Raises
         ------
@@ -161,7 +162,7 @@ class Attempt:
             self.wait_for_store(lambda key=key, file=file: self.jobs.blobs.put(key, file))  # type: ignore[misc]
 
     def wait_for_store(self, call: Callable[[], object]) -> None:
-        """Call until the store answers, at most for `PATIENCE` seconds.
+        """Retry a call until the store answers, for at most `PATIENCE` seconds.
 
         Raises
         ------
@@ -176,11 +177,11 @@ class Attempt:
                 raise Interrupted
             call()
 
-        Patience(PATIENCE).ask(wanted)
+        Patience(PATIENCE).retry(wanted)
 
     @property
     def prefix(self) -> str:
-        """Where this attempt's artifacts lie; only the record makes them the job's."""
+        """Blob prefix of this attempt's artifacts; they become the job's when its record names the prefix."""
         return f"jobs/{self.id}/{self.attempt_id}/artifacts/"
 
     def _status(self) -> Status | None:
@@ -197,7 +198,7 @@ class Attempt:
 def work(
     attempt: Attempt, stored: Stored, directory: Path, *, reconstruct: Callable[..., Finished] | None = None
 ) -> Finished | Problem | None:
-    """Run the job; every exception becomes the problem it is, its traceback goes into the log.
+    """Run the job; map every exception to a problem and write its traceback to the log.
 
     `reconstruct` replaces `pliant.worker.execution.pipeline.reconstruct`, in tests.
     """
@@ -215,11 +216,11 @@ def work(
         attempt.store(finished, results)
     except Interrupted:
         late = time.monotonic() >= attempt.deadline
-        attempt.log("Stopped: it took too long." if late else "Stopped on request.")
+        attempt.log("Stopped: the time limit was reached." if late else "Stopped on request.")
         return timed_out(attempt.jobs.settings.time_limit) if late else None
     except (StaleAttempt, UnknownJob):
         raise
-    except Exception as error:  # noqa: BLE001  whatever it is, the user is owed an answer and the log the traceback
+    except Exception as error:  # noqa: BLE001  every failure must end the job with a problem
         problem = problem_of(error, memory_limit=attempt.jobs.settings.memory_limit)
         attempt.log(f"Failed: {problem.detail}")
         if problem.code in ("internal_error", "storage_failed", "store_unavailable", "out_of_memory"):
@@ -242,15 +243,14 @@ def _reconstruct(
     options = stored.job.options
     if not is_source(inputs):
         return (reconstruct or pipeline.reconstruct)(
-            load_inputs(inputs), options, results, on_progress=attempt.tell, should_stop=attempt.should_stop
+            load_inputs(inputs), options, results, on_progress=attempt.report, should_stop=attempt.should_stop
         )
     settings, scratch = attempt.jobs.settings, inputs.with_name("film")
-    memory = min(FilmBounds().memory, settings.memory_limit or FilmBounds().memory)
     source = open_source(inputs, inputs.with_name("source"))
     scratch.mkdir()
     return reconstruct_film(
-        source, options, results, scratch=scratch, threads=settings.threads_per_job, bounds=FilmBounds(memory=memory),
-        on_progress=attempt.tell, should_stop=attempt.should_stop,
+        source, options, results, scratch=scratch, threads=settings.threads_per_job, bounds=FilmBounds.of(settings),
+        on_progress=attempt.report, should_stop=attempt.should_stop,
     )  # fmt: skip
 
 
@@ -261,7 +261,7 @@ def _write_further(attempt: Attempt, stored: Stored, inputs: Path, results: Path
     file, key = inputs.with_name("result.npz"), stored.result
     assert key is not None
     attempt.wait_for_store(lambda: attempt.jobs.blobs.fetch(key, file))
-    return write_further(inputs, file, stored.job, results, on_progress=attempt.tell, should_stop=attempt.should_stop)
+    return write_further(inputs, file, stored.job, results, on_progress=attempt.report, should_stop=attempt.should_stop)
 
 
 def _listed(names: Sequence[str]) -> str:
@@ -274,7 +274,7 @@ def _deadline(settings: Settings) -> float:
 
 @contextlib.contextmanager
 def _limited_memory(limit: int) -> Iterator[None]:
-    """Bound the address space, so that too large an array is a MemoryError instead of a kill."""
+    """Limit the address space, so that too large an array raises MemoryError instead of ending the process."""
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     resource.setrlimit(resource.RLIMIT_AS, (limit or soft, hard))
     try:
@@ -285,7 +285,7 @@ def _limited_memory(limit: int) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _own_output(file: Path) -> Iterator[None]:
-    """Send standard output and error, native code's too, into the attempt's own file; a crash leaves its stack there."""
+    """Redirect standard output and error, native code's included, to the attempt's file, which also receives crash traces."""
     with file.open("wb") as output:
         kept = os.dup(1), os.dup(2)
         for descriptor in (1, 2):

@@ -1,4 +1,4 @@
-"""From what went wrong in a job to the problem in its record: one table, in words for the user."""
+"""Map exceptions of a job to the problems in its record."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from pliant.schemas.job import Problem
 from pliant.worker.errors import StoreUnavailable, TimedOut
 
 _NO_ROOM_FOR_A_THREAD = ("can't start new thread", os.strerror(errno.EAGAIN))
-"""What Python and SciPy's pool say when a thread's stack does not fit into the address space."""
+"""Messages of Python and SciPy when a thread's stack does not fit into the address space."""
 
 
 def problem_of(error: BaseException, *, memory_limit: int = 0) -> Problem:
-    """Return the problem that an exception in a job is. The traceback belongs into the log, never into the record.
+    """Return the problem for an exception in a job. Tracebacks go to the log, never into the record.
 
     Parameters
     ----------
     memory_limit : int
-        Address space the job may take, bytes; 0: no limit.
+        Limit of the job's address space, bytes; 0: no limit.
     """
     from pliant.solver import (
         InvalidInput,
-    )  # here, because it loads NumPy, which the reconciler has no use for
+    )  # imported here because it loads NumPy, which the reconciler does not need
 
     if isinstance(error, InvalidInput):
         return Problem(
@@ -49,18 +49,18 @@ def problem_of(error: BaseException, *, memory_limit: int = 0) -> Problem:
         reason = os.strerror(error.errno)
         return Problem(
             title="Storage failed", status=503, code="storage_failed", retryable=True,
-            detail=f"A file could not be read or written ({reason}). Free space or mend the disk, then retry the job.",
+            detail=f"A file could not be read or written ({reason}). Free disk space or repair the disk, then retry the job.",
         )  # fmt: skip
     return Problem(
         title="Internal error", status=500, code="internal_error",
-        detail=f"The job failed with an unexpected {type(error).__name__}; this is our fault, not yours. "
-        "The job's log has the details: please report them.",
+        detail=f"The job failed with an unexpected {type(error).__name__}; this is a defect of Pliant. "
+        "Please report it with the job's log, which has the details.",
     )  # fmt: skip
 
 
 def out_of_memory(limit: int = 0) -> Problem:
-    """Return the problem of a job that needed more memory than there was."""
-    there = f"{limit / 2**30:.1f} GiB" if limit else "the machine had"
+    """Return the problem of a job that ran out of memory."""
+    there = f"{limit / 2**30:.1f} GiB" if limit else "the machine has"
     return Problem(
         title="Out of memory", status=507, code="out_of_memory", retryable=True,
         detail=f"The job needed more memory than {there}. Send fewer points or frames, set precision to float32, "
@@ -69,28 +69,28 @@ def out_of_memory(limit: int = 0) -> Problem:
 
 
 def timed_out(limit: float) -> Problem:
-    """Return the problem of a job that took longer than it may."""
+    """Return the problem of a job that exceeded its time limit."""
     return Problem(
         title="Timed out", status=504, code="timed_out", retryable=True,
-        detail=f"The job took longer than the {limit:g} s it may. Send fewer points or frames, lower max_reweightings, "
-        "or have the operator raise PLIANT_TIME_LIMIT.",
+        detail=f"The job exceeded the time limit of {limit:g} s. Send fewer points or frames, lower max_reweightings, "
+        "or ask the operator to raise PLIANT_TIME_LIMIT.",
     )  # fmt: skip
 
 
 def worker_lost(reason: str) -> Problem:
-    """Return the problem of a job whose process ended without a last word."""
+    """Return the problem of a job whose process ended without recording an outcome."""
     return Problem(
         title="Worker lost", status=503, code="worker_lost", retryable=True,
-        detail=f"{reason} Nothing else is affected; retry the job.",
+        detail=f"{reason} Other jobs are not affected; retry this one.",
     )  # fmt: skip
 
 
 def how_it_ended(status: int) -> str:
-    """Say in words what a wait status means."""
+    """Return a sentence for a wait status."""
     if os.WIFSIGNALED(status):
         number = os.WTERMSIG(status)
-        return f"The process that worked on the job was ended by signal {number} ({signal.Signals(number).name})."
-    return f"The process that worked on the job ended with code {os.WEXITSTATUS(status)} and no last word."
+        return f"The job process was ended by signal {number} ({signal.Signals(number).name})."
+    return f"The job process ended with code {os.WEXITSTATUS(status)} without recording an outcome."
 
 
 def _sentence(text: str) -> str:

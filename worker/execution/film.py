@@ -1,4 +1,4 @@
-"""A whole job from a film: track it in the film process, solve, write the files."""
+"""A complete job from a film: track it in the film process, solve, write the files."""
 
 from __future__ import annotations
 
@@ -48,13 +48,13 @@ def reconstruct_film(
     options : Options
         How to track, solve and write; see `film_options`.
     directory : Path
-        Where the files go; made if need be.
+        Where to write the files; created if missing.
     scratch : Path
         An empty folder for the film process.
     threads : int
         Threads for optical flow.
     bounds : FilmBounds
-        What the film may cost.
+        Limits of the film.
     on_progress, should_stop : callable, optional
         As in `reconstruct`; the first stage is `track`.
 
@@ -73,7 +73,7 @@ def reconstruct_film(
     try:
         tracked = track_film(
             source, options, scratch, bounds=bounds, threads=threads,
-            on_progress=lambda done: reporter.part("track", done), should_stop=halt.asked,
+            on_progress=lambda done: reporter.part("track", done), should_stop=halt.requested,
         )  # fmt: skip
     except Interrupted:
         halt.check()

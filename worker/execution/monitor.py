@@ -1,4 +1,4 @@
-"""Watching over one attempt from outside: signs of life, reasons to kill it, and the last word if it had none."""
+"""Supervision of one attempt by its worker: heartbeats, reasons to kill it, and its outcome if it recorded none."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ from pliant.worker.settings import Settings
 logger = logging.getLogger(__name__)
 
 BEAT = 1.0
-"""Seconds between signs of life; each also tells how the job stands."""
+"""Seconds between heartbeats; each also returns the job's status."""
 
 
 Answer = TypeVar("Answer")
 
 
 class Patience:
-    """How long one still waits for a store that does not answer: one span of time for all that is asked within it."""
+    """Retries of calls to an unavailable store within one common time limit."""
 
     def __init__(self, seconds: float) -> None:
         self._until = time.monotonic() + seconds
 
-    def ask(self, call: Callable[[], Answer]) -> Answer:
-        """Repeat what is asked or told until the store answers or the time is over; try once at least.
+    def retry(self, call: Callable[[], Answer]) -> Answer:
+        """Repeat a call until the store answers or the time limit is reached; call at least once.
 
         Raises
         ------
@@ -55,7 +55,7 @@ class Patience:
 
 
 class Reason(StrEnum):
-    """Why an attempt is ended from outside."""
+    """Why the worker ends an attempt."""
 
     CANCELLED = "cancelled"
     TIMED_OUT = "timed_out"
@@ -65,37 +65,37 @@ class Reason(StrEnum):
 
 @dataclass(slots=True)
 class Watch:
-    """What the worker knows of the attempt that its job process is at."""
+    """The worker's view of the attempt that its job process runs."""
 
     settings: Settings
     records: Records
     id: str
     attempt_id: str
     worker: str
-    """Name of the worker that watches."""
+    """Name of the worker."""
     clock: Callable[[], float] = time.monotonic
     reason: Reason | None = None
-    """Why it was killed, once it was."""
+    """Why the job process was killed; None if it was not."""
     stopping: bool = False
-    """The worker is being shut down; whoever does that may kill the job process as well."""
+    """Whether the worker is shutting down; the service manager may then kill the job process as well."""
     began: float = field(init=False)
     kills: OomKills = field(init=False)
     _next_beat: float = field(init=False)
     _cancelled: float | None = None
     _own_limit: float | None = None
-    """The option `time_limit` of the job, 0 for none; None: not read yet."""
+    """The job's option `time_limit`, 0 for none; None before it is read."""
 
     def __post_init__(self) -> None:
         self.began = self._next_beat = self.clock()
         self.kills = OomKills.now()
 
     def must_end(self, *, stop_by: float | None) -> Reason | None:
-        """Give a sign of life if one is due, and return why the job process must be killed now, or None.
+        """Write a heartbeat if one is due; return the reason to kill the job process now, or None.
 
         Parameters
         ----------
         stop_by : float or None
-            Until when the worker's own shutdown lets the job go on.
+            Monotonic time until which the job may continue while the worker shuts down.
         """
         now = self.clock()
         self.stopping = stop_by is not None
@@ -115,7 +115,7 @@ class Watch:
 
     @property
     def limit(self) -> float:
-        """Seconds that the attempt may take: the lower one of the setting's and the job's own; 0: no limit."""
+        """Return the time limit of the attempt, seconds: the lower of the setting and the job's option; 0: no limit."""
         return min((each for each in (self.settings.time_limit, self._own_limit or 0.0) if each > 0), default=0.0)
 
     def _look(self, now: float) -> None:
@@ -126,7 +126,7 @@ class Watch:
         except UnknownJob:
             status = None
         except StoreUnavailable:
-            return  # the job goes on; it needs no store until it writes its result
+            return  # the job continues; it needs no store until it writes its result
         if status is None:
             self.reason = Reason.STALE
         elif status is Status.CANCELLING and self._cancelled is None:
@@ -134,19 +134,19 @@ class Watch:
 
 
 def finalize(watch: Watch, *, status: int, peak: int, patience: Patience) -> Stored | None:
-    """Write the record's last word for a job process that ended without one; one that spoke is left alone.
+    """Record the outcome of a job process that ended without recording one; otherwise change nothing.
 
-    Returns the record if there was something to write. The job's log has the reason and the end of the job process's own output
-    before the record is final: whoever is told that a job has ended finds its log whole.
+    Returns the record if it was written. The reason and the last output of the job process are logged before the record
+    becomes final, so the log of a finished job is complete.
 
     Parameters
     ----------
     status : int
         As `os.wait4` returns it.
     peak : int
-        The job process's largest resident size, bytes.
+        Peak resident size of the job process, bytes.
     patience : Patience
-        With a store that does not answer.
+        Time limit for an unavailable store.
 
     Raises
     ------
@@ -154,17 +154,17 @@ def finalize(watch: Watch, *, status: int, peak: int, patience: Patience) -> Sto
         The store does not answer.
     """
     change = _verdict(watch, status=status, peak=peak)
-    sentence = f"Ended from outside: {watch.reason}." if watch.reason is not None else how_it_ended(status)
+    sentence = f"Ended by the worker: {watch.reason}." if watch.reason is not None else how_it_ended(status)
     words = [sentence, *last_words(watch.settings, watch.attempt_id)]
 
     def speak() -> Stored:
-        change(watch.records.get(watch.id))  # raises where there is nothing to say
+        change(watch.records.get(watch.id))  # raises if the outcome is recorded already
         watch.records.append_log(watch.id, words)
         words.clear()
         return watch.records.update(watch.id, change)
 
     try:
-        settled = patience.ask(speak)
+        settled = patience.retry(speak)
     except (StaleAttempt, UnknownJob):
         return None
     logger.warning("job %s: %s", watch.id, sentence)
@@ -175,7 +175,7 @@ def _verdict(watch: Watch, *, status: int, peak: int) -> Callable[[Stored], Stor
     settings, attempt_id, now = watch.settings, watch.attempt_id, datetime.now(UTC)
 
     def change(stored: Stored) -> Stored:
-        if stored.worker != watch.worker:  # a second delivery of one attempt must not end the first
+        if stored.worker != watch.worker:  # a duplicate delivery must not end the first one
             raise StaleAttempt(watch.id)
         if watch.reason is Reason.CANCELLED:
             return lifecycle.stop(stored, attempt_id=attempt_id, now=now, retention=settings.retention)
@@ -202,7 +202,7 @@ def _verdict(watch: Watch, *, status: int, peak: int) -> Callable[[Stored], Stor
 
 
 def _death(watch: Watch, *, status: int, peak: int) -> Problem:
-    """Tell a death for want of memory from the others: by the kernel's counters, or by a limit that was nearly full."""
+    """Whether the process died for lack of memory: by the kernel's counters, or by a limit that was nearly reached."""
     killed = _was_killed(status)
     limit = watch.settings.memory_limit
     if (killed and OomKills.now().since(watch.kills)) or (limit > 0 and peak > 0.9 * limit):

@@ -1,4 +1,4 @@
-"""A whole job as a plain call: inputs in, files out. `pliant solve` and the queue's worker both call exactly this."""
+"""A complete job as a plain call from inputs to files, used by `pliant solve` and by the workers."""
 
 from __future__ import annotations
 
@@ -20,38 +20,38 @@ from pliant.worker.formats import Inputs
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Finished:
-    """How a job ended, and what it left in its directory."""
+    """Outcome of a job and the files in its directory."""
 
     metrics: dict[str, float]
-    """Every metric that the inputs allow and that is finite, by its documented name."""
+    """Every metric for which the inputs suffice and that is finite, by its documented name."""
 
     outcome: str
-    """How the solver ended: `converged` or `max_reweightings`."""
+    """Outcome of the solver: `converged`, `max_reweightings` or `rejected`."""
 
     sentence: str
     """The outcome in words."""
 
     warnings: tuple[str, ...]
-    """Sentences the user should read about this result."""
+    """Warnings about this result."""
 
     artifacts: tuple[Artifact, ...]
-    """The files, named as they lie in the directory."""
+    """The files by their names in the directory."""
 
     interpretation: Interpretation | None = None
-    """How the inputs were read, where that was not known before the job ran: the tracks of a film."""
+    """Interpretation of the inputs if it was not known at submission, as for the tracks of a film."""
 
     verdict: str | None = None
-    """`good`, `with_care` or `do_not_use`; None where the solver did not judge the result."""
+    """`good`, `with_care` or `do_not_use`; None if the solver gave no verdict."""
 
     verdict_reasons: tuple[str, ...] = ()
-    """A sentence for each sign against the result, the gravest first."""
+    """A sentence for each reason against the result, most severe first."""
 
     trust_sentence: str | None = None
-    """The expected error and what depth rests on, in words."""
+    """A sentence with the expected error and the evidence for depth."""
 
 
 def solver_settings(options: Options, *, y_up: bool = False) -> Settings:
-    """Return the solver's part of a job's options; `y_up` as the tracks were read."""
+    """Return the solver settings of a job's options; `y_up` as the tracks were read."""
     values = {name: getattr(options, name) for name in SOLVER_FIELDS}
     values["image_size"] = _pair(options.image_size, "x")
     values["principal_point"] = _pair(options.principal_point, ",")
@@ -80,28 +80,28 @@ def reconstruct(
     Parameters
     ----------
     inputs : Inputs
-        As the readers give them.
+        As returned by the readers.
     options : Options
-        How to solve and write.
+        How to solve and which files to write.
     directory : Path
-        Where the files go; made if need be.
+        Where to write the files; created if missing.
     on_progress : callable, optional
-        Told often; whoever cannot listen so often drops some.
+        Called frequently; throttle if needed.
     should_stop : callable, optional
-        Asked often; once it says True, the job ends with `Interrupted`, and the files it has written are not all.
+        Called frequently; once it returns True, the job ends with `Interrupted`, possibly before all files are written.
     solver : callable, optional
         Replaces `pliant.solver.solve`, in tests.
 
     Raises
     ------
     Interrupted
-        `should_stop` said so.
+        `should_stop` returned True.
     TimedOut
-        It took longer than `options.time_limit`.
+        The job took longer than `options.time_limit`.
     InvalidInput
-        The inputs and the options do not fit together, or a file is asked for that cannot be written here.
+        Inputs and options contradict each other, or a requested file cannot be written in this installation.
     """
-    # What cannot be written is refused before anything is computed.
+    # Reject files that cannot be written before computing anything.
     kinds_for(options, size=(inputs.tracks.num_frames, inputs.tracks.num_points))
     reporter = Reporter(on_progress if on_progress is not None else silent)
     halt = Halt(should_stop, options.time_limit)
@@ -118,16 +118,16 @@ def solve_and_write(
     spent: Mapping[str, float] | None = None,
     solver: Callable[..., Solution] | None = None,
 ) -> Finished:
-    """Do what `reconstruct` does, as a part of a longer job.
+    """Run `reconstruct` as part of a longer job.
 
     Parameters
     ----------
     inputs, options, directory
         As in `reconstruct`.
     reporter : Reporter
-        Gets the parts `loading`, `solving` and `exporting`.
+        Receives the parts `loading`, `solving` and `exporting`.
     halt : Halt
-        Whether to stop.
+        The stop condition.
     spent : mapping, optional
         Seconds of earlier parts, for the report.
     solver : callable, optional
@@ -141,8 +141,8 @@ def solve_and_write(
         inputs.mesh,
         cameras=inputs.cameras,
         settings=solver_settings(options, y_up=inputs.interpretation.y_axis == "up"),
-        on_step=lambda step: _told(reporter, step),
-        should_stop=halt.asked,
+        on_step=lambda step: _report_step(reporter, step),
+        should_stop=halt.requested,
     )
     if solution.outcome is Outcome.STOPPED:
         halt.check()
@@ -172,15 +172,15 @@ def solve_and_write(
 
 @dataclass(slots=True)
 class Halt:
-    """Whether to stop, and why; once asked for, it stays so."""
+    """The stop condition of a job with its reason; once requested, a stop stays requested."""
 
     should_stop: Callable[[], bool] | None
     limit: float | None
     began: float = field(default_factory=time.monotonic)
     reason: Interrupted | TimedOut | None = None
 
-    def asked(self) -> bool:
-        """Return True once the job is to stop."""
+    def requested(self) -> bool:
+        """Whether the job has to stop."""
         if self.reason is None and self.should_stop is not None and self.should_stop():
             self.reason = Interrupted()
         if self.reason is None and self.limit is not None and time.monotonic() > self.began + self.limit:
@@ -188,8 +188,8 @@ class Halt:
         return self.reason is not None
 
     def check(self) -> None:
-        """Raise the reason to stop, if there is one."""
-        if self.asked() and self.reason is not None:
+        """Raise the reason to stop, if any."""
+        if self.requested() and self.reason is not None:
             raise self.reason
 
 
@@ -200,7 +200,7 @@ def _metrics(inputs: Inputs, solution: Solution) -> dict[str, float]:
     return {name: value for name, value in values.items() if math.isfinite(value)}
 
 
-def _told(reporter: Reporter, step: Step) -> None:
+def _report_step(reporter: Reporter, step: Step) -> None:
     reporter.part(
         "solving",
         step.fraction,
@@ -213,5 +213,5 @@ def _told(reporter: Reporter, step: Step) -> None:
 
 
 def silent(progress: Progress) -> None:
-    """Take progress that nobody asked for."""
+    """Ignore the progress."""
     del progress

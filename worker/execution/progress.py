@@ -1,4 +1,4 @@
-"""Progress: from the solver's steps to what a user reads, with an honest estimate of the time that is left."""
+"""Progress of a job: one fraction from the steps of its parts, with an estimate of the remaining time."""
 
 from __future__ import annotations
 
@@ -10,30 +10,30 @@ from datetime import UTC, datetime
 from pliant.schemas.job import Progress
 
 SHARES = {"loading": (0.0, 0.02), "solving": (0.02, 0.85), "exporting": (0.85, 1.0)}
-"""Where each part of a job begins and ends on the way from 0 to 1."""
+"""Start and end of each part of a job as fractions of the whole."""
 
 FILM_SHARES = {"track": (0.0, 0.5), "loading": (0.5, 0.51), "solving": (0.51, 0.93), "exporting": (0.93, 1.0)}
-"""The same for a film, by the times of films of a few seconds on two cores."""
+"""The same for a film, from the timings of films of a few seconds on two cores."""
 
 WORTH_ESTIMATING = 0.05
-"""Share that must be done before the time left is extrapolated from the time spent."""
+"""Fraction from which the remaining time is extrapolated from the elapsed time."""
 
 
 @dataclass(slots=True)
 class Reporter:
-    """Turns parts of parts into one fraction that never falls.
+    """Combines the progress of parts into one fraction that never decreases.
 
     Parameters
     ----------
-    tell : callable
-        Given every `Progress`.
+    on_progress : callable
+        Called with every `Progress`.
     clock : callable
         Monotonic seconds.
     shares : mapping
         The parts of the job.
     """
 
-    tell: Callable[[Progress], None]
+    on_progress: Callable[[Progress], None]
     clock: Callable[[], float] = time.monotonic
     shares: Mapping[str, tuple[float, float]] = field(default_factory=lambda: SHARES)
     _began: float | None = None
@@ -51,27 +51,27 @@ class Reporter:
         objective: float | None = None,
         residual: float | None = None,
     ) -> None:
-        """Say that `done` (0 to 1) of a part is done; numbers not given stay as they were told last.
+        """Report that the share `done` (0 to 1) of a part is done; omitted numbers keep their last value.
 
         Parameters
         ----------
         part : str
             A key of `shares`.
         stage : str, optional
-            The user's word for it; by default the part's own.
+            Stage to report; the name of the part by default.
         """
         now = self.clock()
         if self._began is None:
             self._began = now
-        told = {
+        given = {
             "reweighting": reweighting, "max_reweightings": max_reweightings, "objective": objective, "residual": residual,
         }  # fmt: skip
-        self._last |= {name: value for name, value in told.items() if value is not None}
+        self._last |= {name: value for name, value in given.items() if value is not None}
         low, high = self.shares[part]
         self._furthest = max(self._furthest, low + (high - low) * min(max(done, 0.0), 1.0))
         fraction, spent = self._furthest, now - self._began
         left = spent * (1 - fraction) / fraction if fraction >= WORTH_ESTIMATING else None
-        self.tell(
+        self.on_progress(
             Progress.model_validate(
                 {
                     **self._last,

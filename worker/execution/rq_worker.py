@@ -1,9 +1,9 @@
-"""Our RQ worker: RQ dequeues and forks; how a delivery is checked, watched and buried is ours.
+"""The RQ worker: RQ dequeues and forks; this module validates deliveries, supervises job processes and reaps them.
 
-What of RQ is switched off, and why: its job timeout (an alarm that waits for a C call to return), its maintenance
-(notices a lost job after minutes, and two at once queue it twice), its scheduler (a forked one keeps a dead worker's
-connection and swallows jobs), its commands (a thread beside a fork), callbacks and webhooks named by a delivery
-(whoever may write to Redis could name any function).
+Disabled features of RQ, with the reason: job timeout (its alarm waits for a C call to return), maintenance (detects a
+lost job after minutes, and two instances queue it twice), scheduler (a forked one keeps a dead worker's connection and
+loses jobs), commands (a thread beside a fork), callbacks and webhooks named by a delivery (whoever can write to Redis
+could name any function).
 """
 
 from __future__ import annotations
@@ -38,42 +38,44 @@ from rq.worker import WorkerStatus
 logger = logging.getLogger(__name__)
 
 IDLE_WAKE = 5
-"""Seconds an idle worker waits for a delivery before it gives a sign of life."""
+"""Seconds an idle worker waits for a delivery between heartbeats."""
 
 ALIVE_FOR = 20
-"""Seconds after its last sign of life that a worker counts as running."""
+"""Seconds after its last heartbeat that a worker counts as running."""
 
 RSS_UNIT = 1 if sys.platform == "darwin" else 1024
 """Bytes in one unit of `ru_maxrss`."""
 
 AWAY = (redis.ConnectionError, redis.TimeoutError)
-"""What Redis raises when it does not answer."""
+"""Exceptions of an unavailable Redis."""
 
 POLL = 0.05
-"""Seconds between looks at a running job process."""
+"""Seconds between checks of a running job process."""
 
 
 class Delivery(RqJob):
-    """A delivery names a job and an attempt. It runs nothing but our own function, whatever it claims to be."""
+    """A delivery of a job's attempt. It runs `attempt.run` only, whatever function it names."""
 
     settings: Settings | None = None
 
     def perform(self) -> None:
-        """Run the attempt; a delivery of anything else is refused."""
+        """Run the attempt; reject deliveries of other functions."""
         named, arguments = self.func_name, list(self.args)
         fits = len(arguments) == 2 and all(isinstance(each, str) for each in arguments) and not self.kwargs
         if named != FUNCTION or not fits or self.settings is None:
-            raise PermissionError(f"a delivery named {named!r} with {len(arguments)} arguments is not ours: refused")
+            raise PermissionError(
+                f"rejected a delivery of {named!r} with {len(arguments)} arguments, which is not an attempt"
+            )
         work.run(arguments[0], arguments[1], settings=self.settings, worker=str(self.worker_name))
 
     @property
     def success_callback(self) -> None:
-        """None: a delivery has no say in what is called."""
+        """None: deliveries cannot name callbacks."""
 
     failure_callback = stopped_callback = success_callback
 
     def send_webhooks(self, *_: Any, **__: Any) -> None:
-        """Send nothing: a delivery has no say in whom we call."""
+        """Do nothing: deliveries cannot name webhooks."""
 
 
 class PliantWorker(Worker):
@@ -98,13 +100,13 @@ class PliantWorker(Worker):
         self._stop_by: float | None = None
 
     def subscribe(self) -> None:
-        """Listen to no commands: we cancel by the record, and a process that forks is better off without threads."""
+        """Do not listen for commands: jobs are cancelled through their record, and forking is safer without threads."""
 
     def unsubscribe(self) -> None:
         """Do nothing; see `subscribe`."""
 
     def run_maintenance_tasks(self) -> None:
-        """Do nothing: the reconciler looks after lost jobs."""
+        """Do nothing: the reconciler requeues lost jobs."""
 
     @property
     def should_run_maintenance_tasks(self) -> bool:
@@ -112,26 +114,26 @@ class PliantWorker(Worker):
         return False
 
     def check_for_suspension(self, burst: bool) -> None:
-        """Do nothing: we have no use for suspended workers, and the question would need the store."""
+        """Do nothing: workers are never suspended, and the check would need the store."""
 
     def set_state(self, state: str, pipeline: Any = None) -> None:
-        """Note the state, in RQ's books too if the store is there."""
+        """Set the state, also in RQ's records if the store is available."""
         try:
             super().set_state(state, pipeline)
         except AWAY as error:
             logger.warning("state %s not written: %s", state, error)
 
     def heartbeat(self, timeout: int | None = None, pipeline: Any = None) -> None:
-        """Give RQ's sign of life, and our own that ends with us; a store that is away is no reason to end."""
+        """Send RQ's heartbeat and the worker's own, which expires with it; an unavailable store is ignored."""
         target: Any = pipeline if pipeline is not None else self.connection
         try:
             super().heartbeat(timeout, pipeline)
             target.set(alive_key(self._settings.queue, self.name), os.getpid(), ex=ALIVE_FOR)
         except AWAY as error:
-            logger.warning("no sign of life: %s", error)
+            logger.warning("heartbeat not written: %s", error)
 
     def execute_job(self, job: RqJob, queue: RqQueue) -> None:
-        """Run a delivery. If the store goes away before there is a job process, the reconciler delivers the job again."""
+        """Run a delivery. If the store becomes unavailable before the fork, the reconciler delivers the job again."""
         try:
             super().execute_job(job, queue)
         except AWAY as error:
@@ -140,7 +142,7 @@ class PliantWorker(Worker):
             logger.warning("delivery %s: %s", job.id, error)
 
     def request_stop(self, signum: int, frame: FrameType | None) -> None:  # noqa: ARG002
-        """SIGTERM: end when idle; with a job, let it go on for the grace. A second one ends the grace."""
+        """Handle SIGTERM: end if idle; else let the job continue for the grace period, which a second signal ends."""
         first = self._stop_by is None
         self._stop_by = time.monotonic() + (self._settings.stop_grace if first else 0.0)
         self._stop_requested = True
@@ -150,7 +152,7 @@ class PliantWorker(Worker):
     request_force_stop = request_stop
 
     def kill_horse(self, sig: signal.Signals = signal.SIGKILL) -> None:
-        """Kill the job process and what it started. Before it has its own process group, its group is ours: spare that."""
+        """Kill the job process and its children, unless it still shares the worker's process group."""
         with suppress(ProcessLookupError):
             if os.getpgid(self.horse_pid) == self.horse_pid:
                 os.killpg(self.horse_pid, sig)
@@ -158,23 +160,23 @@ class PliantWorker(Worker):
                 os.kill(self.horse_pid, sig)
 
     def main_work_horse(self, job: RqJob, queue: RqQueue) -> None:
-        """Be the job process: die with the worker, and say nothing but into the attempt's own log."""
+        """Run as the job process: end with the worker, and write output to the attempt's file only."""
         die_with_parent(int(os.environ["PLIANT_WORKER_PROCESS"]))
         job.settings = self._settings  # type: ignore[attr-defined]
         super().main_work_horse(job, queue)
 
     def setup_work_horse_signals(self) -> None:
-        """Leave stopping to the worker: service managers send SIGTERM to every process of a service at once."""
+        """Ignore SIGTERM: service managers send it to every process of a service, and the worker stops its job process."""
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
 
     def fork_work_horse(self, job: RqJob, queue: RqQueue) -> None:
-        """Fork; the job process must know who its parent was even if that one is gone at once."""
+        """Fork; the parent's id is taken before, since the parent may end at once."""
         os.environ["PLIANT_WORKER_PROCESS"] = str(os.getpid())
         super().fork_work_horse(job, queue)
 
     def monitor_work_horse(self, job: RqJob, queue: RqQueue) -> None:  # noqa: ARG002
-        """Watch the job process until it ends, then bury what it left behind."""
+        """Wait for the job process, record the outcome, clean up."""
         id, attempt_id = (str(each) for each in (*job.args, "", "")[:2])
         watch = Watch(self._settings, self._records, id=id, attempt_id=attempt_id, worker=self.name)
         next_sign = time.monotonic() + IDLE_WAKE
@@ -192,11 +194,11 @@ class PliantWorker(Worker):
         self._reap(watch, job, status=status, peak=usage.ru_maxrss * RSS_UNIT)
 
     def _keep_execution(self, job: RqJob) -> None:
-        """Give our sign of life, and RQ's for the delivery: without it RQ declares every job of more than 90 s abandoned."""
+        """Write the job's heartbeat, and RQ's for the delivery: without it RQ abandons every job of more than 90 s."""
         try:
             self.maintain_heartbeats(job)
         except AWAY as error:
-            logger.warning("no sign of life: %s", error)
+            logger.warning("heartbeat not written: %s", error)
 
     def _reap(self, watch: Watch, job: RqJob, *, status: int, peak: int) -> None:
         patience = Patience(60.0 if self._stop_by is None else 2.0)
@@ -204,17 +206,17 @@ class PliantWorker(Worker):
             settled = finalize(watch, status=status, peak=peak, patience=patience)
             if settled is not None and settled.job.status is Status.QUEUED:
                 fresh = settled.attempt_id
-                patience.ask(lambda: self._deliveries.push(watch.id, fresh, front=True))  # it has waited before
-            patience.ask(lambda: self._deliveries.remove(job.id))
+                patience.retry(lambda: self._deliveries.push(watch.id, fresh, front=True))  # it has waited before
+            patience.retry(lambda: self._deliveries.remove(job.id))
         except StoreUnavailable as error:
-            logger.warning("job %s: %s; the reconciler will look after it", watch.id, error)
+            logger.warning("job %s: %s; the reconciler will requeue it", watch.id, error)
         finally:
-            with suppress(StoreUnavailable):  # then the reconciler clears what is left
-                if not patience.ask(lambda: self._elsewhere(watch)):
+            with suppress(StoreUnavailable):  # the reconciler removes the files then
+                if not patience.retry(lambda: self._elsewhere(watch)):
                     clean_up(self._settings, watch.attempt_id)
 
     def _elsewhere(self, watch: Watch) -> bool:
-        """Tell whether another worker is at this very attempt: ours was a second delivery, and the working files are not ours."""
+        """Whether another worker runs this attempt: then this delivery was a duplicate, and the scratch directory is not ours."""
         try:
             held = self._records.get(watch.id)
         except UnknownJob:

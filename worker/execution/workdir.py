@@ -1,4 +1,4 @@
-"""The working files of an attempt, while it runs and when it is dead."""
+"""Scratch directories of attempts."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from pathlib import Path
 from pliant.worker.settings import Settings
 
 OUTPUT = "output.log"
-"""What the attempt writes to its standard output and error, its crash's stack among it."""
+"""File with the attempt's standard output and error, including crash traces."""
 
 
 def working_directory(settings: Settings, attempt_id: str) -> Path:
-    """Return the directory of an attempt's working files."""
+    """Return the scratch directory of an attempt."""
     return settings.work / attempt_id
 
 
 def last_words(settings: Settings, attempt_id: str) -> list[str]:
-    """Return the end of what a dead attempt wrote to its standard output and error."""
+    """Return the last standard output and error of an ended attempt."""
     file = working_directory(settings, attempt_id) / OUTPUT
     if not file.exists():
         return []
@@ -27,5 +27,5 @@ def last_words(settings: Settings, attempt_id: str) -> list[str]:
 
 
 def clean_up(settings: Settings, attempt_id: str) -> None:
-    """Remove an attempt's working files."""
+    """Remove an attempt's scratch directory."""
     shutil.rmtree(working_directory(settings, attempt_id), ignore_errors=True)

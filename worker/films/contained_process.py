@@ -1,4 +1,4 @@
-"""The film process: the one place where films are decoded. It has limits, no network, and a scratch folder of its own."""
+"""The film process, the only one that decodes films. It has resource limits, no network, and its own scratch folder."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ if TYPE_CHECKING:
     from pliant.tracking import Film, FilmError, FilmLimits, TrackingStep
 
 OPEN_FILES = 256
-"""Descriptors that the process may have: libraries, the film, the frame store."""
+"""Maximum number of open descriptors: libraries, the film, the frame store."""
 
 PROGRESS_EVERY = 0.2
-"""Least seconds between two lines of progress."""
+"""Minimum seconds between two lines of progress."""
 
 SHARES = {"read": (0.0, 0.15), "locate": (0.15, 0.25), "track": (0.25, 1.0)}
-"""Where each stage of the tracker begins and ends on the way from 0 to 1, by its usual time."""
+"""Start and end of each stage of the tracker as fractions of the whole, from typical timings."""
 
 LEAST_FRAMES = 3
-"""Frames that a reconstruction needs."""
+"""Minimum number of frames of a reconstruction."""
 
 FULL = ("Insufficient memory", "can't start new thread")
-"""What OpenCV and Python say when the address space is full."""
+"""Messages of OpenCV and Python when the address space is exhausted."""
 
 OPTIONS = ("frames", "template_frame", "grid_step", "longest_side", "region_frame")
-"""Fields of a `FilmError` that are options of the job."""
+"""Fields of a `FilmError` that are job options."""
 
 
 def main() -> int:
@@ -97,10 +97,20 @@ def _check(request: dict[str, Any], bounds: FilmBounds) -> dict[str, Any]:
     region = _region(request)
     if region is not None:
         read_region(region, film.size)
-    return {
+    facts = {
         "container": film.container, "width": film.size[0], "height": film.size[1], "fps": film.fps / step,
-        "stated_frames": film.stated_frames, "frames": count or 0,
+        "stated_frames": film.stated_frames, "frames": count or 0, "seconds": film.stated_frames / film.fps,
+        "rotation": film.rotation, "pixel_aspect": film.pixel_aspect,
     }  # fmt: skip
+    if request["estimate"]:
+        from pliant.tracking.estimate import estimate
+
+        expected = estimate(
+            film, region=region, region_frame=options["region_frame"], grid_step=options["grid_step"],
+            longest_side=options["longest_side"], threads=request["threads"],
+        )  # fmt: skip
+        facts |= {"points": expected.points, "track_seconds": expected.seconds}
+    return facts
 
 
 def _track(request: dict[str, Any], bounds: FilmBounds) -> dict[str, Any]:
@@ -144,7 +154,7 @@ def _region(request: dict[str, Any]) -> Path | list[list[float]] | None:
 
 
 def _reporter(target: int) -> Callable[[TrackingStep], None]:
-    """Return a callback that writes the share that is done to a descriptor, at most every `PROGRESS_EVERY` seconds."""
+    """Return a callback that writes the completed share to a descriptor, at most every `PROGRESS_EVERY` seconds."""
     after = 0.0
 
     def report(step: TrackingStep) -> None:
@@ -161,7 +171,7 @@ def _reporter(target: int) -> Callable[[TrackingStep], None]:
 
 
 def _refused(error: FilmError, request: dict[str, Any]) -> InvalidInput:
-    """Return the refusal with the job's own names; where its files lie concerns nobody."""
+    """Return the error with the job's field names and without paths."""
     field = f"options.{error.field}" if error.field in OPTIONS else error.field
     if field == "region" and request["region"] is None and request["options"]["region_polygon"] is not None:
         field = "options.region_polygon"
@@ -173,7 +183,7 @@ def _refused(error: FilmError, request: dict[str, Any]) -> InvalidInput:
 
 
 def _for_want_of_memory(error: Exception) -> bool:
-    """Tell a limit on memory or on files from other failures."""
+    """Translate exceeded limits on memory or file size to `InvalidInput`."""
     full = isinstance(error, OSError) and error.errno in (errno.ENOMEM, errno.EFBIG)
     return isinstance(error, MemoryError) or full or any(sign in str(error) for sign in FULL)
 

@@ -14,7 +14,7 @@ from pliant.worker.formats.reading.arrays import read_file
 from pliant.worker.formats.records import Inputs, Limits, Selection
 from pliant.worker.formats.texture import Texture
 from pliant.worker.formats.tracks.decimation import thin
-from pliant.worker.formats.tracks.selection import hide_seldom_seen
+from pliant.worker.formats.tracks.selection import hide_sparsely_observed
 
 NEEDED = frozenset(("tracks", "visibility", "confidence", "grid"))
 PICTURE = frozenset(("template_image", "uv"))
@@ -26,9 +26,9 @@ def read_tracked(file: Path, tracked: Tracked, options: Options, *, limits: Limi
     Parameters
     ----------
     file : Path
-        As the film process wrote it; read with the checks of an uploaded file.
+        As written by the film process; validated like an uploaded file.
     tracked : Tracked
-        What else was found.
+        The other results of tracking.
     options : Options
         `stride`, `max_points` and `min_seen`.
     limits : Limits
@@ -47,7 +47,7 @@ def read_tracked(file: Path, tracked: Tracked, options: Options, *, limits: Limi
     given = points.shape[1]
     kept, mesh, how = thin(points, visible, Mesh.from_grid(arrays["grid"]), options)
     points, visible = points[:, kept], visible[:, kept]
-    confidence, left_out, seldom = hide_seldom_seen(points, visible, mesh, options)
+    confidence, left_out, sparse = hide_sparsely_observed(points, visible, mesh, options)
     checked = Tracks.from_arrays(points, confidence)
     hidden = float((checked.visible == 0).mean())
     notes = [
@@ -57,7 +57,7 @@ def read_tracked(file: Path, tracked: Tracked, options: Options, *, limits: Limi
         num_frames=checked.num_frames, num_points=checked.num_points, num_faces=0 if mesh is None else len(mesh.faces),
         hidden_fraction=hidden, mesh_source="film", has_ground_truth=False, has_rotations=False, layout="tracks (F, P, 2)",
         format=f"film ({tracked.container})", given_points=given, num_left_out=len(left_out),
-        left_out_points=left_out[:1000].tolist(), notes=[*notes, *how, *seldom, *tracked.warnings],
+        left_out_points=left_out[:1000].tolist(), notes=[*notes, *how, *sparse, *tracked.warnings],
     )  # fmt: skip
     frames = np.arange(checked.num_frames)
     selection = Selection(frames, kept, (len(frames), given))

@@ -1,4 +1,4 @@
-"""A film and the region to track in it: as files, and stored together as the inputs of a job."""
+"""A film and the region to track, as files, or stored together as the inputs of a job."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pathlib import Path
 
 from pliant.schemas.job import Interpretation
 from pliant.worker.formats.errors import damaged
+from pliant.worker.settings import Settings
 
 VERSION = 1
 _MARK, _FILM, _REGION = "film.json", "film", "region"
@@ -21,7 +22,7 @@ PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".bmp")
 
 @dataclass(frozen=True, slots=True)
 class FilmSource:
-    """What is to be tracked."""
+    """A film and the region to track."""
 
     film: Path
     """A film, a zip of pictures, or (on the command line) a folder of pictures."""
@@ -32,7 +33,7 @@ class FilmSource:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FilmBounds:
-    """How much one film may cost; the limits of its playing time and frames are those of `pliant.tracking.FilmLimits`."""
+    """Limits of one film; those on playing time and frames are enforced by `pliant.tracking.FilmLimits`."""
 
     max_bytes: int = 1 << 30
     """Size of the film's file, or of all pictures of a zip."""
@@ -58,9 +59,18 @@ class FilmBounds:
     scratch_bytes: int = 8 << 30
     """Size of one file that this process writes: the grey frames of the film, packed without loss."""
 
+    @classmethod
+    def of(cls, settings: Settings, *, max_bytes: int = 1 << 30) -> FilmBounds:
+        """Return the bounds that an installation sets; a job's own limit on memory holds for its film, too."""
+        memory = min(settings.film_memory, settings.memory_limit or settings.film_memory)
+        return cls(
+            max_bytes=max_bytes, max_frames=settings.film_frames, max_pixels=settings.film_pixels,
+            max_seconds=settings.film_seconds, memory=memory,
+        )  # fmt: skip
+
 
 def looks_like_film(path: Path) -> bool:
-    """Return True for what a command line should take for a film instead of tracks: by content, then by name."""
+    """Whether a command-line argument is a film rather than tracks: by content, then by name."""
     if path.is_dir():
         return True
     try:
@@ -86,7 +96,7 @@ def _holds_pictures(path: Path) -> bool:
 
 
 def save_source(source: FilmSource, interpretation: Interpretation, target: Path) -> None:
-    """Store film and region in one file, uncompressed; `open_source` gives them back byte for byte."""
+    """Store film and region in one file, uncompressed; `open_source` restores them byte for byte."""
     stated = {
         "version": VERSION,
         "film": source.film.suffix.lower(),
@@ -101,7 +111,7 @@ def save_source(source: FilmSource, interpretation: Interpretation, target: Path
 
 
 def is_source(path: Path) -> bool:
-    """Return True for a file that `save_source` wrote, False for other inputs of a job."""
+    """Whether `save_source` wrote this file; False for other inputs of a job."""
     try:
         with zipfile.ZipFile(path) as archive:
             return _MARK in archive.namelist()
@@ -110,12 +120,12 @@ def is_source(path: Path) -> bool:
 
 
 def open_source(path: Path, folder: Path) -> FilmSource:
-    """Unpack a stored source into a folder, which is made.
+    """Unpack a stored source into a new folder.
 
     Raises
     ------
     InvalidInput
-        Code damaged_file, when the file is not one of ours or was damaged.
+        Code damaged_file: `save_source` did not write this file, or it was damaged.
     """
     folder.mkdir(parents=True, exist_ok=True)
     try:

@@ -1,4 +1,4 @@
-"""Have a film checked or tracked by the film process, and take over what it found."""
+"""Check or track a film in the film process and read its results."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 MODULE = "pliant.worker.films.contained_process"
 NEEDED = {"frames", "template_frame", "grid_step", "longest_side", "region_frame", "region_polygon"}
-"""Options that the film process reads."""
+"""Job options that the film process uses."""
 
 Count = Annotated[int, Field(ge=0, lt=2**40)]
 Words = Annotated[str, Field(max_length=1000)]
 
 
 class FilmFacts(BaseModel):
-    """What the check of a film found."""
+    """Facts about a film, from its check."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -35,17 +35,32 @@ class FilmFacts(BaseModel):
     width: Annotated[int, Field(ge=1, le=10**5)]
     height: Annotated[int, Field(ge=1, le=10**5)]
     fps: Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)]
-    """Frames a second of the frames that are used, as the file states them."""
+    """Frames per second of the selected frames, as stated in the file."""
 
     stated_frames: Count
-    """Frames in the file, as it states them; 0 if it does not."""
+    """Number of frames as stated in the file; 0 if it is not stated."""
 
     frames: Count
-    """Of these, frames that the option `frames` selects; 0 if unknown."""
+    """Number of these frames that the option `frames` selects; 0 if unknown."""
+
+    seconds: Annotated[float, Field(ge=0, allow_inf_nan=False)]
+    """Playing time by the stated frames and rate; 0 if unknown."""
+
+    rotation: Annotated[int, Field(ge=0, lt=360)]
+    """Degrees clockwise by which the stored frames are turned to be upright."""
+
+    pixel_aspect: Annotated[float, Field(gt=0, allow_inf_nan=False)]
+    """Width over height of a stored pixel; `width` and `height` count square pixels."""
+
+    points: Count = 0
+    """Points that tracking would follow, about; 0 if it was not estimated."""
+
+    track_seconds: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
+    """Seconds that tracking would take on this machine, about; 0 if it was not estimated."""
 
 
 class Tracked(BaseModel):
-    """What tracking found, besides the files."""
+    """Results of tracking besides the files."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -53,17 +68,33 @@ class Tracked(BaseModel):
     warnings: Annotated[tuple[Words, ...], Field(max_length=100)]
 
 
-def check_film(source: FilmSource, options: Options, bounds: FilmBounds = FilmBounds()) -> FilmFacts:  # noqa: B008 - frozen
-    """Open a film and its region without tracking it: seconds, whatever the film's length.
+def check_film(
+    source: FilmSource,
+    options: Options,
+    bounds: FilmBounds = FilmBounds(),  # noqa: B008 - frozen
+    *,
+    estimate: bool = False,
+    threads: int = 1,
+) -> FilmFacts:
+    """Open a film and its region without tracking it; takes seconds, whatever the film's length.
+
+    Parameters
+    ----------
+    source, options, bounds
+        The film, how it would be tracked, and what it may cost.
+    estimate
+        Also estimate how many points would be tracked, and the time that it would take with so many threads.
+    threads
+        Threads that tracking would have.
 
     Raises
     ------
     InvalidInput
-        No film, beyond the limits, or a region or an option that does not fit it.
+        Not a film, a limit is exceeded, or a region or option does not fit the film.
     """
     _check_region(source, options)
     with TemporaryDirectory(prefix="pliant-film-") as scratch:
-        ended = _run("check", source, options, bounds, Path(scratch), threads=1)
+        ended = _run("check", source, options, bounds, Path(scratch), threads=threads, estimate=estimate)
     return _answer(FilmFacts, ended, bounds, bounds.check_seconds)
 
 
@@ -82,20 +113,20 @@ def track_film(
     Parameters
     ----------
     source, options, bounds
-        The film, how to track it, and what it may cost.
+        The film, how to track it, and its limits.
     scratch : Path
         An empty folder.
     threads : int
         Threads for optical flow.
     on_progress : callable, optional
-        Called with the share that is done, in [0, 1].
+        Called with the completed share, in [0, 1].
     should_stop : callable, optional
         Called ten times a second; the film process is killed once it returns True.
 
     Raises
     ------
     InvalidInput
-        A film that cannot be tracked; the error states what to do, or what to film instead.
+        The film cannot be tracked; the hint states what to change or how to film instead.
     Interrupted
         `should_stop` returned True.
     """
@@ -113,20 +144,20 @@ def track_film(
 
 
 def described(facts: FilmFacts, options: Options) -> Interpretation:
-    """Return what is known of the inputs before the film is tracked."""
+    """Return the interpretation of a film before it is tracked."""
     of_all = f" of {facts.stated_frames}" if facts.frames and facts.frames != facts.stated_frames else ""
     count = f"{facts.frames}{of_all} frames" if facts.frames else "frames not counted yet"
     return Interpretation(
         num_frames=facts.frames, num_points=0, num_faces=0, hidden_fraction=0.0, mesh_source="film",
         has_ground_truth=False, has_rotations=False, layout="tracks (F, P, 2)", format=f"film ({facts.container})",
-        given_frames=facts.stated_frames or None,
-        notes=[f"A film of {facts.width}×{facts.height} pixels, {count}, {options.fps:.3g} frames a second. "
+        given_frames=facts.stated_frames or None, image_size=f"{facts.width}x{facts.height}", fps=facts.fps,
+        notes=[f"A film of {facts.width}×{facts.height} pixels, {count}, {options.fps:.3g} frames per second. "
                "Its points are tracked when the job runs."],
     )  # fmt: skip
 
 
 def film_options(options: Options, facts: FilmFacts) -> Options:
-    """Fill in what the film states: the picture's size, and the frame rate where the job gives none."""
+    """Return the options with the picture's size, and the frame rate if the job gives none, from the film."""
     known: dict[str, Any] = {"image_size": f"{facts.width}x{facts.height}"}
     if "fps" not in options.model_fields_set:
         known["fps"] = facts.fps
@@ -137,16 +168,16 @@ def _check_region(source: FilmSource, options: Options) -> None:
     if source.region is not None and options.region_polygon is not None:
         raise refusal(
             "conflicting_parts", "options.region_polygon", expected="a mask picture or a polygon", got="both",
-            hint="Leave one of them out.",
+            hint="Omit one of them.",
         )  # fmt: skip
 
 
 def _run(
-    action: str, source: FilmSource, options: Options, bounds: FilmBounds, scratch: Path, *, threads: int,
+    action: str, source: FilmSource, options: Options, bounds: FilmBounds, scratch: Path, *, threads: int, estimate: bool = False,
     on_line: Callable[[dict[str, Any]], None] | None = None, should_stop: Callable[[], bool] | None = None,
 ) -> Ended:  # fmt: skip
     request = {
-        "action": action, "film": str(source.film.absolute()), "threads": max(1, min(threads, 64)),
+        "action": action, "film": str(source.film.absolute()), "threads": max(1, min(threads, 64)), "estimate": estimate,
         "region": None if source.region is None else str(source.region.absolute()),
         "options": options.model_dump(mode="json", include=NEEDED),
         "bounds": asdict(bounds), "folder": str(scratch.absolute()),

@@ -1,6 +1,6 @@
-"""Readers: files as people have them in, checked records out. What cannot be read is refused with a code and a hint.
+"""Readers: input files to validated records. Files that cannot be read are rejected with a code and a hint.
 
-Names are looked up when first used, so that the child process that parses a stranger's file loads its parser and no more.
+Names are imported on first access, so that the sandbox process loads only the parser it needs.
 """
 
 from importlib import import_module

@@ -1,4 +1,4 @@
-"""The stored form of a job's inputs: one npz of ours, written once at the door and read back bit for bit."""
+"""The canonical form of a job's inputs: an npz file, written at submission and read back bit for bit."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def load_inputs(path: Path) -> Inputs:
     Raises
     ------
     InvalidInput
-        Code damaged_file, when the file is not one of ours or was damaged.
+        Code damaged_file: `save_inputs` did not write this file, or it was damaged.
     """
     arrays = read_file(path, field="inputs", limits=_OURS)
     missing = {"version", "points", "visible", "interpretation"} - set(arrays)
@@ -79,8 +79,10 @@ def load_inputs(path: Path) -> Inputs:
     if "source_frames" in arrays:
         frames, kept = (arrays[name].astype(np.intp) for name in ("source_frames", "source_points"))
         selection = Selection(frames, kept, (int(arrays["source_whole"][0]), int(arrays["source_whole"][1])))
-    told = Interpretation.model_validate(json.loads(arrays["interpretation"].tobytes()))
-    return Inputs(Tracks(points, _wide(arrays["visible"])), mesh, truth, cameras, told, selection, _texture(arrays))
+    interpretation = Interpretation.model_validate(json.loads(arrays["interpretation"].tobytes()))
+    return Inputs(
+        Tracks(points, _wide(arrays["visible"])), mesh, truth, cameras, interpretation, selection, _texture(arrays)
+    )
 
 
 def _texture(arrays: Arrays) -> Texture | None:
@@ -93,7 +95,7 @@ def _texture(arrays: Arrays) -> Texture | None:
 
 
 def _narrow(values: NDArray[np.float64]) -> NDArray[np.generic]:
-    """Choose the smallest type that gives back the same bits."""
+    """Choose the smallest type that restores the same bits."""
     with np.errstate(invalid="ignore", over="ignore"):
         if not (np.signbit(values) & (values == 0)).any() and np.array_equal(values.astype(np.uint8), values):
             return values.astype(np.uint8)

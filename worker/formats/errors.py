@@ -1,7 +1,7 @@
-"""Refusals of the readers.
+"""Errors of the readers.
 
-    pliant.solver.InvalidInput      base: every refusal has code, field, expected, got and hint
-    └── AmbiguousInput              two readings fit; lists the choices
+    pliant.solver.InvalidInput      base: every error has code, field, expected, got and hint
+    └── AmbiguousInput              several interpretations fit; lists them as choices
 
 Codes of this package: ambiguous_coordinates, ambiguous_layout, damaged_file, duplicate_member, duplicate_observation, empty_file,
 member_name, missing_array, missing_image_size, no_frames_left, object_array, out_of_range, pickle_refused, too_large, too_slow,
@@ -16,12 +16,12 @@ from pliant.solver import InvalidInput
 
 
 class AmbiguousInput(InvalidInput):
-    """More than one reading of the input fits, and guessing could be wrong.
+    """Several interpretations of the input fit.
 
     Attributes
     ----------
     choices : list of dict
-        One for each reading: `layout` in words, `options` that select it, `evidence` for it.
+        One per interpretation: `layout` as text, `options` that select it, `evidence` for it.
     """
 
     def __init__(
@@ -32,12 +32,12 @@ class AmbiguousInput(InvalidInput):
 
 
 def refusal(code: str, field: str, *, expected: str, got: str, hint: str) -> InvalidInput:
-    """Build (not raise) a refusal; the caller raises it, so that the traceback starts where the fault was seen."""
+    """Return the error; the caller raises it, so that the traceback starts where the fault was found."""
     return InvalidInput(code, field=field, expected=expected, got=got, hint=hint)
 
 
 def too_large(field: str, *, expected: str, got: str) -> InvalidInput:
-    """Say that the input is beyond a limit of this installation."""
+    """Return the error for an input that exceeds a limit of this installation."""
     return refusal(
         "too_large", field, expected=expected, got=got,
         hint="Reduce the input, e.g. fewer frames or points, or ask the operator to raise the limit.",
@@ -45,7 +45,7 @@ def too_large(field: str, *, expected: str, got: str) -> InvalidInput:
 
 
 def damaged(field: str, what: str) -> InvalidInput:
-    """Say that the file claims a format that its bytes do not hold."""
+    """Return the error for a file whose content does not match its format."""
     return refusal(
         "damaged_file", field, expected="a complete, consistent file", got=what, hint="Write the file again."
     )

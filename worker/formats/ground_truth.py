@@ -1,8 +1,8 @@
-"""Ground truth and known cameras, in the shapes that data sets have them, brought to frames first and points in the tracks' order.
+"""Ground truth and known cameras, in the array layouts of data sets, converted to frames first and points in the tracks' order.
 
-True shapes come as `(F, P, 3)`, `(F, 3, P)`, `(3, P, F)` and the like, or as matrices `(3F, P)` whose rows go x1, y1, z1, x2 … or all x,
-all y, all z. The tracks decide: of the readings that an array's shape allows, the right one is that which an affine camera carries onto
-them. Rotations are read the way that makes their rows orthonormal.
+True shapes come as `(F, P, 3)`, `(F, 3, P)`, `(3, P, F)` and the like, or as matrices `(3F, P)` with rows x1, y1, z1, x2 … or all x,
+all y, all z. Among the layouts that fit an array's shape, the one whose affine projection fits the tracks best is chosen. For
+rotations, the layout with the most nearly orthonormal rows is chosen.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from pliant.worker.formats.tracks.tracker_formats import TRUE_ROTATIONS, TRUE_SH
 TRUTH_NAMES = frozenset([*TRUE_SHAPES, *TRUE_ROTATIONS])
 CAMERA_NAMES = frozenset([*TRUE_ROTATIONS, "scales"])
 DECISIVE = 1.3
-"""Another reading than the usual one, which comes first, must explain the tracks better by this factor."""
+"""Factor by which another layout must fit the tracks better than the usual one."""
 
 SAMPLE = 24
-"""Frames in which a reading of the truth is held against the tracks."""
+"""Number of frames in which a layout is compared with the tracks."""
 
 FAR = 0.5
-"""Above this share of the tracks' extent left unexplained, truth and tracks hardly belong together."""
+"""Unexplained share of the tracks' extent above which truth and tracks are considered not to match."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,7 +43,7 @@ class Truth:
 
 
 def read_truth(path: Path | None, understood: Understood, *, limits: Limits) -> Truth | None:
-    """Truth from its own file, or from the tracks' file when true shapes came along.
+    """Return the truth from its own file, or from the tracks' file if it contains true shapes.
 
     Raises
     ------
@@ -94,7 +94,7 @@ def read_rotations(path: Path, *, num_frames: int, frames: NDArray[np.intp], lim
 
 
 def as_rotations(array: NDArray[np.generic], num_frames: int) -> NDArray[np.generic]:
-    """Rotations frames first; of several readings the one with the most nearly orthonormal rows. What does not fit stays as it is."""
+    """Return the rotations with frames first, in the layout with the most nearly orthonormal rows; unchanged if none fits."""
     found: list[NDArray[np.generic]] = []
     if array.ndim == 2:
         found = [rows for _, rows in _matrix_readings(array, num_frames, (2, 3), 3)]
@@ -133,7 +133,7 @@ def as_shapes(array: NDArray[np.generic], understood: Understood) -> tuple[NDArr
     if costs[0] <= DECISIVE * costs[best]:
         best = 0
     rival = min(cost for place, cost in enumerate(costs) if place != best)
-    evidence = f"True shapes read as {found[best][0]}: a camera explains the tracks but for {costs[best]:.1%}; next best {rival:.1%}."
+    evidence = f"True shapes read as {found[best][0]}: a camera leaves {costs[best]:.1%} of the tracks unexplained; next {rival:.1%}."
     return found[best][1], [evidence, *_far(costs[best])]
 
 
@@ -175,7 +175,7 @@ def _far(share: float) -> list[str]:
     if share <= FAR:
         return []
     return [
-        f"No camera explains the tracks from the true shapes ({share:.0%} is left over): are both in the same order?"
+        f"The true shapes do not fit the tracks under any camera ({share:.0%} unexplained): check that both have the same order."
     ]
 
 

@@ -1,8 +1,8 @@
 """The isolated reader: read large inputs in a separate process, so that the server's memory does not grow.
 
-Checking and converting a gigabyte of tracks takes several gigabytes, freed memory rarely returns to the system, and a crafted file may
-declare a hundred times its size. Inputs that declare more than `LARGE` bytes are therefore read, checked and stored by a process with
-limits of its own; the server gets the interpretation or the refusal. Smaller inputs are read in the server.
+Validating and converting a gigabyte of tracks takes several gigabytes, freed memory rarely returns to the system, and a crafted file
+may declare a hundred times its size. Inputs that declare more than `LARGE` bytes are therefore read, validated and stored by a process
+with its own limits; the server receives the interpretation or the error. Smaller inputs are read in the server.
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ LARGE = 16 << 20
 """Bytes of arrays, as the files declare them, above which the isolated reader is used."""
 
 GROWTH = {b"MATLAB": 1032, b"\x89PNG": 8 * 1032}
-"""What a byte may become: deflate makes at most 1032 of it, and a pixel's point number has 8."""
+"""Maximum expansion of a byte: 1032 by deflate, times 8 bytes for a pixel's point index."""
 
 TEXT = 8
-"""A byte of text or of a mesh file becomes at most this many."""
+"""Maximum expansion of a byte of text or of a mesh file."""
 
 NUMBER = 8
-"""Bytes of a number while it is worked on, however it is stored."""
+"""Bytes of a number in memory, however it is stored."""
 
 WITHOUT_BOUND = 1 << 62
-"""HDF5 says in a kilobyte that there are gigabytes of zeros."""
+"""Maximum expansion of an HDF5 file, which can declare gigabytes of zeros in a kilobyte."""
 
 MEMBERS = 256
-"""Members of a zip file that are looked at; more are refused."""
+"""Maximum number of members of a zip file."""
 
 MODULE = "pliant.worker.formats.isolated_reader"
 
@@ -67,7 +67,7 @@ def store_inputs(
     tracks, mesh, ground_truth, rotations, options, limits
         As in `read_inputs`.
     target : Path, optional
-        Where to write the canonical inputs; None: nowhere, the interpretation is all that is wanted.
+        Where to write the canonical inputs; None returns the interpretation only.
 
     Raises
     ------
@@ -89,12 +89,12 @@ def _here(parts: dict[str, Any], options: Options, limits: Limits, target: Path 
 
 
 def declared_bytes(path: Path, *, field: str) -> int:
-    """Bytes that a file may become when it is read, by what it says or by what its kind allows.
+    """Return the maximum size of a file in memory, from its declared sizes or the maximum expansion of its format.
 
     Raises
     ------
     InvalidInput
-        It is a zip file without an orderly directory.
+        A zip file with an invalid directory.
     """
     size = path.stat().st_size
     with path.open("rb") as file:
@@ -119,7 +119,7 @@ def _member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, field: str) -> int:
 
 
 def _numbers(file: IO[bytes], size: int, field: str) -> int:
-    """Bytes of an array as numbers of 8 bytes; of what is no orderly array, as many as there are."""
+    """Return the size of an array with 8 bytes per number; of an invalid array, its stored size."""
     try:
         header, _ = read_header(file, field=field, limits=Limits())
     except InvalidInput:

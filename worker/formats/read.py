@@ -1,9 +1,10 @@
-"""Read a job's files, whatever wrote them, into checked records, and say how they were understood."""
+"""Read a job's files from any supported program into validated records, with notes on their interpretation."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,17 +13,18 @@ from pliant.schemas.options import Options
 from pliant.solver import InvalidInput, Mesh, Tracks
 from pliant.worker.formats.errors import refusal, too_large
 from pliant.worker.formats.ground_truth import read_rotations, read_truth
-from pliant.worker.formats.meshes.surface import read_surface, whole_grid
+from pliant.worker.formats.meshes.surface import Surface, read_surface, whole_grid
 from pliant.worker.formats.meshes.triangulation import triangulate
 from pliant.worker.formats.reading.containers import read_arrays
 from pliant.worker.formats.records import FARTHEST, GroundTruth, Inputs, Limits, Selection
 from pliant.worker.formats.tracks.decimation import thin
+from pliant.worker.formats.tracks.film_tracks import FilmTracks, read_film_tracks
 from pliant.worker.formats.tracks.interpretation import Understood, understand
-from pliant.worker.formats.tracks.selection import chosen_frames, hide_seldom_seen
-from pliant.worker.formats.tracks.tracker_formats import KNOWN
+from pliant.worker.formats.tracks.selection import chosen_frames, hide_sparsely_observed
+from pliant.worker.formats.tracks.tracker_formats import KNOWN, OWN
 
 LISTED = 1000
-"""Most left-out points that the interpretation lists by number."""
+"""Maximum number of hidden points that the interpretation lists by index."""
 
 
 def read_inputs(
@@ -41,31 +43,35 @@ def read_inputs(
     tracks : Path
         The tracks, in any of the documented formats; recognised by content, not by name.
     mesh : Path or str, optional
-        A mesh file whose vertex i is point i, a grid size `"ROWSxCOLUMNS"`, or `"none"`; left out: one is made.
+        A mesh file whose vertex i is point i, a grid size `"ROWSxCOLUMNS"`, or `"none"`; by default a mesh is generated.
     ground_truth, rotations : Path, optional
-        True shapes, used for metrics alone; known cameras, used instead of estimated ones. Both for all frames and points of the
-        tracks; what the options `frames`, `stride` and `max_points` choose is chosen from them too.
+        True shapes, used for metrics only; known cameras, used instead of estimated ones. Both for all frames and points of the
+        tracks; the options `frames`, `stride` and `max_points` select from them as well.
     options : Options
-        `layout`, `rows`, `coordinates` … overrule what the data suggest.
+        `layout`, `rows`, `coordinates` … take precedence over detection.
     limits : Limits
-        How much may come in.
+        Limits of the input.
 
     Raises
     ------
     InvalidInput
-        With a stable code, the field, both sides and a hint.
+        With a stable code, the field, expected and actual value, and a hint.
     AmbiguousInput
-        Two readings fit; the error lists them.
+        Several interpretations fit; the error lists them.
     """
     understood = understand(read_arrays(tracks, field="tracks", limits=limits, wanted=KNOWN), options)
-    chosen = _choose(understood, mesh, options, limits)
+    film: FilmTracks | None = None
+    if understood.format == OWN:
+        film = read_film_tracks(tracks, shape=understood.points.shape[:2], limits=limits)
+        understood = replace(understood, visible=film.visible)
+    chosen = _choose(understood, mesh, options, limits, film)
     truth, truth_notes = _read_truth(ground_truth, understood, chosen.selection, limits)
     cameras = None
     if rotations is not None:
         frames = chosen.selection.frames
         cameras = read_rotations(rotations, num_frames=len(understood.points), frames=frames, limits=limits)
     checked = chosen.tracks
-    told = Interpretation(
+    interpretation = Interpretation(
         num_frames=checked.num_frames, num_points=checked.num_points,
         num_faces=0 if chosen.mesh is None else len(chosen.mesh.faces),
         hidden_fraction=float((checked.visible == 0).mean()),
@@ -74,13 +80,22 @@ def read_inputs(
         given_frames=understood.points.shape[0], given_points=understood.points.shape[1],
         num_left_out=len(chosen.left_out), left_out_points=chosen.left_out[:LISTED].tolist(),
         notes=[*understood.notes, *chosen.notes, *truth_notes],
+        **({} if film is None else _stated(film, chosen.selection)),
     )  # fmt: skip
-    return Inputs(checked, chosen.mesh, truth, cameras, told, chosen.selection if chosen.selection.narrows else None)
+    texture = None if film is None or film.texture is None else film.texture.at_points(chosen.selection.points)
+    selection = chosen.selection if chosen.selection.narrows else None
+    return Inputs(checked, chosen.mesh, truth, cameras, interpretation, selection, texture=texture)
+
+
+def _stated(film: FilmTracks, selection: Selection) -> dict[str, Any]:
+    """Picture size and rate of the chosen frames, as the interpretation gives them."""
+    step = float(np.median(np.diff(selection.frames)))
+    return {"image_size": f"{film.image_size[0]}x{film.image_size[1]}", "fps": film.fps / step}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Chosen:
-    """The frames and points that are worked on, checked."""
+    """The selected frames and points, validated."""
 
     tracks: Tracks
     mesh: Mesh | None
@@ -92,10 +107,15 @@ class _Chosen:
     notes: list[str]
 
 
-def _choose(understood: Understood, mesh: Path | str | None, options: Options, limits: Limits) -> _Chosen:
+def _choose(
+    understood: Understood, mesh: Path | str | None, options: Options, limits: Limits, film: FilmTracks | None
+) -> _Chosen:
     whole = understood.points.shape[:2]
     frames, notes = chosen_frames(options.frames, whole[0])
-    surface = read_surface(mesh, num_points=whole[1], picture=understood.grid, limits=limits)
+    if film is not None and mesh is None:
+        surface = Surface(film.mesh, "film", ["The mesh is the grid of the film's tracker."])
+    else:
+        surface = read_surface(mesh, num_points=whole[1], picture=understood.grid, limits=limits)
     points, visible = understood.points, understood.visible
     picked = np.arange(whole[1]) if surface.points is None else surface.points
     if len(frames) < whole[0]:
@@ -112,11 +132,11 @@ def _choose(understood: Understood, mesh: Path | str | None, options: Options, l
     if source == "delaunay":
         made, more = triangulate(Tracks.from_arrays(points, visible), y_axis=understood.y_axis)
         source = "none" if made is None else source
-    confidence, left_out, seldom = hide_seldom_seen(points, visible, made, options)
+    confidence, left_out, sparse = hide_sparsely_observed(points, visible, made, options)
     checked = Tracks.from_arrays(points, confidence)
     _check_extent(checked)
     selection = Selection(frames, picked[kept], whole)
-    notes += [*surface.notes, *how, *_hidden_notes(checked), *seldom, *more]
+    notes += [*surface.notes, *how, *_hidden_notes(checked), *sparse, *more]
     return _Chosen(checked, made, source, whole_grid(surface), selection, left_out, notes)
 
 
@@ -144,7 +164,7 @@ def _check_range(points: NDArray[np.generic], visible: NDArray[np.float64] | Non
 
 
 def _check_extent(tracks: Tracks) -> None:
-    """Refuse at submission what the solver would refuse: in every frame, all visible points at one position."""
+    """Reject tracks that the solver would reject: in every frame, all visible points at one position."""
     seen = (tracks.visible > 0)[..., None]
     low = np.where(seen, tracks.points, np.inf).min(axis=1)
     high = np.where(seen, tracks.points, -np.inf).max(axis=1)
@@ -158,7 +178,7 @@ def _check_extent(tracks: Tracks) -> None:
 def _read_truth(
     given: Path | None, understood: Understood, selection: Selection, limits: Limits
 ) -> tuple[GroundTruth | None, list[str]]:
-    """Truth of the chosen frames and points; what came along with the tracks and does not fit is passed over, and said."""
+    """Return the truth of the selected frames and points; invalid truth in the tracks' file is skipped with a note."""
     raw = read_truth(given, understood, limits=limits)
     if raw is None:
         return None, []
@@ -177,12 +197,12 @@ def _read_truth(
         if given is not None:
             raise
         return None, [
-            f"The tracks file holds true shapes that cannot be used: expected {error.expected}, got {error.got}."
+            f"The tracks file contains true shapes that cannot be used: expected {error.expected}, got {error.got}."
         ]
     if given is not None:
         return truth, raw.notes
     return truth, [
-        "The tracks file holds true shapes too: they are used for metrics, and for nothing else.",
+        "The tracks file also contains true shapes; they are used for metrics only.",
         *raw.notes,
     ]
 
@@ -192,5 +212,5 @@ def _hidden_notes(tracks: Tracks) -> list[str]:
     notes = [f"{hidden:.1%} of the observations are hidden and carry no weight."] if hidden else []
     unseen = np.flatnonzero((tracks.visible > 0).sum(axis=1) == 0)
     if len(unseen):
-        notes.append(f"{len(unseen)} frames show no point at all (first: frame {unseen[0]}).")
+        notes.append(f"{len(unseen)} frames have no visible points (first: frame {unseen[0]}).")
     return notes

@@ -1,4 +1,4 @@
-"""What the readers give: checked inputs, and the limits that they keep."""
+"""Results of the readers: validated inputs, and the limits of the readers."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ if TYPE_CHECKING:  # a contained child needs none of it
     from pliant.worker.formats.texture import Texture
 
 Arrays = dict[str, NDArray[np.generic]]
-"""Named arrays as a file holds them, not yet interpreted; members of nested structures have dotted names."""
+"""Named arrays of a file, not yet interpreted; members of nested structures have dotted names."""
 
 
 FARTHEST = 1e12
-"""Coordinates beyond this are no measurement, and squares of them leave the range of numbers."""
+"""Largest absolute coordinate that is accepted; squares of larger ones may overflow."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Limits:
-    """How much one job may bring. Beyond them a reader refuses before it allocates."""
+    """Limits of the inputs of one job; readers check them before they allocate memory."""
 
     max_bytes: int = 1 << 30
     """Size of one file, and of all arrays that are read from it, inflated."""
@@ -59,7 +59,7 @@ class Limits:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GroundTruth:
-    """The right answer, where it is known; used for metrics alone."""
+    """Ground truth, used for metrics only."""
 
     shapes: NDArray[np.float64]
     """Shape `(F, P, 3)`, any unit, finite."""
@@ -95,13 +95,13 @@ class GroundTruth:
         if given.shape != (*like, 3):
             raise refusal(
                 "wrong_shape", "ground_truth.shapes", expected=expected, got=str(given.shape),
-                hint="Truth is (frames, points, 3), with the tracks' frames and points in the tracks' order.",
+                hint="Ground truth is (frames, points, 3), with frames and points in the order of the tracks.",
             )  # fmt: skip
         points = np.array(given, dtype=np.float64, order="C")
         if not np.isfinite(points).all():
             raise refusal(
                 "not_finite", "ground_truth.shapes", expected="finite coordinates", got=f"{int((~np.isfinite(points)).sum())} that are not",
-                hint="Give truth for every point and frame, or leave it out.",
+                hint="Give truth for every point and frame, or omit it.",
             )  # fmt: skip
         if np.abs(points).max() > FARTHEST:
             raise refusal(
@@ -111,7 +111,7 @@ class GroundTruth:
         if not (np.ptp(points, axis=1) > 0).any(axis=1).all():
             raise refusal(
                 "no_extent", "ground_truth.shapes", expected="points that differ in every frame", got="a frame whose points are all one",
-                hint="Leave the ground truth out if it is not known.",
+                hint="Omit the ground truth if it is not known.",
             )  # fmt: skip
         points.flags.writeable = False
         if rotations is None:
@@ -127,26 +127,26 @@ class GroundTruth:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Selection:
-    """Which frames and points of the files are worked on, in the files' order."""
+    """The selected frames and points of the files, in the order of the files."""
 
     frames: NDArray[np.intp]
-    """Rising indices, shape `(F,)`."""
+    """Increasing indices, shape `(F,)`."""
 
     points: NDArray[np.intp]
-    """Rising indices, shape `(P,)`: vertex i of the result is point `points[i]` of the files."""
+    """Increasing indices, shape `(P,)`: vertex i of the result is point `points[i]` of the files."""
 
     whole: tuple[int, int]
     """Frames and points of the files."""
 
     @property
     def narrows(self) -> bool:
-        """Whether anything was left away."""
+        """Whether any frame or point is excluded."""
         return (len(self.frames), len(self.points)) != self.whole
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Inputs:
-    """Everything a job works on, checked; vertex i of the mesh and of the truth is point i of the tracks."""
+    """The validated inputs of a job; vertex i of the mesh and of the truth is point i of the tracks."""
 
     tracks: Tracks
     mesh: Mesh | None
@@ -155,7 +155,7 @@ class Inputs:
     interpretation: Interpretation
 
     selection: Selection | None = None
-    """Which frames and points of the files these are; None: all of them."""
+    """The selected frames and points of the files; None: all."""
 
     texture: Texture | None = None
-    """The picture on the surface, with a place for each of the P points; None: there is none."""
+    """The texture, with coordinates for each of the P points, or None."""

@@ -1,4 +1,4 @@
-"""The picture on a surface: the film's template frame as JPEG, with a place in it for every point."""
+"""The texture of a surface: the film's template frame as JPEG, with texture coordinates of every point."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What can happen to a job: pure functions from record to record. Nobody else writes a status.
+"""The state machine of a job: pure functions from record to record, the only code that changes a status.
 
 ::
 
@@ -24,12 +24,12 @@ FINAL = (Status.SUCCEEDED, Status.FAILED, Status.CANCELLED)
 
 
 def claim(stored: Stored, *, attempt_id: str, worker: str, now: datetime) -> Stored:
-    """Begin the job.
+    """Start the job.
 
     Raises
     ------
     StaleAttempt
-        The job is not queued under this attempt_id: a second delivery, or one that came too late.
+        The job is not queued under this attempt id: a duplicate or late delivery.
     """
     if stored.attempt_id != attempt_id or stored.job.status is not Status.QUEUED:
         raise StaleAttempt(stored.job.id)
@@ -40,7 +40,7 @@ def claim(stored: Stored, *, attempt_id: str, worker: str, now: datetime) -> Sto
 
 
 def report(stored: Stored, *, attempt_id: str, progress: Progress) -> Stored:
-    """Say how far the job is.
+    """Record the progress of the job.
 
     Raises
     ------
@@ -68,9 +68,9 @@ def succeed(
     verdict_reasons: Sequence[str] = (),
     trust_sentence: str | None = None,
 ) -> Stored:
-    """Publish the result, and the interpretation where the job found it out.
+    """Publish the result, and the interpretation if the job determined it.
 
-    A job whose cancellation was requested meanwhile ends cancelled, as its owner was told.
+    A job whose cancellation was requested in the meantime ends cancelled.
 
     Raises
     ------
@@ -113,12 +113,12 @@ def fail(stored: Stored, *, attempt_id: str, problem: Problem, now: datetime, re
 
 
 def stop(stored: Stored, *, attempt_id: str, now: datetime, retention: float) -> Stored:
-    """End the attempt because it was told to.
+    """End the attempt after a cancellation.
 
     Raises
     ------
     StaleAttempt
-        The job belongs to another attempt, is finished, or nobody asked for its end.
+        The job belongs to another attempt, is finished, or was not cancelled.
     """
     _check_owner(stored, attempt_id)
     if stored.job.status is not Status.CANCELLING:
@@ -127,7 +127,7 @@ def stop(stored: Stored, *, attempt_id: str, now: datetime, retention: float) ->
 
 
 def cancel(stored: Stored, *, now: datetime, retention: float) -> Stored:
-    """Give the job up: a queued one ends at once, a running one is told to stop. Repeating it is no error.
+    """Cancel the job: a queued one ends at once, a running one is marked as cancelling. Idempotent.
 
     Raises
     ------
@@ -142,7 +142,7 @@ def cancel(stored: Stored, *, now: datetime, retention: float) -> Stored:
     if status in (Status.CANCELLING, Status.CANCELLED):
         return stored
     raise NotAllowedNow(
-        stored.job.id, status, wanted="cancelled", hint="It is finished; delete it if it is not wanted."
+        stored.job.id, status, wanted="cancelled", hint="It is finished; delete it if you do not need it."
     )
 
 
@@ -156,12 +156,12 @@ def requeue(
     max_attempts: int | None,
     retention: float,
 ) -> Stored:
-    """Put a job back that lost its worker; after `max_attempts` (None: never) it fails with `problem`.
+    """Requeue a job that lost its worker; after `max_attempts` (None: no limit) it fails with `problem`.
 
     Parameters
     ----------
     attempt_id, fresh : str
-        The attempt that was lost, and the one that may write from now on.
+        The lost attempt, and the id of the next one.
 
     Raises
     ------
@@ -177,7 +177,7 @@ def requeue(
 
 
 def redeliver(stored: Stored, *, attempt_id: str, fresh: str) -> Stored:
-    """Give a queued job that the queue has forgotten a new attempt_id, so that only the new delivery counts.
+    """Give a queued job whose delivery was lost a new attempt id, so that only the new delivery is valid.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The operations on jobs that the service offers: submit, look, list, cancel, run again, delete."""
+"""The operations on jobs: submit, get, list, cancel, retry, delete."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ from pliant.worker.store.redis import RedisRecords
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Jobs:
-    """Jobs of one owner, or of everybody.
+    """Jobs of one owner, or of all owners.
 
-    Every method may raise `StoreUnavailable`, and every one that takes an id `UnknownJob`.
+    Every method may raise `StoreUnavailable`; those that take an id may raise `UnknownJob`.
     """
 
     records: Records
@@ -44,7 +44,7 @@ class Jobs:
     queue: Queue
     settings: Settings
     owner: str | None = None
-    """None: everybody's jobs; otherwise this owner's alone, and the others do not exist for it."""
+    """None: jobs of all owners; otherwise only those of this owner are visible."""
     max_queued: int = 0
     """Jobs of one owner that may be queued at once; 0: any number."""
     max_running: int | None = None
@@ -53,9 +53,9 @@ class Jobs:
 
     @classmethod
     def open(cls, settings: Settings) -> Jobs:
-        """Connect to what the settings name. Nothing is sent before it is needed, so Redis may still be starting."""
+        """Return the jobs of the stores in the settings. Connections are made on first use, so Redis may still be starting."""
         if settings.blob_url is None:
-            with suppress(OSError):  # what is wrong is said by what opens it
+            with suppress(OSError):  # opening the store reports the error
                 make_data_directory(settings.data)
         return cls(
             records=RedisRecords(connect(settings.redis, decode=True), prefix=settings.queue),
@@ -65,19 +65,19 @@ class Jobs:
         )
 
     def of(self, owner: str) -> Jobs:
-        """Return the same jobs as this owner sees them."""
+        """Return the jobs of this owner."""
         return replace(self, owner=owner)
 
     def submit(self, inputs_file: Path, submission: Submission, *, interpretation: Interpretation) -> Job:
-        """Accept a job. Once this returns, the job will end with a result or a reason, whichever process is killed.
+        """Accept a job. After this returns the job ends with a result or an error, whichever process is killed.
 
         Parameters
         ----------
         inputs_file : Path
-            Canonical inputs, as `worker.formats.save_inputs` writes them. Linked or copied; the caller may remove the
-            name, and must not write to the file.
+            Canonical inputs, as written by `worker.formats.save_inputs`. Linked or copied: the caller may unlink the
+            file, but must not write to it.
         submission : Submission
-            What the client asks for.
+            The client's request.
         interpretation : Interpretation
             How the inputs were read.
 
@@ -88,9 +88,9 @@ class Jobs:
         InvalidRequest
             The id or the key is malformed.
         QuotaExceeded
-            Jobs and uploads hold as many bytes as they may.
+            Jobs and uploads have reached the disk quota.
         TooManyQueued
-            As many jobs of this owner are queued as may be.
+            The owner's limit of queued jobs is reached.
         """
         known = self.known(submission)
         if known is not None:
@@ -107,7 +107,7 @@ class Jobs:
         return self.create(job, submission, lambda key: self.blobs.put(key, inputs_file), size=size)
 
     def known(self, submission: Submission) -> Job | None:
-        """Return the job that a repeated request has already made, None if the request is new. Raises as `submit`."""
+        """Return the job of an earlier identical request, None if the request is new. Raises as `submit`."""
         if submission.id is not None:
             check_id(submission.id)
         if submission.idempotency_key is not None:
@@ -120,14 +120,14 @@ class Jobs:
         return None if found is None else self._same(found, submission)
 
     def check_capacity(self, *, id: str | None = None, idempotency_key: str | None = None) -> None:
-        """Check that the queue has a place for a submission, before its inputs are received.
+        """Check the limit of queued jobs before the inputs of a submission are received.
 
-        A repeated request passes: it makes no new job. The limit is checked again, atomically, when the record is written.
+        A repeated request passes, since it creates no job. The limit is checked again, atomically, when the record is written.
 
         Raises
         ------
         TooManyQueued
-            As many jobs of this owner are queued as may be.
+            The owner's limit of queued jobs is reached.
         """
         if not 0 < self.max_queued <= self.records.count([Status.QUEUED], owner=self.owner or ""):
             return
@@ -156,7 +156,7 @@ class Jobs:
         NotAllowedNow
             The job is not finished, or has succeeded.
         UnknownJob
-            There is no such job, or it was deleted meanwhile.
+            There is no such job, or it was deleted in the meantime.
         """
         stored = self.stored(id)
         job = stored.job
@@ -200,16 +200,16 @@ class Jobs:
         Parameters
         ----------
         cursor : str, optional
-            `JobPage.next` of the page before.
+            `JobPage.next` of the previous page.
         limit : int
             1–200.
         statuses : sequence of Status, optional
-            Only these.
+            Statuses to include; all by default.
 
         Raises
         ------
         InvalidRequest
-            The cursor is not one, or the limit is out of range.
+            The cursor is malformed, or the limit is out of range.
         """
         check_page(cursor, limit)
         wanted = tuple(Status) if statuses is None else tuple(statuses)
@@ -230,7 +230,7 @@ class Jobs:
         return self.records.count(statuses, owner=self.owner)
 
     def cancel(self, id: str) -> Job:
-        """Ask a job to end: a queued one is cancelled at once, a running one is `cancelling` until it has stopped.
+        """Cancel a job: a queued one ends at once, a running one is `cancelling` until it has stopped.
 
         Raises
         ------
@@ -246,7 +246,7 @@ class Jobs:
         return after.job
 
     def delete(self, id: str) -> None:
-        """Remove a finished job, its record and its files. Files that cannot be removed now are removed by the reconciler.
+        """Remove a finished job with its record and files. Files that cannot be removed now are removed by the reconciler.
 
         Raises
         ------
@@ -262,7 +262,7 @@ class Jobs:
             self.records.forget_deleted(id)
 
     def artifact(self, id: str, name: str) -> tuple[Artifact, Blob]:
-        """Return a result file's description and its bytes, readable in ranges.
+        """Return the record of a result file, and the file, readable in ranges.
 
         Raises
         ------
@@ -294,24 +294,24 @@ class Jobs:
         return stored.job, file
 
     def log(self, id: str) -> str:
-        """Return what the job's attempts have logged so far."""
+        """Return the log of the job's attempts so far."""
         self.stored(id)
         return "".join(f"{line}\n" for line in self.records.log(id))
 
     def events(self, id: str, *, after: str | None = None) -> list[Event]:
-        """Return the job's changes after one of them; `records.changes` reports when there are new ones.
+        """Return the job's events after a given one; `records.changes` signals new ones.
 
         The last event of a finished job is a `job` event with a final status; nothing follows it.
 
         Parameters
         ----------
         after : str, optional
-            `Event.id`; None returns all that are kept (the latest 256; of a finished job the latest 16).
+            `Event.id`; None returns all that are kept: the latest 256, or the latest 16 of a finished job.
 
         Raises
         ------
         InvalidRequest
-            `after` is not an event's id.
+            `after` is not an event id.
         """
         if after is not None:
             check_event_id(after)
@@ -319,11 +319,11 @@ class Jobs:
         return self.records.events(id, after=after)
 
     def used(self) -> int:
-        """Return the bytes that everybody's jobs hold together."""
+        """Return the total bytes of all jobs."""
         return self.records.used()
 
     def ready(self) -> dict[str, str]:
-        """Return for `redis`, `blobs` and `workers` the word `ok`, or a sentence that says what is wrong."""
+        """Return `ok` or a sentence with the fault, for each of `redis`, `blobs` and `workers`."""
         found: dict[str, str] = {}
         for part, check in (("redis", self.records.ping), ("blobs", self.blobs.check)):
             try:
@@ -388,7 +388,7 @@ class Jobs:
         return self._placed(kept) if kept.inputs == stored.inputs else self._same(kept, submission, wanted=job.id)
 
     def _same(self, found: Stored, submission: Submission, *, wanted: str | None = None) -> Job:
-        """Return the job of a repeated request, or refuse a different one."""
+        """Return the job of a repeated request; raise `Conflict` for a different one."""
         mine = self.owner is None or found.owner == self.owner
         if mine and submission.fingerprint is not None and found.fingerprint == submission.fingerprint:
             return self._placed(found)
@@ -397,7 +397,7 @@ class Jobs:
             sentence = f"The id {wanted!r} is already used by a different job. Choose another id."
             raise Conflict("id_taken", id=wanted, sentence=sentence)
         sentence = (
-            f"This Idempotency-Key was used for a different request, which made job {found.job.id!r}. Use a new key."
+            f"This Idempotency-Key was used for a different request, which created job {found.job.id!r}. Use a new key."
         )
         raise Conflict("idempotency_conflict", id=found.job.id, sentence=sentence)
 

@@ -1,4 +1,4 @@
-"""The record of what a client submits, and the writing of a new job: quota, inputs, record, queue, in this order."""
+"""The submission record, and the creation of a job: quota, inputs, record and queue entry, in this order."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from pliant.worker.uploads.service import Uploads
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Submission:
-    """What a client asks for, besides the input files."""
+    """A client's request, besides the input files."""
 
     options: Options
     """How to solve and which files to write."""
@@ -27,13 +27,13 @@ class Submission:
     """The user's label."""
 
     id: str | None = None
-    """The client's own id: 3–64 letters, digits, underscores, dashes; None: one is made."""
+    """Id chosen by the client: 3–64 letters, digits, underscores, dashes; None: generated."""
 
     idempotency_key: str | None = None
-    """A repeated request with the same key returns the first job; a key is kept as long as its job."""
+    """A repeated request with the same key returns the existing job; a key is kept as long as its job."""
 
     fingerprint: str | None = None
-    """SHA-256 of the whole request, which distinguishes a repeated request from a different one."""
+    """SHA-256 of the complete request, which distinguishes a repeated request from a different one."""
 
     webhook: Webhook | None = None
     """Called when the job has ended."""
@@ -41,7 +41,7 @@ class Submission:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Acceptance:
-    """Writes new jobs to the stores."""
+    """Creates jobs in the stores."""
 
     records: Records
     blobs: Blobs
@@ -49,19 +49,19 @@ class Acceptance:
     settings: Settings
 
     def check_quota(self, more: int) -> None:
-        """Check that `more` bytes fit beside what jobs and uploads hold or have reserved.
+        """Check that `more` bytes fit into the disk quota beside jobs, uploads and reservations.
 
         Raises
         ------
         QuotaExceeded
-            They do not.
+            The quota would be exceeded.
         """
         quota = self.settings.disk_quota
         if quota > 0 and (used := self.records.used() + self._uploaded()) + more > quota:
             raise QuotaExceeded(used=used, quota=quota)
 
     def create(self, stored: Stored, put: Callable[[str], object], *, max_queued: int) -> Stored:
-        """Store inputs, then the record, then the queue entry; a failure in between leaves nothing that was promised.
+        """Store inputs, record and queue entry, in this order; a failure in between leaves no accepted job.
 
         Parameters
         ----------
@@ -80,7 +80,7 @@ class Acceptance:
         Raises
         ------
         TooManyQueued, QuotaExceeded
-            Nothing is kept.
+            Nothing is stored.
         """
         put(stored.inputs)
         quota = self.settings.disk_quota
@@ -99,16 +99,16 @@ class Acceptance:
             else:
                 self.queue.push(stored.job.id, stored.attempt_id)
         except StoreUnavailable:
-            return kept  # the record is safe, and the reconciler queues what the queue lacks
+            return kept  # the record is stored, and the reconciler adds the missing queue entry
         return kept
 
     def _uploaded(self) -> int:
         return Uploads.open(self.settings).used()
 
     def _over_running_limit(self, stored: Stored) -> bool:
-        """Return True if the new job waits until fewer jobs of its owner run; the reconciler queues it then.
+        """Whether the new job is held back until fewer jobs of its owner run; the reconciler queues it then.
 
-        Counted after the record was written, so two simultaneous submissions cannot both miss each other.
+        Counted after the record is written, so that simultaneous submissions count each other.
         """
         most = self.settings.max_running if stored.max_running is None else stored.max_running
         unfinished = (Status.QUEUED, Status.RUNNING, Status.CANCELLING)

@@ -1,4 +1,4 @@
-"""Checks of keys, cursors and event ids, made before a store is queried."""
+"""Validation of keys, cursors and event ids, before a store is queried."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ LONGEST_KEY = 255
 _CURSOR = re.compile(r"[0-9]{14}:[A-Za-z0-9_-]{3,64}")
 _EVENT = re.compile(r"[0-9]{1,20}-[0-9]{1,20}")
 _LARGEST_EVENT = 2**64 - 1
-"""Largest part of the id of an entry of a Redis stream."""
+"""Maximum of each part of the id of a Redis stream entry."""
 
 
 def check_key(idempotency_key: str) -> None:
@@ -28,7 +28,7 @@ def check_page(cursor: str | None, limit: int) -> None:
     """Check that a cursor is one that `Jobs.page` returned, and that a limit is in range."""
     if not 1 <= limit <= LARGEST_PAGE:
         raise InvalidRequest(
-            "invalid_limit", field="limit", expected=f"1–{LARGEST_PAGE}", got=str(limit), hint="Ask for less at once."
+            "invalid_limit", field="limit", expected=f"1–{LARGEST_PAGE}", got=str(limit), hint="Request fewer at once."
         )
     if cursor is not None and not _CURSOR.fullmatch(cursor):
         raise InvalidRequest(
@@ -42,5 +42,5 @@ def check_event_id(after: str) -> None:
     if not _EVENT.fullmatch(after) or any(int(part) > _LARGEST_EVENT for part in after.split("-")):
         raise InvalidRequest(
             "invalid_event_id", field="Last-Event-ID", expected="the id of an event", got=repr(after)[:80],
-            hint="Leave it out to get all events that are kept.",
+            hint="Omit it to get all events that are kept.",
         )  # fmt: skip

@@ -1,7 +1,7 @@
-"""fsck: compares what is stored with the records, and lists what does not fit.
+"""fsck: compare the stores with the job records and list inconsistencies.
 
-A sound installation at rest gives no findings. While jobs come and go, a finding may be a change caught half-way:
-look twice before believing it (`findings` does, by `pause`).
+A consistent installation without running jobs has no findings. Changes in progress look like inconsistencies, so `findings`
+checks each one again after `pause` seconds.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pliant.worker.uploads.service import Uploads
 
 
 def findings(jobs: Jobs, *, pause: float = 5.0) -> list[str]:
-    """Return a sentence for everything that does not fit, seen in two looks `pause` seconds apart.
+    """Return a sentence for each inconsistency that two checks, `pause` seconds apart, both find.
 
     Raises
     ------
@@ -43,7 +43,7 @@ def _look(jobs: Jobs) -> Iterator[str]:
     yield from Uploads.open(jobs.settings).findings(jobs.clock())
     used, counted = jobs.records.used(), sum(stored.bytes for stored in records)
     if used != counted:
-        yield f"The jobs hold {counted:,} bytes, but {used:,} are on the books."
+        yield f"The jobs hold {counted:,} bytes, but {used:,} are counted."
 
 
 def _all(jobs: Jobs) -> Iterator[Stored]:
@@ -71,7 +71,7 @@ def _of_record(stored: Stored, sizes: dict[str, int]) -> Iterator[str]:
     if (job.status is Status.FAILED) is not (job.error is not None):
         yield f"Job {job.id} is {job.status.value} and its error is {job.error}."
     if (job.status is Status.SUCCEEDED) is not (stored.prefix is not None):
-        yield f"Job {job.id} is {job.status.value} and its results lie under {stored.prefix}."
+        yield f"Job {job.id} is {job.status.value} and its results are stored under {stored.prefix}."
 
 
 def _of_files(jobs: Jobs, records: list[Stored], sizes: dict[str, int]) -> Iterator[str]:
@@ -81,7 +81,7 @@ def _of_files(jobs: Jobs, records: list[Stored], sizes: dict[str, int]) -> Itera
         if held is None:
             yield f"File {key} belongs to no job."
         elif key not in (held.inputs, held.result) and not _counts(held, key):
-            yield f"File {key} belongs to no attempt of its job that counts."
+            yield f"File {key} belongs to no current attempt of its job."
     attempt_ids = {stored.attempt_id for stored in records if stored.job.status in ACTIVE}
     work = jobs.settings.work
     for directory in work.iterdir() if work.exists() else ():
@@ -96,7 +96,7 @@ def _counts(held: Stored, key: str) -> bool:
 
 
 def _held_back(jobs: Jobs, records: list[Stored], waiting: set[str]) -> set[str]:
-    """Return the queued jobs whose owner has as many running or about to run as may."""
+    """Return the queued jobs whose owner has reached the limit of running jobs."""
     taken = Counter(stored.owner for stored in records if stored.job.status in ACTIVE or stored.attempt_id in waiting)
     usual = jobs.settings.max_running
     most = {each.job.id: usual if each.max_running is None else each.max_running for each in records}

@@ -1,10 +1,10 @@
-"""The reconciler: requeues jobs whose worker was lost, and queues again those that the queue has lost.
+"""The reconciler: requeue jobs whose worker was lost, and queued jobs that are missing from the queue.
 
-Any number of reconcilers may run; every change is a compare-and-set, so the second one to act finds nothing to do.
+Any number of reconcilers may run: every change is a compare-and-set, so only the first one takes effect.
 
-A running job is lost when its heartbeat count has not changed for `Settings.lost_after` seconds of observation. The reconciler adds
-up the time between two successful reads, each gap counted as at most twice its usual length. So neither a clock that jumps, nor a
-store that is unreachable for minutes, nor a machine that was suspended makes a job look lost.
+A running job is lost when its heartbeat count has not changed for `Settings.lost_after` seconds of observation. The observed
+time is the sum of the intervals between successful reads, each counted as at most twice its usual length. Clock jumps, an
+unreachable store and a suspended machine therefore do not make a job look lost.
 """
 
 from __future__ import annotations
@@ -31,25 +31,25 @@ from pliant.worker.records import Beat
 logger = logging.getLogger(__name__)
 
 LOOK_EVERY = 1.0
-"""Seconds between two looks at the running and queued jobs."""
+"""Seconds between two checks of the running and queued jobs."""
 
 FORGOTTEN_AFTER = 3.0
-"""Seconds of watching after which a queued job that the queue does not hold is queued again."""
+"""Seconds of observation after which a queued job that is missing from the queue is queued again."""
 
 
 STALE_WRITES = 3600.0
-"""Seconds for which the files of a job that was taken from a worker are looked at again, every `retention.TIDY_EVERY` seconds: a
-worker that was cut off for that long and returns stores nothing more once its next heartbeat fails."""
+"""Seconds for which the files of a requeued job are checked again, every `retention.TIDY_EVERY` seconds: the lost worker may
+return within this time and still store files until its next heartbeat fails."""
 
 
 @dataclass(slots=True)
 class Stillness:
-    """For how long each thing has not changed, by the monotonic clock."""
+    """Time for which each value has not changed, by the monotonic clock."""
 
     _seen: dict[str, tuple[object, float]] = field(default_factory=dict)
 
     def look(self, things: dict[str, object], gap: float) -> dict[str, float]:
-        """Take a look, `gap` seconds after the one before; return each thing's seconds without a change."""
+        """Observe the values `gap` seconds after the previous time; return for each the seconds without a change."""
         still: dict[str, tuple[object, float]] = {}
         for name, value in things.items():
             before, seconds = self._seen.get(name, (None, 0.0))
@@ -60,7 +60,7 @@ class Stillness:
 
 @dataclass(slots=True, kw_only=True)
 class Reconciler:
-    """Looks after the jobs of one installation."""
+    """Reconciles the records, queue and files of one installation."""
 
     jobs: Jobs
     clock: Callable[[], float] = time.monotonic
@@ -70,9 +70,9 @@ class Reconciler:
     _looked: float | None = None
     _cleaned: set[str] = field(default_factory=set)
     _ended: int | None = None
-    """How many jobs had ended when their attempts' files were last removed."""
+    """Number of finished jobs when the files of their attempts were last removed."""
     _taken: dict[str, float] = field(default_factory=dict)
-    """When each job was last taken from a worker: that worker may be alive and store files until it hears of it."""
+    """When each job was last requeued; its former worker may be alive and store files for a while."""
 
     def __post_init__(self) -> None:
         self.retention = Retention(jobs=self.jobs)
@@ -83,7 +83,7 @@ class Reconciler:
         Raises
         ------
         StoreUnavailable
-            The store does not answer; what was due stays due.
+            The store does not answer; nothing is lost, the work stays due.
         """
         now = self.clock()
         gap = 0.0 if self._looked is None else min(now - self._looked, 2 * LOOK_EVERY)
@@ -92,10 +92,10 @@ class Reconciler:
         self._queue_forgotten(gap)
         self._clean_up_after_attempts(now)
         if self.retention.tick(now):
-            self._ended = None  # one job may have expired while another ended: look again whatever the number
+            self._ended = None  # expired and finished jobs may cancel out in the count
 
     def run(self, should_stop: Callable[[], bool]) -> None:
-        """Tick until told to stop; a store that does not answer is waited for."""
+        """Tick until `stop` is set; wait while the store is unavailable."""
         while not should_stop():
             try:
                 self.tick()
@@ -115,7 +115,7 @@ class Reconciler:
                 lifecycle.requeue,
                 attempt_id=beat.attempt_id,
                 fresh=fresh,
-                problem=worker_lost("The worker that had the job gave no sign of life any more."),
+                problem=worker_lost("The worker of the job sent no more heartbeats."),
                 now=self.jobs.clock(),
                 max_attempts=settings.max_attempts,
                 retention=settings.retention,
@@ -123,23 +123,23 @@ class Reconciler:
             with suppress(StaleAttempt, UnknownJob):
                 after = records.update(id, change)
                 clean_up(settings, beat.attempt_id)
-                self._say(id, f"Lost its worker; it is {after.job.status.value} now.")
+                self._say(id, f"The worker was lost; the job is {after.job.status.value} now.")
                 if after.job.status is Status.QUEUED:
-                    self.jobs.queue.push(id, fresh, front=True)  # it has waited before
+                    self.jobs.queue.push(id, fresh, front=True)  # it has been queued before
                 self._taken[id] = self.clock()
                 self._remove_unwanted(id)
 
     def _queue_forgotten(self, gap: float) -> None:
-        """Queue what the queue has lost, and what was held back until fewer of its owner's jobs run.
+        """Queue the jobs that are missing from the queue, and those held back whose owner has capacity again.
 
-        The queue's own notes tell the two apart: what we saw at our last look would not do, since a job may be held back,
-        and its place become free, between two looks.
+        The marks in the queue distinguish the two. The previous check cannot, since a job may be held back and its owner
+        regain capacity between two checks.
         """
         records, queue = self.jobs.records, self.jobs.queue
-        noted = queue.held()  # read first: a note is written after its record, so one without a record has had its time
+        noted = queue.held()  # read first: a mark is written after its record, so one without a record is stale
         queued = records.beats(records.ids(Status.QUEUED))
         for attempt_id in noted - {beat.attempt_id for beat in queued.values()}:
-            queue.let_go(attempt_id)
+            queue.release(attempt_id)
         waiting = set(queue.waiting())
         absent = {id: beat for id, beat in queued.items() if beat.attempt_id not in waiting}
         held = self._over_the_limit(queued, absent)
@@ -153,12 +153,12 @@ class Reconciler:
         lost = {id: attempt_id for id, attempt_id in free.items() if attempt_id not in noted}
         for id, still in self._queued.look(dict(lost), gap).items():
             if still >= FORGOTTEN_AFTER and self._queue_again(id, lost[id], front=True):
-                self._say(id, "The queue had forgotten it; queued again.")
+                self._say(id, "The job was missing from the queue; queued again.")
 
     def _over_the_limit(self, queued: Mapping[str, Beat], absent: Mapping[str, Beat]) -> set[str]:
-        """Return the queued jobs that must wait because their owner has no more running.
+        """Return the queued jobs to hold back because their owner has reached the limit of running jobs.
 
-        What is in the queue, or on its way from there to a worker, counts as running; the places that are left go to the oldest.
+        Jobs in the queue, or on their way to a worker, count as running; the remaining capacity goes to the oldest.
         """
         usual = self.jobs.settings.max_running
         if usual == 0 and all(beat.max_running is None for beat in absent.values()):
@@ -168,7 +168,7 @@ class Reconciler:
         taken = Counter(beat.owner for beat in active.values())
         taken.update(beat.owner for id, beat in queued.items() if id not in absent)
         held: set[str] = set()
-        for id, beat in absent.items():  # oldest first, as `ids` gives them
+        for id, beat in absent.items():  # oldest first, as returned by `ids`
             taken[beat.owner] += 1
             most = usual if beat.max_running is None else beat.max_running
             if 0 < most < taken[beat.owner]:
@@ -176,7 +176,7 @@ class Reconciler:
         return held
 
     def _queue_again(self, id: str, old: str, *, front: bool) -> bool:
-        """Put a queued job into the queue under a new attempt_id; False if somebody else was quicker."""
+        """Queue a job under a new attempt id; return False if another process did so first."""
         fresh = new_attempt_id(id)
         try:
             self.jobs.records.update(id, partial(lifecycle.redeliver, attempt_id=old, fresh=fresh))
@@ -187,7 +187,7 @@ class Reconciler:
         return True
 
     def _clean_up_after_attempts(self, now: float) -> None:
-        """Remove the files of attempts that did not become their job's result, once for each job that has ended."""
+        """Remove the files of attempts that are not their job's result, once for each finished job."""
         self._taken = {id: since for id, since in self._taken.items() if now < since + STALE_WRITES}
         ended = self.jobs.count(lifecycle.FINAL)
         if ended == self._ended:
@@ -199,7 +199,7 @@ class Reconciler:
         self._cleaned, self._ended = set(untidy) - self._taken.keys(), ended
 
     def _remove_unwanted(self, id: str) -> None:
-        """Remove what a job's ended attempts have stored."""
+        """Remove the files of a job's ended attempts."""
         for key, _ in self.jobs.blobs.list(f"jobs/{id}/"):
             if is_wanted(self.jobs, key) is False:
                 self.jobs.blobs.delete(key)

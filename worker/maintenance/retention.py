@@ -1,4 +1,4 @@
-"""Retention: removes expired jobs and uploads, and files that belong to no job or attempt."""
+"""Retention: remove expired jobs and uploads, and files that belong to no job or attempt."""
 
 from __future__ import annotations
 
@@ -17,31 +17,31 @@ from pliant.worker.uploads.service import Uploads
 logger = logging.getLogger(__name__)
 
 TIDY_EVERY = 30.0
-"""Seconds between two looks for what has expired."""
+"""Seconds between two checks for expired jobs and uploads."""
 
 SWEEP_EVERY = 3600.0
-"""Seconds between two looks for files that belong to no job."""
+"""Seconds between two checks for files that belong to no job."""
 
 ORPHAN_AGE = timedelta(hours=6)
-"""A file of an unknown job is removed when it is older: a younger one may belong to a submission that has no record yet."""
+"""Age in seconds above which a file of an unknown job is removed; a younger one may belong to a submission without a record yet."""
 
 DEAD_AGE = timedelta(minutes=1)
-"""Scratch directories of ended attempts are removed when they are older: until then their worker may be reading them."""
+"""Age in seconds above which scratch directories of ended attempts are removed; their worker may still read younger ones."""
 
 JUMP = 60.0
-"""Seconds by which the wall clock and the monotonic clock must diverge between two looks for it to be a jump."""
+"""Seconds by which wall clock and monotonic clock must diverge between two checks to count as a jump."""
 
 HOLD = 3600.0
-"""Seconds after a jump of the clock in which nothing expires: a wrong clock is mostly corrected soon, a deletion never."""
+"""Seconds without expiry after a clock jump: wrong clocks are usually corrected soon, and deletions cannot be undone."""
 
 
 @dataclass(slots=True, kw_only=True)
 class Retention:
-    """Removes what is no longer kept."""
+    """Removes expired jobs, uploads and stray files."""
 
     jobs: Jobs
     _ahead: float | None = None
-    """Seconds that the wall clock is ahead of the monotonic clock."""
+    """Wall clock minus monotonic clock, seconds."""
     _held_until: float | None = None
     _tidied: float | None = None
     _swept: float | None = None
@@ -52,7 +52,7 @@ class Retention:
         Raises
         ------
         StoreUnavailable
-            A store does not answer; what was due stays due.
+            A store does not answer; nothing is lost, the work stays due.
         """
         self._check_clock(now)
         tidied = self._tidied is None or now >= self._tidied + TIDY_EVERY
@@ -70,7 +70,7 @@ class Retention:
         return tidied
 
     def _check_clock(self, now: float) -> None:
-        """Suspend expiry for a while if the wall clock has jumped, since expiry depends on it alone."""
+        """Suspend expiry for a while if the wall clock, on which it depends, has jumped."""
         ahead = self.jobs.clock().timestamp() - now
         if self._ahead is not None and abs(ahead - self._ahead) > JUMP:
             self._held_until = now + HOLD
@@ -92,12 +92,12 @@ class Retention:
                 return
 
     def _expire_uploads(self) -> None:
-        """Remove uploads that were neither continued nor used for longer than they are kept."""
+        """Remove uploads that were neither continued nor used within the retention period."""
         for id in Uploads.open(self.jobs.settings).expire(self.jobs.clock()):
             logger.info("upload %s: expired and removed", id)
 
     def _remove_deleted(self) -> None:
-        """Remove the files of deleted jobs that the blob store did not remove when it was asked to."""
+        """Remove the files of deleted jobs that the blob store failed to remove."""
         for id, deleted_at in self.jobs.records.deleted().items():
             for key, written in self.jobs.blobs.list(f"jobs/{id}/"):
                 if written <= deleted_at and not is_wanted(self.jobs, key):
@@ -105,7 +105,7 @@ class Retention:
             self.jobs.records.forget_deleted(id)
 
     def _sweep(self) -> None:
-        """Remove files that belong to no job or attempt: of submissions without a record, of attempts that were killed."""
+        """Remove files that belong to no job or attempt: from submissions without a record and from killed attempts."""
         oldest = self.jobs.clock() - ORPHAN_AGE
         for key, written in self.jobs.blobs.list("jobs/"):
             wanted = is_wanted(self.jobs, key)
@@ -114,7 +114,7 @@ class Retention:
                 logger.info("removed %s, which belongs to no job or attempt", key)
 
     def _clear_work(self) -> None:
-        """Remove scratch directories of ended attempts whose worker was killed before it could."""
+        """Remove scratch directories of ended attempts whose worker was killed before it removed them."""
         work, oldest = self.jobs.settings.work, self.jobs.clock() - DEAD_AGE
         for directory in work.iterdir() if work.exists() else ():
             with suppress(FileNotFoundError):
@@ -126,7 +126,7 @@ class Retention:
 
 
 def is_wanted(jobs: Jobs, key: str) -> bool | None:
-    """Return True if a job needs a file, False if it does not; None: there is no such job, or not yet."""
+    """Return whether a job needs a file; None if the job does not exist (yet)."""
     try:
         held = jobs.records.get(key.split("/")[1])
     except UnknownJob:

@@ -1,9 +1,9 @@
-"""Run a module of this package in a process of its own that has limits, and get its answer or its refusal.
+"""Run a module of this package in a separate process with resource limits, and return its answer or its rejection.
 
-Three processes are started this way: the isolated reader, which reads large inputs, the sandbox, which parses formats whose parsers
-are not trusted, and the film process, which decodes and tracks films. They receive a JSON request on standard input and write a JSON
-answer to standard output, which is a temporary file, so that the parent never holds more than `MAX_ANSWER` bytes of it. They end
-with their parent. A process that takes long may send progress over a pipe, one JSON object a line.
+Three processes are started this way: the isolated reader, which reads large inputs; the sandbox, which runs untrusted parsers;
+and the film process, which decodes and tracks films. Each receives a JSON request on standard input and writes a JSON answer to
+standard output, a temporary file, of which the parent reads at most `MAX_ANSWER` bytes. It ends with its parent. Long-running
+processes may send progress over a pipe, one JSON object per line.
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ from pliant.solver.errors import InvalidInput
 from pliant.worker.processes.containment import die_with_parent
 
 DONE, REFUSED = 0, 3
-"""Exit codes of a process that answered, and of one that refused its input."""
+"""Exit codes of a process that succeeded, and of one that rejected its input."""
 
 MAX_ANSWER = 1 << 20
-"""Bytes of an answer that the parent reads."""
+"""Maximum bytes of an answer that the parent reads."""
 
 ERRORS_KEPT = 4096
-"""Bytes of standard error that the parent reads."""
+"""Maximum bytes of standard error that the parent reads."""
 
 MAX_LINE = 4096
-"""Bytes of one line of progress; longer ones are dropped."""
+"""Maximum bytes of a line of progress; longer lines are dropped."""
 
 POLL = 0.1
-"""Seconds between two looks at a process that may be stopped."""
+"""Seconds between two calls of `should_stop`."""
 
 PARTS = ("code", "field", "expected", "got", "hint")
-"""Attributes of `InvalidInput` that a refusal carries."""
+"""Attributes of `InvalidInput` that are transferred."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,10 +55,10 @@ class Ended:
     """End of its standard error."""
 
     overdue: bool = False
-    """True if it was killed because it took too long."""
+    """Whether it was killed at its time limit."""
 
     stopped: bool = False
-    """True if it was killed because `should_stop` returned True."""
+    """Whether it was killed because `should_stop` returned True."""
 
 
 def run_contained(
@@ -72,7 +72,7 @@ def run_contained(
     on_line: Callable[[dict[str, Any]], None] | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> Ended:
-    """Start `python -I -m module`, wait for it, and return how it ended. It inherits nothing but what is passed.
+    """Start `python -I -m module`, wait for it, and return how it ended. It inherits only what is passed.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def run_contained(
     descriptors : tuple of int
         Open files that it inherits.
     environment : mapping, optional
-        Variables it gets besides those that keep the numerical libraries to one thread.
+        Environment variables, besides those that limit the numerical libraries to one thread.
     on_line : callable, optional
         Called with every JSON object that the process writes to the descriptor `progress` of its request.
     should_stop : callable, optional
@@ -140,7 +140,7 @@ def _run(
 
 
 class _Progress:
-    """The pipe over which a contained process sends its progress; none if nobody listens."""
+    """The pipe over which a contained process sends its progress; absent without a callback."""
 
     def __init__(self, on_line: Callable[[dict[str, Any]], None] | None) -> None:
         self._on_line = on_line
@@ -170,7 +170,7 @@ class _Progress:
             self.read()
 
     def read(self) -> None:
-        """Pass on what has arrived, at most one pipe's worth."""
+        """Pass on the lines that have arrived, at most one pipe buffer."""
         if self._source is None or self._on_line is None:
             return
         try:
@@ -187,7 +187,7 @@ class _Progress:
 
 
 def refusal_in(ended: Ended) -> dict[str, Any] | None:
-    """Return the parts of the refusal that a process wrote, `choices` among them; None if they cannot be read."""
+    """Return the attributes of the error that a process wrote, including `choices`; None if they cannot be read."""
     try:
         stated = json.loads(ended.answer)
         parts: dict[str, Any] = {name: str(stated[name]) for name in PARTS}
@@ -197,7 +197,7 @@ def refusal_in(ended: Ended) -> dict[str, Any] | None:
 
 
 def serve(handle: Callable[[dict[str, Any]], str]) -> int:
-    """Be the contained process: read the request, call `handle`, write its answer or its refusal; return the exit code."""
+    """Run as the contained process: read the request, call `handle`, write its answer or error; return the exit code."""
     die_with_parent(int(sys.argv[1]))
     try:
         answer, code = handle(json.load(sys.stdin)), DONE
@@ -210,7 +210,7 @@ def serve(handle: Callable[[dict[str, Any]], str]) -> int:
 
 
 def limit_process(limits: Mapping[int, int]) -> None:
-    """Set resource limits for the rest of the process's life; one that the system does not know is passed over."""
+    """Set resource limits for the rest of the process's life; limits that the system lacks are skipped."""
     for name, bound in limits.items():
         with suppress(ValueError, OSError):  # macOS has no limit on the address space
             _, hard = resource.getrlimit(name)

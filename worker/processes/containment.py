@@ -1,4 +1,4 @@
-"""Small dealings with the operating system: dying with one's parent, and the traces of the out-of-memory killer."""
+"""Operating system interfaces: ending with the parent process, and detecting the out-of-memory killer."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ _libc = ctypes.CDLL(None, use_errno=True) if sys.platform == "linux" else None
 
 
 def die_with_parent(parent: int, *, how: signal.Signals = signal.SIGKILL) -> None:
-    """Ask the kernel to signal this process when its parent ends (Linux; elsewhere the parent's id is polled).
+    """Make the kernel signal this process when its parent ends (Linux; elsewhere the parent's id is polled).
 
     Parameters
     ----------
     parent : int
-        Process id of the parent, taken before the fork: it may have ended since.
+        Process id of the parent, taken before the fork, since the parent may have ended.
     how : signal
-        What to be sent.
+        Signal to receive.
     """
     if _libc is not None:
         _libc.prctl(_PR_SET_PDEATHSIG, int(how), 0, 0, 0)
@@ -31,18 +31,18 @@ def die_with_parent(parent: int, *, how: signal.Signals = signal.SIGKILL) -> Non
 
 @dataclass(frozen=True, slots=True)
 class OomKills:
-    """How often the kernel has killed for want of memory: in our control group, and on the whole machine."""
+    """Counts of out-of-memory kills: in the own control group, and on the whole machine."""
 
     group: int
     machine: int
 
     @classmethod
     def now(cls) -> OomKills:
-        """Read the kernel's counters; 0 where there are none."""
+        """Read the kernel's counters; 0 where they do not exist."""
         return cls(_counter(_group_events(), "oom_kill"), _counter(Path("/proc/vmstat"), "oom_kill"))
 
     def since(self, before: OomKills) -> bool:
-        """Tell whether there was one between two readings."""
+        """Whether there was a kill between two readings."""
         return self.group > before.group or self.machine > before.machine
 
 

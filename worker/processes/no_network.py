@@ -1,4 +1,4 @@
-"""Take the network away from this process: a seccomp filter that denies opening sockets and starting programs (Linux)."""
+"""Deny network access to this process: a seccomp filter that blocks opening sockets and starting programs (Linux)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _NO_NEW_PRIVILEGES, _SET_SECCOMP, _FILTER = 38, 22, 2
 """Constants of prctl(2): PR_SET_NO_NEW_PRIVS, PR_SET_SECCOMP, SECCOMP_MODE_FILTER."""
 
 _ALLOW, _DENY, _KILL = 0x7FFF0000, 0x00050000 | errno.EACCES, 0x80000000
-"""Verdicts of a filter: SECCOMP_RET_ALLOW, SECCOMP_RET_ERRNO with EACCES, SECCOMP_RET_KILL_PROCESS."""
+"""Return values of a filter: SECCOMP_RET_ALLOW, SECCOMP_RET_ERRNO with EACCES, SECCOMP_RET_KILL_PROCESS."""
 
 _LOAD, _EQUAL, _AT_LEAST, _RETURN = 0x20, 0x15, 0x35, 0x06
 """Instructions of the filter: load a word of `seccomp_data`, compare it, return."""
@@ -39,19 +39,19 @@ class _Program(ctypes.Structure):
 def forbid_network() -> bool:
     """Deny new sockets and new programs to this process for the rest of its life.
 
-    Call it before threads start: it holds for the calling thread and for what that thread starts.
+    Call it before starting threads: it applies to the calling thread and its descendants.
 
     Returns
     -------
     bool
-        False where the system or the machine has no such filter.
+        False if the system or the architecture does not support the filter.
     """
     if sys.platform != "linux" or platform.machine() not in DENIED:
         return False
     machine, denied = DENIED[platform.machine()]
     count = len(denied)
     steps = [
-        (_LOAD, 0, 0, 4),  # the machine that the call is made for
+        (_LOAD, 0, 0, 4),  # the architecture of the call
         (_EQUAL, 1, 0, machine),
         (_RETURN, 0, 0, _KILL),
         (_LOAD, 0, 0, 0),  # the number of the call

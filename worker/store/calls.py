@@ -1,4 +1,4 @@
-"""Calls to a remote store: each with a time limit, on a small pool of threads, and refused at once when too many wait."""
+"""Calls to a remote store: with a time limit, in a small thread pool, and rejected when too many are waiting."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from typing import TypeVar
 from pliant.worker.errors import StoreUnavailable
 
 AT_ONCE = 12
-"""Calls that are made at once."""
+"""Maximum number of concurrent calls."""
 
 WAITING = 12
-"""Further calls that may wait for one of them. Together they are fewer than the 40 threads of the service's requests, so that requests
-which need no blob store find a thread while the store hangs."""
+"""Maximum number of waiting calls. With the concurrent ones they are fewer than the 40 request threads of the service, so that
+requests that need no blob store are served while the store hangs."""
 
 Answer = TypeVar("Answer")
 
@@ -28,21 +28,21 @@ class RemoteCalls:
         self._waiting = 0
 
     def run(self, call: Callable[[], Answer], *, seconds: float) -> Answer:
-        """Return what the call returns; its exceptions pass through.
+        """Return the result of the call; its exceptions pass through.
 
         Parameters
         ----------
         seconds : float
-            How long to wait for it, its wait for a thread included. The call itself ends later, by its own time limit.
+            Time limit, including the wait for a thread. The call itself may end later, by its own time limit.
 
         Raises
         ------
         StoreUnavailable
-            It took longer, or too many calls wait.
+            The time limit is reached, or too many calls are waiting.
         """
         with self._lock:
             if self._waiting >= AT_ONCE + WAITING:
-                raise StoreUnavailable("The blob store", reason="too many requests wait for it")
+                raise StoreUnavailable("The blob store", reason="too many requests are waiting for it")
             self._waiting += 1
             if self._pool is None:
                 self._pool = ThreadPoolExecutor(AT_ONCE, thread_name_prefix="blobs")

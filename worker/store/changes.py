@@ -1,7 +1,7 @@
-"""Which jobs have changed, for one process: a single subscription however many jobs are followed.
+"""Notifications of changed jobs: one subscription per process, however many jobs are followed.
 
-Every write of a record publishes the job's id on one channel. A message can be lost while the connection is re-established, so
-a follower also reads its job again now and then; the channel only makes it prompt.
+Every write of a record publishes the job's id on one channel. Messages can be lost while a connection is re-established, so
+followers also poll their job at longer intervals.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class RedisChanges(Changes):
             until = time.monotonic() + timeout
             while not found and (left := until - time.monotonic()) > 0:
                 message = self._pubsub.get_message(timeout=left)
-                while message is not None:  # whatever else has arrived already
+                while message is not None:  # and all other messages that have arrived
                     found.add(_text(message["data"]))
                     message = self._pubsub.get_message(timeout=0)
         return found

@@ -1,4 +1,4 @@
-"""Connections to Redis, and the translation of their failures into ours."""
+"""Connections to Redis, and the translation of their errors."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from redis.backoff import ExponentialWithJitterBackoff
 from redis.retry import Retry
 
 ANSWER_WITHIN = 10.0
-"""Seconds a command may take; while Redis hangs, a request is answered with 503 after this time."""
+"""Seconds a command may take; while Redis hangs, requests end with 503 after this time."""
 
 BLOCK_WITHIN = 30.0
-"""The same for a command that blocks on purpose: a worker that waits for a delivery."""
+"""The same for blocking commands: a worker that waits for a delivery."""
 
 
 def connect(url: str, *, decode: bool, retries: int = 3, answer_within: float | None = None) -> redis.Redis:
-    """Return a client, which connects when it is first used.
+    """Return a client that connects on first use.
 
     Parameters
     ----------
@@ -27,11 +27,10 @@ def connect(url: str, *, decode: bool, retries: int = 3, answer_within: float | 
     decode : bool
         Text instead of bytes; RQ needs bytes.
     retries : int
-        Attempts after the first when the connection breaks, with growing pauses of up to half a second. Every write
-        of ours is a compare-and-set or may be repeated, so a retry after an unheard answer does no harm. A server that
-        is there and does not answer is not asked again: that would only multiply the wait.
+        Retries after a broken connection, with growing pauses of up to 0.5 s. All writes are compare-and-set or
+        idempotent, so a retry after a lost reply is harmless. Timeouts are not retried: that would multiply the wait.
     answer_within : float, optional
-        Seconds a command may take; `ANSWER_WITHIN` when not given.
+        Seconds a command may take; `ANSWER_WITHIN` by default.
     """
     seconds = ANSWER_WITHIN if answer_within is None else answer_within
     return redis.Redis.from_url(
@@ -44,11 +43,39 @@ def connect(url: str, *, decode: bool, retries: int = 3, answer_within: float | 
     )
 
 
+def check_server(url: str, *, answer_within: float = 3.0) -> str:
+    """Send a command that needs the password of the URL; return the server's policy for full memory, empty if it is not readable.
+
+    Raises
+    ------
+    StoreUnavailable
+        The server does not answer, or refuses the password.
+    """
+    try:
+        client = connect(url, decode=True, retries=0, answer_within=answer_within)
+    except ValueError as error:
+        raise StoreUnavailable("The job store", reason=str(error)) from error
+    try:
+        with reachable():
+            client.get("pliant:doctor")
+            try:
+                found: dict[str, str] = client.config_get("maxmemory-policy")  # type: ignore[assignment]
+            except redis.ResponseError:  # managed servers hide their configuration
+                return ""
+            return found.get("maxmemory-policy", "")
+    except redis.ResponseError as error:  # no password was sent where one is needed, or its user may not do this
+        raise StoreUnavailable("The job store", reason=str(error)[:200]) from error
+    finally:
+        client.close()
+
+
 @contextmanager
 def reachable() -> Iterator[None]:
-    """Turn Redis' failures to answer into `StoreUnavailable`; what Redis says against a command passes through."""
+    """Translate connection failures to `StoreUnavailable`; errors of commands pass through."""
     try:
         yield
+    except redis.AuthenticationError as error:
+        raise StoreUnavailable("The job store", reason="it refuses the password") from error
     except (redis.ConnectionError, redis.TimeoutError, redis.exceptions.ClusterDownError) as error:
         raise StoreUnavailable("The job store", reason=type(error).__name__) from error
     except redis.OutOfMemoryError as error:

@@ -1,4 +1,4 @@
-"""The doubles of record store and queue, in memory: for tests and for reading. The same suite runs on them as on Redis."""
+"""In-memory record store and queue for tests; the same test suite runs on them and on Redis."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pliant.worker.store.queue import Queue
 
 
 class MemoryRecords(Records):
-    """Records of one process, safe among its threads."""
+    """Thread-safe records of one process."""
 
     def __init__(self) -> None:
         self._lock = threading.RLock()
@@ -223,7 +223,7 @@ class MemoryQueue(Queue):
 
     def remove(self, attempt_id: str) -> None:
         """See `Queue.remove`."""
-        self.let_go(attempt_id)
+        self.release(attempt_id)
         if attempt_id in self._attempt_ids:
             self._attempt_ids.remove(attempt_id)
 
@@ -235,8 +235,8 @@ class MemoryQueue(Queue):
         """See `Queue.held`."""
         return set(self._held)
 
-    def let_go(self, attempt_id: str) -> None:
-        """See `Queue.let_go`."""
+    def release(self, attempt_id: str) -> None:
+        """See `Queue.release`."""
         self._held.discard(attempt_id)
 
     def waiting(self) -> list[str]:

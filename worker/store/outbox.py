@@ -1,7 +1,6 @@
-"""The outbox: jobs whose end is still to be told by webhook. An entry is written together with the job's final status, in one step.
+"""The outbox: finished jobs whose webhook is still to be sent. An entry is written atomically with the job's final status.
 
-So a message is owed exactly when the job has ended, whatever is killed in between; it is sent at least once, and the receiver
-knows a repetition by its `webhook-id`.
+Webhooks are therefore delivered at least once, whichever process is killed; receivers recognise duplicates by `webhook-id`.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ from typing import Any
 import redis
 from pliant.worker.store.connection import reachable
 
-# ARGV: 1 prefix, 2 now, 3 until when nobody else takes it. Answers id and how often it was tried, this time among them.
+# ARGV: 1 prefix, 2 now, 3 end of the lease. Returns id and number of attempts, including this one.
 _TAKE = """
 local at = ARGV[1]
 local due = redis.call('ZRANGEBYSCORE', at .. 'outbox', '-inf', ARGV[2], 'LIMIT', 0, 1)
@@ -39,7 +38,7 @@ return 1
 
 
 class Outbox:
-    """The messages that are owed. All times in milliseconds since 1970; every method may raise `StoreUnavailable`."""
+    """The pending messages. All times in milliseconds since 1970; every method may raise `StoreUnavailable`."""
 
     def __init__(self, client: redis.Redis, *, prefix: str) -> None:
         self._redis: Any = client
@@ -49,39 +48,39 @@ class Outbox:
         self._close = client.register_script(_CLOSE)
 
     def take(self, *, now: int, until: int) -> tuple[str, int] | None:
-        """Take the message that has been due longest, so that nobody else takes it before `until`.
+        """Lease the message that has been due longest until the time `until`.
 
         Returns
         -------
         id : str
             The job.
         tries : int
-            How often it was taken, this time among them.
+            Number of leases, including this one.
         """
         with reachable():
             found = self._take(args=[self._at, now, until])
         return None if found is None else (str(found[0]), int(found[1]))
 
     def delivered(self, id: str) -> None:
-        """Forget a message that has arrived."""
+        """Remove a delivered message."""
         self._closed(id, "webhooks:delivered")
 
     def given_up(self, id: str) -> None:
-        """Forget a message that will never arrive."""
+        """Remove a message that cannot be delivered."""
         self._closed(id, "webhooks:given_up")
 
     def later(self, id: str, *, due: int) -> None:
-        """Try a message again, then; nothing happens if its job is gone."""
+        """Schedule the next attempt at a message; nothing happens if its job was deleted."""
         with reachable():
             self._redis.zadd(f"{self._at}outbox", {id: due}, xx=True)
 
     def postpone(self, id: str, *, due: int) -> None:
-        """Put back a message that was taken and not tried."""
+        """Return a message that was leased but not tried."""
         with reachable():
             self._postpone(args=[self._at, id, due])
 
     def owed(self) -> int:
-        """Return how many messages there are."""
+        """Return the number of pending messages."""
         with reachable():
             return int(self._redis.zcard(f"{self._at}outbox"))
 

@@ -1,4 +1,4 @@
-"""The queue: RQ carries an attempt's attempt_id from the one who submits to the one who works; it knows nothing else."""
+"""The queue: RQ carries attempt ids from the service to the workers, and nothing else."""
 
 from __future__ import annotations
 
@@ -18,56 +18,56 @@ FUNCTION = "pliant.worker.execution.attempt.run"
 """The only function a delivery may name."""
 
 FAILURE_KEPT = 60
-"""Seconds RQ keeps its own note of a delivery that died; ours is the job record."""
+"""Seconds RQ keeps its entry of a failed delivery; the authority is the job record."""
 
 
 def alive_key(queue: str, worker: str) -> str:
-    """Return the key that lives only as long as its worker does (RQ's own entry outlives a killed worker by minutes)."""
+    """Return the key that expires with its worker (RQ's own entry outlives a killed worker by minutes)."""
     return f"{queue}:worker:{worker}"
 
 
 class Queue(ABC):
-    """Who is next."""
+    """The order in which attempts run."""
 
     @abstractmethod
     def push(self, id: str, attempt_id: str, *, front: bool = False) -> None:
-        """Put an attempt at the end, or before all the others; nothing happens if it waits already."""
+        """Append an attempt, or put it first; nothing happens if it is queued already."""
 
     @abstractmethod
     def remove(self, attempt_id: str) -> None:
-        """Take an attempt out, whether it waits or is held back."""
+        """Remove an attempt, whether it is queued or held back."""
 
     @abstractmethod
     def hold(self, attempt_id: str) -> None:
-        """Note that an attempt is kept out on purpose, until fewer of its owner's jobs run."""
+        """Mark an attempt as held back until fewer of its owner's jobs run."""
 
     @abstractmethod
     def held(self) -> set[str]:
-        """Return the attempt_ids that are noted as held back."""
+        """Return the ids of the attempts that are held back."""
 
     @abstractmethod
-    def let_go(self, attempt_id: str) -> None:
-        """Strike the note that an attempt is held back; nothing else happens to it."""
+    def release(self, attempt_id: str) -> None:
+        """Remove the mark that an attempt is held back; it is not queued."""
 
     @abstractmethod
     def waiting(self) -> list[str]:
-        """Return the attempt_ids of all attempts that wait, next first."""
+        """Return the ids of all queued attempts, next one first."""
 
     @abstractmethod
     def place(self, attempt_id: str) -> int | None:
-        """Return how many attempts wait before this one, None if it does not wait."""
+        """Return the number of attempts ahead of this one, None if it is not queued."""
 
     @abstractmethod
     def tidy(self) -> None:
-        """Remove what dead workers left behind in the queue's own books."""
+        """Remove entries of ended workers from RQ's records."""
 
     @abstractmethod
     def workers(self) -> list[str]:
-        """Return the names of the workers that have shown signs of life lately."""
+        """Return the names of the workers with a recent heartbeat."""
 
 
 class RedisQueue(Queue):
-    """RQ on Redis, JSON only. One queue, so that RQ moves ids by BLMOVE and cannot drop one between two hands."""
+    """RQ on Redis, JSON only. With a single queue RQ moves ids by BLMOVE and cannot lose one in between."""
 
     def __init__(self, client: redis.Redis, *, name: str) -> None:
         self._redis: Any = client
@@ -84,7 +84,7 @@ class RedisQueue(Queue):
                 FUNCTION,
                 args=(id, attempt_id),
                 job_id=attempt_id,
-                timeout=-1,  # ours is kept by the worker, who can end a C call; RQ's alarm cannot
+                timeout=-1,  # the worker enforces the time limit, since RQ's alarm cannot end a C call
                 result_ttl=0,
                 failure_ttl=FAILURE_KEPT,
                 description=f"job {id}",
@@ -93,15 +93,15 @@ class RedisQueue(Queue):
 
     def remove(self, attempt_id: str) -> None:
         """See `Queue.remove`."""
-        self.let_go(attempt_id)
+        self.release(attempt_id)
         with reachable():
             for key in (self._queue.key, self._queue.intermediate_queue_key):
                 self._redis.lrem(key, 0, attempt_id)
             try:
                 RqJob.fetch(attempt_id, connection=self._redis, serializer=JSONSerializer).delete()
-            except (NoSuchJobError, InvalidJobOperation):  # gone already, or just now
+            except (NoSuchJobError, InvalidJobOperation):  # removed already
                 return
-            except ValueError:  # the worker that took it strikes its note of that just now; RQ stumbles over the gap
+            except ValueError:  # the worker that took it is just removing its own entry, which RQ reports as an error
                 self._redis.delete(RqJob.key_for(attempt_id))
 
     def hold(self, attempt_id: str) -> None:
@@ -114,8 +114,8 @@ class RedisQueue(Queue):
         with reachable():
             return {attempt_id.decode() for attempt_id in self._redis.smembers(self._held)}
 
-    def let_go(self, attempt_id: str) -> None:
-        """See `Queue.let_go`."""
+    def release(self, attempt_id: str) -> None:
+        """See `Queue.release`."""
         with reachable():
             self._redis.srem(self._held, attempt_id)
 

@@ -6,13 +6,13 @@ Keys, all under one prefix::
     index:*:<status>      sorted set of sort keys, all jobs of a status; index:@<owner>:<status> the owner's
     events:<id>, log:<id> stream and list, both capped
     key:<digest>          the job of an idempotency key
-    used                  bytes that all jobs hold
+    used                  bytes of all jobs
     deleted               sorted set of deleted jobs whose files are still to be removed, by time of deletion
     changes               channel on which the id of every changed job is published
-    tally                 hash: what has been counted since the installation began
-    outbox, outbox:tries  jobs whose end is to be told by webhook and when; how often it was tried (`worker.outbox`)
+    tally                 hash: counters since the installation was created
+    outbox, outbox:tries  jobs with a pending webhook and when it is due; number of attempts (`worker.outbox`)
 
-Each write is one Lua script, hence atomic; the append-only file holds it wholly or not at all.
+Each write is one Lua script and therefore atomic, also in the append-only file.
 """
 
 from __future__ import annotations
@@ -68,10 +68,10 @@ return false
 """
 
 _FULL, _NO_SPACE = "!full", "!space"
-"""What `_CREATE` returns instead of an id when the owner's queue or the quota is full; no id begins with this sign."""
+"""Results of `_CREATE` when the owner's queue or the quota is full; ids never start with this character."""
 
 # ARGV: 1 prefix, 2 id, 3 version before, 4 version, 5 status, 6 attempt id, 7 bytes, 8 body, 9 event, 10 data, 11 cap,
-# 12 when to tell it by webhook ('': never), 13 … tallies and what to add to them
+# 12 when the webhook is due ('': none), 13 … tallies and what to add to them
 _REPLACE = """
 local at, job = ARGV[1], ARGV[1] .. 'job:' .. ARGV[2]
 local held = redis.call('HMGET', job, 'version', 'status', 'owner', 'sort', 'bytes')
@@ -130,7 +130,7 @@ class RedisRecords(Records):
     """Records in Redis under one key prefix."""
 
     def __init__(self, client: redis.Redis, *, prefix: str) -> None:
-        self._redis: Any = client  # redis-py types every answer as a union with its awaitable twin
+        self._redis: Any = client  # redis-py types every reply as a union with its awaitable counterpart
         self._at = f"{prefix}:"
         self._create = client.register_script(_CREATE)
         self._replace = client.register_script(_REPLACE)

@@ -1,10 +1,9 @@
-"""One upload on the disk: a folder, what it holds, and its lock.
+"""One upload on disk: a folder with its file and a lock.
 
-While it grows it holds `part`, whose size is the offset; when it is whole, `part` is renamed to `whole-SHA256`, and never written
-again. So the one thing that tells a whole upload from half of one is an atomic rename, and a process that is killed leaves nothing
-that has to be repaired.
+An incomplete upload is the file `part`, whose size is the offset. A complete one is renamed to `whole-SHA256` and never written
+again. The rename is atomic, so nothing has to be repaired after a process is killed.
 
-Whoever writes to, removes or expires an upload holds a lock on its folder; the kernel gives it up with the process.
+Writing to, removing and expiring an upload require a lock on its folder, which the kernel releases when the process ends.
 """
 
 from __future__ import annotations
@@ -18,19 +17,19 @@ from pathlib import Path
 from pliant.worker.errors import Conflict, UnknownUpload
 
 PART, WHOLE, LENGTH, RESERVED = "part", "whole-", "length", "reserved"
-"""`reserved` exists while the upload is written to: the bytes set aside for it, locked by the writer."""
+"""File that exists while the upload is written: its reserved bytes, locked by the writer."""
 
 
 @contextmanager
 def locked(folder: Path, *, make: bool, id: str) -> Iterator[None]:
-    """Hold an upload's folder alone.
+    """Lock an upload's folder exclusively.
 
     Raises
     ------
     UnknownUpload
-        There is none, and it is not to be made.
+        There is none, and `make` is False.
     Conflict
-        Somebody else holds it.
+        Another process holds the lock.
     """
     descriptor = _lock(folder, make=make, id=id)
     try:
@@ -51,12 +50,12 @@ def _lock(folder: Path, *, make: bool, id: str) -> int:
             raise UnknownUpload(id) from None
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            # It may have been removed, and made anew, between the two calls; then the lock is of a folder without a name.
+            # The folder may have been removed and created again between the two calls; the lock is then on a removed folder.
             if os.path.samestat(os.fstat(descriptor), folder.stat()):
                 return descriptor
         except BlockingIOError:
             os.close(descriptor)
-            sentence = f"Somebody else writes to upload {id!r} just now. Try again in a moment."
+            sentence = f"Upload {id!r} is being written by another request. Try again in a moment."
             raise Conflict("upload_busy", id=id, sentence=sentence) from None
         except FileNotFoundError:
             pass
@@ -64,8 +63,8 @@ def _lock(folder: Path, *, make: bool, id: str) -> int:
 
 
 def content(folder: Path) -> Path | None:
-    """Return the file that holds an upload's bytes, None if there is none."""
-    for _ in range(2):  # between the two looks it may have become whole
+    """Return the file of an upload's bytes, None if there is none."""
+    for _ in range(2):  # it may have been completed between the two checks
         for path in folder.glob(f"{WHOLE}*"):
             return path
         if (folder / PART).exists():
@@ -81,7 +80,7 @@ def reserve(folder: Path) -> int:
 
 
 def taken(folder: Path) -> int:
-    """Return the bytes of the quota that an upload takes: what it holds, or has reserved while it is written to."""
+    """Return the bytes that an upload takes of the quota: its size, or its reservation while it is written."""
     file = content(folder)
     held = 0
     with suppress(FileNotFoundError):
@@ -96,7 +95,7 @@ def taken(folder: Path) -> int:
 
 @contextmanager
 def counting(directory: Path) -> Iterator[None]:
-    """Hold the lock under which space is counted and reserved, so that two uploads cannot reserve the same bytes."""
+    """Hold the lock for counting and reserving space, so that two uploads cannot reserve the same bytes."""
     directory.mkdir(parents=True, exist_ok=True, mode=0o700)
     descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
@@ -107,6 +106,6 @@ def counting(directory: Path) -> Iterator[None]:
 
 
 def declared_length(folder: Path) -> int | None:
-    """Return the length of the whole upload as declared when it began; None if it was not."""
+    """Return the declared length of the complete upload, None if it was not declared."""
     file = folder / LENGTH
     return int(file.read_text()) if file.exists() else None

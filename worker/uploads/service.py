@@ -1,6 +1,6 @@
-"""Large inputs before there is a job: files that arrive over several requests, kept on the data volume until they expire.
+"""Uploads: large input files sent in several requests before a job, kept on the data volume until they expire.
 
-An upload is a folder (`uploads.folder`) that grows (`uploads.writer`); a job can take its input only from a complete one.
+An upload is a folder (`uploads.folder`), extended by `uploads.writer`. Only complete uploads can be the input of a job.
 """
 
 from __future__ import annotations
@@ -24,37 +24,37 @@ from pliant.worker.uploads.writer import Writer as Writer
 from pliant.worker.uploads.writer import inconsistent
 
 MOST = 100
-"""Uploads that one owner may have at a time."""
+"""Maximum number of uploads per owner."""
 
 LATE = timedelta(minutes=10)
-"""How long after its time an upload may still be there before fsck reports it."""
+"""Seconds after its expiry from which fsck reports an upload."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Uploads:
-    """The uploads of one owner, or of a service without owners."""
+    """The uploads of one owner, or of a service without authentication."""
 
     directory: Path
     expiry: float
-    """Seconds after its last byte or last use that an upload is removed; 0: never."""
+    """Seconds after its last byte or last use at which an upload is removed; 0: never."""
     owner: str = ""
 
     @classmethod
     def open(cls, settings: Settings) -> Uploads:
-        """Return the uploads of an installation; nothing is made before it is needed."""
+        """Return the uploads of an installation; folders are created on first use."""
         return cls(directory=settings.uploads, expiry=settings.upload_expiry)
 
     def of(self, owner: str) -> Uploads:
-        """Return the same uploads as this owner sees them."""
+        """Return the uploads of this owner."""
         return replace(self, owner=owner)
 
     def get(self, id: str) -> Upload:
-        """Return how far an upload is.
+        """Return the state of an upload.
 
         Raises
         ------
         UnknownUpload
-            There is none of that id.
+            There is no upload of that id.
         """
         folder = self._folder(id)
         file = content(folder)
@@ -75,33 +75,33 @@ class Uploads:
         )
 
     def find(self, id: str) -> Upload | None:
-        """Return how far an upload is, None if there is none of that id."""
+        """Return the state of an upload, None if there is no upload of that id."""
         with suppress(UnknownUpload):
             return self.get(id)
         return None
 
     def size(self, id: str) -> int:
-        """Return the bytes that have arrived of an upload, 0 if there is none of that id."""
+        """Return the received bytes of an upload, 0 if there is no upload of that id."""
         there = self.find(id)
         return 0 if there is None else there.offset
 
     @contextmanager
     def write(self, id: str, *, offset: int, length: int | None, capacity: Capacity) -> Iterator[Writer]:
-        """Go on with an upload, or begin it at 0: what an unfinished one of that id held is thrown away then.
+        """Resume an upload, or start it at offset 0, which discards an incomplete one of the same id.
 
         Parameters
         ----------
         offset : int
-            Where the bytes that follow belong; must be what the upload holds.
+            Position of the next bytes; must equal the current size of the upload.
         length : int, optional
-            Bytes of the whole upload, where they are known.
+            Bytes of the complete upload, if known.
         capacity : Capacity
-            How much it may take.
+            Limits of its size.
 
         Raises
         ------
         Conflict
-            The upload is whole already, or another process writes to it; `OffsetMismatch` if it is elsewhere.
+            The upload is complete or being written; `OffsetMismatch` if its size differs from `offset`.
         UnknownUpload, InvalidRequest, UploadTooLarge, QuotaExceeded, TooManyUploads
             See `pliant.worker.errors`.
         """
@@ -114,7 +114,7 @@ class Uploads:
             file = content(folder)
             if file is not None and file.name.startswith(WHOLE):
                 raise Conflict(
-                    "upload_complete", id=id, sentence=f"Upload {id!r} is whole. Use it, or delete it first."
+                    "upload_complete", id=id, sentence=f"Upload {id!r} is complete. Use it, or delete it first."
                 )
             if offset > 0 and file is None:
                 raise UnknownUpload(id)
@@ -123,34 +123,34 @@ class Uploads:
                 raise OffsetMismatch(id, expected=held, got=offset)
             known = declared_length(folder) if offset > 0 else None
             if length is not None and known not in (None, length):
-                raise inconsistent(f"{known} bytes, as declared at first", str(length))
+                raise inconsistent(f"{known} bytes, as declared in the first request", str(length))
             writer = Writer(id=id, folder=folder, length=length if length is not None else known, capacity=capacity)
             try:
                 writer.open(offset)
                 yield writer
             finally:
                 writer.close()
-                if folder.exists() and content(folder) is None:  # refused before its first byte
+                if folder.exists() and content(folder) is None:  # rejected before its first byte
                     shutil.rmtree(folder)
 
     def take(self, id: str, to: Path) -> str:
-        """Give a whole upload a second name, where neither deletion nor expiry reaches it, and return its SHA-256.
+        """Link a complete upload to another name, so that deletion and expiry do not affect it; return its SHA-256.
 
         Raises
         ------
         UnknownUpload
-            There is none of that id.
+            There is no upload of that id.
         Conflict
-            It is not whole yet.
+            It is not complete yet.
         """
         file = content(self._folder(id))
         if file is None:
             raise UnknownUpload(id)
         if not file.name.startswith(WHOLE):
-            sentence = f"Upload {id!r} is not whole yet: send the rest of it, from the offset that HEAD reports."
+            sentence = f"Upload {id!r} is not complete yet: send the rest, from the offset that HEAD reports."
             raise Conflict("upload_incomplete", id=id, sentence=sentence)
         try:
-            os.utime(file)  # used: its time begins anew
+            os.utime(file)  # use restarts the retention period
             try:
                 os.link(file, to)
             except FileNotFoundError:
@@ -162,29 +162,29 @@ class Uploads:
         return file.name.removeprefix(WHOLE)
 
     def delete(self, id: str) -> None:
-        """Remove an upload, whole or not.
+        """Remove an upload, complete or not.
 
         Raises
         ------
         UnknownUpload
-            There is none of that id.
+            There is no upload of that id.
         Conflict
-            Another process writes to it.
+            It is being written.
         """
         folder = self._folder(id)
         with locked(folder, make=False, id=id):
             shutil.rmtree(folder)
 
     def used(self) -> int:
-        """Return the bytes that everybody's uploads hold, or have reserved while they are written to."""
+        """Return the total bytes of all uploads, including reservations."""
         return sum(taken(folder) for folder in self.directory.glob("*/*"))
 
     def expire(self, now: datetime) -> list[str]:
-        """Remove everybody's uploads whose time is over and which nobody writes to; return their ids."""
+        """Remove all expired uploads that are not being written; return their ids."""
         gone = []
         for folder in self.directory.glob("*/*") if self.expiry > 0 else ():
             with suppress(Conflict, UnknownUpload, FileNotFoundError), locked(folder, make=False, id=folder.name):
-                file = content(folder) or folder  # killed between making the folder and the file
+                file = content(folder) or folder  # the process was killed between creating the folder and the file
                 if _moment(file.stat().st_mtime) + timedelta(seconds=self.expiry) <= now:
                     shutil.rmtree(folder)
                     gone.append(folder.name)

@@ -1,4 +1,4 @@
-"""An upload while it grows: bytes at the end of a file, their digest, and how many there may be."""
+"""Writing of an upload: append bytes, update the digest, enforce the limits."""
 
 from __future__ import annotations
 
@@ -14,32 +14,32 @@ from pliant.worker.errors import InvalidRequest, QuotaExceeded, UploadTooLarge
 from pliant.worker.uploads.folder import LENGTH, PART, RESERVED, WHOLE, counting, reserve, taken
 
 STEP = 16 << 20
-"""Bytes that are reserved at a time for an upload whose length is not known."""
+"""Bytes reserved at a time for an upload of unknown length."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Capacity:
-    """How much one upload may take."""
+    """Limits of one upload."""
 
     max_bytes: int
-    """Size of the whole upload."""
+    """Maximum size of the complete upload, bytes."""
     quota: int = 0
-    """Bytes that everything stored may take together; 0: no quota."""
+    """Disk quota for jobs and uploads together, bytes; 0: no quota."""
     used: int = 0
-    """Bytes that the jobs take."""
+    """Bytes used by the jobs."""
 
 
 @dataclass(slots=True, kw_only=True)
 class Writer:
-    """An upload while it grows, behind its lock; made by `Uploads.write`."""
+    """An upload open for writing, under its lock; created by `Uploads.write`."""
 
     id: str
     folder: Path
     length: int | None
-    """Bytes of the whole upload, where they are known."""
+    """Bytes of the complete upload, if known."""
     capacity: Capacity
     offset: int = 0
-    """Bytes that it holds."""
+    """Bytes received so far."""
     _began: int = 0
     _reservation: int | None = None
     """Descriptor of the locked reservation."""
@@ -48,12 +48,12 @@ class Writer:
     _digest: hashlib._Hash = field(default_factory=hashlib.sha256)
 
     def open(self, offset: int) -> None:
-        """Begin, or go on after what is there, which is read once for its digest.
+        """Start or resume after the existing bytes.
 
         Raises
         ------
         OSError
-            ENOSPC: the disk has no room for the rest of it.
+            ENOSPC: the remaining bytes do not fit on the disk.
         """
         if self.capacity.quota > 0:
             self._reservation = reserve(self.folder)
@@ -67,25 +67,22 @@ class Writer:
         elif offset == 0:
             (self.folder / LENGTH).unlink(missing_ok=True)
         part = self.folder / PART
-        if offset > 0:
-            with part.open("rb") as before:
-                self._digest = hashlib.file_digest(before, "sha256")
         self._file = part.open("ab" if offset > 0 else "wb", buffering=0)
         self.offset = self._began = offset
 
     def write(self, piece: bytes) -> None:
-        """Add bytes.
+        """Append bytes.
 
         Raises
         ------
         InvalidRequest
-            They are more than the upload's length; what fitted is kept.
+            They exceed the upload's length; the bytes that fit are kept.
         UploadTooLarge
-            The upload is larger than it may be; it is removed, since it can never become whole.
+            The upload exceeds its maximum size; it is removed, since it can never be completed.
         QuotaExceeded
-            Everything stored is as much as it may be; what fitted is kept.
+            The disk quota is reached; the bytes that fit are kept.
         OSError
-            The disk is full; what this request brought is given back to it, since others need the room.
+            The disk is full; the bytes of this request are removed to free the space.
         """
         assert self._file is not None
         if self.length is not None and self.offset + len(piece) > self.length:
@@ -95,7 +92,8 @@ class Writer:
         try:
             while rest:
                 count = self._file.write(rest)
-                self._digest.update(rest[:count])
+                if self._began == 0:
+                    self._digest.update(rest[:count])
                 rest = rest[count:]
                 self.offset += count
         except OSError:
@@ -103,27 +101,27 @@ class Writer:
             raise
 
     def finish(self, *, sha256: str | None) -> None:
-        """Make the upload whole.
+        """Complete the upload.
 
         Parameters
         ----------
         sha256 : str, optional
-            What the sender says that it is.
+            Expected digest, from the sender.
 
         Raises
         ------
         InvalidRequest
-            Bytes are missing; or they are not the sender's, and then the upload is removed.
+            Bytes are missing, or the digest differs; then the upload is removed.
         """
         if self.length is not None and self.offset != self.length:
             raise inconsistent(f"{self.length} bytes in all", str(self.offset))
-        found = self._digest.hexdigest()
+        found = self._sha256()
         if sha256 is not None and sha256 != found:
             self.close()
             shutil.rmtree(self.folder)
             raise InvalidRequest(
                 "digest_mismatch", field="Repr-Digest", expected=sha256, got=found,
-                hint="The bytes changed on their way; the upload was removed, send it again.",
+                hint="The bytes changed in transit; the upload was removed, send it again.",
             )  # fmt: skip
         self.close()
         (self.folder / PART).rename(self.folder / f"{WHOLE}{found}")
@@ -134,7 +132,7 @@ class Writer:
             os.close(folder)
 
     def close(self) -> None:
-        """Put what has arrived on the disk, and give back what was reserved beyond it."""
+        """Flush the received bytes to disk and release the unused reservation."""
         if self._file is not None:
             os.fsync(self._file.fileno())
             self._file.close()
@@ -144,11 +142,18 @@ class Writer:
             os.close(self._reservation)
             self._reservation = None
 
-    def _check(self, size: int) -> None:
-        """Check that the upload may have so many bytes, and reserve them.
+    def _sha256(self) -> str:
+        """Return the digest of the whole. One that came in several requests is read once, here: not at each of them."""
+        if self._began == 0:
+            return self._digest.hexdigest()
+        with (self.folder / PART).open("rb") as whole:
+            return hashlib.file_digest(whole, "sha256").hexdigest()
 
-        Bytes are reserved before they are written, those of a declared length at once and others in steps, so that uploads which
-        arrive at the same time cannot exceed the quota together.
+    def _check(self, size: int) -> None:
+        """Check the limits for a size in bytes, and reserve it.
+
+        Bytes are reserved before they are written, all at once for a declared length and otherwise in steps, so that
+        concurrent uploads cannot exceed the quota together.
         """
         capacity = self.capacity
         if size > capacity.max_bytes:
@@ -168,8 +173,8 @@ class Writer:
 
 
 def inconsistent(expected: str, got: str) -> InvalidRequest:
-    """Return the error of an upload whose bytes do not fit its declared length."""
+    """Return the error for an upload that does not match its declared length."""
     return InvalidRequest(
         "inconsistent_upload_length", field="Upload-Length", expected=expected, got=got,
-        hint="Send what is missing, or begin anew at Upload-Offset: 0.",
+        hint="Send the missing bytes, or start again at Upload-Offset: 0.",
     )  # fmt: skip

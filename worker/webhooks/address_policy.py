@@ -1,7 +1,7 @@
-"""Which addresses a webhook may be sent to.
+"""The policy on addresses that webhooks may be sent to.
 
-A client names the address, so it must not reach the network that the service runs in: a name is resolved once, every address it has
-must be public or in an allowed network, and the connection goes to the very address that was checked.
+Clients choose the address, so it must not reach the service's own network: the host name is resolved once, each of its addresses
+must be public or in an allowed network, and the connection is made to the address that was checked.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ _NAT64 = ipaddress.ip_network("64:ff9b::/96")
 
 
 class NotPublic(Exception):
-    """The receiver's name resolves to an address that webhooks may not be sent to."""
+    """The receiver's host name resolves to an address that webhooks may not be sent to."""
 
 
 def resolve(host: str, port: int) -> list[Address]:
-    """Return the addresses of a name; of an address, itself."""
+    """Return the addresses of a host name; an address is returned unchanged."""
     found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
     return list(dict.fromkeys(ipaddress.ip_address(str(each[4][0]).partition("%")[0]) for each in found))
 
@@ -29,8 +29,8 @@ def checked_address(host: str, addresses: list[Address], networks: str) -> Addre
     Raises
     ------
     NotPublic
-        One of the addresses is not allowed, or there is none. The message does not name the addresses: the job's log is read
-        by the client, who must not learn what internal names resolve to.
+        One of the addresses is not allowed, or there is none. The message omits the addresses, because clients can read the
+        job's log and must not learn what internal names resolve to.
     """
     if not addresses or not all(may_reach(each, networks) for each in addresses):
         found = "an address that is not on the public internet" if addresses else "no address"
@@ -39,9 +39,9 @@ def checked_address(host: str, addresses: list[Address], networks: str) -> Addre
 
 
 def may_reach(address: Address, networks: str = "") -> bool:
-    """Return True if a webhook may be sent to an address: a public one, or one of an allowed network.
+    """Whether a webhook may be sent to an address: a public one, or one of an allowed network.
 
-    An IPv6 address that stands for an IPv4 address (mapped, 6to4, NAT64, Teredo) is judged as that one.
+    An IPv6 address that embeds an IPv4 address (mapped, 6to4, NAT64, Teredo) is checked as the latter.
     """
     real = _embedded(address)
     if any(
@@ -57,7 +57,7 @@ def may_reach(address: Address, networks: str = "") -> bool:
 
 
 def _is_translated(address: Address) -> bool:
-    """Return True if an IPv6 address is only another way to write an IPv4 address, and belongs to no network by itself."""
+    """Whether an IPv6 address only represents an IPv4 address and belongs to no network of its own."""
     return isinstance(address, ipaddress.IPv6Address) and (address.ipv4_mapped is not None or address in _NAT64)
 
 
@@ -71,7 +71,7 @@ def _embedded(address: Address) -> Address:
 
 
 def literal_address(host: str) -> Address | None:
-    """Return the address that a host is written as, None if it is a name."""
+    """Return the address if a host is written as one, None if it is a name."""
     try:
         return ipaddress.ip_address(host)
     except ValueError:

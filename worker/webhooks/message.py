@@ -17,7 +17,7 @@ from pliant.worker.errors import InvalidRequest
 from pliant.worker.records import Webhook
 from pliant.worker.webhooks.address_policy import literal_address, may_reach
 
-SECRET_PREFIX = "whsec_"  # noqa: S105 - what every secret begins with, not a secret
+SECRET_PREFIX = "whsec_"  # noqa: S105 - prefix of secrets, not a secret
 LONGEST_URL = 2000
 SECRET_BYTES = range(24, 65)
 
@@ -37,7 +37,7 @@ def parse_webhook(url: str, secret: str, *, networks: str = "") -> Webhook | Non
     Raises
     ------
     InvalidRequest
-        One is given without the other, or one is malformed.
+        URL or secret is missing or malformed.
     """
     if not url and not secret:
         return None
@@ -55,7 +55,7 @@ def parse_webhook(url: str, secret: str, *, networks: str = "") -> Webhook | Non
     if literal is not None and not may_reach(literal, networks):
         raise InvalidRequest(
             "webhook_not_public", field="webhook", expected="an address of the public internet", got=host[:80],
-            hint="Whoever runs the service may allow its network in PLIANT_WEBHOOK_NETWORKS.",
+            hint="The operator can allow its network with PLIANT_WEBHOOK_NETWORKS.",
         )  # fmt: skip
     if _key(secret) is None:
         got = "none" if not secret else f"{len(secret)} characters"
@@ -82,9 +82,9 @@ def signed(secret: str, *, id: str, timestamp: int, body: bytes) -> dict[str, st
     Parameters
     ----------
     id : str
-        The same for every try at one message, so that the receiver recognises a repetition.
+        The same for all attempts at one message, so that the receiver recognises duplicates.
     timestamp : int
-        Time of this try, seconds since 1970.
+        Time of this attempt, seconds since 1970.
     """
     key = _key(secret)
     assert key is not None, "checked when the job was submitted"
@@ -97,7 +97,7 @@ def signed(secret: str, *, id: str, timestamp: int, body: bytes) -> dict[str, st
 
 
 def _split(url: str) -> SplitResult | None:
-    """Return a URL's parts; None if programs may disagree about them."""
+    """Return the parts of a URL; None if different parsers may disagree about them."""
     if len(url) > LONGEST_URL or not url.isascii() or any(sign <= " " or sign in '\\"<>^`{|}' for sign in url):
         return None
     try:

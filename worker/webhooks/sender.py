@@ -1,7 +1,7 @@
-"""The webhook sender: sends the messages of the outbox, with retries for about a day. It runs in the reconciler's process.
+"""The webhook sender: send the messages of the outbox, with retries for about a day. It runs in the reconciler's process.
 
-No job waits for a receiver. Up to `CONCURRENT` messages are sent at once, at most `PER_RECEIVER` of them to one host, so a receiver that
-does not answer delays nobody else's messages.
+Jobs never wait for receivers. Up to `CONCURRENT` messages are sent at once, at most `PER_RECEIVER` of them to one host, so that an
+unresponsive receiver does not delay other messages.
 """
 
 from __future__ import annotations
@@ -29,22 +29,22 @@ from pliant.worker.webhooks.message import message, signed
 logger = logging.getLogger(__name__)
 
 PAUSES = (5.0, 30.0, 120.0, 600.0, 1800.0, 7200.0, 21600.0, 54000.0)
-"""Seconds between the tries, a day in all; each is stretched by chance, up to a fifth."""
+"""Seconds between attempts, about a day in total; each is extended randomly by up to 20 %."""
 
 CONCURRENT = 16
-"""Messages that are sent at once."""
+"""Messages sent at once."""
 
 PER_RECEIVER, PER_OWNER = 2, 8
-"""The same to one host, and of the jobs of one owner: one that is silent leaves the others their share."""
+"""Messages sent at once to one host, and for jobs of one owner, so that slow receivers leave capacity for others."""
 
 POSTPONED = 2.0
-"""Seconds after which a message is looked at again whose receiver or owner had reached its share."""
+"""Seconds by which a message is postponed if its receiver or owner has reached `PER_RECEIVER`."""
 
 WITHIN = 20.0
-"""Seconds that one try may take from the name's look-up to the answer's headers."""
+"""Seconds that one attempt may take, from name resolution to the response headers."""
 
 LEASE = 60.0
-"""Seconds after which a message that a killed process had taken is sent by another; more than `WITHIN`."""
+"""Seconds after which a message leased by a killed process is sent by another; more than `WITHIN`."""
 
 LOOK_EVERY = 0.5
 
@@ -53,7 +53,7 @@ Resolve = Callable[[str, int], list[Address]]
 
 @dataclass(kw_only=True)
 class WebhookSender:
-    """Sends the messages of one installation. Any number may run: a message is taken by one of them at a time."""
+    """Sends the messages of one installation. Any number may run: each message is leased by one sender at a time."""
 
     records: Records
     outbox: Outbox
@@ -64,28 +64,28 @@ class WebhookSender:
     """Seconds since 1970."""
     pauses: tuple[float, ...] = PAUSES
     trusted: ssl.SSLContext | None = None
-    """Which certificates count; None: those of the usual authorities."""
+    """Trusted certificates; None: those of the system's default authorities."""
     _ended: threading.Event = field(default_factory=threading.Event)
     _thread: threading.Thread | None = None
 
     @classmethod
     def open(cls, settings: Settings, records: Records) -> WebhookSender:
-        """Connect to what the settings name."""
+        """Return the sender for the stores in the settings."""
         outbox = Outbox(connect(settings.redis, decode=True), prefix=settings.queue)
         return cls(records=records, outbox=outbox, networks=settings.webhook_networks)
 
     def start(self) -> None:
-        """Begin, on a thread of its own."""
+        """Start a thread that sends messages."""
         self._thread = threading.Thread(target=lambda: asyncio.run(self._run()), name="webhook sender", daemon=True)
         self._thread.start()
 
     @property
     def alive(self) -> bool:
-        """False if the thread has ended, which it does by itself only through a defect."""
+        """Whether the thread is running; it ends by itself only after an unexpected error."""
         return self._thread is not None and self._thread.is_alive()
 
     def stop(self) -> None:
-        """End; what is under way is sent again by the next one."""
+        """Stop the thread; messages in progress are sent again by the next sender."""
         self._ended.set()
         if self._thread is not None:
             self._thread.join(2 * LOOK_EVERY + 1)
@@ -109,21 +109,21 @@ class WebhookSender:
             busy.update(limits)
             task.add_done_callback(under_way.discard)
             task.add_done_callback(partial(_release, busy, limits))
-            task.add_done_callback(_complain)
+            task.add_done_callback(_log_error)
         for task in under_way:
             task.cancel()
 
     def _take(self, busy: Counter[str]) -> tuple[str, int, list[str]] | None:
-        """Take a message that is due and whose receiver and owner have few under way; postpone the others.
+        """Lease a due message whose receiver and owner are below `PER_RECEIVER`; postpone the others.
 
         Returns
         -------
         id : str
             The job.
         tries : int
-            How often it was tried, this time among them.
+            Number of attempts, including this one.
         limits : list of str
-            The receiver and the owner, as they are counted in `busy`.
+            Keys of the receiver and the owner in `busy`.
         """
         while True:
             now = self.clock()
@@ -142,14 +142,14 @@ class WebhookSender:
             self.outbox.postpone(taken[0], due=int((now + POSTPONED) * 1000))
 
     async def _deliver(self, id: str, tries: int) -> None:
-        """Try once, and write down what came of it."""
+        """Send the message once and record the outcome."""
         try:
             try:
                 stored = await asyncio.to_thread(self.records.get, id)
             except UnknownJob:
                 return await asyncio.to_thread(self.outbox.given_up, id)
-            if stored.webhook is None or tries > len(self.pauses) + 1:  # a try that kills its process counts, too
-                return await asyncio.to_thread(self._give_up, id, "it was tried often enough.")
+            if stored.webhook is None or tries > len(self.pauses) + 1:  # killed attempts count
+                return await asyncio.to_thread(self._give_up, id, "the maximum number of attempts is reached.")
             body = message(stored.job)
             try:
                 async with asyncio.timeout(WITHIN):
@@ -159,12 +159,12 @@ class WebhookSender:
             except _failures() as error:
                 await asyncio.to_thread(self._again, id, tries, type(error).__name__)
             else:
-                await asyncio.to_thread(self._answered, id, tries, status)
-        except StoreUnavailable as error:  # the lease ends, and it is tried again
+                await asyncio.to_thread(self._handle_status, id, tries, status)
+        except StoreUnavailable as error:  # the message is sent again after the lease
             logger.warning("webhook of job %s: %s", id, error)
 
     async def _post(self, webhook: Webhook, *, id: str, body: bytes) -> int:
-        """Send, to the very address that was found good; return the status of the answer, whose body is not read."""
+        """Send to the address that was checked; return the status of the response, whose body is not read."""
         import httpx
 
         parts = urlsplit(webhook.url)
@@ -182,10 +182,10 @@ class WebhookSender:
                 "User-Agent": "Pliant-Webhook/1",
                 **signed(webhook.secret, id=f"msg_{id}", timestamp=int(self.clock()), body=body),
             },
-            # The certificate must be the name's, though the connection goes to the number.
+            # The certificate must match the host name, although the connection is made to the address.
             extensions={"sni_hostname": host, "timeout": httpx.Timeout(WITHIN).as_dict()},
         )
-        # No proxy from the environment, which would look the name up again; no redirect, which would lead elsewhere.
+        # No proxies, which would resolve the name again, and no redirects to other addresses.
         async with httpx.AsyncClient(
             trust_env=False, follow_redirects=False, timeout=WITHIN, verify=self.trusted or True
         ) as client:
@@ -193,30 +193,30 @@ class WebhookSender:
             await answer.aclose()
         return answer.status_code
 
-    # Each is said before it is settled: what is owed no longer has its sentence in the log, whenever we are killed.
+    # Log before the outbox changes: a finished message has its log line even if the process is killed in between.
 
-    def _answered(self, id: str, tries: int, status: int) -> None:
+    def _handle_status(self, id: str, tries: int, status: int) -> None:
         if 200 <= status < 300:
-            self._say(id, f"Webhook delivered: the receiver answered {status} (try {tries}).")
+            self._log(id, f"Webhook delivered: the receiver returned {status} (attempt {tries}).")
             self.outbox.delivered(id)
         elif status == 410:
-            self._give_up(id, "the receiver answered 410, it wants no more.")
+            self._give_up(id, "the receiver returned 410 Gone.")
         else:
-            self._again(id, tries, f"the receiver answered {status}")
+            self._again(id, tries, f"the receiver returned {status}")
 
     def _again(self, id: str, tries: int, why: str) -> None:
         if tries > len(self.pauses):
-            self._give_up(id, f"{why}, at try {tries}, the last.")
+            self._give_up(id, f"{why} (attempt {tries}, the last one).")
             return
-        pause = self.pauses[tries - 1] * (1 + 0.2 * random.random())  # noqa: S311 - so that not all return at once
-        self._say(id, f"Webhook not delivered: {why} (try {tries}); again in {pause:.0f} s.")
+        pause = self.pauses[tries - 1] * (1 + 0.2 * random.random())  # noqa: S311 - spreads the retries
+        self._log(id, f"Webhook not delivered: {why} (attempt {tries}); next attempt in {pause:.0f} s.")
         self.outbox.later(id, due=int((self.clock() + pause) * 1000))
 
     def _give_up(self, id: str, why: str) -> None:
-        self._say(id, f"Webhook given up: {why}")
+        self._log(id, f"Webhook given up: {why}")
         self.outbox.given_up(id)
 
-    def _say(self, id: str, sentence: str) -> None:
+    def _log(self, id: str, sentence: str) -> None:
         logger.info("job %s: %s", id, sentence)
         self.records.append_log(id, [sentence])
 
@@ -225,14 +225,14 @@ def _release(busy: Counter[str], limits: list[str], _: asyncio.Task[None]) -> No
     busy.subtract(limits)
 
 
-def _complain(task: asyncio.Task[None]) -> None:
-    """Say what nobody foresaw; the lease ends, and the message is tried again."""
+def _log_error(task: asyncio.Task[None]) -> None:
+    """Log an unexpected error; the message is sent again after its lease."""
     if not task.cancelled() and (error := task.exception()) is not None:
         logger.error("webhook not sent", exc_info=error)
 
 
 def _failures() -> tuple[type[Exception], ...]:
-    """Return what is raised when there is no answer; TimeoutError is an OSError, a name with too long a label a UnicodeError."""
+    """Return the exceptions of a failed request; TimeoutError is an OSError, too long a host label raises UnicodeError."""
     import httpx
 
     return OSError, UnicodeError, httpx.TransportError, httpx.InvalidURL

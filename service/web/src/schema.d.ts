@@ -89,7 +89,7 @@ export interface components {
         };
         /**
          * Inspection
-         * @description How inputs would be understood, and a glimpse of them.
+         * @description Interpretation of inputs, with a sample of them.
          */
         Inspection: {
             /** Num Frames */
@@ -100,7 +100,7 @@ export interface components {
             num_faces: number;
             /**
              * Hidden Fraction
-             * @description Share of the F·P observations that carry no weight.
+             * @description Share of the F·P observations with weight 0.
              */
             hidden_fraction: number;
             /**
@@ -110,7 +110,7 @@ export interface components {
             mesh_source: string;
             /**
              * Mesh Grid
-             * @description Rows and columns, where the points are a whole grid, row after row.
+             * @description Rows and columns, if the points form a complete grid, row by row.
              */
             mesh_grid: [
                 number,
@@ -127,13 +127,13 @@ export interface components {
             layout: string;
             /**
              * Format
-             * @description Whose output the tracks were recognised as, e.g. `CoTracker`; else `canonical`, `matrix` or `unnamed`.
+             * @description Program whose format was recognised, e.g. `CoTracker`; else `canonical`, `matrix` or `unnamed`.
              * @default
              */
             format: string;
             /**
              * Coordinates
-             * @description How x and y came: `pixels` (or a unit of their own), `unit` or `signed` fractions of the picture, or `projected`.
+             * @description Original coordinates: `pixels` (or another common unit), `unit` or `signed` fractions of the picture, or `projected`.
              * @default pixels
              */
             coordinates: string;
@@ -144,18 +144,28 @@ export interface components {
              */
             y_axis: string;
             /**
+             * Image Size
+             * @description WIDTHxHEIGHT of the picture where the input states it, as films and files of `pliant track` do; used unless the options give another.
+             */
+            image_size: string | null;
+            /**
+             * Fps
+             * @description Frames per second where the input states them; used unless the options give others.
+             */
+            fps: number | null;
+            /**
              * Given Frames
-             * @description Frames in the file, of which `num_frames` are worked on.
+             * @description Frames in the file, of which `num_frames` are used.
              */
             given_frames: number | null;
             /**
              * Given Points
-             * @description Points in the file, of which `num_points` are worked on.
+             * @description Points in the file, of which `num_points` are used.
              */
             given_points: number | null;
             /**
              * Num Left Out
-             * @description Points seen in too few frames to be solved for; they keep their place and follow their neighbours on the mesh.
+             * @description Points visible in too few frames and excluded; they keep their index and follow their neighbours on the mesh.
              * @default 0
              */
             num_left_out: number;
@@ -166,18 +176,18 @@ export interface components {
             left_out_points: number[];
             /**
              * Notes
-             * @description Sentences: the evidence, what was dropped, what was assumed.
+             * @description Sentences with evidence, exclusions and assumptions.
              */
             notes: string[];
             /**
              * Sample
-             * @description Some frames of some points, for a picture: x and y in turn, 0 to 1000, y down; -1 twice where hidden.
+             * @description Some points in some frames, for a picture: x and y in turn, 0 to 1000, y down; -1 twice where hidden.
              */
             sample: number[][];
         };
         /**
          * Interpretation
-         * @description How the inputs were understood.
+         * @description Interpretation of the inputs.
          */
         Interpretation: {
             /** Num Frames */
@@ -188,7 +198,7 @@ export interface components {
             num_faces: number;
             /**
              * Hidden Fraction
-             * @description Share of the F·P observations that carry no weight.
+             * @description Share of the F·P observations with weight 0.
              */
             hidden_fraction: number;
             /**
@@ -198,7 +208,7 @@ export interface components {
             mesh_source: string;
             /**
              * Mesh Grid
-             * @description Rows and columns, where the points are a whole grid, row after row.
+             * @description Rows and columns, if the points form a complete grid, row by row.
              */
             mesh_grid: [
                 number,
@@ -215,13 +225,13 @@ export interface components {
             layout: string;
             /**
              * Format
-             * @description Whose output the tracks were recognised as, e.g. `CoTracker`; else `canonical`, `matrix` or `unnamed`.
+             * @description Program whose format was recognised, e.g. `CoTracker`; else `canonical`, `matrix` or `unnamed`.
              * @default
              */
             format: string;
             /**
              * Coordinates
-             * @description How x and y came: `pixels` (or a unit of their own), `unit` or `signed` fractions of the picture, or `projected`.
+             * @description Original coordinates: `pixels` (or another common unit), `unit` or `signed` fractions of the picture, or `projected`.
              * @default pixels
              */
             coordinates: string;
@@ -232,18 +242,28 @@ export interface components {
              */
             y_axis: string;
             /**
+             * Image Size
+             * @description WIDTHxHEIGHT of the picture where the input states it, as films and files of `pliant track` do; used unless the options give another.
+             */
+            image_size: string | null;
+            /**
+             * Fps
+             * @description Frames per second where the input states them; used unless the options give others.
+             */
+            fps: number | null;
+            /**
              * Given Frames
-             * @description Frames in the file, of which `num_frames` are worked on.
+             * @description Frames in the file, of which `num_frames` are used.
              */
             given_frames: number | null;
             /**
              * Given Points
-             * @description Points in the file, of which `num_points` are worked on.
+             * @description Points in the file, of which `num_points` are used.
              */
             given_points: number | null;
             /**
              * Num Left Out
-             * @description Points seen in too few frames to be solved for; they keep their place and follow their neighbours on the mesh.
+             * @description Points visible in too few frames and excluded; they keep their index and follow their neighbours on the mesh.
              * @default 0
              */
             num_left_out: number;
@@ -254,20 +274,20 @@ export interface components {
             left_out_points: number[];
             /**
              * Notes
-             * @description Sentences: the evidence, what was dropped, what was assumed.
+             * @description Sentences with evidence, exclusions and assumptions.
              */
             notes: string[];
         };
         /**
          * Job
-         * @description One request to reconstruct, and everything known of it.
+         * @description A reconstruction job.
          */
         Job: {
             /** Id */
             id: string;
             /**
              * Name
-             * @description The user's own label.
+             * @description Label chosen by the user.
              * @default
              */
             name: string;
@@ -288,13 +308,13 @@ export interface components {
             expires_at: string | null;
             /**
              * Attempt
-             * @description How often a worker has begun it.
+             * @description Number of attempts so far.
              * @default 0
              */
             attempt: number;
             /**
              * Retry Of
-             * @description The finished job whose inputs and options this one runs again.
+             * @description The finished job that this one repeats.
              */
             retry_of: string | null;
             /**
@@ -304,7 +324,7 @@ export interface components {
             outputs_of: string | null;
             /**
              * Place In Queue
-             * @description 0 is next; null when not queued.
+             * @description Number of queued jobs ahead; null if not queued.
              */
             place_in_queue: number | null;
             options: components["schemas"]["Options"];
@@ -312,39 +332,39 @@ export interface components {
             progress: components["schemas"]["Progress"] | null;
             /**
              * Metrics
-             * @description Every error metric that the inputs allow, by its documented name.
+             * @description Every error metric for which the inputs suffice, by its documented name.
              */
             metrics: {
                 [key: string]: number;
             } | null;
             /**
              * Outcome
-             * @description How the solver ended: `converged`, `max_reweightings`.
+             * @description Outcome of the solver: `converged`, `max_reweightings` or `rejected`.
              */
             outcome: string | null;
             /**
              * Sentence
-             * @description The outcome in words.
+             * @description The outcome as a sentence.
              */
             sentence: string | null;
             /**
              * Verdict
-             * @description Whether the result can be used, judged without ground truth; null: not judged.
+             * @description Whether the result can be used, estimated without ground truth; null: no verdict.
              */
             verdict: ("good" | "with_care" | "do_not_use") | null;
             /**
              * Verdict Reasons
-             * @description A sentence with a figure for each sign against the result, the gravest first.
+             * @description A sentence with a figure for each reason against the result, most severe first.
              */
             verdict_reasons: string[];
             /**
              * Trust Sentence
-             * @description The expected error and what depth rests on, in words.
+             * @description A sentence with the expected error and the evidence for depth.
              */
             trust_sentence: string | null;
             /**
              * Warnings
-             * @description What the user should read about this result.
+             * @description Warnings about this result.
              */
             warnings: string[];
             /** Artifacts */
@@ -360,13 +380,13 @@ export interface components {
             jobs: components["schemas"]["Job"][];
             /**
              * Next
-             * @description Pass as `cursor` for the page after this one; null at the end.
+             * @description Pass as `cursor` to get the next page; null at the end.
              */
             next: string | null;
         };
         /**
          * Options
-         * @description How to reconstruct. Everything has a default; an unknown name is refused.
+         * @description How to reconstruct. Every option has a default; unknown names are rejected.
          */
         Options: {
             /**
@@ -378,14 +398,14 @@ export interface components {
             method: "pseudo_inverse" | "temporal" | "spatio_temporal" | "robust";
             /**
              * Camera
-             * @description perspective: a pinhole camera. scaled_orthographic: no perspective, one scale per frame. orthographic: no scales. auto: perspective where the tracks are clearly more probable with it, else scaled_orthographic.
+             * @description perspective: a pinhole camera. scaled_orthographic: no perspective, one scale per frame. orthographic: no scales. auto: perspective if the tracks are clearly more probable with it, else scaled_orthographic.
              * @default auto
              * @enum {string}
              */
             camera: "auto" | "perspective" | "scaled_orthographic" | "orthographic";
             /**
              * Focal
-             * @description Focal length in pixels of the tracks; null: estimated where the camera is perspective.
+             * @description Focal length in pixels of the tracks; null: estimated for a perspective camera.
              * @default null
              */
             focal: number | null;
@@ -403,26 +423,26 @@ export interface components {
             principal_point: string | null;
             /**
              * Surface
-             * @description isometric: a sheet that bends without stretching, such as paper or cloth, seen in perspective. free: no such assumption. auto: isometric where the tracks are those of a sheet and its edge lengths single out a focal length; needs image_size or focal.
+             * @description isometric: a sheet that bends without stretching, such as paper or cloth, seen in perspective. free: no such assumption. auto: isometric if the tracks are those of a sheet and its edge lengths determine a focal length; needs image_size or focal.
              * @default auto
              * @enum {string}
              */
             surface: "auto" | "isometric" | "free";
             /**
              * Basis Size
-             * @description Number K of basis shapes in the factorization that gives the rotations; null: chosen from the data.
+             * @description Number K of basis shapes in the factorization for the rotations; null: selected from the data.
              * @default null
              */
             basis_size: number | null;
             /**
              * Refine Rotations
-             * @description Refine the cameras: those under which the tracks are most probable.
+             * @description Refine the cameras by maximising the likelihood of the tracks.
              * @default true
              */
             refine_rotations: boolean;
             /**
              * Preset
-             * @description Where weights that are not given come from. auto: measured from noise and motion. paper: the published setting.
+             * @description Source of weights that are not given. auto: measured from noise and motion. paper: the published setting.
              * @default auto
              * @enum {string}
              */
@@ -441,13 +461,13 @@ export interface components {
             spatial_weight: number | null;
             /**
              * Robust Scale
-             * @description Residual size where the loss turns from quadratic to linear, in RMS radii of the tracks; null: the preset's.
+             * @description Residual at which the loss changes from quadratic to linear, in RMS radii of the tracks; null: the preset's.
              * @default null
              */
             robust_scale: number | null;
             /**
              * Temporal Order
-             * @description 1 penalises velocity, 2 acceleration; null: the preset's. Without effect with prior gaussian.
+             * @description 1 penalises velocity, 2 acceleration; null: the preset's. No effect with prior gaussian.
              * @default null
              */
             temporal_order: (1 | 2) | null;
@@ -467,45 +487,45 @@ export interface components {
             laplacian: "auto" | "grid8" | "uniform" | "cotangent";
             /**
              * Prior
-             * @description gaussian: one Gaussian over the frames for the positions of a point, learned from the tracks (method robust with preset auto; else smooth); smooth: the published method; smooth+low_rank also favours shapes that few basis shapes explain (with preset paper only if low_rank_weight is given).
+             * @description gaussian: a Gaussian over the frames for the positions of each point, learned from the tracks (method robust with preset auto; else smooth); smooth: the published method; smooth+low_rank also favours shapes that few basis shapes explain (with preset paper only if low_rank_weight is given).
              * @default gaussian
              * @enum {string}
              */
             prior: "gaussian" | "smooth+low_rank" | "smooth";
             /**
              * Low Rank Weight
-             * @description λ3, strength of the low-rank prior, dimensionless; null: from the data. Without effect unless prior is smooth+low_rank.
+             * @description λ3, weight of the low-rank prior, dimensionless; null: from the data. No effect unless prior is smooth+low_rank.
              * @default null
              */
             low_rank_weight: number | null;
             /**
              * Max Reweightings
-             * @description Upper bound on the reweightings of the robust loss.
+             * @description Maximum number of reweightings of the robust loss.
              * @default 60
              */
             max_reweightings: number;
             /**
              * Tolerance
-             * @description Converged when the objective's relative change in one reweighting is below this.
+             * @description Relative change of the objective over one reweighting below which the solve has converged.
              * @default 0.0001
              */
             tolerance: number;
             /**
              * Precision
-             * @description Arithmetic of the large arrays; prior gaussian needs float64.
+             * @description Precision of the large arrays; prior gaussian needs float64.
              * @default float64
              * @enum {string}
              */
             precision: "float64" | "float32";
             /**
              * Seed
-             * @description Seed of every random choice.
+             * @description Seed of all random choices.
              * @default 0
              */
             seed: number;
             /**
              * Time Limit
-             * @description Seconds the job may take before it ends as timed_out; null: the service's own limit alone.
+             * @description Time limit of the job in seconds, after which it fails with timed_out; null: only the service's own limit.
              * @default null
              */
             time_limit: number | null;
@@ -517,17 +537,17 @@ export interface components {
             fps: number;
             /**
              * Outputs
-             * @description Files to write besides shapes.npz, report.json and preview.bin. glb: animated glTF. ply, obj: one mesh a frame, in a zip. usd: USD with time samples. mdd: point cache for Blender, Maya and Houdini. mat: MATLAB. csv: metrics of every frame and of every point.
+             * @description Files to write besides shapes.npz, report.json and preview.bin. glb: animated glTF. ply, obj: a mesh per frame, in a zip. usd: USD with time samples. abc: Alembic. mdd: point cache for Blender, Maya and Houdini. mat: MATLAB. csv: metrics of every frame and of every point.
              * @default [
              *       "glb",
              *       "ply",
              *       "csv"
              *     ]
              */
-            outputs: ("glb" | "ply" | "obj" | "usd" | "mdd" | "mat" | "csv")[];
+            outputs: ("glb" | "ply" | "obj" | "usd" | "abc" | "mdd" | "mat" | "csv")[];
             /**
              * Normals
-             * @description animated: they move with the shape, in shapes.glb and in every frame of PLY, OBJ and USD. static: those of the first shape, in shapes.glb alone. none: viewers make their own.
+             * @description animated: they move with the shape, in shapes.glb and in every frame of PLY, OBJ and USD. static: those of the first shape, in shapes.glb only. none: viewers compute their own.
              * @default animated
              * @enum {string}
              */
@@ -541,27 +561,27 @@ export interface components {
             colours: "none" | "error" | "expected_error";
             /**
              * Axes
-             * @description Axes of PLY and OBJ. tracks: those of the tracks, as in shapes.npz. viewer: y up, as in shapes.glb.
-             * @default tracks
+             * @description Axes of PLY and OBJ. viewer: y up, as in shapes.glb. tracks: those of the tracks, as in shapes.npz.
+             * @default viewer
              * @enum {string}
              */
             axes: "tracks" | "viewer";
             /**
              * Glb Quantized
-             * @description Write shapes.glb with 16-bit positions (KHR_mesh_quantization): two thirds of the size, and rounded to about a 65,000th of the largest extent.
+             * @description Write shapes.glb with 16-bit positions and 8-bit normals (KHR_mesh_quantization): about half the size, and rounded to a 65,000th of the largest extent and half a degree.
              * @default false
              */
             glb_quantized: boolean;
             /**
              * Glb Motion
-             * @description How shapes.glb stores the motion. auto: modes of motion where that makes the file smaller, every point within a thousandth of the bounding box's diagonal. frames: a morph target a frame, exact in single precision; up to 200 frames.
+             * @description How shapes.glb stores the motion. auto: as few modes of motion as keep every point within a thousandth of the bounding box's diagonal. frames: a morph target a frame, exact in single precision; up to 200 frames.
              * @default auto
              * @enum {string}
              */
             glb_motion: "auto" | "frames";
             /**
              * Layout
-             * @description Order of the track array's axes. auto: by the names in the file and by smoothness in time; refused where two fit.
+             * @description Order of the track array's axes. auto: by the names in the file and by smoothness in time; an error if several fit.
              * @default auto
              * @enum {string}
              */
@@ -575,21 +595,21 @@ export interface components {
             rows: "auto" | "interleaved" | "stacked";
             /**
              * Y Axis
-             * @description Which way y grows. auto: down (pixels), or up where coordinates are centred on zero. Turns written meshes upright.
+             * @description Direction of y. auto: down (pixels), or up if coordinates are centred on zero. Written meshes are always upright.
              * @default auto
              * @enum {string}
              */
             y_axis: "auto" | "down" | "up";
             /**
              * Coordinates
-             * @description What x and y mean. pixels: taken as they are, whatever their unit. unit: from 0 to 1, divided by (width − 1, height − 1). signed: from −1 to 1 over the same. auto: by the values; values within 0 … 1 without image_size are refused.
+             * @description Unit of x and y. pixels: used unchanged, whatever their unit. unit: from 0 to 1, divided by (width − 1, height − 1). signed: from −1 to 1 likewise. auto: by the values; values within 0 … 1 without image_size are an error.
              * @default auto
              * @enum {string}
              */
             coordinates: "auto" | "pixels" | "unit" | "signed";
             /**
              * Image Size
-             * @description WIDTHxHEIGHT of the picture in pixels, e.g. 640x480; needed where coordinates are fractions of it. Its centre is the principal point of a perspective camera.
+             * @description WIDTHxHEIGHT of the picture in pixels, e.g. 640x480; needed if coordinates are fractions of it. Its centre is the principal point of a perspective camera.
              * @default null
              */
             image_size: string | null;
@@ -602,7 +622,7 @@ export interface components {
             coordinate_order: "auto" | "xy" | "yx";
             /**
              * Visibility
-             * @description What the numbers beside the tracks mean. bool: not 0 is yes. probability: from 0 to 1. logits: of any size, 0 is undecided. auto: by their values. Whether they say seen or hidden comes from the array's name.
+             * @description Type of the visibility array. bool: not 0 is true. probability: from 0 to 1. logits: any number, 0 is undecided. auto: by the values. The name of the array determines whether it marks visible or hidden points.
              * @default auto
              * @enum {string}
              */
@@ -615,49 +635,49 @@ export interface components {
             frames: string | null;
             /**
              * Stride
-             * @description Use every n-th point: every n-th row and column of a pixel grid, else every n-th of the list; of a given mesh, one in n, spread evenly.
+             * @description Use every n-th point: every n-th row and column of a pixel grid, else every n-th of the list; with a given mesh, one in n, spread evenly.
              * @default 1
              */
             stride: number;
             /**
              * Max Points
-             * @description Use at most this many points, spread evenly, the mesh thinned along with them; null: all there are. A pixel grid stays one: the smallest stride that fits.
+             * @description Use at most this many points, spread evenly, and decimate the mesh accordingly; null: all. A pixel grid is decimated by the smallest stride that suffices.
              * @default null
              */
             max_points: number | null;
             /**
              * Min Seen
-             * @description A point seen in fewer frames than this is left out of the solve. It keeps its place in the result, where it follows its neighbours on the mesh.
+             * @description A point visible in fewer frames than this is excluded from the solve. It keeps its index in the result and follows its neighbours on the mesh.
              * @default 2
              */
             min_seen: number;
             /**
              * Template Frame
-             * @description Of a film: the frame whose points are followed to both ends, counted in the whole film from 0; null: the region's frame, or a sharp one in the middle where no region is given.
+             * @description For a film: the frame whose points are tracked in both directions, counted in the complete film from 0; null: the region's frame, or a sharp one in the middle without a region.
              * @default null
              */
             template_frame: number | null;
             /**
              * Grid Step
-             * @description Of a film: distance of neighbouring points in the film's pixels; null: so that the region holds about 4,000 points.
+             * @description For a film: distance of neighbouring points in the film's pixels; null: about 4,000 points in the region.
              * @default null
              */
             grid_step: number | null;
             /**
              * Longest Side
-             * @description Of a film: longest side of the frames that are tracked, pixels; larger films are reduced. Tracks stay in the film's own pixels.
+             * @description For a film: maximum size of the longer side of tracked frames, pixels; larger films are scaled down. Tracks remain in the film's own pixels.
              * @default 960
              */
             longest_side: number;
             /**
              * Region Frame
-             * @description Of a film: the frame that the region was drawn on, counted in the whole film from 0.
+             * @description For a film: the frame on which the region was drawn, counted in the complete film from 0.
              * @default 0
              */
             region_frame: number;
             /**
              * Region Polygon
-             * @description Of a film: corners [x, y] around what is to be tracked, in the film's pixels, y down, instead of a mask picture; null: the mask, or the whole picture.
+             * @description For a film: corners [x, y] of the region to track, in the film's pixels, y down, instead of a mask picture; null: the mask, or the entire picture.
              * @default null
              */
             region_polygon: [
@@ -667,19 +687,19 @@ export interface components {
         };
         /**
          * Problem
-         * @description An error as RFC 9457 problem details, with what a person or a program needs to act on it.
+         * @description An error as RFC 9457 problem details.
          */
         Problem: {
             /** Title */
             title: string;
             /**
              * Status
-             * @description The HTTP status code; for a failed job, the one that fits best.
+             * @description The HTTP status code; for a failed job, the most similar one.
              */
             status: number;
             /**
              * Detail
-             * @description A whole sentence that ends with what to do next.
+             * @description A complete sentence that ends with what to do.
              */
             detail: string;
             /** @description Stable machine-readable name of the error. */
@@ -691,7 +711,7 @@ export interface components {
             type?: string;
             /**
              * Field
-             * @description The input at fault, e.g. `tracks` or `options.loss`.
+             * @description The invalid input, e.g. `tracks` or `options.loss`.
              * @default null
              */
             field: string | null;
@@ -719,7 +739,7 @@ export interface components {
             retryable: boolean;
             /**
              * Choices
-             * @description The readings that fit, where the input is ambiguous.
+             * @description The possible interpretations of an ambiguous input.
              * @default null
              */
             choices: {
@@ -730,10 +750,10 @@ export interface components {
          * ProblemCode
          * @enum {string}
          */
-        ProblemCode: "bad_request" | "malformed_form" | "no_such_address" | "method_not_allowed" | "body_stalled" | "precondition_failed" | "body_too_large" | "text_too_large" | "unsupported_media_type" | "range_not_satisfiable" | "unknown_host" | "invalid_request" | "unknown_part" | "repeated_part" | "missing_part" | "conflicting_parts" | "not_a_file" | "not_utf8" | "name_too_long" | "invalid_limit" | "invalid_cursor" | "invalid_event_id" | "http_error" | "internal_error" | "not_ready" | "conflicting_headers" | "unauthorized" | "invalid_token" | "expired_token" | "invalid_share" | "expired_share" | "beyond_share" | "insufficient_scope" | "cross_site_request" | "too_many_requests" | "unknown_job" | "unknown_artifact" | "unknown_example" | "not_allowed_now" | "not_finished" | "id_taken" | "idempotency_conflict" | "invalid_id" | "invalid_idempotency_key" | "too_many_queued" | "unknown_option" | "invalid_option" | "output_unavailable" | "invalid_webhook" | "invalid_webhook_secret" | "webhook_not_public" | "artifact_gone" | "timed_out" | "out_of_memory" | "worker_lost" | "storage_failed" | "interrupted" | "stale_attempt" | "store_unavailable" | "storage_full" | "quota_exceeded" | "worker_error" | "unknown_upload" | "upload_incomplete" | "upload_complete" | "upload_offset_mismatch" | "upload_busy" | "upload_taken_over" | "upload_too_large" | "inconsistent_upload_length" | "invalid_digest" | "digest_mismatch" | "unknown_share" | "too_many_shares" | "too_many_uploads" | "unknown_format" | "empty_file" | "damaged_file" | "pickle_refused" | "object_array" | "unsupported_feature" | "too_large" | "too_slow" | "member_name" | "duplicate_member" | "duplicate_observation" | "missing_array" | "film_unavailable" | "unsupported_film" | "unreadable_film" | "empty_film" | "playlist" | "external_reference" | "truncated_film" | "undecodable_film" | "no_picture" | "broken_picture" | "changing_size" | "too_small" | "too_many_streams" | "too_many_pictures" | "too_many_bytes" | "too_many_pixels" | "too_many_frames" | "too_long" | "wrong_selection" | "no_such_frame" | "unreadable_region" | "wrong_region" | "wrong_region_size" | "wrong_polygon" | "empty_region" | "region_lost" | "no_texture" | "tracks_lost" | "outside_picture" | "principal_point_far" | "unwritable_film" | "stopped" | "ambiguous_layout" | "ambiguous_coordinates" | "missing_image_size" | "wrong_type" | "wrong_shape" | "out_of_range" | "not_finite" | "too_few_frames" | "too_few_points" | "no_frames_left" | "nothing_visible" | "too_little_seen" | "no_extent" | "vertex_count_mismatch" | "mesh_mismatch" | "index_out_of_range" | "degenerate_face" | "not_a_rotation" | "camera_mismatch" | "invalid_setting" | "data_directory_in_use" | "server_failed" | "unknown_token" | "invalid_token_name" | "invalid_duration" | "no_scope";
+        ProblemCode: "bad_request" | "malformed_form" | "no_such_address" | "method_not_allowed" | "body_stalled" | "precondition_failed" | "body_too_large" | "text_too_large" | "unsupported_media_type" | "range_not_satisfiable" | "unknown_host" | "invalid_request" | "unknown_part" | "repeated_part" | "missing_part" | "conflicting_parts" | "not_a_file" | "not_utf8" | "name_too_long" | "invalid_limit" | "invalid_cursor" | "invalid_event_id" | "http_error" | "internal_error" | "not_ready" | "conflicting_headers" | "unauthorized" | "invalid_token" | "expired_token" | "invalid_share" | "expired_share" | "beyond_share" | "insufficient_scope" | "cross_site_request" | "too_many_requests" | "unknown_job" | "unknown_artifact" | "unknown_example" | "not_allowed_now" | "not_finished" | "id_taken" | "idempotency_conflict" | "invalid_id" | "invalid_idempotency_key" | "too_many_queued" | "unknown_option" | "invalid_option" | "output_unavailable" | "invalid_webhook" | "invalid_webhook_secret" | "webhook_not_public" | "artifact_gone" | "timed_out" | "out_of_memory" | "worker_lost" | "storage_failed" | "interrupted" | "stale_attempt" | "store_unavailable" | "storage_full" | "quota_exceeded" | "worker_error" | "unknown_upload" | "upload_incomplete" | "upload_complete" | "upload_offset_mismatch" | "upload_busy" | "upload_taken_over" | "upload_too_large" | "inconsistent_upload_length" | "invalid_digest" | "digest_mismatch" | "unknown_share" | "too_many_shares" | "too_many_uploads" | "unknown_format" | "empty_file" | "damaged_file" | "pickle_refused" | "object_array" | "unsupported_feature" | "too_large" | "too_slow" | "member_name" | "duplicate_member" | "duplicate_observation" | "missing_array" | "film_unavailable" | "unsupported_film" | "unreadable_film" | "empty_film" | "playlist" | "external_reference" | "truncated_film" | "undecodable_film" | "no_picture" | "broken_picture" | "changing_size" | "too_small" | "too_many_streams" | "too_many_pictures" | "too_many_bytes" | "too_many_pixels" | "too_many_frames" | "too_long" | "wrong_selection" | "no_such_frame" | "unreadable_region" | "wrong_region" | "wrong_region_size" | "wrong_polygon" | "empty_region" | "region_lost" | "no_texture" | "tracks_lost" | "outside_picture" | "principal_point_far" | "unwritable_film" | "stopped" | "ambiguous_layout" | "ambiguous_coordinates" | "missing_image_size" | "wrong_type" | "wrong_shape" | "out_of_range" | "not_finite" | "too_few_frames" | "too_few_points" | "no_frames_left" | "nothing_visible" | "too_little_seen" | "no_extent" | "vertex_count_mismatch" | "mesh_mismatch" | "index_out_of_range" | "degenerate_face" | "not_a_rotation" | "camera_mismatch" | "invalid_setting" | "data_directory_in_use" | "newer_data" | "bad_backup" | "server_failed" | "unknown_token" | "invalid_token_name" | "invalid_token_text" | "invalid_duration" | "no_scope";
         /**
          * Progress
-         * @description How far a running job is.
+         * @description Progress of a running job.
          */
         Progress: {
             /**
@@ -762,7 +782,7 @@ export interface components {
             residual: number | null;
             /**
              * Seconds Left
-             * @description Estimate; null while there is nothing to base it on.
+             * @description Estimate; null until one is possible.
              */
             seconds_left: number | null;
             /**
@@ -773,7 +793,7 @@ export interface components {
         };
         /**
          * ServiceLimits
-         * @description What a service accepts; beyond these it refuses.
+         * @description Limits of a service.
          */
         ServiceLimits: {
             /**
@@ -788,7 +808,7 @@ export interface components {
             max_text_bytes: number;
             /**
              * Max Upload Bytes
-             * @description Largest upload, over all its requests; 0: there are no uploads.
+             * @description Largest upload, over all its requests; 0: uploads are not available.
              * @default 0
              */
             max_upload_bytes: number;
@@ -810,29 +830,29 @@ export interface components {
             max_faces: number;
             /**
              * Max Wait Seconds
-             * @description Longest `Prefer: wait=n` that is honoured.
+             * @description Maximum n of `Prefer: wait=n`.
              */
             max_wait_seconds: number;
             /**
              * Max Page
-             * @description Most jobs on one page.
+             * @description Maximum number of jobs on one page.
              */
             max_page: number;
             /**
              * Max Queued
-             * @description Jobs of yours that may wait at once; 0: any number. Beyond: 429.
+             * @description Maximum number of your queued jobs, above which submissions fail with 429; 0: no limit.
              * @default 0
              */
             max_queued: number;
             /**
              * Max Running
-             * @description Jobs of yours that are worked on at once, the others wait; 0: as many as there are workers.
+             * @description Maximum number of your running jobs, the others wait; 0: no limit.
              * @default 0
              */
             max_running: number;
             /**
              * Requests Per Minute
-             * @description Requests in a minute; 0: any number. Beyond: 429.
+             * @description Maximum number of requests per minute, above which requests fail with 429; 0: no limit.
              * @default 0
              */
             requests_per_minute: number;
@@ -867,40 +887,40 @@ export interface components {
         };
         /**
          * Status
-         * @description Where a job stands. The last three are final and never change.
+         * @description Status of a job. The last three are final and never change.
          * @enum {string}
          */
         Status: "queued" | "running" | "cancelling" | "succeeded" | "failed" | "cancelled";
         /**
          * Upload
-         * @description A large input on its way, or waiting for jobs to name it.
+         * @description A large input that is uploaded separately and then named by jobs.
          */
         Upload: {
             /** Id */
             id: string;
             /**
              * Offset
-             * @description Bytes that have arrived.
+             * @description Bytes received.
              */
             offset: number;
             /**
              * Length
-             * @description Bytes of the whole; null while nobody has said.
+             * @description Bytes of the complete upload; null while unknown.
              */
             length: number | null;
             /**
              * Complete
-             * @description True once all of it is there; only then may a job name it.
+             * @description True once all bytes are received; only then can a job use it.
              */
             complete: boolean;
             /**
              * Sha256
-             * @description Of the whole; null until it is complete.
+             * @description Digest of the complete upload; null until it is complete.
              */
             sha256: string | null;
             /**
              * Expires At
-             * @description When it is removed unless used before; null: never.
+             * @description When it is removed unless it is used before; null: never.
              */
             expires_at: string | null;
         };
@@ -913,7 +933,7 @@ export interface components {
              * Outputs
              * @description Files to write: glb, ply, obj, usd, mdd, mat, csv; see the option `outputs` of a job.
              */
-            outputs: ("glb" | "ply" | "obj" | "usd" | "mdd" | "mat" | "csv")[];
+            outputs: ("glb" | "ply" | "obj" | "usd" | "abc" | "mdd" | "mat" | "csv")[];
             /**
              * Fps
              * @description Frames per second of the written animation.

@@ -62,7 +62,7 @@ def test_else_nothing_is_stopped(points: int, modes: int, drift: float) -> None:
 
 
 def test_a_sample_of_more_points_is_not_judged(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(early_stopping, "SAMPLE", 30)
+    monkeypatch.setattr(early_stopping, "MAX_SAMPLE_POINTS", 30)
     _, _, why = both(drawn(30, modes=12, drift=0.03))
     assert "learned in" not in why
 

@@ -44,17 +44,17 @@ def through(now: list[float], seconds: float, each: Callable[[], object]) -> Non
         each()
 
 
-def test_progress_is_told_twice_a_second_at_most(jobs: Jobs, attempt: Attempt, now: list[float]) -> None:
+def test_progress_is_written_at_most_twice_a_second(jobs: Jobs, attempt: Attempt, now: list[float]) -> None:
     moments: list[float] = []
 
-    def tell() -> None:
-        attempt.tell(Progress(stage="reweight", fraction=now[0] / 10, updated_at=datetime.now(UTC)))
+    def report() -> None:
+        attempt.report(Progress(stage="reweight", fraction=now[0] / 10, updated_at=datetime.now(UTC)))
         progress = jobs.get(attempt.id).progress
         assert progress is not None
         if progress.fraction == now[0] / 10:
             moments.append(now[0])
 
-    through(now, 2.0, tell)
+    through(now, 2.0, report)
     assert moments == pytest.approx([0.0, 0.5, 1.0, 1.5])
 
 
@@ -103,3 +103,13 @@ def test_a_finished_job_waits_for_a_blob_store_that_is_away(
     away[0] = 1
     with pytest.raises(StoreUnavailable):
         attempt.store(finished, tmp_path)
+
+
+def test_a_new_stage_is_told_at_once(jobs: Jobs, attempt: Attempt, now: list[float]) -> None:
+    """A job that waits for its blob store tells nothing more: its record must not stay at the stage before."""
+    for stage in ("reweight", "finish", "exporting"):
+        now[0] += 0.01
+        attempt.tell(Progress(stage=stage, fraction=0.5, updated_at=datetime.now(UTC)))
+        progress = jobs.get(attempt.id).progress
+        assert progress is not None
+        assert progress.stage == stage

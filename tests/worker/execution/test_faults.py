@@ -134,7 +134,7 @@ def test_the_job_of_a_killed_worker_is_done_by_another(house: House) -> None:
     os.kill(worker, signal.SIGKILL)
     house.until(lambda: not running(job_process), "the job process dies with its worker")
     house.until(lambda: house.jobs.get(id).attempt == 2, "another worker begins it", seconds=30)
-    assert "Lost its worker" in house.jobs.log(id)
+    assert "The worker was lost" in house.jobs.log(id)
     house.jobs.cancel(id)
     assert house.final(id).status is Status.CANCELLED
 
@@ -293,7 +293,7 @@ def test_fsck_is_a_command(house: House) -> None:
     command = [sys.executable, "-m", "pliant.worker", "fsck"]
     env = {**os.environ, **house.settings.to_environment()}
     clean = subprocess.run(command, capture_output=True, text=True, check=False, env=env)
-    assert (clean.returncode, clean.stdout) == (0, "Everything stored is as the records state.\n")
+    assert (clean.returncode, clean.stdout) == (0, "The stores are consistent with the job records.\n")
     house.jobs.blobs.put("jobs/nobody/nobody-1/inputs.npz", house.short_inputs)
     found = subprocess.run(command, capture_output=True, text=True, check=False, env=env)
     assert (found.returncode, found.stdout) == (1, "File jobs/nobody/nobody-1/inputs.npz belongs to no job.\n")

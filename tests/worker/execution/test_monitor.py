@@ -81,7 +81,7 @@ def test_a_jobs_own_time_limit_is_enforced_too(running: Callable[..., Watch]) ->
     after = finalize(watch, status=KILLED, peak=0, patience=Patience(0))
     assert after is not None
     assert after.job.error is not None
-    assert (after.job.error.code, "4 s of its option time_limit" in after.job.error.detail) == ("timed_out", True)
+    assert (after.job.error.code, "option time_limit of 4 s" in after.job.error.detail) == ("timed_out", True)
 
 
 def test_without_a_limit_there_is_none(running: Callable[..., Watch]) -> None:
@@ -184,7 +184,7 @@ def test_patience_repeats_until_the_store_answers(jobs: Jobs, running: Callable[
             raise error
         return jobs.records.get(watch.id)
 
-    assert Patience(10).ask(call) == jobs.records.get(watch.id)  # type: ignore[arg-type]
+    assert Patience(10).retry(call) == jobs.records.get(watch.id)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -217,7 +217,7 @@ def test_a_thread_that_does_not_fit_is_want_of_memory_only_under_a_limit() -> No
 
 def test_limits_are_named_in_words() -> None:
     assert "2.0 GiB" in out_of_memory(2**31).detail
-    assert "the machine had" in out_of_memory().detail
+    assert "the machine has" in out_of_memory().detail
     assert "1.5 s" in timed_out(1.5).detail
     assert "signal 11 (SIGSEGV)" in how_it_ended(11)
     assert "code 3" in how_it_ended(3 << 8)

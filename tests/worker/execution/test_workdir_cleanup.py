@@ -29,11 +29,11 @@ def test_patience_is_one_span_for_all_that_is_asked() -> None:
 
     patience = Patience(0.7)
     with pytest.raises(StoreUnavailable):
-        patience.ask(gone)
+        patience.retry(gone)
     assert len(asked) > 1
     asked.clear()
     with pytest.raises(StoreUnavailable):
-        patience.ask(gone)
+        patience.retry(gone)
     assert asked == ["again"], "tried once, though the time is over"
 
 

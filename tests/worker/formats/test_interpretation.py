@@ -70,7 +70,7 @@ def test_y_before_x_is_seen_where_only_so_all_is_inside(tmp_path: Path) -> None:
     wide = POINTS * [80, 20]
     got = read(tmp_path, {"tracks": wide[..., ::-1]}, image_size="641x100")
     np.testing.assert_array_equal(got.tracks.points, wide)
-    assert any("read as y, x: so 100%" in note for note in got.interpretation.notes)
+    assert any("read as y, x: 100%" in note for note in got.interpretation.notes)
     kept = read(tmp_path, {"tracks": wide[..., ::-1]}, image_size="641x100", coordinate_order="xy")
     np.testing.assert_array_equal(kept.tracks.points, wide[..., ::-1])
 
@@ -95,7 +95,7 @@ def test_y_axis_is_as_asked(tmp_path: Path) -> None:
     assert read(tmp_path, {"tracks": POINTS}).interpretation.y_axis == "down"
     up = read(tmp_path, {"tracks": POINTS}, y_axis="up").interpretation
     assert up.y_axis == "up"
-    assert "y points up, as asked." in up.notes
+    assert "y points up, as set by y_axis." in up.notes
 
 
 def test_numbers_above_1_are_a_mask_or_logits(tmp_path: Path) -> None:
@@ -156,7 +156,7 @@ def test_truth_is_read_the_way_that_explains_the_tracks() -> None:
         np.testing.assert_array_equal(as_shapes(array, understood)[0], SHAPES)
     assert unexplained(SHAPES, POINTS) < 1e-12 < 0.3 < unexplained(stacked.reshape(F, 3, P).transpose(0, 2, 1), POINTS)
     _, notes = as_shapes(SHAPES[:, np.random.default_rng(1).permutation(P)], understood)
-    assert "same order?" in notes[0]
+    assert "same order" in notes[0]
     wrong = np.zeros((F, 4))
     assert as_shapes(wrong, understood)[0] is wrong
     assert unexplained(SHAPES[:, :3], POINTS[:, :3]) == 0.0  # too few points to say

@@ -213,12 +213,12 @@ def test_points_seen_too_seldom_are_left_out_and_said(folder: Path) -> None:
     assert (got.tracks.visible[:, [7, 9]] == 0).all()
     assert got.tracks.visible[:, 4].sum() == 3
     notes = " ".join(got.interpretation.notes)
-    assert "2 points are seen in fewer than 3 frames" in notes
+    assert "2 points are visible in fewer than 3 frames" in notes
     assert "1 of them follow their neighbours" in notes
     assert "1 of them belong to no face" in notes
     assert read(folder, folder / "most.npz", min_seen=4).interpretation.left_out_points == [4, 7, 9]
     assert read(folder, folder / "most.npz", min_seen=1).interpretation.num_left_out == 0
-    with pytest.raises(InvalidInput, match="seen in 11 frames or more") as caught:
+    with pytest.raises(InvalidInput, match="visible in 11 or more frames") as caught:
         read(folder, folder / "most.npz", min_seen=11)
     assert (caught.value.code, caught.value.field) == ("nothing_visible", "options.min_seen")
 

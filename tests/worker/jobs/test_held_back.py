@@ -89,7 +89,7 @@ def test_what_is_held_back_is_known_to_a_keeper_that_has_only_begun(
         world.jobs.submit(inputs_file, Submission(options=Options(), id=f"job-{n}"), interpretation=interpretation).id
         for n in "12"
     )
-    world.jobs.queue.let_go(world.jobs.records.get(second).attempt_id)  # as if nobody had had the time to note it
+    world.jobs.queue.release(world.jobs.records.get(second).attempt_id)  # as if nobody had had the time to note it
     world.pass_seconds(1)
     assert world.jobs.queue.held() == {world.jobs.records.get(second).attempt_id}
     world.reconciler = Reconciler(jobs=world.jobs, clock=lambda: world.monotonic)

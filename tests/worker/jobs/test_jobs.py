@@ -66,7 +66,7 @@ def test_a_submitted_job_has_record_blob_and_place(jobs: Jobs, submit, inputs_fi
 
 def test_an_unknown_job_is_said_so(jobs: Jobs) -> None:
     for id in ("nobody", "../etc/passwd", "x" * 500):
-        with pytest.raises(UnknownJob, match="List the jobs"):
+        with pytest.raises(UnknownJob, match="List your jobs"):
             jobs.get(id)
 
 
@@ -327,7 +327,7 @@ def test_the_quota_refuses_what_does_not_fit(jobs: Jobs, submit, inputs_file: Pa
 
     tight = dataclasses.replace(jobs, settings=dataclasses.replace(jobs.settings, disk_quota=4_000_000))
     submit(tight)
-    with pytest.raises(QuotaExceeded, match=r"3,000,000 bytes and may hold 4,000,000.*PLIANT_DISK_QUOTA"):
+    with pytest.raises(QuotaExceeded, match=r"3,000,000 of 4,000,000 bytes.*PLIANT_DISK_QUOTA"):
         submit(tight)
     assert len(blob_names(jobs)) == 1
 
@@ -361,11 +361,11 @@ def test_jobs_count_the_uploads_and_the_quota_holds_at_the_moment_of_writing(job
     uploads = Uploads.open(tight.settings)
     with uploads.write("big-one", offset=0, length=None, capacity=Capacity(max_bytes=10**7)) as writer:
         writer.write(bytes(1_500_000))
-    with pytest.raises(QuotaExceeded, match="hold 1,500,000 bytes"):
+    with pytest.raises(QuotaExceeded, match="1,500,000 of 4,000,000 bytes"):
         submit(tight)
     uploads.delete("big-one")
     stored = jobs.records.get(submit(tight).id)
     job = stored.job.model_copy(update={"id": "another"})
-    with pytest.raises(QuotaExceeded, match="hold 3,000,000 bytes and may hold 4,000,000"):
+    with pytest.raises(QuotaExceeded, match="3,000,000 of 4,000,000 bytes"):
         jobs.records.create(stored.model_copy(update={"job": job}), max_bytes=4_000_000)
     assert jobs.records.used() == 3_000_000

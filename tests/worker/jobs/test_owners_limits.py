@@ -25,7 +25,7 @@ def test_no_more_of_an_owners_jobs_wait_than_may(jobs: Jobs, submit) -> None:  #
         lambda: ada.check_capacity(id="third"),
         lambda: ada.check_capacity(idempotency_key="k"),
     ):
-        with pytest.raises(TooManyQueued, match="2 of your jobs wait"):
+        with pytest.raises(TooManyQueued, match="2 jobs are already queued"):
             refused()
     assert list(jobs.blobs.list("jobs/")) == before, "what was refused leaves no file"
     assert submit(ada, id="second", fingerprint="f").id == "second"

@@ -79,7 +79,7 @@ def test_every_kind_of_misfit_is_found(jobs: Jobs, submit: Callable[[], Stored],
 
     stale = f"jobs/{stored.job.id}/{stored.job.id}-0/artifacts/shapes.npz"
     jobs.blobs.put(stale, inputs_file)
-    only("belongs to no attempt")
+    only("belongs to no current attempt")
     jobs.blobs.delete(stale)
 
     directory = working_directory(jobs.settings, "nobody-1")
@@ -115,7 +115,7 @@ def test_every_kind_of_misfit_is_found(jobs: Jobs, submit: Callable[[], Stored],
         only(sentence)
         jobs.records.update(stored.job.id, lambda held, job=sound: held.model_copy(update={"job": job}))  # type: ignore[misc]
     jobs.records.update(stored.job.id, lambda held: held.model_copy(update={"prefix": "p/"}))
-    assert any("its results lie under p/" in found for found in findings(jobs, pause=0))
+    assert any("its results are stored under p/" in found for found in findings(jobs, pause=0))
     jobs.records.update(stored.job.id, lambda held: held.model_copy(update={"prefix": None}))
 
     upload = jobs.settings.uploads / "somebody" / "half"

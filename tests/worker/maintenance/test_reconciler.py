@@ -75,7 +75,7 @@ def test_neither_an_outage_nor_a_jumping_clock_loses_a_job(world: World, submit:
     id = submit(world)
     attempt_id = world.claim(id)
     world.pass_seconds(2)
-    world.monotonic += 600  # nobody could look, and nobody could give a sign of life
+    world.monotonic += 600  # neither checks nor heartbeats were possible
     world.now += timedelta(days=1)
     world.pass_seconds(1)
     assert world.jobs.get(id).status is Status.RUNNING
@@ -173,7 +173,7 @@ def test_what_a_killed_attempt_had_uploaded_is_removed(
     world.jobs.records.update(
         id, lambda held: lifecycle.fail(held, attempt_id=attempt_id, problem=problem, now=world.now, retention=0)
     )
-    assert any("belongs to no attempt" in each for each in findings(world.jobs, pause=0))
+    assert any("belongs to no current attempt" in each for each in findings(world.jobs, pause=0))
     world.pass_seconds(1)
     assert findings(world.jobs, pause=0) == []
     assert [key for key, _ in world.jobs.blobs.list("jobs/")] == [world.jobs.records.get(id).inputs]

@@ -12,8 +12,9 @@ import time
 from pathlib import Path
 
 import pytest
+from obstore.store import MemoryStore
 from pliant.worker.errors import StoreUnavailable
-from pliant.worker.store.blobs import CHUNK, Blobs
+from pliant.worker.store.blobs import CHUNK, CLIENT, Blobs, client_options
 from pliant.worker.store.calls import AT_ONCE, WAITING, RemoteCalls
 
 
@@ -88,7 +89,7 @@ def test_a_key_cannot_leave_the_store(tmp_path: Path, file: Path) -> None:
 
 def test_a_store_that_does_not_answer_is_said_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     (tmp_path / "a-file").write_text("")
-    with pytest.raises(StoreUnavailable, match="cannot be used now"):
+    with pytest.raises(StoreUnavailable, match="is unavailable"):
         Blobs.open((tmp_path / "a-file" / "below").as_uri())
     readonly = Blobs.open((tmp_path / "store").as_uri())
     shutil.rmtree(tmp_path / "store")
@@ -175,3 +176,29 @@ def written() -> int:
     """Return the bytes that this process has written."""
     counters = dict(line.split(": ") for line in Path("/proc/self/io").read_text().splitlines())
     return int(counters["wchar"])
+
+
+def test_variables_about_the_connection_reach_the_store(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """obstore reads no `AWS_` variable about the connection beside options that it is given, so each is passed on."""
+    bundle = tmp_path / "ca.pem"
+    bundle.write_text("a certificate")
+    variables = {
+        "AWS_ALLOW_HTTP": "TRUE", "AWS_ALLOW_INVALID_CERTIFICATES": "0", "AWS_PROXY_URL": "http://proxy:3128",
+        "AWS_PROXY_EXCLUDES": "", "AWS_CA_BUNDLE": str(bundle), "AWS_REGION": "us-east-1",
+    }  # fmt: skip
+    assert client_options(variables) == {
+        "allow_http": True, "allow_invalid_certificates": False, "proxy_url": "http://proxy:3128",
+        "root_certificate": "a certificate",
+    }  # fmt: skip
+    assert client_options({}) == {}
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    given: dict[str, object] = {}
+
+    def opened(url: str, **options: object) -> MemoryStore:
+        given.update(options["client_options"])  # type: ignore[call-overload]
+        return MemoryStore()
+
+    monkeypatch.setattr("pliant.worker.store.blobs.from_url", opened)
+    Blobs.open("s3://bucket/prefix")
+    assert given == {**CLIENT, **client_options(variables)}

@@ -133,7 +133,7 @@ def test_the_end_of_a_job_is_told_once_signed_and_whole(
     said = json.loads(body)
     assert (said["type"], Job.model_validate(said["data"])) == ("job.cancelled", job)
     assert SECRET.encode() not in body
-    until(lambda: "Webhook delivered: the receiver answered 204 (try 1)." in door.log(job.id))
+    until(lambda: "Webhook delivered: the receiver returned 204 (attempt 1)." in door.log(job.id))
     time.sleep(0.7)
     assert len(receiver.got) == 1
 
@@ -149,8 +149,8 @@ def test_a_receiver_that_fails_is_asked_again_with_the_same_id(
     assert {path for path, _, _ in receiver.got} == {"/hook?x=1"}, "a redirect is not followed"
     assert len({body for _, _, body in receiver.got}) == 1
     log = door.log(job.id)
-    assert "the receiver answered 500 (try 1); again in" in log
-    assert "the receiver answered 302 (try 2)" in log
+    assert "the receiver returned 500 (attempt 1); next attempt in" in log
+    assert "the receiver returned 302 (attempt 2)" in log
     assert "(try 3)" in log
 
 
@@ -161,10 +161,10 @@ def test_after_the_last_try_or_a_410_it_is_given_up(
     job = made(receiver.url)
     webhook_sender.start()
     until(lambda: webhook_sender.outbox.owed() == 0)
-    until(lambda: "given up: the receiver answered 500, at try 3, the last." in door.log(job.id))
+    until(lambda: "given up: the receiver returned 500 (attempt 3, the last one)." in door.log(job.id))
     receiver.answers = [410]
     other = made(receiver.url)
-    until(lambda: "given up: the receiver answered 410" in door.log(other.id))
+    until(lambda: "given up: the receiver returned 410" in door.log(other.id))
     assert len(receiver.got) == 4
     tallies = door.records.tallies()
     assert (tallies["webhooks:tried"], tallies["webhooks:given_up"]) == (4, 2)
@@ -314,7 +314,7 @@ def test_a_message_that_kills_its_sender_each_time_is_not_tried_for_ever(
     for _ in range(4):
         webhook_sender.outbox.take(now=int(time.time() * 1000) + 10, until=0)
     webhook_sender.start()
-    until(lambda: "tried often enough" in door.log(job.id))
+    until(lambda: "maximum number of attempts" in door.log(job.id))
     assert receiver.got == []
 
 

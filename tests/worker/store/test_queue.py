@@ -17,8 +17,8 @@ def test_the_queue_notes_what_is_held_back_and_forgets_what_is_not(jobs: Jobs) -
         queue.hold(attempt_id)
     assert (queue.held(), queue.waiting()) == ({"job-1", "job-2"}, [])
     queue.push("job", "job-3")
-    queue.let_go("job-1")
-    queue.let_go("job-3")
+    queue.release("job-1")
+    queue.release("job-3")
     queue.remove("job-2")
     assert (queue.held(), queue.waiting()) == (set(), ["job-3"])
 

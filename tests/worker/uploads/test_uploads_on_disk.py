@@ -11,6 +11,7 @@ import subprocess
 import sys
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import BinaryIO
 
 import pytest
 from hypothesis import given, settings
@@ -59,13 +60,13 @@ def test_however_it_is_cut_the_whole_is_the_whole(
 def test_a_part_cannot_be_taken_and_a_whole_one_not_be_written(uploads: Uploads, tmp_path: Path) -> None:
     send(uploads, "one", b"half", finish=False)
     assert (uploads.get("one").complete, uploads.get("one").sha256) == (False, None)
-    with pytest.raises(errors.Conflict, match="not whole yet") as caught:
+    with pytest.raises(errors.Conflict, match="not complete yet") as caught:
         uploads.take("one", tmp_path / "taken")
     assert caught.value.code == "upload_incomplete"
     assert not (tmp_path / "taken").exists()
     send(uploads, "one", b"", offset=4)
     for offset in (0, 4):
-        with pytest.raises(errors.Conflict, match="is whole"):
+        with pytest.raises(errors.Conflict, match="is complete"):
             send(uploads, "one", b"more", offset=offset)
     uploads.take("one", tmp_path / "taken")
     uploads.delete("one")
@@ -83,7 +84,7 @@ def test_a_part_cannot_be_taken_and_a_whole_one_not_be_written(uploads: Uploads,
 
 def test_bytes_in_the_wrong_place_are_refused_and_beginning_anew_is_allowed(uploads: Uploads) -> None:
     send(uploads, "one", b"half", finish=False)
-    with pytest.raises(errors.OffsetMismatch, match=r"Go on at 4\.") as caught:
+    with pytest.raises(errors.OffsetMismatch, match=r"Continue at 4\.") as caught:
         send(uploads, "one", b"x", offset=3)
     assert caught.value.offset == 4
     send(uploads, "one", b"new")
@@ -156,7 +157,7 @@ def test_two_processes_do_not_write_to_one_upload(uploads: Uploads) -> None:
     assert other.stdout is not None
     other.stdout.readline()
     for write in (lambda: send(uploads, "one", b"x", offset=3), lambda: uploads.delete("one")):
-        with pytest.raises(errors.Conflict, match="just now") as caught:
+        with pytest.raises(errors.Conflict, match="being written") as caught:
             write()
         assert caught.value.code == "upload_busy"
     assert uploads.expire(now(days=9)) == [], "what is being written does not expire"
@@ -256,7 +257,7 @@ def test_a_declared_length_is_reserved_at_once_and_a_refusal_leaves_nothing(uplo
     tight = Capacity(max_bytes=1000, quota=100, used=0)
     with uploads.write("one", offset=0, length=80, capacity=tight) as writer:
         assert uploads.used() == 80
-        with pytest.raises(errors.QuotaExceeded, match="hold 80 bytes and may hold 100"):
+        with pytest.raises(errors.QuotaExceeded, match="80 of 100 bytes"):
             send(uploads, "two", b"", length=30, capacity=tight)
         assert [folder.name for folder in uploads.directory.glob("*/*")] == ["one"]
         writer.write(b"x" * 30)
@@ -269,3 +270,21 @@ def test_a_reservation_ends_with_its_process(uploads: Uploads) -> None:
     (next(uploads.directory.glob("*/one")) / "reserved").write_text("1000000")
     assert uploads.used() == 4
     assert list(uploads.findings(now())) == []
+
+
+def test_a_byte_more_does_not_read_what_is_there(uploads: Uploads, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each small PATCH used to read the whole upload again: a third of a second of processor time on 400 MB."""
+    read: list[int] = []
+    whole = hashlib.file_digest
+
+    def counted(file: BinaryIO, name: str) -> object:
+        read.append(os.fstat(file.fileno()).st_size)
+        return whole(file, name)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(hashlib, "file_digest", counted)
+    for offset in range(9):
+        send(uploads, "slow", b"x", offset=offset, finish=False)
+    assert read == []
+    send(uploads, "slow", b"y", offset=9)
+    assert read == [10]
+    assert uploads.get("slow").sha256 == hashlib.sha256(b"x" * 9 + b"y").hexdigest()

@@ -20,28 +20,28 @@ MESH_NAMES = frozenset(("faces", "grid", "mask", "vertices"))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface:
-    """How the points hang together, as given."""
+    """The connectivity of the points, as given."""
 
     mesh: Mesh | None
-    """None: none wanted, or one is to be made."""
+    """None: no mesh requested, or one is to be generated."""
 
     source: str
-    """`given`, `grid`, `none`, or `delaunay` where one is to be made."""
+    """`given`, `grid`, `none`, or `delaunay` if one is to be generated."""
 
     notes: list[str]
     points: NDArray[np.intp] | None = None
-    """The points that the mesh is about, where a mask picks some of a picture's; None: all."""
+    """The points of the mesh, if a mask selects some of a picture's; None: all."""
 
 
 def read_surface(
     mesh: Path | str | None, *, num_points: int, picture: tuple[int, int] | None, limits: Limits
 ) -> Surface:
-    """Read what the form's part `mesh` says.
+    """Read the form part `mesh`.
 
     Parameters
     ----------
     mesh : Path, str or None
-        A file, ROWSxCOLUMNS, `none`, or nothing: the picture's own grid where the points are its pixels.
+        A file, ROWSxCOLUMNS or `none`. None: the picture's grid if the points are its pixels, else a generated mesh.
     num_points : int
         P.
     picture : tuple of int, optional
@@ -65,7 +65,7 @@ def read_surface(
     if "mask" in arrays and picture is not None and arrays["mask"].shape == picture:
         marked = np.flatnonzero(arrays["mask"])
         if 0 < len(marked) < num_points:
-            note = f"The mask picks {len(marked)} of the picture's {num_points} points."
+            note = f"The mask selects {len(marked)} of the picture's {num_points} points."
             return Surface(Mesh.from_grid(number_cells(arrays["mask"])), "grid", [note], marked)
     given_vertices(arrays, num_points=num_points, field="mesh")
     surface = _mesh_of(arrays, num_points)
@@ -76,7 +76,7 @@ def read_surface(
 
 def _by_word(word: str, num_points: int, limits: Limits) -> Surface:
     if word.strip().lower() == "none":
-        return Surface(None, "none", ["No mesh, as asked: no smoothness in space."])
+        return Surface(None, "none", ["No mesh was requested: no smoothness in space."])
     found = GRID_SIZE.fullmatch(word.strip())
     if found is None:
         raise refusal(
@@ -111,13 +111,13 @@ def _mesh_of(arrays: Arrays, num_points: int) -> Mesh:
             raise mismatch("mesh", num_points, surface.num_points)
         return surface
     raise refusal(
-        "missing_array", "mesh", expected="faces, or grid", got=", ".join(sorted(arrays)) or "nothing known",
+        "missing_array", "mesh", expected="faces, or grid", got=", ".join(sorted(arrays)) or "no array of a known name",
         hint="Save the faces as numpy.savez('mesh.npz', faces=faces).",
     )  # fmt: skip
 
 
 def whole_grid(surface: Surface) -> tuple[int, int] | None:
-    """Return rows and columns if all points fill a grid row by row, so that `"ROWSxCOLUMNS"` says the same mesh."""
+    """Return rows and columns if the mesh equals that of `"ROWSxCOLUMNS"`, with all points row by row; else None."""
     if surface.mesh is None or surface.mesh.grid is None or surface.points is not None:
         return None
     rows, columns = surface.mesh.grid.shape

@@ -1,4 +1,4 @@
-"""The default mesh, where none is given: a Delaunay triangulation of the best-seen frame with its long edges cut."""
+"""The default mesh: a Delaunay triangulation of the frame with most visible points, without long edges."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from pliant.solver import Mesh, Tracks
 from scipy.spatial import Delaunay, QhullError
 
 LONGEST = 5.0
-"""Triangles with an edge above this many times the median edge are cut: they bridge gaps and the concave parts of the outline."""
+"""Ratio of an edge to the median edge above which its triangles are removed: they bridge gaps and concave parts of the outline."""
 
 
 def triangulate(tracks: Tracks, *, y_axis: str) -> tuple[Mesh | None, list[str]]:
     """Triangulate the points of the frame in which most are visible (the first such frame).
 
-    Triangles with an edge longer than 5 times the median edge length are cut. Faces turn counter-clockwise as the camera sees
-    them. Points hidden in that frame get no face and so no smoothness along the surface.
+    Triangles with an edge longer than 5 times the median edge length are removed. Faces are counter-clockwise as seen from the camera.
+    Points hidden in that frame have no face and so no spatial smoothness.
 
     Returns
     -------
     mesh : Mesh or None
         None when fewer than three points are visible at once or all lie on a line.
     notes : list of str
-        What was done, for the job's interpretation.
+        Notes for the job's interpretation.
     """
     frame = int(np.argmax((tracks.visible > 0).sum(axis=1)))
     seen = np.flatnonzero(tracks.visible[frame] > 0)
@@ -33,7 +33,7 @@ def triangulate(tracks: Tracks, *, y_axis: str) -> tuple[Mesh | None, list[str]]
         triangles = np.zeros((0, 3), dtype=np.intc)
     if len(triangles) == 0:
         return None, [
-            f"No mesh was given and frame {frame} has too few points apart to make one; no smoothness in space."
+            f"No mesh was given and frame {frame} has too few distinct points to generate one; no smoothness in space."
         ]
     corners = points[triangles]
     longest = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)
@@ -44,15 +44,15 @@ def triangulate(tracks: Tracks, *, y_axis: str) -> tuple[Mesh | None, list[str]]
     alone = tracks.num_points - len(np.unique(faces))
     notes = [
         f"No mesh was given: Delaunay triangulation of frame {frame}, where {len(seen)} of {tracks.num_points} points are visible; "
-        f"{int((~kept).sum())} of {len(kept)} triangles with an edge over {LONGEST:g} × the median were cut."
+        f"{int((~kept).sum())} of {len(kept)} triangles with an edge over {LONGEST:g} × the median were removed."
     ]
     if alone:
-        notes.append(f"{alone} points belong to no face of the made mesh, so no smoothness in space reaches them.")
+        notes.append(f"{alone} points belong to no face of the generated mesh and have no smoothness in space.")
     return mesh, notes
 
 
 def _facing_camera(triangles: NDArray[np.intc], points: NDArray[np.float64], y_axis: str) -> NDArray[np.intc]:
-    """Order corners counter-clockwise for the viewer, whichever way y points."""
+    """Return faces with corners counter-clockwise for the viewer, whichever way y points."""
     one, two, three = (points[triangles[:, i]] for i in range(3))
     area = (two[:, 0] - one[:, 0]) * (three[:, 1] - one[:, 1]) - (two[:, 1] - one[:, 1]) * (three[:, 0] - one[:, 0])
     wrong = area < 0 if y_axis == "up" else area > 0

@@ -1,8 +1,8 @@
-"""Read .npy and .npz without trusting them: headers are checked before anything is inflated, and nothing is unpickled.
+"""Safe reading of .npy and .npz files: headers are validated before anything is inflated, and nothing is unpickled.
 
-NumPy's own `load` inflates whatever the file says (a megabyte can become a gigabyte), takes the last of two members with one name,
-and reads object arrays by unpickling when allowed. Here the zip directory and every header are read first; then exactly as many
-bytes as the header announces are read into memory that the system hands out only as it is filled.
+`numpy.load` inflates any declared size (a megabyte can become a gigabyte), takes the last of two members of the same name, and
+unpickles object arrays if allowed. Here the zip directory and every header are read first; then exactly as many bytes as the header
+declares are read, into memory that the system allocates as it is filled.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ MEMBER = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_. -]{0,120}\.npy")
 UNREADABLE_ZIP = (
     zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, OSError, OverflowError, struct.error, UnicodeDecodeError,
 )  # fmt: skip
-"""What Python's reader raises at files that are none of its making."""
+"""Exceptions of Python's zip reader for invalid files."""
 
 PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 
@@ -45,7 +45,7 @@ ZIP64_LOCATOR = b"PK\x06\x07"
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """What a .npy says of itself."""
+    """The header of a .npy file."""
 
     shape: tuple[int, ...]
     fortran: bool
@@ -192,7 +192,7 @@ def film_as_tracks(got: str) -> InvalidInput:
 
 
 def pickle_refusal(field: str) -> InvalidInput:
-    """Pickles run code when they are read."""
+    """Return the error for pickles, which run code when they are read."""
     return refusal(
         "pickle_refused", field, expected="arrays that can be read without running code", got="a Python pickle",
         hint="Convert it where it was made: numpy.savez('tracks.npz', tracks=..., visibility=...); for a torch tensor use .cpu().numpy().",

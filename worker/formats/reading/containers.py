@@ -1,4 +1,4 @@
-"""Containers: recognise a file by its first bytes and get the named arrays out of it, in a child process unless it is plain NumPy."""
+"""Containers: detect the format of a file by its first bytes and read its arrays, in the sandbox unless it is plain NumPy."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ ZIP = (b"PK\x03\x04", b"PK\x05\x06")
 
 
 def read_arrays(path: Path, *, field: str, limits: Limits, wanted: Collection[str]) -> Arrays:
-    """Get the named arrays out of a file of any known container.
+    """Read the named arrays of a file in any known container format.
 
     Raises
     ------

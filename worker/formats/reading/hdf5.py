@@ -13,7 +13,7 @@ from pliant.worker.formats.errors import refusal, too_large
 from pliant.worker.formats.records import Arrays, Limits
 
 UNREADABLE = (OSError, ValueError, KeyError, RuntimeError, TypeError, AttributeError, OverflowError, IndexError)
-"""What h5py raises at damaged files."""
+"""Exceptions of h5py for damaged files."""
 
 DEFLATE = 1032
 """Bytes that deflate makes of one byte at most."""

@@ -1,4 +1,4 @@
-"""A mask picture as a mesh: the marked pixels are the points, row by row, and neighbours in the picture are neighbours on the surface."""
+"""A mask picture as a mesh: the marked pixels are the points, row by row; neighbouring pixels are neighbours on the surface."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""MATLAB .mat files of version 5, as non-rigid structure-from-motion data sets come: W, S, Rs, perhaps inside structs.
+"""MATLAB .mat files of version 5, the format of non-rigid structure-from-motion data sets: W, S, Rs, possibly inside structs.
 
-SciPy's reader trusts sizes and offsets, so a crafted file can crash it: this runs in a child process (see `child`), never in a server.
+SciPy's reader trusts sizes and offsets, so a crafted file can crash it; it runs in the sandbox (`reading.sandbox`), never in a server.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ UNREADABLE = (
     ValueError, TypeError, KeyError, IndexError, OSError, NotImplementedError, zlib.error, struct.error, NameError, ArithmeticError,
     EOFError, AttributeError, RecursionError, scipy.io.matlab.MatReadError,
 )  # fmt: skip
-"""What SciPy raises at damaged files; NameError where it does not expect a class."""
+"""Exceptions of SciPy's reader for damaged files; NameError for unexpected classes."""
 
 MAX_DEPTH = 4
 MAX_ARRAYS = 256

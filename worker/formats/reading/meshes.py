@@ -23,7 +23,7 @@ NOT_A_MESH = "Give an OBJ, PLY, glTF or npz mesh, a grid size such as 48x64, or 
 
 
 def read_obj(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
-    """Read `v` and `f` of a Wavefront OBJ; everything else is passed over.
+    """Read `v` and `f` of a Wavefront OBJ; everything else is ignored.
 
     Returns
     -------
@@ -121,10 +121,10 @@ def given_vertices(arrays: Arrays, *, num_points: int, field: str) -> None:
 
 
 def mismatch(field: str, num_points: int, num_vertices: int) -> InvalidInput:
-    """Say that the mesh and the tracks do not belong together."""
+    """Return the error for a mesh that does not match the tracks."""
     return refusal(
         "vertex_count_mismatch", field, expected=f"{num_points} vertices, as the tracks have points", got=f"{num_vertices}",
-        hint="Vertex i of the mesh must be point i of the tracks, in the same order; give no mesh to have one made.",
+        hint="Vertex i of the mesh must be point i of the tracks, in the same order; omit the mesh to have one generated.",
     )  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""The parsers that run in a child process, by name, and how a file is recognised as theirs."""
+"""The parsers that run in the sandbox, by name, and detection of their formats."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pliant.worker.formats.records import Arrays, Limits
 
 @dataclass(frozen=True, slots=True)
 class Parser:
-    """A parser by name: its libraries are loaded when they are needed, since a child that parses a PNG needs no SciPy."""
+    """A parser by module and name, so that the sandbox imports only the libraries of the parser it runs."""
 
     module: str
     function: str
@@ -75,7 +75,7 @@ def recognise(head: bytes, field: str) -> str:
 
 
 def parse(parser: Callable[..., Arrays], stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
-    """Run a parser; running out of memory is the file's fault, since the limits left enough for honest ones."""
+    """Run a parser; a MemoryError becomes an input error, since the limits are sufficient for valid files."""
     try:
         return parser(stream, field=field, limits=limits)
     except MemoryError as error:
@@ -83,7 +83,7 @@ def parse(parser: Callable[..., Arrays], stream: IO[bytes], *, field: str, limit
 
 
 def unknown_format(field: str, head: bytes) -> InvalidInput:
-    """Say that none of the readers knows the file."""
+    """Return the error for a file of an unknown format."""
     mesh = "npz, npy, OBJ, PLY, glTF, GLB or a PNG mask"
     kinds = mesh if field == "mesh" else "npz, npy, MATLAB .mat, CSV, or DeepLabCut, SLEAP and MediaPipe exports"
     return refusal(

@@ -1,4 +1,4 @@
-"""Parse an untrusted file in a process that can be lost without harm.
+"""The sandbox: parse an untrusted file in a restricted process.
 
 Every format but plain .npy and .npz is parsed here. The process starts with two open files, the input and the output, and then gives up
 the right to open another descriptor (RLIMIT_NOFILE = 0), so a parser that is taken over reaches no other file and no network. Its
@@ -32,7 +32,7 @@ def parse_in_sandbox(parser: str, path: Path, *, field: str, limits: Limits) -> 
     Raises
     ------
     InvalidInput
-        What the parser refuses; too_large beyond the memory, too_slow beyond the time, damaged_file when it crashed the parser.
+        The parser's error; too_large above the memory limit, too_slow above the time limit, damaged_file after a crash.
     """
     from pliant.worker.formats.reading.arrays import read_file
 
@@ -56,7 +56,7 @@ def _fault(ended: Ended, *, field: str, limits: Limits) -> InvalidInput:
     if ended.code == REFUSED:
         parts = refusal_in(ended)
         if parts is None:
-            return damaged(field, "a file that confuses its reader")
+            return damaged(field, "a file that its reader cannot process")
         del parts["choices"]
         return InvalidInput(parts.pop("code"), **parts)
     if ended.overdue or ended.code in (-signal.SIGXCPU, -signal.SIGKILL):

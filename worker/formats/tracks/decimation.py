@@ -38,22 +38,22 @@ def thin(
     Parameters
     ----------
     points : ndarray, shape (F, P, 2)
-        Of the chosen frames; NaN where not seen.
+        Points of the selected frames; NaN where hidden.
     visible : ndarray, shape (F, P), optional
         Confidence.
     mesh : Mesh, optional
-        The mesh of all points; None: the points are a list, whose neighbours are not known yet.
+        The mesh of all points; None if neighbours are not known yet.
     options : Options
         `stride` and `max_points`.
 
     Returns
     -------
     kept : ndarray
-        Indices of the kept points, rising.
+        Indices of the kept points, increasing.
     mesh : Mesh or None
-        The mesh of the kept points; None where none was given.
+        The mesh of the kept points; None without `mesh`.
     notes : list of str
-        What was done.
+        Notes for the interpretation.
 
     Raises
     ------
@@ -128,7 +128,7 @@ def _thin_mesh(
         f"{len(mesh.faces)} faces became {len(coarse.faces)}."
     ]
     if alone:
-        notes.append(f"{alone} of the points used belong to no face, so no smoothness in space reaches them.")
+        notes.append(f"{alone} of the points used belong to no face and have no smoothness in space.")
     return kept, coarse, notes
 
 
@@ -138,13 +138,13 @@ def spread(places: NDArray[np.float64], seen: NDArray[np.bool], limit: int, part
     Parameters
     ----------
     places : ndarray, shape (m, P, 2)
-        Places in some frames.
+        Positions in some frames.
     seen : ndarray of bool, shape (m, P)
-        Where the places mean something.
+        Whether the positions are valid.
     limit : int
-        Most points.
+        Maximum number of points.
     parts : ndarray, shape (P,), optional
-        Number of the connected part that each point belongs to; each is sampled by itself.
+        Index of each point's connected component; components are sampled separately.
     """
     with np.errstate(invalid="ignore"):
         weight = seen[..., None].astype(np.float64)

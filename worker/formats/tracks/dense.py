@@ -1,4 +1,4 @@
-"""Batch axes, and tracks of every pixel of a picture: arrays of four and five axes brought to three, and the pixel grid they came from."""
+"""Batch axes and tracks of all pixels: arrays of four and five axes reduced to three, with the original pixel grid."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ class Flat:
     """Two axes (a matrix), or three of which one is the coordinates."""
 
     grid: tuple[int, int] | None = None
-    """Rows and columns, where the points were the pixels of a picture; point index = row · columns + column."""
+    """Rows and columns, if the points were the pixels of a picture; point index = row · columns + column."""
 
 
 def flatten(name: str, array: NDArray[np.generic], *, field: str) -> Flat:
-    """Remove a batch axis of length 1, and lay the pixels of whole pictures in a row.
+    """Remove a batch axis of length 1, and flatten the pixels of pictures.
 
-    Whole pictures are `(F, H, W, 2 or 3)` or `(F, 2, H, W)`, with or without a batch axis. Four axes whose first is longer than 1
-    are pictures if the first frame's x rises along the columns and y along the rows; else they are a batch.
+    Pictures are `(F, H, W, 2 or 3)` or `(F, 2, H, W)`, with or without a batch axis. Four axes with a first axis longer than 1 are
+    pictures if the first frame's x increases along the columns and y along the rows; otherwise they are a batch.
 
     Raises
     ------

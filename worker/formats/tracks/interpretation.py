@@ -1,4 +1,4 @@
-"""From named arrays to tracks: which array, which axis, what its numbers and its visibility mean, which way is up; each said in words."""
+"""Interpretation of named arrays as tracks: array, axes, units, visibility and direction of y, each with a note."""
 
 from __future__ import annotations
 
@@ -13,7 +13,15 @@ from pliant.worker.formats.records import Arrays
 from pliant.worker.formats.tracks.dense import flatten
 from pliant.worker.formats.tracks.layouts import Reading, choose
 from pliant.worker.formats.tracks.pixels import Placed, place, project
-from pliant.worker.formats.tracks.tracker_formats import INTRINSICS, PLAIN, TRUE_SHAPES, Dialect, recognise, short_names
+from pliant.worker.formats.tracks.tracker_formats import (
+    INTRINSICS,
+    OWN,
+    PLAIN,
+    TRUE_SHAPES,
+    Dialect,
+    recognise,
+    short_names,
+)
 from pliant.worker.formats.tracks.visibility import find_visibility
 
 CENTRED = 0.05
@@ -22,24 +30,24 @@ CENTRED = 0.05
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Understood:
-    """A track array, interpreted but not yet checked."""
+    """A track array, interpreted but not yet validated."""
 
     points: NDArray[np.generic]
     """Shape `(F, P, 2)`."""
 
     visible: NDArray[np.float64] | None
-    """Shape `(F, P)`, or None: all that is finite."""
+    """Shape `(F, P)`; None: all finite points are visible."""
 
     format: str
     layout: str
     coordinates: str
     y_axis: str
     grid: tuple[int, int] | None
-    """Rows and columns, where the points are all the pixels of a picture."""
+    """Rows and columns, if the points are all pixels of a picture."""
 
     notes: list[str]
     arrays: Arrays
-    """All that the file held, for truth that came along."""
+    """All arrays of the file, which may include ground truth."""
 
 
 def understand(arrays: Arrays, options: Options) -> Understood:
@@ -50,10 +58,12 @@ def understand(arrays: Arrays, options: Options) -> Understood:
     InvalidInput
         Codes missing_array, missing_image_size, wrong_type, wrong_shape.
     AmbiguousInput
-        Two readings fit.
+        Several interpretations fit.
     """
     named = short_names(arrays)
     dialect, name = _recognised(named)
+    if dialect.name == OWN:
+        return _of_our_tracker(named, name, options)
     flat = flatten(name, _numeric(named[name], name), field="tracks")
     array, depths, named = _two_numbers(flat.array, name, dialect, named)
     reading, notes = choose(name, array, dialect=dialect, options=options, field="tracks")
@@ -75,24 +85,39 @@ def understand(arrays: Arrays, options: Options) -> Understood:
     )  # fmt: skip
 
 
+def _of_our_tracker(named: Arrays, name: str, options: Options) -> Understood:
+    """Read tracks whose axes, unit and direction are known; visibility and mesh follow from the rest of the file."""
+    points = _numeric(named[name], name)
+    if points.ndim != 3 or points.shape[2] != 2:
+        raise refusal(
+            "wrong_shape", f"tracks.{name}", expected="(frames, points, 2), as pliant track writes it", got=str(points.shape),
+            hint="Save the file of pliant track as it is, or leave frame_indices out.",
+        )  # fmt: skip
+    y_axis = "down" if options.y_axis == "auto" else options.y_axis
+    return Understood(
+        points=points, visible=None, format=OWN, layout="tracks (F, P, 2)", coordinates="pixels", y_axis=y_axis, grid=None,
+        notes=["Recognised as the output of pliant track."], arrays=named,
+    )  # fmt: skip
+
+
 def upwards(points: NDArray[np.generic], options: Options) -> tuple[str, list[str]]:
-    """Which way y grows: as told, else down unless the coordinates are centred on zero, as no picture's are."""
+    """Return the direction of y: from the options, else down unless the coordinates are centred on zero, unlike pixels."""
     if options.y_axis != "auto":
-        return options.y_axis, [f"y points {options.y_axis}, as asked."]
+        return options.y_axis, [f"y points {options.y_axis}, as set by y_axis."]
     flat = points.reshape(-1, 2)[:: max(1, points.shape[0] * points.shape[1] // 100_000)]
     finite = flat[np.isfinite(flat).all(axis=1)]
     shares = (finite < 0).mean(axis=0) if len(finite) else np.zeros(2)
     if (shares >= CENTRED).all():
         return "up", [
-            f"y is taken to point up: {shares[1]:.0%} of its values are negative, so these are not pixels of a picture."
+            f"y is assumed to point up: {shares[1]:.0%} of its values are negative, so these are not pixels of a picture."
         ]
-    return "down", ["y is taken to point down, as in pictures: coordinates are not centred on zero."]
+    return "down", ["y is assumed to point down, as in pictures: coordinates are not centred on zero."]
 
 
 def _two_numbers(
     array: NDArray[np.generic], name: str, dialect: Dialect, named: Arrays
 ) -> tuple[NDArray[np.generic], NDArray[np.generic] | None, Arrays]:
-    """Split off a third number of each point: visibility joins the named arrays, a point in space is returned whole."""
+    """Split off a third number of each point: visibility is added to the arrays; points in space are returned unchanged."""
     if array.ndim != 3 or array.shape[-1] != 3 or 2 in array.shape[:2]:
         return array, None, named
     if dialect.third == "depth" or any(one in named for one in INTRINSICS):
@@ -109,7 +134,7 @@ def _two_numbers(
 
 
 def _projected(depths: NDArray[np.generic], reading: Reading, named: Arrays) -> Placed:
-    """Take the picture of points in space; where no truth came along, they are the truth."""
+    """Project points in space; unless the file has ground truth, they are used as such."""
     spatial = depths.transpose(1, 0, 2) if reading.order == "points_frames" else depths
     intrinsics = next((named[one] for one in INTRINSICS if one in named), None)
     points, kind, notes = project(spatial, intrinsics)

@@ -1,8 +1,8 @@
-"""Which axis is what. Every reading that an array's shape allows is tried; documentation and smoothness in time decide.
+"""Detection of the axes of a track array: documented layouts are preferred, otherwise temporal smoothness decides.
 
-Tracks hardly move from one frame to the next, while the points of one frame lie all over the picture. So of two readings the right
-one has the smaller mean step in time, measured against the spread of the coordinates. In a matrix whose rows are taken for x and y
-in the wrong order, x and y of a reading are two neighbouring frames of one coordinate, so they are almost equal: that tells too.
+Points move little between frames, while the points of one frame are spread over the picture. The correct layout therefore has the
+smallest mean step in time relative to the spread of the coordinates. If rows of a matrix are assigned to x and y in the wrong order,
+x and y are neighbouring frames of one coordinate and almost equal, which is detected by their correlation.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from pliant.worker.formats.records import FARTHEST
 from pliant.worker.formats.tracks.tracker_formats import Dialect
 
 CONTRADICTED = 5.0
-"""The documented order is doubted when another reading is this many times smoother in time."""
+"""Ratio of temporal smoothness above which another layout replaces the documented one."""
 
 DECISIVE = 1.3
-"""Without a documented order, the best reading must beat the next by this factor."""
+"""Ratio of temporal smoothness by which the best undocumented layout must exceed the next."""
 
 ALIKE = 0.98
-"""Correlation of x and y over the points, in the median frame, above which they are one coordinate taken twice."""
+"""Correlation of x and y over the points, in the median frame, above which both are the same coordinate."""
 
 SAMPLE = 96
 
 MANY_FRAMES = 10_000
-"""No video has more; a list of all pixels has, and its neighbours are closer to each other than one frame to the next."""
+"""Maximum length of the frame axis. A longer axis lists pixels, whose neighbours are closer than consecutive frames."""
 
 OF_ANY_ORDER = ("matrix", "unnamed")
 """Dialects whose arrays of three axes have no documented order."""
@@ -38,10 +38,10 @@ OF_ANY_ORDER = ("matrix", "unnamed")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reading:
-    """One way to see an array as tracks."""
+    """One interpretation of an array as tracks."""
 
     layout: str
-    """In words, e.g. `W (2F, P), rows interleaved`."""
+    """Description, e.g. `W (2F, P), rows interleaved`."""
 
     order: str
     """Option `layout` that selects it."""
@@ -59,7 +59,7 @@ class Reading:
 
 
 def readings(name: str, array: NDArray[np.generic]) -> list[Reading]:
-    """Every way to read an array as `(F, P, 2)`; those with fewer than 3 frames or 4 points only if there is no other."""
+    """Return all interpretations of an array as `(F, P, 2)`; those with fewer than 3 frames or 4 points only as a last resort."""
     found: list[Reading] = []
     if array.ndim == 3:
         for axis in [axis for axis in (2, 1, 0) if array.shape[axis] == 2]:
@@ -86,7 +86,7 @@ def readings(name: str, array: NDArray[np.generic]) -> list[Reading]:
 
 
 def roughness(points: NDArray[np.generic]) -> float:
-    """Mean step in time over the spread of the coordinates, of a sample; infinite if x and y are the same coordinate."""
+    """Return the mean step in time over the spread of the coordinates, for a sample; infinite if x and y are the same."""
     count = points.shape[1]
     chosen = np.unique(np.linspace(0, count - 1, SAMPLE).round().astype(int))
     sample = np.asarray(points[: 4 * SAMPLE][:, chosen], dtype=np.float64)
@@ -112,16 +112,16 @@ def roughness(points: NDArray[np.generic]) -> float:
 def choose(
     name: str, array: NDArray[np.generic], *, dialect: Dialect, options: Options, field: str
 ) -> tuple[Reading, list[str]]:
-    """Pick the reading that was asked for, that is documented, or that the data show.
+    """Select the interpretation that the options request, that is documented, or that the data indicate.
 
     Parameters
     ----------
     name, array
         As found in the file, batch axis removed.
     dialect : Dialect
-        Its documented order is kept unless another is five times smoother in time.
+        Its documented layout is used unless another is five times smoother in time.
     options : Options
-        `layout` and `rows` overrule detection.
+        `layout` and `rows` take precedence over detection.
 
     Returns
     -------
@@ -132,11 +132,11 @@ def choose(
     Raises
     ------
     InvalidInput
-        Code wrong_shape when no reading fits.
+        Code wrong_shape if no interpretation fits.
     AmbiguousInput
         When several do.
     """
-    allowed = [one for one in readings(name, array) if _asked_for(one, options)]
+    allowed = [one for one in readings(name, array) if _is_allowed(one, options)]
     if not allowed:
         raise refusal(
             "wrong_shape", field, expected="(frames, points, 2) or a matrix of 2·frames rows, with 3 frames and 4 points or more",
@@ -158,11 +158,11 @@ def choose(
     ]
     raise AmbiguousInput(
         field=field, expected="tracks whose layout is certain", got=f"{name} of shape {array.shape}, which can be read as "
-        + " or ".join(one.layout for one in ranked), hint="Set the options layout and rows to the reading that is right.", choices=choices,
+        + " or ".join(one.layout for one in ranked), hint="Set the options layout and rows to the correct one.", choices=choices,
     )  # fmt: skip
 
 
-def _asked_for(reading: Reading, options: Options) -> bool:
+def _is_allowed(reading: Reading, options: Options) -> bool:
     return options.layout in ("auto", reading.order) and (
         reading.rows is None or options.rows in ("auto", reading.rows)
     )
@@ -176,6 +176,4 @@ def _evidence(best: Reading, rival: Reading, costs: dict[str, float]) -> str:
 
 
 def _number(cost: float) -> str:
-    return (
-        f"{cost:.3g} of the coordinates' spread" if np.isfinite(cost) else "x and y would be one coordinate taken twice"
-    )
+    return f"{cost:.3g} of the coordinates' spread" if np.isfinite(cost) else "x and y would be the same coordinate"

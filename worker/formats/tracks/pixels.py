@@ -1,4 +1,4 @@
-"""What two numbers mean: pixels, fractions of the picture, x before y or after it; and points before a camera as its picture shows them."""
+"""Conversion of coordinates to pixels: fractions of the picture, order of x and y, and projection of points in space."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from pliant.worker.formats.records import FARTHEST
 SAMPLE = 100_000
 SLACK = 0.02
 MOST = 0.9
-"""Fractions of a picture: this share of the points lies inside it, and none farther outside than the picture is large."""
+"""Share of points that must lie inside the picture for coordinates to be fractions of it; none may lie a picture size outside."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Placed:
-    """Points in one unit for x and y."""
+    """Points with the same unit for x and y."""
 
     points: NDArray[np.generic]
     """Shape `(F, P, 2)`, x first."""
 
     coordinates: str
-    """`pixels` (or a unit of their own), `unit` or `signed`: how they came."""
+    """Original unit: `pixels` (or another common unit), `unit` or `signed`."""
 
     notes: list[str]
 
 
 def place(points: NDArray[np.generic], options: Options, *, picture: tuple[int, int] | None = None) -> Placed:
-    """Bring coordinates to pixels where they are fractions of the picture, and x before y.
+    """Convert fractions of the picture to pixels, and the coordinate order to x, y.
 
     Parameters
     ----------
@@ -40,14 +40,14 @@ def place(points: NDArray[np.generic], options: Options, *, picture: tuple[int, 
     options : Options
         `coordinates`, `image_size` and `coordinate_order`.
     picture : tuple of int, optional
-        Width and height, where the points are all the pixels of a picture.
+        Width and height, if the points are all pixels of a picture.
 
     Raises
     ------
     InvalidInput
         Code missing_image_size.
     AmbiguousInput
-        Code ambiguous_coordinates: values from 0 to 1, which may be fractions of a picture or a unit of their own.
+        Code ambiguous_coordinates: values from 0 to 1, which may be fractions of a picture or another unit.
     """
     size = _size(options.image_size)
     sample = _sampled(points)
@@ -65,13 +65,13 @@ def place(points: NDArray[np.generic], options: Options, *, picture: tuple[int, 
     wide = np.asarray(points, dtype=np.float64)
     with np.errstate(over="ignore", invalid="ignore"):
         placed = wide * last if kind == "unit" else (wide + 1.0) * (last / 2.0)
-    return Placed(placed, kind, [*notes, *why, f"Brought to pixels of a picture of {size[0]} × {size[1]}."])
+    return Placed(placed, kind, [*notes, *why, f"Converted to pixels of a picture of {size[0]} × {size[1]}."])
 
 
 def project(
     points: NDArray[np.generic], intrinsics: NDArray[np.generic] | None
 ) -> tuple[NDArray[np.float64], str, list[str]]:
-    """Take the picture of points before a camera: x = fx X / Z + cx, y = fy Y / Z + cy; NaN for those not before it.
+    """Project points in camera coordinates: x = fx X / Z + cx, y = fy Y / Z + cy; NaN for points behind the camera.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ def project(
     depth = np.where(wide[..., 2] > 0, wide[..., 2], np.nan)
     with np.errstate(over="ignore", invalid="ignore"):
         seen = np.stack([fx * wide[..., 0] / depth + cx, fy * wide[..., 1] / depth + cy], axis=-1)
-    note = f"Points in space, projected with fx = {fx:g}, fy = {fy:g}, cx = {cx:g}, cy = {cy:g}; the points themselves serve as truth."
+    note = f"Points in space, projected with fx = {fx:g}, fy = {fy:g}, cx = {cx:g}, cy = {cy:g}; the points are used as ground truth."
     return seen, "projected", [note]
 
 
@@ -129,28 +129,28 @@ def _ordered(
 ) -> tuple[NDArray[np.generic], NDArray[np.float64], list[str]]:
     turned, notes = options.coordinate_order == "yx", []
     if turned:
-        notes = ["Coordinates read as y, x, as asked."]
+        notes = ["Coordinates read as y, x, as set by coordinate_order."]
     elif options.coordinate_order == "auto" and size is not None and len(sample):
         inside = [(sample <= np.array(limits)).all(axis=1).mean() for limits in (size, size[::-1])]
         turned = bool(inside[0] < MOST and inside[1] >= 0.99)
         if turned:
             notes = [
-                f"Coordinates read as y, x: so {inside[1]:.0%} of them lie inside {size[0]} × {size[1]}, as x, y only {inside[0]:.0%}."
+                f"Coordinates read as y, x: {inside[1]:.0%} of them lie inside {size[0]} × {size[1]}, but only {inside[0]:.0%} as x, y."
             ]
     return (points[..., ::-1], sample[:, ::-1], notes) if turned else (points, sample, notes)
 
 
 def _kind(sample: NDArray[np.float64], options: Options, size: tuple[int, int] | None) -> tuple[str, list[str]]:
     if options.coordinates != "auto":
-        return options.coordinates, [f"Coordinates taken as {options.coordinates}, as asked."]
+        return options.coordinates, [f"Coordinates read as {options.coordinates}, as set by coordinates."]
     if not len(sample) or not (np.ptp(sample, axis=0) > 0).any():
         return "pixels", []
     low, high = sample.min(axis=0), sample.max(axis=0)
-    said = f"values from {low.min():.3g} to {high.max():.3g}"
+    observed = f"values from {low.min():.3g} to {high.max():.3g}"
     if low.min() >= -1 and high.max() <= 2 and _inside(sample, 0.0, 1.0) >= MOST:
         if size is None:
-            raise _fractions_or_not(said)
-        return "unit", [f"Coordinates are fractions of the picture: {said}."]
+            raise _fractions_or_not(observed)
+        return "unit", [f"Coordinates are fractions of the picture: {observed}."]
     if (
         size is not None
         and min(size) > 4
@@ -158,7 +158,7 @@ def _kind(sample: NDArray[np.float64], options: Options, size: tuple[int, int] |
         and high.max() <= 3
         and _inside(sample, -1.0, 1.0) >= MOST
     ):
-        return "signed", [f"Coordinates run from −1 to 1 over the picture: {said}."]
+        return "signed", [f"Coordinates run from −1 to 1 over the picture: {observed}."]
     return "pixels", []
 
 
@@ -166,15 +166,15 @@ def _inside(sample: NDArray[np.float64], low: float, high: float) -> float:
     return float(((sample >= low - SLACK) & (sample <= high + SLACK)).all(axis=1).mean())
 
 
-def _fractions_or_not(said: str) -> AmbiguousInput:
+def _fractions_or_not(observed: str) -> AmbiguousInput:
     choices: list[dict[str, Any]] = [
         {
             "layout": "fractions of the picture's width and height", "options": {"coordinates": "unit"},
-            "evidence": f"{said}; give image_size=WIDTHxHEIGHT too",
+            "evidence": f"{observed}; give image_size=WIDTHxHEIGHT too",
         },
-        {"layout": "one unit for x and y, taken as it is", "options": {"coordinates": "pixels"}, "evidence": said},
+        {"layout": "one unit for x and y, unchanged", "options": {"coordinates": "pixels"}, "evidence": observed},
     ]  # fmt: skip
     return AmbiguousInput(
-        code="ambiguous_coordinates", field="tracks", expected="coordinates whose unit is certain", got=said,
+        code="ambiguous_coordinates", field="tracks", expected="coordinates whose unit is certain", got=observed,
         hint="Give the option image_size=WIDTHxHEIGHT if they are fractions of the picture, else coordinates=pixels.", choices=choices,
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Which frames and points of the input are worked on, and which points are seen too seldom to say anything."""
+"""Selection of frames, and exclusion of sparsely observed points."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pliant.solver.records import MIN_FRAMES
 from pliant.worker.formats.errors import refusal
 
 SHOWN = 10
-"""Point numbers that a note lists."""
+"""Maximum number of point indices listed in a note."""
 
 
 def chosen_frames(text: str | None, num_frames: int) -> tuple[NDArray[np.intp], list[str]]:
@@ -29,7 +29,7 @@ def chosen_frames(text: str | None, num_frames: int) -> tuple[NDArray[np.intp], 
     if len(frames) < MIN_FRAMES:
         raise refusal(
             "no_frames_left", "options.frames", expected=f"at least {MIN_FRAMES} of the {num_frames} frames",
-            got=f"{len(frames)} by {text}", hint="Widen the range, or leave frames out for all of them.",
+            got=f"{len(frames)} by {text}", hint="Widen the range, or omit frames to use all of them.",
         )  # fmt: skip
     note = f"Frames {text}: {len(frames)} of {num_frames}, from {frames[0]} to {frames[-1]}"
     if step is not None and step > 1:
@@ -37,19 +37,19 @@ def chosen_frames(text: str | None, num_frames: int) -> tuple[NDArray[np.intp], 
     return frames, [f"{note}."]
 
 
-def hide_seldom_seen(
+def hide_sparsely_observed(
     points: NDArray[np.generic], visible: NDArray[np.float64] | None, mesh: Mesh | None, options: Options
 ) -> tuple[NDArray[np.float64], NDArray[np.intp], list[str]]:
-    """Take the weight from points that are seen in too few frames.
+    """Set the weight of points that are visible in too few frames to 0.
 
     Parameters
     ----------
     points : ndarray, shape (F, P, 2)
-        NaN where not seen.
+        NaN where hidden.
     visible : ndarray, shape (F, P), optional
         Confidence.
     mesh : Mesh, optional
-        Whether neighbours can say where such a point is.
+        Determines whether such points have neighbours to follow.
     options : Options
         `min_seen`.
 
@@ -60,12 +60,12 @@ def hide_seldom_seen(
     dropped : ndarray
         Their indices.
     notes : list of str
-        How many, which, and what the result holds for them.
+        Their number, indices, and position in the result.
 
     Raises
     ------
     InvalidInput
-        Code nothing_visible, when that leaves no point.
+        Code nothing_visible, if no point remains.
     """
     confidence = np.ones(points.shape[:2]) if visible is None else np.array(visible, dtype=np.float64)
     confidence[~np.isfinite(points).all(axis=2)] = 0.0
@@ -74,20 +74,20 @@ def hide_seldom_seen(
         return confidence, dropped, []
     if len(dropped) == points.shape[1] and confidence.any():
         raise refusal(
-            "nothing_visible", "options.min_seen", expected=f"points that are seen in {options.min_seen} frames or more",
+            "nothing_visible", "options.min_seen", expected=f"points that are visible in {options.min_seen} or more frames",
             got=f"none of {len(dropped)}", hint="Set min_seen lower.",
         )  # fmt: skip
     confidence[:, dropped] = 0.0
     shown = ", ".join(str(index) for index in dropped[:SHOWN]) + (" …" if len(dropped) > SHOWN else "")
     notes = [
-        f"{len(dropped)} points are seen in fewer than {options.min_seen} frames and left out of the solve (points {shown}). They "
-        "keep their place in the result."
+        f"{len(dropped)} points are visible in fewer than {options.min_seen} frames and excluded from the solve (points {shown}). They "
+        "keep their index in the result."
     ]
     near = np.zeros(0, dtype=np.intp) if mesh is None else np.intersect1d(dropped, mesh.faces)
     if len(near):
         notes.append(f"{len(near)} of them follow their neighbours on the mesh.")
     if len(near) < len(dropped):
         notes.append(
-            f"{len(dropped) - len(near)} of them belong to no face: nothing says where they are, and their coordinates mean nothing."
+            f"{len(dropped) - len(near)} of them belong to no face: their position is undetermined and their coordinates are meaningless."
         )
     return confidence, dropped, notes

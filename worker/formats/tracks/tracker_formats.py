@@ -1,11 +1,12 @@
-"""Who writes tracks how: one row for each program or data set whose files are known.
+"""Track formats of known programs and data sets, one record each.
 
 Sources: each project's documented output at the time of writing. CoTracker `pred_tracks (B, T, N, 2)` and `pred_visibility`; TAPIR,
 BootsTAPIR and LocoTrack `tracks (B, N, T, 2)` with `occlusion` and `expected_dist` logits; TAPNext `(B, T, N, 2)` with
 `visible_logits` (its model returns y before x, its demonstrations turn that round); TAP-Vid `points (N, T, 2)` with `occluded`;
 AllTracker `trajs_e` and `visconfs_e`, or whole pictures `(B, T, 2, H, W)`; PIPs++ `trajs_e`; DOT `(B, T, H, W, 3)` or `(B, T, N, 3)`
 with visibility as the third number; TAPVid-3D `tracks_xyz` in metres before the camera; MATLAB data sets of non-rigid structure from
-motion `W`, `S`, `Rs`. DeepLabCut, SLEAP and MediaPipe: the names that `reading.pose_tables` and `reading.pose_hdf5` give their arrays.
+motion `W`, `S`, `Rs`. Pliant's own tracker is known by `frame_indices`. DeepLabCut, SLEAP and MediaPipe: the names that
+`reading.pose_tables` and `reading.pose_hdf5` give their arrays.
 """
 
 from __future__ import annotations
@@ -22,26 +23,30 @@ Third = Literal["visibility", "depth"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Dialect:
-    """One way to name and lay out tracks."""
+    """Array names and layout of one track format."""
 
     name: str
     tracks: tuple[str, ...]
-    """Names that the track array goes by."""
+    """Names of the track array."""
 
     needs: tuple[str, ...] = ()
-    """At least one of these must be there too; none: nothing more is needed."""
+    """At least one of these arrays must be present; empty: no further array is required."""
 
     order: Order | None = "frames_points"
-    """Axis order by documentation; None: from the data."""
+    """Documented axis order; None: detected from the data."""
 
     third: Third | None = None
-    """What a third number for each point means; None: there are two numbers. `depth`: metres before the camera, X, Y, Z."""
+    """Meaning of a third number per point; None: there are two numbers. `depth`: X, Y, Z in metres in front of the camera."""
 
     note: str = ""
-    """A sentence that whoever uses this format should read."""
+    """Note for users of this format."""
 
+
+OWN = "Pliant"
+"""The output of `pliant track`; what else it holds is read by `film_tracks`."""
 
 DIALECTS = (
+    Dialect(name=OWN, tracks=("tracks",), needs=("frame_indices",)),
     Dialect(name="CoTracker", tracks=("pred_tracks",)),
     Dialect(
         name="AllTracker", tracks=("trajs_e", "traj_maps_e"), needs=("visconfs_e", "visconf_maps_e"),
@@ -70,10 +75,10 @@ DIALECTS = (
     Dialect(name="unnamed", tracks=("array", "arr_0")),
 )  # fmt: skip
 PLAIN = ("canonical", "matrix", "unnamed")
-"""Dialects that are nobody's in particular."""
+"""Names of the generic dialects."""
 
 HIDING = ("occlusion", "occlusions", "occluded", "MD")
-"""Names that say hidden where others say seen."""
+"""Names of arrays that mark hidden instead of visible points."""
 
 VISIBILITY = (
     "visibility", "visible", "visibles", "pred_visibility", "vis", "mask", "vis_e", "visconfs_e", "visconf_maps_e", "visible_logits",
@@ -84,8 +89,8 @@ TRUE_SHAPES = ("shapes", "S", "S_gt", "Shat_gt", "S_GT", "P3_gt", "GT", "gt")
 TRUE_ROTATIONS = ("rotations", "Rs", "R_gt", "Rs_gt", "R", "RO")
 
 TRACKS = frozenset(name for dialect in DIALECTS for name in dialect.tracks)
-KNOWN = TRACKS | {*VISIBILITY, *INTRINSICS, *TRUE_SHAPES, *TRUE_ROTATIONS}
-"""Every name that a reader of tracks looks at; other members of an npz are never inflated."""
+KNOWN = TRACKS | {"frame_indices", *VISIBILITY, *INTRINSICS, *TRUE_SHAPES, *TRUE_ROTATIONS}
+"""All array names that the track reader uses; other members of an npz are never inflated."""
 
 
 def short_names(arrays: Arrays) -> Arrays:
@@ -126,5 +131,5 @@ def _two_of_one_name(one: str, other: str) -> AmbiguousInput:
     choices: list[dict[str, Any]] = [{"layout": name, "options": {}} for name in (one, other)]
     return AmbiguousInput(
         field="tracks", expected="one track array", got=f"{one} and {other}",
-        hint="Save the one that is meant in a file of its own.", choices=choices,
+        hint="Save the intended one in a separate file.", choices=choices,
     )  # fmt: skip

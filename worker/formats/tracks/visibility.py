@@ -1,4 +1,4 @@
-"""What trackers say about visibility: bool, probability, logits, occlusion instead of visibility, or two numbers to combine."""
+"""Visibility as written by trackers: bool, probability, logits, occlusion, or two numbers to combine."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pliant.worker.formats.tracks.layouts import Reading
 from pliant.worker.formats.tracks.tracker_formats import HIDING, VISIBILITY
 
 SURE = 0.5
-"""A probability below this means hidden: trackers extrapolate there; above, it is kept as the weight."""
+"""Probability below which a point counts as hidden, since trackers extrapolate there; above, it is kept as the weight."""
 
 TWO_MAPS = ("visconfs_e", "visconf_maps_e")
 """AllTracker's names: the first channel is visibility, the second confidence."""
@@ -22,23 +22,23 @@ TWO_MAPS = ("visconfs_e", "visconf_maps_e")
 def find_visibility(
     named: Arrays, reading: Reading, *, grid: tuple[int, int] | None, kind: str
 ) -> tuple[NDArray[np.float64], list[str]] | None:
-    """Confidence that each point is seen, in the order of the tracks.
+    """Return the confidence that each point is visible, in the order of the tracks.
 
     Parameters
     ----------
     named : dict
         The arrays of the tracks file.
     reading : Reading
-        How the tracks were read; visibility goes the same way.
+        Interpretation of the tracks, applied to visibility as well.
     grid : tuple of int, optional
-        Rows and columns of the picture whose pixels the points are.
+        Rows and columns of the picture, if the points are its pixels.
     kind : str
         The option `visibility`: auto, bool, probability or logits.
 
     Returns
     -------
     tuple or None
-        Confidence in [0, 1], shape `(F, P)`, and the notes; None when the file says nothing.
+        Confidence in [0, 1], shape `(F, P)`, and notes; None if the file has no visibility.
 
     Raises
     ------
@@ -69,9 +69,9 @@ def find_visibility(
 
 
 def _check_number(name: str, array: NDArray[np.generic], reading: Reading) -> None:
-    """Refuse an array with more values than the tracks explain, before it is converted to eight times its size.
+    """Reject an array with too many values for the tracks, before it is converted to eight times its size.
 
-    Two values for each observation are the most: visibility and confidence, or one for x and one for y.
+    There are at most two values per observation: visibility and confidence, or one for x and one for y.
     """
     frames, points = reading.points.shape[:2]
     if array.size > 2 * frames * points:
@@ -101,7 +101,7 @@ def _confidence(
 
 
 def _meant(name: str, values: NDArray[np.float64], kind: str) -> tuple[NDArray[np.float64], str]:
-    """Numbers as probabilities, and in words what they were."""
+    """Return numbers as probabilities, and a description of what they were."""
     finite = values[np.isfinite(values)]
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
     if kind == "auto":

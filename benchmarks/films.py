@@ -1,0 +1,229 @@
+"""Films end to end: accuracy of tracks and shapes, and what tracking costs.
+
+    python -m benchmarks.films rendered [--only NAME] [--frames N] [--size WxH] [--points N] [--out FILE]
+    python -m benchmarks.films recorded FOLDER [--points N] [--out FILE]
+    python -m benchmarks.films speed [--seconds S] [--size WxH] [--threads N] [--out FILE]
+
+`rendered` renders gallery surfaces with texture, background, blur and noise, tracks them, and solves the tracks found and, for the same
+points, the exact ones. `recorded` takes a folder with `film.mp4`, `mask.png` and `truth.npz` (`frames`, `pixels (K, N, 2)`, `shapes
+(K, N, 3)`). The focal length is never given. `speed` tracks a made-up film of moving texture in a process of its own and prints seconds
+and peak memory, for the film and for its first quarter. Results are appended as JSON lines; what FILE holds is not measured again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from pliant.solver import Mesh, Settings, Tracks, solve
+from pliant.solver.evaluation.metrics import e3d_frame_scaled
+from pliant.solver.gallery import Sequence, face, flag, sphere
+from pliant.tracking import TrackedFilm, open_film, track_film
+from pliant.tracking.rendering import RenderedFilm, Truth, render_film
+from scipy.interpolate import LinearNDInterpolator
+
+SCENES: dict[str, tuple[Callable[[int], Sequence], bool]] = {
+    "face": (lambda frames: face(frames, 3000, degrees=30), False),
+    "flag": (lambda frames: flag(frames, 3000, degrees=30), False),
+    "sphere": (lambda frames: sphere(frames, 2000, degrees=40), False),
+    "face, occluder": (lambda frames: face(frames, 3000, degrees=25), True),
+}
+"""Surface, and whether a bar passes in front of it."""
+
+DISTANCE = 5.0
+"""Of the camera, in half heights of the object."""
+
+
+def rendered(given: argparse.Namespace) -> None:
+    """Measure the rendered films that are missing in the file of results."""
+    size = _size(given.size)
+    for name, (make, occluder) in SCENES.items():
+        if given.only and not any(word in name for word in given.only):
+            continue
+        label = f"{name} {given.size} F={given.frames}"
+        if any(row["film"] == label for row in _rows(given.out)):
+            continue
+        film = render_film(make(given.frames), size=size, distance=DISTANCE, occluder=occluder)
+        _keep(given.out, {"film": label, **_end_to_end(film, given.points)})
+
+
+def _end_to_end(film: RenderedFilm, points: int) -> dict[str, Any]:
+    start = film.num_frames // 2
+    with tempfile.TemporaryDirectory() as folder:
+        path = film.write(Path(folder) / "film.mkv")
+        began = time.perf_counter()
+        tracked = track_film(path, region=film.region(start), region_frame=start)
+        seconds = time.perf_counter() - began
+    truth = Truth.of(film, tracked.tracks, tracked.template)
+    accuracy = truth.track_accuracy(tracked.tracks, tracked.visibility)
+    mesh, kept = _thinned(tracked, points, truth)
+    visible = np.where(tracked.visibility, tracked.confidence, 0)[:, kept]
+    place = np.cumsum(truth.on) - 1
+    exact, seen = truth.tracks[:, place[kept]], truth.visible[:, place[kept]]
+    found = _solved(tracked.tracks[:, kept], visible, mesh, film.size)
+    ideal = _solved(exact, seen, mesh, film.size)
+    return {
+        "track_median": accuracy.median, "track_p95": accuracy.p95, "precision": accuracy.precision, "recall": accuracy.recall,
+        "track_seconds": seconds, "points": len(kept), "e3d_frame_scaled": truth.shape_error(found, kept),
+        "e3d_frame_scaled_exact_tracks": truth.shape_error(ideal, kept),
+    }  # fmt: skip
+
+
+def _thinned(tracked: TrackedFilm, points: int, truth: Truth) -> tuple[Mesh, np.ndarray]:
+    """Every n-th row and column of the grid, without points that are not on the object in truth."""
+    grid, stride = tracked.grid, 1
+    while (grid[::stride, ::stride] >= 0).sum() > points:
+        stride += 1
+    coarse = grid[::stride, ::stride]
+    coarse = np.where((coarse >= 0) & truth.on[np.maximum(coarse, 0)], coarse, -1)
+    kept = np.sort(coarse[coarse >= 0])
+    return Mesh.from_grid(np.where(coarse >= 0, np.searchsorted(kept, coarse), -1)), kept
+
+
+def _solved(tracks: np.ndarray, visible: np.ndarray, mesh: Mesh, size: tuple[int, int]) -> np.ndarray:
+    settings = Settings(image_size=(float(size[0]), float(size[1])))
+    return solve(Tracks.from_arrays(tracks.astype(float), visible.astype(float)), mesh, settings=settings).shapes
+
+
+def recorded(given: argparse.Namespace) -> None:
+    """Measure a recorded film against points with known pixels and places."""
+    with np.load(given.folder / "truth.npz") as file:
+        frames, pixels, shapes = file["frames"], file["pixels"], file["shapes"]
+    began = time.perf_counter()
+    tracked = track_film(given.folder / "film.mp4", region=given.folder / "mask.png")
+    tracking = time.perf_counter() - began
+    rows = np.searchsorted(tracked.film.frame_indices, frames)
+    first = int(np.abs(rows - tracked.template).argmin())
+    here = tracked.tracks[rows[first]].astype(float)
+    followed = _carried(here, tracked.tracks[rows], pixels[first])
+    seen = _carried(here, tracked.visibility[rows, :, None].astype(float), pixels[first])[..., 0] > 0.99
+    error = np.linalg.norm(followed - pixels, axis=2)[seen]
+    visible = np.where(tracked.visibility, tracked.confidence, 0)
+    began = time.perf_counter()
+    found = _solved(tracked.tracks, visible, Mesh.from_grid(tracked.grid), tracked.image_size)
+    at = _carried(here, found[rows], pixels[first])
+    on = np.isfinite(at).all(axis=(0, 2))
+    row = {
+        "film": given.folder.name, "track_median": float(np.median(error)), "track_p95": float(np.percentile(error, 95)),
+        "kept": float(seen[:, on].mean()), "points": tracked.tracks.shape[1], "track_seconds": tracking,
+        "solve_seconds": time.perf_counter() - began, "e3d_frame_scaled": e3d_frame_scaled(at[:, on], shapes[:, on]),
+    }  # fmt: skip
+    _keep(given.out, row)
+
+
+def _carried(here: np.ndarray, values: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Interpolate values `(K, P, C)` of points that lie `here (P, 2)` at other places `(N, 2)`: `(K, N, C)`."""
+    count, _, width = values.shape
+    flat = values.transpose(1, 0, 2).reshape(len(here), -1)
+    return LinearNDInterpolator(here, flat)(places).reshape(len(places), count, width).transpose(1, 0, 2)
+
+
+def speed(given: argparse.Namespace) -> None:
+    """Track a film and its first quarter, each in a process of its own."""
+    size, frames = _size(given.size), round(given.seconds * 30)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "film.mp4"
+        write_moving_texture(path, size, frames)
+        for count in (frames // 4, frames):
+            command = [sys.executable, "-m", "benchmarks.films", "track", str(path), str(count), str(given.threads)]
+            ran = subprocess.run(command, capture_output=True, text=True, check=True)
+            _keep(given.out, {"film": f"moving texture {given.size}", "frames": count, **json.loads(ran.stdout)})
+
+
+def write_moving_texture(path: Path, size: tuple[int, int], frames: int) -> None:
+    """Write a film of blurred noise that turns, swells and drifts smoothly: cheap to make at any size."""
+    width, height = size
+    noise = np.random.default_rng(0).standard_normal((2 * height, 2 * width, 3)).astype(np.float32)
+    noise = cv2.GaussianBlur(noise, (0, 0), 2.0)
+    texture = np.clip(128 + 50 * noise / noise.std(), 0, 255).astype(np.uint8)
+    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"mp4v"), 30.0, size)
+    for frame in range(frames):
+        time_ = 2 * np.pi * frame / 120
+        matrix = cv2.getRotationMatrix2D((width, height), 8 * np.sin(time_), 1 + 0.1 * np.sin(0.7 * time_))
+        matrix[:, 2] -= (width / 2 + 0.05 * width * np.sin(0.5 * time_), height / 2)
+        writer.write(cv2.warpAffine(texture, matrix, size, flags=cv2.INTER_LINEAR))
+    writer.release()
+
+
+def track(given: argparse.Namespace) -> None:
+    """Track the first frames of a film and print seconds and this process's peak memory as JSON."""
+    import resource
+
+    began = time.perf_counter()
+    width, height = open_film(given.path).size
+    region = np.zeros((height, width), np.uint8)
+    cv2.ellipse(region, (width // 2, height // 2), (round(0.3 * width), round(0.38 * height)), 0, 0, 360, 255, -1)
+    tracked = track_film(given.path, region=region, frames=f":{given.count}", threads=given.threads)
+    seconds = time.perf_counter() - began
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    cpu = time.process_time()
+    print(
+        json.dumps(
+            {
+                "points": tracked.tracks.shape[1], "threads": given.threads, "seconds": seconds, "cpu_seconds": cpu,
+                "peak_mib": peak, "visible": float(tracked.visibility.mean()),
+            }
+        )
+    )  # fmt: skip
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, _, height = text.partition("x")
+    return int(width), int(height)
+
+
+def _rows(path: Path) -> Iterator[dict[str, Any]]:
+    for line in path.read_text().splitlines() if path.exists() else []:
+        yield json.loads(line)
+
+
+def _keep(path: Path, row: dict[str, Any]) -> None:
+    rounded = {name: float(f"{value:.4g}") if isinstance(value, float) else value for name, value in row.items()}
+    print(json.dumps(rounded, ensure_ascii=False), flush=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a") as file:
+        file.write(json.dumps(rounded, ensure_ascii=False) + "\n")
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run one of the measurements."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(required=True)
+    out = Path("benchmarks/results/films.jsonl")
+    one = commands.add_parser("rendered")
+    one.add_argument("--only", action="append", default=[], help="names that hold this word")
+    one.add_argument("--frames", type=int, default=30)
+    one.add_argument("--size", default="240x180")
+    one.add_argument("--points", type=int, default=800, help="points that are solved, at most")
+    one.set_defaults(run=rendered)
+    two = commands.add_parser("recorded")
+    two.add_argument("folder", type=Path)
+    two.set_defaults(run=recorded)
+    three = commands.add_parser("speed")
+    three.add_argument("--seconds", type=float, default=10.0)
+    three.add_argument("--size", default="640x480")
+    three.add_argument("--threads", type=int, default=len(os.sched_getaffinity(0)))
+    three.set_defaults(run=speed)
+    for each in (one, two, three):
+        each.add_argument("--out", type=Path, default=out)
+    four = commands.add_parser("track")
+    four.add_argument("path", type=Path)
+    four.add_argument("count", type=int)
+    four.add_argument("threads", type=int)
+    four.set_defaults(run=track)
+    given = parser.parse_args(arguments)
+    given.run(given)
+
+
+if __name__ == "__main__":
+    main()

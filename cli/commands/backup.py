@@ -1,0 +1,62 @@
+"""`pliant backup` and `pliant restore`: a copy of an installation, made while it runs."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from pliant.cli.extras import require_server
+from pliant.cli.session import Json
+from pliant.cli.show import err, print_json
+from pliant.cli.up import Data, chosen
+
+if TYPE_CHECKING:
+    from pliant.worker.maintenance.backup import Summary
+
+
+def backup(
+    ctx: typer.Context,
+    target: Annotated[
+        Path, typer.Argument(help="Directory of the backup; an earlier one there is updated.", show_default=False)
+    ],
+    data: Data = None,
+    as_json: Json = False,
+) -> None:
+    """Copy all jobs, files and tokens of an installation, which may be running, into a directory."""
+    ctx.obj.json = as_json
+    require_server("pliant backup")
+    from pliant.worker.maintenance.backup import write_backup
+    from pliant.worker.processes.valkey import attended
+
+    settings = chosen(data, None)
+    with attended(settings):
+        summary = write_backup(settings, target)
+    _show("Backed up", summary, target, as_json=as_json)
+
+
+def restore(
+    ctx: typer.Context,
+    source: Annotated[Path, typer.Argument(help="Directory that `pliant backup` wrote.", show_default=False)],
+    data: Data = None,
+    as_json: Json = False,
+) -> None:
+    """Restore a backup into an installation without jobs and tokens; jobs that had not ended are queued again."""
+    ctx.obj.json = as_json
+    require_server("pliant restore")
+    from pliant.worker.maintenance.backup import restore_backup
+    from pliant.worker.processes.valkey import attended
+
+    settings = chosen(data, None)
+    with attended(settings):
+        summary = restore_backup(settings, source)
+    _show("Restored", summary, source, as_json=as_json)
+
+
+def _show(verb: str, summary: Summary, folder: Path, *, as_json: bool) -> None:
+    if as_json:
+        print_json({**asdict(summary), "folder": str(folder)})
+        return
+    size = f"{summary.bytes / 1e6:,.1f} MB"
+    err().print(f"{verb} {summary.jobs} jobs with {summary.blobs} files ({size}, {summary.copied} copied): {folder}")

@@ -1,0 +1,104 @@
+{{- define "pliant.labels" -}}
+app.kubernetes.io/name: pliant
+app.kubernetes.io/instance: {{ .Release.Name }}
+app.kubernetes.io/version: {{ .Chart.AppVersion | quote }}
+app.kubernetes.io/managed-by: {{ .Release.Service }}
+{{- end }}
+
+{{- define "pliant.image" -}}
+{{ .Values.image.repository }}:{{ .Values.image.tag | default .Chart.AppVersion }}
+{{- end }}
+
+{{- define "pliant.redisSecret" -}}
+{{- if .Values.valkey.enabled }}{{ .Release.Name }}-redis{{ else }}{{ required "redis.existingSecret names the Secret with the URL, where valkey.enabled is false" .Values.redis.existingSecret }}{{ end }}
+{{- end }}
+
+{{- define "pliant.tokenSecret" -}}
+{{ .Values.firstToken.existingSecret | default (printf "%s-token" .Release.Name) }}
+{{- end }}
+
+{{- define "pliant.podSecurity" -}}
+runAsNonRoot: true
+runAsUser: 10001
+runAsGroup: 10001
+fsGroup: 10001
+fsGroupChangePolicy: OnRootMismatch
+seccompProfile: {type: RuntimeDefault}
+{{- end }}
+
+{{- define "pliant.containerSecurity" -}}
+allowPrivilegeEscalation: false
+readOnlyRootFilesystem: true
+capabilities: {drop: [ALL]}
+{{- end }}
+
+{{- define "pliant.env" -}}
+- name: PLIANT_DATA
+  value: /data
+- name: PLIANT_REDIS_URL
+  valueFrom:
+    secretKeyRef: {name: {{ include "pliant.redisSecret" . }}, key: url}
+- name: PLIANT_BLOB_URL
+{{- if eq .Values.storage.type "s3" }}
+  value: {{ required "storage.s3.url is s3://bucket/prefix" .Values.storage.s3.url | quote }}
+{{- with .Values.storage.s3.region }}
+- name: AWS_REGION
+  value: {{ . | quote }}
+{{- end }}
+{{- with .Values.storage.s3.endpoint }}
+- name: AWS_ENDPOINT_URL
+  value: {{ . | quote }}
+{{- if hasPrefix "http://" . }}
+- name: AWS_ALLOW_HTTP
+  value: "true"
+{{- end }}
+{{- end }}
+{{- else }}
+  value: file:///data/shared/blobs
+{{- end }}
+- name: PLIANT_LOG_FORMAT
+  value: json
+{{- range $name, $value := .Values.settings }}
+- name: {{ $name }}
+  value: {{ $value | quote }}
+{{- end }}
+{{- end }}
+
+{{- define "pliant.envFrom" -}}
+{{- if and (eq .Values.storage.type "s3") .Values.storage.s3.existingSecret }}
+envFrom:
+  - secretRef: {name: {{ .Values.storage.s3.existingSecret }}}
+{{- end }}
+{{- end }}
+
+{{- define "pliant.mounts" -}}
+- {name: scratch, mountPath: /data}
+- {name: tmp, mountPath: /tmp}
+{{- if eq .Values.storage.type "pvc" }}
+- {name: shared, mountPath: /data/shared}
+{{- end }}
+{{- end }}
+
+{{- define "pliant.volumes" -}}
+- name: tmp
+  emptyDir: {}
+{{- if eq .Values.storage.type "pvc" }}
+- name: shared
+  persistentVolumeClaim: {claimName: {{ .Values.storage.pvc.existingClaim | default (printf "%s-data" .Release.Name) }}}
+{{- end }}
+{{- end }}
+
+{{- define "pliant.scheduling" -}}
+{{- with .Values.imagePullSecrets }}
+imagePullSecrets: {{ toYaml . | nindent 2 }}
+{{- end }}
+{{- with .Values.nodeSelector }}
+nodeSelector: {{ toYaml . | nindent 2 }}
+{{- end }}
+{{- with .Values.tolerations }}
+tolerations: {{ toYaml . | nindent 2 }}
+{{- end }}
+{{- with .Values.affinity }}
+affinity: {{ toYaml . | nindent 2 }}
+{{- end }}
+{{- end }}

@@ -1,0 +1,183 @@
+"""The Helm chart: rendered by Helm's own code, every object checked against Kubernetes' schemas, and what they start exists."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from deployments import read_variables, starts
+from pliant.worker.tokens import _FORM
+
+ROOT = Path(__file__).parents[2]
+CHART = ROOT / "deploy" / "helm" / "pliant"
+KUBERNETES = "1.30"
+S3 = {"storage": {"type": "s3", "s3": {"url": "s3://bucket/prefix", "endpoint": "http://minio:9000", "region": "us-east-1",
+                                       "existingSecret": "aws"}}}  # fmt: skip
+EVERYTHING = {
+    **S3, "api": {"replicas": 3, "allowedHosts": "pliant.example.org"}, "keda": {"enabled": True},
+    "ingress": {"enabled": True, "host": "pliant.example.org", "tlsSecret": "tls", "className": "nginx"},
+    "serviceMonitor": {"enabled": True}, "settings": {"PLIANT_RETENTION": "604800"},
+    "serviceAccount": {"annotations": {"role": "arn"}}, "nodeSelector": {"disk": "ssd"},
+    "tolerations": [{"key": "k", "operator": "Exists"}], "imagePullSecrets": [{"name": "registry"}],
+}  # fmt: skip
+EXTERNAL = {
+    "valkey": {"enabled": False},
+    "redis": {"existingSecret": "redis"},
+    "firstToken": {"existingSecret": "mine"},
+}
+VALUES: dict[str, dict[str, Any]] = {"usual": {}, "everything": EVERYTHING, "external": {**S3, **EXTERNAL}}
+
+
+def helm() -> Any:
+    """Return Helm's code, which a package of PyPI brings for Linux and macOS."""
+    if os.environ.get("CI"):
+        import helm_python.chart as module
+    else:
+        module = pytest.importorskip("helm_python.chart", reason="no Helm here: pip install helm-python-sdk")
+    return module
+
+
+def rendered(values: dict[str, Any]) -> list[dict[str, Any]]:
+    with helm().Chart.load(CHART) as chart:
+        texts = chart.render(values, name="demo", namespace="ns", is_install=True)
+    return [each for name, text in texts.items() if name.endswith(".yaml") for each in yaml.safe_load_all(text) if each]
+
+
+@pytest.fixture(scope="module", params=VALUES)
+def objects(request: pytest.FixtureRequest) -> list[dict[str, Any]]:
+    return rendered(VALUES[request.param])
+
+
+def of(objects: list[dict[str, Any]], kind: str) -> dict[str, dict[str, Any]]:
+    return {each["metadata"]["name"]: each for each in objects if each["kind"] == kind}
+
+
+def pods(objects: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    return {
+        name: each["spec"]["template"]
+        for kind in ("Deployment", "StatefulSet")
+        for name, each in of(objects, kind).items()
+    }
+
+
+def containers(objects: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    specs = [pod["spec"] for pod in pods(objects).values()]
+    return [each for spec in specs for each in (*spec["containers"], *spec.get("initContainers", ()))]
+
+
+def test_helm_finds_nothing_to_complain_of() -> None:
+    report = helm().lint(CHART, strict=True)
+    assert report["errors"] == []
+    assert {message["error"] for message in report["messages"]} <= {"icon is recommended"}
+
+
+def test_every_object_is_one_that_kubernetes_accepts(objects: list[dict[str, Any]]) -> None:
+    validate = pytest.importorskip("kubernetes_validate", reason="pip install kubernetes-validate")
+    checked = 0
+    for each in objects:
+        if each["apiVersion"].startswith(("keda.sh/", "monitoring.coreos.com/")):
+            continue  # their operators' own kinds; the tests below look at them
+        validate.validate(each, KUBERNETES, strict=True)
+        checked += 1
+    assert checked >= 7
+
+
+def test_the_validation_would_notice() -> None:
+    validate = pytest.importorskip("kubernetes_validate", reason="pip install kubernetes-validate")
+    wrong = of(rendered({}), "Deployment")["demo-api"]
+    wrong["spec"]["template"]["spec"]["containers"][0]["livenes"] = {}
+    with pytest.raises(validate.ValidationError):
+        validate.validate(wrong, KUBERNETES, strict=True)
+
+
+def test_containers_start_what_exists_with_variables_that_are_read(objects: list[dict[str, Any]]) -> None:
+    ours = [each for each in containers(objects) if each["image"].startswith("pliant:")]
+    assert {each["name"] for each in ours} == {"api", "first-token", "worker", "reconciler"}
+    for each in ours:
+        command = each["command"]
+        assert command[:3] == ["pliant", "token", "create"] or starts(command)
+        names = {variable["name"] for variable in each["env"]}
+        assert {name for name in names if name.startswith("PLIANT_")} <= read_variables()
+    assert {each["command"][3] for each in ours if each["command"][2] == "pliant.worker"} == {"work", "reconcile"}
+
+
+def test_no_container_has_more_rights_than_it_needs(objects: list[dict[str, Any]]) -> None:
+    for name, pod in pods(objects).items():
+        assert pod["spec"]["securityContext"]["runAsNonRoot"] is True, name
+        assert pod["spec"]["automountServiceAccountToken"] is False
+    for each in containers(objects):
+        assert each["securityContext"] == {
+            "allowPrivilegeEscalation": False, "readOnlyRootFilesystem": True, "capabilities": {"drop": ["ALL"]},
+        }  # fmt: skip
+        assert "memory" in each["resources"]["limits"]
+        assert "startupProbe" in each or each["name"] == "first-token"
+
+
+def test_selectors_find_their_pods_and_volumes_are_there(objects: list[dict[str, Any]]) -> None:
+    labels = {name: pod["metadata"]["labels"] for name, pod in pods(objects).items()}
+
+    def found(selector: dict[str, str]) -> list[str]:
+        return [name for name, held in labels.items() if selector.items() <= held.items()]
+
+    for kind in ("Deployment", "StatefulSet", "PodDisruptionBudget"):
+        for name, each in of(objects, kind).items():
+            assert found(each["spec"]["selector"]["matchLabels"]) == [name]
+    services = of(objects, "Service")
+    assert found(services["demo"]["spec"]["selector"]) == ["demo-api"]
+    for pod in pods(objects).values():
+        volumes = {each["name"] for each in pod["spec"].get("volumes", ())}
+        volumes |= {"data"} if "valkey" in str(pod["metadata"]["labels"]) else set()
+        for each in (*pod["spec"]["containers"], *pod["spec"].get("initContainers", ())):
+            assert {mount["name"] for mount in each["volumeMounts"]} <= volumes
+
+
+def test_a_worker_has_the_time_to_drain(objects: list[dict[str, Any]]) -> None:
+    pod = pods(objects)["demo-worker"]["spec"]
+    grace = next(each["value"] for each in pod["containers"][0]["env"] if each["name"] == "PLIANT_STOP_GRACE")
+    assert pod["terminationGracePeriodSeconds"] > int(grace) + 20
+
+
+def test_workers_are_scaled_by_queued_and_running_jobs() -> None:
+    objects = rendered(EVERYTHING)
+    (scaled,) = of(objects, "ScaledObject").values()
+    assert "replicas" not in of(objects, "Deployment")["demo-worker"]["spec"], "two would fight over the number"
+    (trigger,) = scaled["spec"]["triggers"]
+    query = trigger["metadata"]["query"]
+    assert (trigger["type"], trigger["metadata"]["threshold"]) == ("prometheus", "1")
+    assert re.search(r'pliant_jobs\{namespace="ns", status=~"queued\|running\|cancelling"\}', query)
+    assert "pliant_queue_depth" not in query, "the queue is empty while jobs run, which would end them"
+    assert of(rendered({}), "ScaledObject") == {}
+
+
+def test_the_first_token_is_one(tmp_path: Path) -> None:
+    objects = rendered({})
+    assert _FORM.fullmatch(of(objects, "Secret")["demo-token"]["stringData"]["token"])
+    url = of(objects, "Secret")["demo-redis"]["stringData"]["url"]
+    assert re.fullmatch(r"redis://:\w{40}@demo-valkey:6379/0", url)
+    assert of(rendered({**S3, **EXTERNAL}), "Secret") == {}
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"valkey": {"enabled": False}}, "redis.existingSecret"),
+        ({"storage": {"type": "s3"}}, "storage.s3.url"),
+        ({"storage": {"type": "nfs"}}, "storage"),
+        ({"settings": {"RETENTION": "1"}}, "'RETENTION' does not match"),
+        ({"api": {"replicas": 2}, "storage": {"pvc": {"accessMode": "ReadWriteOnce"}}}, "ReadWriteMany"),
+    ],
+)
+def test_values_that_cannot_work_are_refused(values: dict[str, Any], words: str) -> None:
+    from helm_python.errors import HelmError
+
+    def render() -> None:
+        with helm().Chart.load(CHART) as chart:
+            chart.validate_schema(values)
+            chart.render(values, name="demo", namespace="ns")
+
+    with pytest.raises(HelmError, match=re.escape(words)):
+        render()

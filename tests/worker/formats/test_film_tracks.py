@@ -1,0 +1,126 @@
+"""Files of `pliant track`: what they hold besides tracks is used."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pliant.schemas.options import Options
+from pliant.solver.errors import InvalidInput
+from pliant.worker.films.inputs import read_tracked
+from pliant.worker.films.tracker import Tracked
+from pliant.worker.formats import load_inputs, read_inputs, save_inputs
+from pliant.worker.formats.tracks.film_tracks import tracks_options
+
+FRAMES, ROWS, COLUMNS = 5, 4, 5
+POINTS = ROWS * COLUMNS - 1
+
+
+def film_arrays() -> dict[str, np.ndarray]:
+    """A grid with one hole that moves to the right, with every array of `TrackedFilm.save_npz`."""
+    random = np.random.default_rng(0)
+    grid = np.arange(ROWS * COLUMNS, dtype=np.int32).reshape(ROWS, COLUMNS) - 1  # the first cell is the hole
+    row, column = np.nonzero(grid >= 0)
+    start = 8.0 * np.stack([column, row], axis=1) + 10
+    tracks = start + np.arange(FRAMES)[:, None, None] * (1.5, 0.2) + 0.05 * random.standard_normal((FRAMES, POINTS, 2))
+    visible = np.ones((FRAMES, POINTS), dtype=bool)
+    visible[2, 3] = visible[4, 0] = False
+    confidence = np.where(visible, random.uniform(0.2, 1, visible.shape), 0)
+    return {
+        "tracks": tracks.astype(np.float32), "visibility": visible, "confidence": confidence.astype(np.float32), "grid": grid,
+        "uv": ((start + 0.5) / (64, 48)).astype(np.float32), "template": np.array(0), "fps": np.array(24.0),
+        "template_image": random.integers(0, 256, (48, 64, 3), dtype=np.uint8), "image_size": np.array([64, 48]),
+        "frame_indices": np.arange(FRAMES), "frame_times": np.arange(FRAMES) / 24,
+    }  # fmt: skip
+
+
+def film_file(path: Path, **changed: object) -> Path:
+    arrays = {name: value for name, value in (film_arrays() | changed).items() if value is not None}
+    np.savez(path, **arrays)  # type: ignore[arg-type]
+    return path
+
+
+def test_all_that_the_tracker_found_is_used(tmp_path: Path) -> None:
+    given = film_arrays()
+    inputs = read_inputs(tracks=film_file(tmp_path / "tracks.npz"), options=Options())
+    np.testing.assert_array_equal(inputs.tracks.points[given["visibility"]], given["tracks"][given["visibility"]])
+    np.testing.assert_array_equal(inputs.tracks.visible, given["confidence"])
+    assert inputs.mesh is not None
+    np.testing.assert_array_equal(inputs.mesh.grid, given["grid"])
+    assert inputs.texture is not None
+    np.testing.assert_allclose(inputs.texture.uv, given["uv"])
+    told = inputs.interpretation
+    assert (told.format, told.mesh_source, told.image_size, told.fps) == ("Pliant", "film", "64x48", 24.0)
+    assert tracks_options(Options(), told) == Options(image_size="64x48", fps=24)
+    save_inputs(inputs, tmp_path / "stored.npz")
+    back = load_inputs(tmp_path / "stored.npz")
+    assert back.interpretation == told
+    assert back.texture == inputs.texture or back.texture.jpeg == inputs.texture.jpeg  # type: ignore[union-attr]
+
+
+def test_options_and_a_mesh_overrule_the_file(tmp_path: Path) -> None:
+    file = film_file(tmp_path / "tracks.npz")
+    inputs = read_inputs(tracks=file, mesh="none", options=Options(frames="::2", y_axis="up"))
+    assert inputs.mesh is None
+    assert inputs.interpretation.y_axis == "up"
+    assert inputs.interpretation.fps == 12.0
+    given = Options(image_size="80x60", fps=10)
+    assert tracks_options(given, inputs.interpretation) == given
+    plain = Options()
+    assert tracks_options(plain, read_inputs(tracks=plain_file(tmp_path), options=plain).interpretation) == plain
+
+
+def plain_file(folder: Path) -> Path:
+    given = film_arrays()
+    np.savez(folder / "plain.npz", tracks=given["tracks"], visibility=given["visibility"])
+    return folder / "plain.npz"
+
+
+def test_a_film_job_reads_the_same(tmp_path: Path) -> None:
+    file = film_file(tmp_path / "tracks.npz")
+    alone = read_inputs(tracks=file, options=Options(stride=2))
+    job = read_tracked(file, Tracked(container="mp4", warnings=()), Options(stride=2))
+    np.testing.assert_array_equal(alone.tracks.points, job.tracks.points)
+    np.testing.assert_array_equal(alone.tracks.visible, job.tracks.visible)
+    assert alone.mesh is not None
+    assert job.mesh is not None
+    np.testing.assert_array_equal(alone.mesh.faces, job.mesh.faces)
+    np.testing.assert_array_equal(alone.texture.uv, job.texture.uv)  # type: ignore[union-attr]
+    assert alone.texture.jpeg == job.texture.jpeg  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize(
+    ("changed", "got"),
+    [
+        ({"confidence": None}, "without confidence"),
+        ({"grid": None, "fps": None}, "without grid, fps"),
+        ({"confidence": np.ones((FRAMES, 2))}, "confidence of shape"),
+        ({"visibility": np.ones((FRAMES, 3), dtype=bool)}, "visibility of shape"),
+        ({"confidence": np.full((FRAMES, POINTS), 1.5)}, "confidence outside"),
+        ({"confidence": np.full((FRAMES, POINTS), np.nan)}, "confidence outside"),
+        ({"grid": np.arange(12).reshape(3, 4)}, "a grid of 12 points"),
+        ({"image_size": np.array([64, 0])}, "image_size"),
+        ({"image_size": np.array([6.5, 4.0])}, "image_size"),
+        ({"fps": np.array(0.0)}, "fps"),
+        ({"fps": np.array([24.0, 25.0])}, "fps"),
+        ({"uv": np.zeros((3, 2), np.float32)}, "texture coordinates"),
+        ({"template_image": np.zeros((4, 4), np.uint8)}, "template_image"),
+    ],
+)
+def test_what_does_not_fit_together_is_refused(tmp_path: Path, changed: dict[str, np.ndarray], got: str) -> None:
+    with pytest.raises(InvalidInput, match=got) as refused:
+        read_inputs(tracks=film_file(tmp_path / "tracks.npz", **changed), options=Options())
+    assert refused.value.code == "damaged_file"
+
+
+def test_tracks_of_another_shape_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInput, match="as pliant track writes it") as refused:
+        read_inputs(tracks=film_file(tmp_path / "tracks.npz", tracks=np.zeros((5, 22))), options=Options())
+    assert refused.value.code == "wrong_shape"
+
+
+def test_a_file_without_its_picture_has_no_texture(tmp_path: Path) -> None:
+    inputs = read_inputs(tracks=film_file(tmp_path / "tracks.npz", template_image=None), options=Options())
+    assert inputs.texture is None
+    assert inputs.interpretation.mesh_source == "film"

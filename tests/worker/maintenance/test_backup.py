@@ -1,0 +1,189 @@
+"""Backups of an installation at work, restored where nothing was; and what is refused."""
+
+from __future__ import annotations
+
+import json
+import secrets
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from datetime import UTC, datetime
+from hashlib import sha256
+from pathlib import Path
+
+import pytest
+from pliant.schemas.job import Artifact, Job, Status
+from pliant.worker.errors import BadBackup, NewerData
+from pliant.worker.jobs import lifecycle
+from pliant.worker.jobs.service import Jobs
+from pliant.worker.maintenance.backup import restore_backup, write_backup
+from pliant.worker.maintenance.fsck import findings
+from pliant.worker.records import Webhook
+from pliant.worker.settings import Settings
+from pliant.worker.store.blobs import Blobs
+from pliant.worker.tokens import Tokens
+
+NOW = datetime(2026, 5, 4, 9, 30, tzinfo=UTC)
+
+Submit = Callable[..., Job]
+
+
+@pytest.fixture(params=["redis"])
+def jobs(settings: Settings) -> Jobs:
+    return Jobs.open(settings)
+
+
+@pytest.fixture
+def empty(settings: Settings, tmp_path: Path) -> Settings:
+    """Another machine, where nothing is yet."""
+    return replace(settings, data=tmp_path / "elsewhere", queue=f"test-{secrets.token_hex(4)}")
+
+
+def claim(jobs: Jobs, id: str) -> str:
+    attempt_id = jobs.records.get(id).attempt_id
+    jobs.records.update(id, lambda held: lifecycle.claim(held, attempt_id=attempt_id, worker="w", now=NOW))
+    return attempt_id
+
+
+def succeed(jobs: Jobs, id: str, content: bytes, folder: Path) -> None:
+    attempt_id = claim(jobs, id)
+    file = folder / "result"
+    file.write_bytes(content)
+    prefix = f"jobs/{id}/{attempt_id}/artifacts/"
+    jobs.blobs.put(f"{prefix}shapes.npz", file)
+    file.unlink()
+    digest = sha256(content).hexdigest()
+    artifact = Artifact(name="shapes.npz", media_type="application/zip", bytes=len(content), sha256=digest)
+    jobs.records.update(
+        id,
+        lambda held: lifecycle.succeed(
+            held, attempt_id=attempt_id, prefix=prefix, artifacts=[artifact], metrics={"e": 0.5}, outcome="converged",
+            sentence="Converged.", warnings=[], now=NOW, retention=0,
+        ),
+    )  # fmt: skip
+    jobs.records.append_log(id, ["It went well."])
+
+
+@pytest.fixture
+def sent(jobs: Jobs, submit: Submit, tmp_path: Path) -> dict[str, str]:
+    """One job in each state, and a token; returns the ids."""
+    webhook = Webhook(url="https://example.org/hook", secret="whsec_c2VjcmV0")
+    ids = {
+        state: submit(name=state, webhook=webhook).id for state in ("done", "failed", "queued", "running", "cancelling")
+    }
+    succeed(jobs, ids["done"], secrets.token_bytes(100_000), tmp_path)
+    for state in ("running", "cancelling"):
+        jobs.queue.remove(claim(jobs, ids[state]))
+    jobs.cancel(ids["cancelling"])
+    jobs.queue.remove(jobs.records.get(ids["done"]).attempt_id)
+    jobs.cancel(ids["failed"])
+    Tokens.open(jobs.settings).create("somebody")
+    return ids
+
+
+def test_a_restored_installation_is_the_same(jobs: Jobs, sent: dict[str, str], empty: Settings, tmp_path: Path) -> None:
+    made = write_backup(jobs.settings, tmp_path / "backup")
+    assert (made.jobs, made.blobs, made.copied) == (5, 6, 6)
+    assert restore_backup(empty, tmp_path / "backup").jobs == 5
+    there = Jobs.open(empty)
+    assert findings(there, pause=0) == []
+    assert there.get(sent["done"]) == jobs.get(sent["done"])
+    assert there.log(sent["done"]) == jobs.log(sent["done"]) == "It went well.\n"
+    _, blob = there.artifact(sent["done"], "shapes.npz")
+    assert b"".join(blob.read()) == b"".join(jobs.artifact(sent["done"], "shapes.npz")[1].read())
+    states = {name: there.get(id).status for name, id in sent.items()}
+    assert states == {
+        "done": Status.SUCCEEDED, "failed": Status.CANCELLED, "queued": Status.QUEUED, "running": Status.QUEUED,
+        "cancelling": Status.CANCELLED,
+    }  # fmt: skip
+    assert len(there.queue.waiting()) == 2
+    assert Tokens.open(empty).all() == Tokens.open(jobs.settings).all()
+    assert there.records.tallies()["ended:succeeded"] == 1
+
+
+def test_what_a_webhook_owes_is_owed_after_the_restoration(
+    jobs: Jobs, sent: dict[str, str], empty: Settings, tmp_path: Path
+) -> None:
+    from pliant.worker.store.connection import connect
+
+    write_backup(jobs.settings, tmp_path / "backup")
+    restore_backup(empty, tmp_path / "backup")
+    client = connect(empty.redis, decode=True)
+    assert sent["done"] in client.zrange(f"{empty.queue}:outbox", 0, -1)
+    client.close()
+
+
+def test_a_second_backup_copies_only_what_is_new_and_drops_what_is_gone(
+    jobs: Jobs, sent: dict[str, str], submit: Submit, tmp_path: Path
+) -> None:
+    backup = tmp_path / "backup"
+    write_backup(jobs.settings, backup)
+    new = submit(name="new").id
+    jobs.delete(sent["done"])
+    again = write_backup(jobs.settings, backup)
+    assert (again.jobs, again.copied) == (5, 1)
+    held = {path.relative_to(backup / "blobs").parts[1] for path in (backup / "blobs").rglob("*") if path.is_file()}
+    assert held == {new, *(id for name, id in sent.items() if name != "done")}
+    assert len(list(backup.glob("jobs-*"))) == len(list(backup.glob("rest-*"))) == 1
+
+
+def test_a_job_deleted_while_it_is_copied_is_left_out(
+    jobs: Jobs, sent: dict[str, str], empty: Settings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plain = Blobs.get
+
+    def gone(blobs: Blobs, key: str) -> object:
+        if sent["failed"] in key:
+            jobs.delete(sent["failed"])
+        return plain(blobs, key)
+
+    monkeypatch.setattr(Blobs, "get", gone)
+    assert write_backup(jobs.settings, tmp_path / "backup").jobs == 4
+    monkeypatch.undo()
+    restore_backup(empty, tmp_path / "backup")
+    assert findings(Jobs.open(empty), pause=0) == []
+
+
+@pytest.fixture
+def backup(jobs: Jobs, sent: dict[str, str], tmp_path: Path) -> Path:
+    write_backup(jobs.settings, tmp_path / "backup")
+    copy = tmp_path / "copy"  # blobs of the backup are linked from the store
+    shutil.copytree(tmp_path / "backup", copy)
+    return copy
+
+
+def test_what_is_no_backup_or_not_empty_is_refused(jobs: Jobs, backup: Path, empty: Settings, tmp_path: Path) -> None:
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "letter.txt").write_text("Dear")
+    for place in (tmp_path / "other", tmp_path / "other" / "letter.txt"):
+        with pytest.raises(BadBackup, match="no backup"):
+            write_backup(jobs.settings, place)
+    with pytest.raises(BadBackup, match=r"manifest\.json cannot be read"):
+        restore_backup(empty, tmp_path / "other")
+    with pytest.raises(BadBackup, match="has jobs or tokens already"):
+        restore_backup(jobs.settings, backup)
+
+
+@pytest.mark.parametrize(
+    "what", ["jobs-*", "blobs/**/inputs.npz", "blobs/**/shapes.npz", "flipped", "format", "schema"]
+)
+def test_a_damaged_backup_is_refused_before_anything_is_written(backup: Path, empty: Settings, what: str) -> None:
+    error: type[Exception] = BadBackup
+    manifest = json.loads((backup / "manifest.json").read_text())
+    if what == "flipped":  # the same size, another content
+        file = next(backup.glob("blobs/**/shapes.npz"))
+        content = bytearray(file.read_bytes())
+        content[500] ^= 1
+        file.write_bytes(content)
+    elif what == "format":
+        (backup / "manifest.json").write_text(json.dumps({**manifest, "format": 99}))
+    elif what == "schema":
+        error = NewerData
+        (backup / "manifest.json").write_text(json.dumps({**manifest, "schema": 99}))
+    else:
+        file = next(backup.glob(what))
+        file.write_bytes(file.read_bytes()[:-1])
+    with pytest.raises(error):
+        restore_backup(empty, backup)
+    there = Jobs.open(empty)
+    assert (there.count(list(Status)), there.blobs.list()) == (0, [])

@@ -1,0 +1,120 @@
+"""Data of an older version is brought up to date when the first process starts; data of a newer one is refused.
+
+`tests/data/records_of_fafc6bb.json` holds the Redis keys of an installation that commit fafc6bb had made, the last one before the
+version of the records was stored: three jobs, one of them with a result, and a token. RQ's own entries are left out.
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pliant.schemas.job import Status
+from pliant.service import __main__ as service
+from pliant.worker import __main__ as worker
+from pliant.worker.errors import NewerData
+from pliant.worker.jobs.service import Jobs
+from pliant.worker.maintenance.backup import restore_backup, write_backup
+from pliant.worker.maintenance.fsck import findings
+from pliant.worker.maintenance.reconciler import FORGOTTEN_AFTER, Reconciler
+from pliant.worker.settings import Settings
+from pliant.worker.store.connection import connect
+from pliant.worker.store.schema import CURRENT, STEPS, migrated, prepare
+from pliant.worker.tokens import Tokens
+
+OLD = Path(__file__).parents[2] / "data" / "records_of_fafc6bb.json"
+CONTENTS = {"inputs.npz": b"inputs of an old job", "shapes.npz": b"shapes of an old job"}
+
+
+@pytest.fixture
+def old(settings: Settings) -> Settings:
+    """An installation as the old version left it."""
+    client: Any = connect(settings.redis, decode=True)
+    for kind, name, value in json.loads(OLD.read_text()):
+        key = name.replace("pliant:", f"{settings.queue}:", 1)
+        if kind == "stream":
+            for id, fields in value:
+                client.xadd(key, fields, id=id)
+        else:
+            write = {"string": lambda: client.set(key, value), "hash": lambda: client.hset(key, mapping=value),  # noqa: B023
+                     "list": lambda: client.rpush(key, *value), "zset": lambda: client.zadd(key, dict(value))}  # noqa: B023  # fmt: skip
+            write[kind]()
+    client.close()
+    jobs = Jobs.open(settings)
+    for status in Status:
+        for id in jobs.records.ids(status):
+            stored = jobs.records.get(id)
+            for place in (stored.inputs, *(f"{stored.prefix}{each.name}" for each in stored.job.artifacts)):
+                file = settings.data / "a blob"
+                file.write_bytes(CONTENTS[place.rpartition("/")[2]])
+                jobs.blobs.put(place, file)
+                file.unlink()
+    return settings
+
+
+def bodies(settings: Settings) -> dict[str, dict[str, Any]]:
+    client: Any = connect(settings.redis, decode=True)
+    keys = client.keys(f"{settings.queue}:job:*")
+    found = {key.rpartition(":")[2]: json.loads(client.hget(key, "body")) for key in keys}
+    client.close()
+    return found
+
+
+def test_an_old_installation_goes_on_where_it_was(old: Settings) -> None:
+    assert all("schema" not in body for body in bodies(old).values())
+    assert prepare(old) == 3
+    assert {body["schema"] for body in bodies(old).values()} == {CURRENT}
+    assert prepare(old) == 0, "once"
+    jobs = Jobs.open(old)
+    done = jobs.get("old-done")
+    assert (done.status, done.options.loss, done.metrics) == (Status.SUCCEEDED, "huber", {"residual_median": 0.25})
+    assert b"".join(jobs.artifact("old-done", "shapes.npz")[1].read()) == CONTENTS["shapes.npz"]
+    assert "Attempt 1 began" in jobs.log("old-done")
+    assert [token.name for token in Tokens.open(old).all()] == ["somebody"]
+    reconciler = Reconciler(jobs=jobs, clock=iter([0.0, 1.0, *(float(10 * n) for n in range(1, 20))]).__next__)
+    for _ in range(int(FORGOTTEN_AFTER) + 4):  # RQ's own entries are not part of the old data
+        reconciler.tick()
+    assert len(jobs.queue.waiting()) == 1
+    assert findings(jobs, pause=0) == []
+
+
+def test_a_backup_of_old_records_is_restored_too(old: Settings, tmp_path: Path) -> None:
+    write_backup(old, tmp_path / "backup")
+    new = Settings(data=tmp_path / "new", redis_url=old.redis_url, queue=f"{old.queue}-new")
+    restore_backup(new, tmp_path / "backup")
+    assert {body["schema"] for body in bodies(new).values()} == {CURRENT}
+    assert Jobs.open(new).get("old-done") == Jobs.open(old).get("old-done")
+
+
+def test_processes_that_start_at_once_migrate_once(old: Settings) -> None:
+    counts: list[int] = []
+    threads = [threading.Thread(target=lambda: counts.append(prepare(old))) for _ in range(4)]
+    for each in threads:
+        each.start()
+    for each in threads:
+        each.join()
+    assert sorted(counts) == [0, 0, 0, 3]
+
+
+def test_data_of_a_newer_version_is_refused_by_every_process(
+    old: Settings, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    client: Any = connect(old.redis, decode=True)
+    client.set(f"{old.queue}:schema", CURRENT + 1)
+    client.close()
+    for name, value in old.to_environment().items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr(service, "configure_logging", lambda *_: None)
+    for main in (service.main, worker.main):
+        assert main([]) in (1, 2)
+        assert "written by a newer Pliant" in capsys.readouterr().err
+    with pytest.raises(NewerData):
+        migrated({"schema": CURRENT + 1})
+
+
+def test_there_is_a_step_from_every_older_version() -> None:
+    assert sorted(STEPS) == list(range(1, CURRENT))
+    assert migrated({"version": 5}) == {"version": 5, "schema": CURRENT}

@@ -1,0 +1,89 @@
+"""What tracking a film would take, from one of its frames: how many points, and how much time on this machine."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from pliant.tracking.chaining import DELTAS
+from pliant.tracking.decoding.film import Film
+from pliant.tracking.flow import Grey, dense_flow, opencv_serial
+from pliant.tracking.region import Region, read_region
+from pliant.tracking.seeding import default_step, place
+from pliant.tracking.survey import tracking_scale
+
+FLOWS = 2 * (1 + len(DELTAS))
+"""Flows for each frame: there and back, from the template and from each earlier frame."""
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """What tracking would take."""
+
+    points: int
+    """Points that would be followed, before those that are soon lost are dropped."""
+
+    seconds: float
+    """Wall time of the flows, which is nearly all; 0 where the film states no number of frames."""
+
+
+def estimate(
+    film: Film,
+    *,
+    region: Region | None,
+    region_frame: int,
+    grid_step: float | None,
+    longest_side: int,
+    threads: int,
+) -> Estimate:
+    """Place the points in the region's frame and time one flow of the region's size.
+
+    Parameters
+    ----------
+    film, region, region_frame, grid_step, longest_side, threads
+        As in `track_film`.
+
+    Raises
+    ------
+    FilmError
+        The film cannot be decoded, or the region does not fit it.
+    """
+    grey, scale = _frame(film, region_frame, longest_side)
+    height, width = grey.shape
+    mask = np.ones((height, width), dtype=bool)
+    if region is not None:
+        drawn = read_region(region, film.size).astype(np.uint8) * 255
+        mask = np.asarray(cv2.resize(drawn, (width, height), interpolation=cv2.INTER_AREA) >= 128)
+    seeds, _ = place(grey, mask, step=default_step(mask) if grid_step is None else grid_step * scale)
+    start, stop, step = film.selection
+    count = len(range(film.stated_frames)[start:stop:step])
+    return Estimate(len(seeds.points), count * FLOWS * _flow_seconds(grey, mask) / max(threads, 1))
+
+
+def _frame(film: Film, index: int, longest_side: int) -> tuple[Grey, float]:
+    """Return the first selected frame from `index` on, else the last one, grey and in the tracker's size, with its scale."""
+    image = None
+    for frame in film.frames():
+        image = frame.image
+        if frame.index >= index:
+            break
+    assert image is not None, "a film without frames is refused when it is opened"
+    scale = tracking_scale(film.size, longest_side)
+    size = (max(16, round(film.size[0] * scale)), max(16, round(film.size[1] * scale)))
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), dtype=np.uint8), scale
+
+
+def _flow_seconds(grey: Grey, mask: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> float:
+    """Time the flow inside the region's box between the frame and the frame moved by a pixel."""
+    row, column = np.nonzero(mask)
+    box = np.s_[row.min() : row.max() + 1, column.min() : column.max() + 1]
+    first = np.ascontiguousarray(np.pad(grey[box], 16, mode="edge"))
+    second = np.ascontiguousarray(np.roll(first, 1, axis=1))
+    with opencv_serial():
+        dense_flow(first, second)  # the first call sets up the library
+        began = time.perf_counter()
+        dense_flow(first, second)
+        return time.perf_counter() - began

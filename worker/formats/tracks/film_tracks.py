@@ -1,0 +1,107 @@
+"""The output of `pliant track`: besides tracks it holds confidence, mesh, picture size, rate and texture, and all of them are used."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pliant.schemas.job import Interpretation
+from pliant.schemas.options import Options
+from pliant.solver import InvalidInput, Mesh
+from pliant.worker.formats.errors import damaged
+from pliant.worker.formats.reading.containers import read_arrays
+from pliant.worker.formats.records import Arrays, Limits
+from pliant.worker.formats.texture import Texture
+
+NEEDED = ("visibility", "confidence", "grid", "image_size", "fps")
+PICTURE = ("template_image", "uv")
+LONGEST = 10**5
+"""Largest width or height of a picture, pixels."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FilmTracks:
+    """What a file of `pliant track` states besides its tracks."""
+
+    visible: NDArray[np.float64]
+    """The tracker's confidence where a point is visible, else 0, shape `(F, P)`."""
+
+    mesh: Mesh
+    image_size: tuple[int, int]
+    """Width and height of the film in pixels."""
+
+    fps: float
+    """Frames a second."""
+
+    texture: Texture | None
+    """The template frame with the place of every point in it; None where the file has been stripped of it."""
+
+
+def read_film_tracks(path: Path, *, shape: tuple[int, int], limits: Limits) -> FilmTracks:
+    """Read what belongs to the tracks of a film.
+
+    Parameters
+    ----------
+    path
+        A file of `pliant track`.
+    shape
+        Frames and points of its tracks.
+    limits
+        Largest arrays.
+
+    Raises
+    ------
+    InvalidInput
+        Code damaged_file where an array is missing or does not fit the tracks, and the codes of `read_arrays` and `Mesh`.
+    """
+    arrays = read_arrays(path, field="tracks", limits=limits, wanted=frozenset((*NEEDED, *PICTURE)))
+    missing = [name for name in NEEDED if name not in arrays]
+    if missing:
+        raise damaged("tracks", f"tracks of a film without {', '.join(missing)}")
+    for name in ("visibility", "confidence"):
+        if arrays[name].shape != shape or arrays[name].dtype.kind not in "bfiu":
+            raise damaged("tracks", f"{name} of shape {arrays[name].shape} beside tracks of shape {(*shape, 2)}")
+    confidence = np.asarray(arrays["confidence"], dtype=np.float64)
+    if not ((confidence >= 0) & (confidence <= 1)).all():
+        raise damaged("tracks", "confidence outside 0 … 1")
+    mesh = Mesh.from_grid(arrays["grid"])
+    if mesh.num_points != shape[1]:
+        raise damaged("tracks", f"a grid of {mesh.num_points} points beside tracks of {shape[1]}")
+    size, fps = _shot(arrays)
+    texture = None
+    if all(name in arrays for name in PICTURE):
+        texture = _texture(arrays, shape[1])
+    return FilmTracks(np.where(arrays["visibility"].astype(bool), confidence, 0.0), mesh, size, fps, texture)
+
+
+def tracks_options(options: Options, interpretation: Interpretation) -> Options:
+    """Fill in what a file of tracks states, where the options give nothing: the picture's size and the frame rate."""
+    stated: dict[str, Any] = {}
+    if options.image_size is None and interpretation.image_size is not None:
+        stated["image_size"] = interpretation.image_size
+    if "fps" not in options.model_fields_set and interpretation.fps is not None:
+        stated["fps"] = interpretation.fps
+    return options.model_copy(update=stated) if stated else options
+
+
+def _shot(arrays: Arrays) -> tuple[tuple[int, int], float]:
+    size, rate = arrays["image_size"], arrays["fps"]
+    if size.shape != (2,) or size.dtype.kind not in "iu" or not ((size > 0) & (size <= LONGEST)).all():  # type: ignore[operator]
+        raise damaged("tracks", "an image_size that is not two positive integers, width and height")
+    fps = float(rate) if rate.shape == () and rate.dtype.kind in "fiu" else np.nan
+    if not 0 < fps <= 1000:
+        raise damaged("tracks", "an fps that is not a number from 0 to 1000")
+    return (int(size[0]), int(size[1])), fps
+
+
+def _texture(arrays: Arrays, num_points: int) -> Texture:
+    places = arrays["uv"]
+    if places.shape != (num_points, 2) or places.dtype.kind != "f" or not np.isfinite(places).all():
+        raise damaged("tracks", f"texture coordinates of shape {places.shape} for {num_points} points")
+    try:
+        return Texture.from_tracked(arrays["template_image"], np.clip(places, 0, 1))
+    except InvalidInput as error:
+        raise damaged("tracks", f"a template_image that is no picture ({error.got})") from error
