@@ -288,6 +288,9 @@ class ProblemCode(StrEnum):
      "Delete some, or wait until they expire.")
 
     # Input files
+    NOT_A_RESULT = ("not_a_result", None, "Not a result",
+     "`pliant view` named a folder without `report.json` and `preview.bin`.",
+     "Name the folder that `pliant solve -o` or `pliant result -o` wrote.")
     FILM_AS_TRACKS = ("film_as_tracks", 422, "A film sent as tracks",
      "The part `tracks` is a film or a zip of pictures.",
      "Send it as the part `film`; `pliant submit FILM` and the page recognise films by themselves.")
