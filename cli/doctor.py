@@ -156,11 +156,9 @@ def check_blas() -> Iterator[Finding]:
 
 def check_cores() -> Iterator[Finding]:
     """Check how the cores are divided among workers."""
-    import os
-
     from pliant.worker.settings import Settings, usable_cores
 
-    settings = Settings.from_environment(os.environ)
+    settings = Settings() if missing_modules() else Settings.from_environment()
     threads, cores = settings.threads_per_job, usable_cores()
     found = f"{cores} usable; {settings.workers} worker(s) of {threads} thread(s)"
     if threads * settings.workers > cores:
@@ -189,17 +187,16 @@ def check_storage(data: Path) -> Iterator[Finding]:
 
 def check_valkey() -> Iterator[Finding]:
     """Check the queue: the Redis server of PLIANT_REDIS_URL, or the program of the embedded server."""
-    import os
-
-    address = os.environ.get("PLIANT_REDIS_URL", "")
-    if address != "":
-        yield _redis(address)
-        return
     if missing_modules():
         return
     from pliant.worker.errors import WorkerError
     from pliant.worker.processes.valkey import find_binary
+    from pliant.worker.settings import Settings
 
+    address = Settings.from_environment().redis_url
+    if address is not None:
+        yield _redis(address)
+        return
     try:
         yield Finding("queue", "good", f"embedded Valkey, {find_binary()}")
     except WorkerError as fault:
@@ -240,7 +237,6 @@ def check_service(session: Session, url: str) -> Iterator[Finding]:
 
 def check_stored(data: Path) -> Iterator[Finding]:
     """Compare records, queue, blobs, scratch directories, uploads and incomplete request bodies with each other."""
-    import os
     from dataclasses import replace
 
     from pliant.service.spool import Incoming
@@ -249,7 +245,7 @@ def check_stored(data: Path) -> Iterator[Finding]:
     from pliant.worker.maintenance.fsck import findings
     from pliant.worker.settings import Settings
 
-    settings = replace(Settings.from_environment(os.environ), data=data)
+    settings = replace(Settings.from_environment(), data=data)
     try:
         found = findings(Jobs.open(settings))
     except StoreUnavailable as fault:

@@ -139,6 +139,7 @@ def show_finished(done: Finished, output: Path, *, as_json: bool) -> None:
         print_json(
             {
                 "verdict": done.verdict, "verdict_reasons": list(done.verdict_reasons), "trust_sentence": done.trust_sentence,
+                "camera_sentence": done.camera_sentence,
                 "outcome": done.outcome, "sentence": done.sentence, "metrics": done.metrics, "warnings": list(done.warnings),
                 "files": {artifact.name: str(output / artifact.name) for artifact in done.artifacts},
             }
@@ -152,6 +153,8 @@ def show_finished(done: Finished, output: Path, *, as_json: bool) -> None:
     screen.print(metrics_table(done.metrics))
     for artifact in done.artifacts:
         screen.print(f"{output / artifact.name}  {artifact.bytes / 1e6:.2f} MB", markup=False)
+    if done.camera_sentence is not None:
+        screen.print(done.camera_sentence, markup=False)
     for line in verdict_lines(done) or [Text(done.sentence)]:
         screen.print(line)
 

@@ -39,18 +39,32 @@ Workers = Annotated[
 
 def up(
     ctx: typer.Context,
-    host: Annotated[str, typer.Option("--host", envvar="PLIANT_HOST", help="Address to listen on.")] = "127.0.0.1",
+    host: Annotated[
+        str | None,
+        typer.Option("--host", envvar="PLIANT_HOST", help="Address to listen on.", show_default="127.0.0.1"),
+    ] = None,
     port: Annotated[
-        int, typer.Option("--port", envvar="PLIANT_PORT", help="Port to listen on; 0: a free one.", min=0, max=65535)
-    ] = 8000,
+        int | None,
+        typer.Option(
+            "--port",
+            envvar="PLIANT_PORT",
+            help="Port to listen on; 0: a free one.",
+            min=0,
+            max=65535,
+            show_default="8000",
+        ),
+    ] = None,
     data: Data = None,
     workers: Workers = None,
     auth: Annotated[
-        Literal["auto", "required", "off"],
+        Literal["auto", "required", "off"] | None,
         typer.Option(
-            "--auth", envvar="PLIANT_AUTH", help="Whether requests need a token; auto: not on the loopback address."
+            "--auth",
+            envvar="PLIANT_AUTH",
+            help="Whether requests need a token; auto: not on the loopback address.",
+            show_default="auto",
         ),
-    ] = "auto",
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Run everything: service, page, queue and workers. Ctrl-C stops it.
@@ -59,11 +73,13 @@ def up(
     """
     ctx.obj.json = as_json
     require_server("pliant up")
+    from pliant.service.settings import ServiceSettings
     from pliant.worker.processes.supervisor import Supervisor, valkey_child, worker_children
     from pliant.worker.processes.valkey import Valkey
 
-    settings = chosen(data, workers)
-    port = taken(host, port)
+    settings, service = chosen(data, workers), ServiceSettings.from_environment()
+    host = service.host if host is None else host
+    port = taken(host, service.port if port is None else port)
     url = address(host, port)
     with ExitStack() as held:
         children: list[Child] = []
@@ -71,7 +87,7 @@ def up(
             valkey = Valkey.claim(settings.data)
             held.callback(valkey.release)
             children.append(valkey_child(valkey))
-        children += [*worker_children(settings), service_child(settings, host, port, url, auth=auth)]
+        children += [*worker_children(settings), service_child(settings, host, port, url, auth=auth or service.auth)]
 
         def announce() -> None:
             if as_json:
@@ -111,7 +127,7 @@ def chosen(data: Path | None, workers: int | None) -> Settings:
     """Return the settings; the command line takes precedence over the environment."""
     from pliant.worker.settings import Settings as WorkerSettings
 
-    settings = WorkerSettings.from_environment(os.environ)
+    settings = WorkerSettings.from_environment()
     if data is not None:
         settings = replace(settings, data=data)
     if workers is not None:

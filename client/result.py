@@ -72,6 +72,24 @@ class Reconstruction:
         return self.job.verdict
 
     @property
+    def camera(self) -> dict[str, Any]:
+        """The camera model and its lens, as the report states them: `model`, `focal`, `focal_std`, `field_of_view`, `sentence` and more."""
+        camera: dict[str, Any] = self.report["camera"]
+        return camera
+
+    @property
+    def focal(self) -> float | None:
+        """Focal length in pixels of the tracks; None for orthographic cameras."""
+        focal: float | None = self.camera["focal"]
+        return focal
+
+    @property
+    def field_of_view(self) -> float | None:
+        """Horizontal field of view in degrees; None for orthographic cameras and where `image_size` is not known."""
+        angle: float | None = self.camera.get("field_of_view")
+        return angle
+
+    @property
     def faces(self) -> NDArray[np.int32]:
         """Triangles (T, 3) or quads (T, 4): indices into the points."""
         return self.arrays["faces"]
@@ -168,10 +186,9 @@ def finished(job: Job) -> Job:
     """
     if not job.status.final:
         raise NotAllowedNow(
-            Problem(
-                title="The job is not finished",
-                status=409,
-                code="not_finished",
+            Problem.of(
+                "not_finished",
+                409,
                 detail=f"Job {job.id} is {job.status}; there is no result yet. Wait for it.",
                 retryable=True,
             )
@@ -183,10 +200,8 @@ def unknown_file(job: Job, name: str) -> NotFound:
     """Return the error for a file that a job does not have."""
     held = ", ".join(artifact.name for artifact in job.artifacts) or "none"
     return NotFound(
-        Problem(
-            title="No such file",
-            status=404,
-            code="unknown_artifact",
+        Problem.of(
+            "unknown_artifact",
             detail=f"Job {job.id} ({job.status}) has no file {name!r}. Its files: {held}.",
         )
     )

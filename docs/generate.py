@@ -19,6 +19,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator
 from itertools import pairwise
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 DOCS = Path(__file__).resolve().parent
@@ -61,25 +62,22 @@ def settings() -> str:
     from pliant.service import settings as of_service
     from pliant.worker import settings as of_worker
 
-    notes, defaults = _field_notes(of_worker, "Settings"), of_worker.Settings()
-    for name, (variable, _, _) in of_worker.VARIABLES.items():  # the page speaks of variables, the class of fields
-        notes = {each: note.replace(f"`{name}`", f"`{variable}`") for each, note in notes.items()}
-    worker = [
-        (f"`{variable}`", _default(getattr(defaults, name)), f"{notes[name]} Expected: {expected}.")
-        for name, (variable, expected, _) in of_worker.VARIABLES.items()
-    ]
-    service_defaults = of_service.ServiceSettings()
-    service = []
-    for name, note in _field_notes(of_service, "ServiceSettings").items():
-        found = re.search(r"\s*\((PLIANT_\w+)[^)]*\)", note)
-        if found is not None and found[1] not in {variable for variable, _, _ in of_worker.VARIABLES.values()}:
-            value = getattr(service_defaults, name)
-            note = note.replace(found[0], "")
-            if found[1].endswith("_MB"):  # the class has bytes
-                value, note = value // 2**20, note.replace("in bytes", "in MiB")
-            service.append((f"`{found[1]}`", _default(value), note))
+    worker, service = _settings_of(of_worker, "Settings"), _settings_of(of_service, "ServiceSettings")
     heads = ("variable", "default", "meaning")
     return f"## Storage and work\n\n{_table(heads, worker)}\n\n## Access control and rate limits\n\n{_table(heads, service)}"
+
+
+def _settings_of(module: ModuleType, record: str) -> list[tuple[str, str, str]]:
+    """Return a row for every setting of a record: variable, default, and meaning with what is expected."""
+    from pliant.worker.environment import expected_of, fields_of, variable_of
+
+    notes, fields = _field_notes(module, record), fields_of(getattr(module, record))
+    for name in fields:  # the page speaks of variables, the class of fields
+        notes = {each: note.replace(f"`{name}`", f"`{variable_of(name)}`") for each, note in notes.items()}
+    return [
+        (f"`{variable_of(name)}`", _default(field.default), f"{notes[name]} Expected: {expected_of(field)}.")
+        for name, field in fields.items()
+    ]
 
 
 def errors() -> str:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from datetime import datetime
 from enum import StrEnum
+from http import HTTPStatus
 from typing import Any, Literal
 
 from pliant.schemas.options import Options
-from pliant.schemas.problems import type_of
+from pliant.schemas.problems import RETRYABLE_STATUSES, find_code, type_of
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 
@@ -53,6 +54,39 @@ class Problem(Record):
         None, description="The possible interpretations of an ambiguous input."
     )
 
+    @classmethod
+    def of(cls, code: str, status: int | None = None, *, detail: str, **members: Any) -> Problem:
+        """Return the problem of a code, with the title and the status of the code's entry in the table.
+
+        Parameters
+        ----------
+        code : str
+            Stable machine-readable name.
+        status : int, optional
+            HTTP status code, if not the code's own.
+        detail : str
+            A whole sentence that ends with what to do.
+        **members
+            Further members, e.g. those of an error: `pliant.schemas.invalid.members_of`.
+        """
+        known = find_code(code)
+        status = status or (known.status if known is not None else None) or 500
+        title = HTTPStatus(status).phrase if known is None else known.heading
+        members.setdefault("retryable", status in RETRYABLE_STATUSES)
+        return cls(title=title, status=status, code=code, detail=detail, **members)
+
+
+class FollowedPoints(Record):
+    """Some points of a film in the frame that was tracked last."""
+
+    frame: int = Field(ge=0, description="Number of the frame in the film, from 0.")
+    seconds: float = Field(ge=0, description="From the film's start.")
+    width: int = Field(ge=1, description="Of the film, pixels.")
+    height: int = Field(ge=1, description="Of the film, pixels.")
+    points: list[int] = Field(
+        max_length=400, description="x and y of each visible point in turn, rounded to the film's pixels."
+    )
+
 
 class Progress(Record):
     """Progress of a running job."""
@@ -66,6 +100,7 @@ class Progress(Record):
     objective: float | None = None
     residual: float | None = Field(None, description="Median visible reprojection residual, the tracks' unit.")
     seconds_left: float | None = Field(None, description="Estimate; null until one is possible.")
+    followed: FollowedPoints | None = Field(None, description="Points that the stage `track` tracked last.")
     updated_at: datetime
 
 

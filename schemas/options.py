@@ -10,7 +10,7 @@ from typing import Annotated, Literal, get_args
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
 SOLVER_FIELDS = (
-    "method", "camera", "surface", "basis_size", "refine_rotations", "preset", "temporal_weight", "spatial_weight", "robust_scale",
+    "method", "camera", "surface", "order", "basis_size", "refine_rotations", "preset", "temporal_weight", "spatial_weight", "robust_scale",
     "temporal_order", "loss", "laplacian", "prior", "low_rank_weight", "max_reweightings", "tolerance", "precision", "seed",
     "focal", "field_of_view", "principal_point", "image_size",
 )  # fmt: skip
@@ -64,13 +64,19 @@ class Options(BaseModel):
     )
     principal_point: Annotated[str, Field(pattern=POINT)] | None = Field(
         None,
-        description="Principal point X,Y in pixels, e.g. 319.5,239.5; null: the centre of image_size, or of the tracks without it.",
+        description="Principal point X,Y in pixels, e.g. 319.5,239.5; null: the centre of image_size, "
+        "((width - 1) / 2, (height - 1) / 2), or that of the tracks without it.",
     )
     surface: Literal["auto", "isometric", "free"] = Field(
         "auto",
         description="isometric: a sheet that bends without stretching, such as paper or cloth, seen in perspective. free: no such "
         "assumption. auto: isometric if the tracks are those of a sheet and its edge lengths determine a focal length; "
         "needs image_size or focal.",
+    )
+    order: Literal["auto", "film", "any"] = Field(
+        "auto",
+        description="film: neighbouring frames are alike. any: photographs in no order; results do not depend on it. "
+        "Needs prior gaussian and at most 360 frames. auto: any if neighbouring frames are no more alike than others.",
     )
     basis_size: Annotated[int, Field(ge=1, le=100)] | None = Field(
         None,
@@ -181,8 +187,8 @@ class Options(BaseModel):
     )
     image_size: Annotated[str, Field(pattern=r"^[1-9]\d{0,5}x[1-9]\d{0,5}$")] | None = Field(
         None,
-        description="WIDTHxHEIGHT of the picture in pixels, e.g. 640x480; needed if coordinates are fractions of it. Its centre is the "
-        "principal point of a perspective camera.",
+        description="WIDTHxHEIGHT of the picture in pixels, e.g. 640x480; needed if coordinates are fractions of it. "
+        "Pixel centres lie at whole numbers from 0. The picture's centre is the principal point of a perspective camera.",
     )
     coordinate_order: Literal["auto", "xy", "yx"] = Field(
         "auto", description="Order of a point's two coordinates. auto: x, y, unless only y, x lies inside image_size."

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import signal
 import socket
 import sys
@@ -15,7 +14,8 @@ import uvicorn
 from fastapi import FastAPI
 from pliant.service.app import create_app
 from pliant.service.logs import configure_logging
-from pliant.service.settings import InvalidServiceSetting, ServiceSettings
+from pliant.service.settings import ServiceSettings
+from pliant.worker.environment import variable_of
 from pliant.worker.errors import InvalidSetting, NewerData, StoreUnavailable
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.settings import Settings
@@ -61,7 +61,7 @@ def check_access(settings: ServiceSettings, tokens: Tokens) -> None:
 
     Raises
     ------
-    InvalidServiceSetting
+    InvalidSetting
         There is no valid token; the message names both remedies.
     """
     if not settings.asks_for_tokens:
@@ -75,9 +75,12 @@ def check_access(settings: ServiceSettings, tokens: Tokens) -> None:
     except StoreUnavailable:
         return  # requests are answered 503 until the store is back
     if not usable:
-        raise InvalidServiceSetting(
-            f"Requests to {settings.host} need a token, and none is valid. Create one with `pliant token create NAME`, with the same "
-            "PLIANT_DATA or PLIANT_REDIS_URL, then start again; or set PLIANT_AUTH=off if a proxy controls access."
+        raise InvalidSetting(
+            variable_of("auth"),
+            expected=f"a valid token for requests to {settings.host}",
+            got="none",
+            hint="Create one with `pliant token create NAME`, with the same PLIANT_DATA or PLIANT_REDIS_URL, then start again; "
+            "or set PLIANT_AUTH=off if a proxy controls access.",
         )
 
 
@@ -97,12 +100,12 @@ def main(arguments: Sequence[str] = ()) -> int:
     try:
         settings = ServiceSettings.from_environment()
         configure_logging(settings.log_level, settings.log_format)
-        of_worker = Settings.from_environment(os.environ)
+        of_worker = Settings.from_environment()
         tokens = Tokens.open(of_worker)
         check_access(settings, tokens)
         with suppress(StoreUnavailable):  # requests are answered 503 until the store is back
             prepare(of_worker)
-    except (InvalidServiceSetting, InvalidSetting, NewerData) as error:
+    except (InvalidSetting, NewerData) as error:
         sys.stderr.write(f"{error}\n")
         return 2
     app = create_app(Jobs.open(of_worker), settings, tokens=tokens)

@@ -83,7 +83,7 @@ def create_app(
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        incoming = Incoming(settings.incoming)
+        incoming = Incoming(jobs_of_all.settings.incoming)
         incoming.open()
         app.state.service = Service(
             jobs=jobs_of_all,

@@ -9,14 +9,14 @@ from __future__ import annotations
 import errno
 import logging
 from collections.abc import Mapping, Sequence
-from http import HTTPStatus
 from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import Response
+from pliant.schemas.invalid import Invalid, members_of
 from pliant.schemas.job import Problem
-from pliant.schemas.problems import RETRYABLE_STATUSES, ProblemCode, find_code, type_of
+from pliant.schemas.problems import ProblemCode
 from pydantic import ValidationError
 from starlette.exceptions import HTTPException
 from starlette.types import Receive, Scope, Send
@@ -88,9 +88,13 @@ class ProblemResponse(Response):
 
 
 def wrong_input(code: ProblemCode, *, field: str, expected: str, got: str, hint: str, **more: Any) -> Refusal:
-    """Return (not raise) the refusal of an input, its sentence made of both sides and the hint."""
-    detail = f"{field}: expected {expected}, got {got}. {hint}"
-    return Refusal(code, detail=detail, field=field, expected=expected, got=got, hint=hint, **more)
+    """Return (not raise) the refusal of an input; `more` goes to `Refusal`."""
+    return refused(Invalid(code, field=field, expected=expected, got=got, hint=hint), **more)
+
+
+def refused(error: Invalid, **more: Any) -> Refusal:
+    """Return the refusal that an error about an invalid value amounts to; `more` goes to `Refusal`."""
+    return Refusal(ProblemCode[error.code.upper()], detail=str(error), **{**members_of(error), **more})
 
 
 def answer(
@@ -116,16 +120,7 @@ def answer(
     **members
         Further members of `Problem`.
     """
-    return ProblemResponse(problem(code, status or code.status or 500, detail=detail, **members), headers=headers)
-
-
-def problem(code: str, status: int, *, detail: str, **members: Any) -> Problem:
-    """Return a `Problem`; its type is the address that explains the code, its title the code's own."""
-    known = find_code(code)
-    title = HTTPStatus(status).phrase if known is None else known.heading
-    members.setdefault("retryable", status in RETRYABLE_STATUSES)
-    members.setdefault("type", type_of(code))
-    return Problem(title=title, status=status, code=code, detail=detail, **members)
+    return ProblemResponse(Problem.of(code, status, detail=detail, **members), headers=headers)
 
 
 def from_error(error: Exception, status: int) -> Problem:
@@ -138,8 +133,8 @@ def from_error(error: Exception, status: int) -> Problem:
     status : int
         Status code of its class.
     """
-    members = {name: getattr(error, name, None) for name in ("field", "expected", "got", "hint", "choices")}
-    return problem(str(getattr(error, "code", ProblemCode.INTERNAL_ERROR)), status, detail=str(error), **members)
+    code = str(getattr(error, "code", ProblemCode.INTERNAL_ERROR))
+    return Problem.of(code, status, detail=str(error), **members_of(error))
 
 
 def from_validation(errors: Sequence[Any], *, options: bool = False) -> Refusal:
@@ -193,10 +188,10 @@ def install(app: FastAPI, table: Mapping[type[Exception], int], *, security_head
         Headers of the answer to an unexpected exception, which is made outside all middleware.
     """
 
-    async def refused(_: Request, error: Exception) -> Response:
+    async def of_refusal(_: Request, error: Exception) -> Response:
         assert isinstance(error, Refusal)
         return ProblemResponse(
-            problem(error.code, error.status, detail=error.detail, **error.members), headers=error.headers
+            Problem.of(error.code, error.status, detail=error.detail, **error.members), headers=error.headers
         )
 
     async def of_ours(_: Request, error: Exception) -> Response:
@@ -215,7 +210,7 @@ def install(app: FastAPI, table: Mapping[type[Exception], int], *, security_head
 
     async def of_validation(request: Request, error: Exception) -> Response:
         assert isinstance(error, (RequestValidationError, ValidationError))
-        return await refused(request, from_validation(error.errors()))
+        return await of_refusal(request, from_validation(error.errors()))
 
     async def of_disk(request: Request, error: Exception) -> Response:
         assert isinstance(error, OSError)
@@ -233,7 +228,7 @@ def install(app: FastAPI, table: Mapping[type[Exception], int], *, security_head
         own = {"X-Request-ID": kept["request_id"]} if "request_id" in kept else {}
         return answer(code, detail=detail, headers={**security_headers, **own, "Cache-Control": "no-store"})
 
-    app.add_exception_handler(Refusal, refused)
+    app.add_exception_handler(Refusal, of_refusal)
     app.add_exception_handler(HTTPException, of_http)
     app.add_exception_handler(RequestValidationError, of_validation)
     app.add_exception_handler(OSError, of_disk)

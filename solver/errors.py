@@ -10,6 +10,8 @@ Not converging is not an error: see `pliant.solver.Outcome`.
 
 from __future__ import annotations
 
+from pliant.schemas.invalid import Invalid
+
 
 class SolverError(Exception):
     """The solver failed."""
@@ -24,28 +26,8 @@ class NotFinite(SolverError):
         super().__init__(f"{what}. Check the tracks for absurdly large values, or solve in float64.")
 
 
-class InvalidInput(SolverError):
-    """An input is invalid.
-
-    Attributes
-    ----------
-    code : str
-        Stable machine-readable name of the fault, e.g. ``"too_few_frames"``.
-    field : str
-        The input at fault, e.g. ``"tracks"`` or ``"mesh.faces"``.
-    expected, got : str
-        What was expected and what was given.
-    hint : str
-        What the user can do about it.
-    """
-
-    def __init__(self, code: str, *, field: str, expected: str, got: str, hint: str) -> None:
-        super().__init__(f"{field}: expected {expected}, got {got}. {hint}")
-        self.code = code
-        self.field = field
-        self.expected = expected
-        self.got = got
-        self.hint = hint
+class InvalidInput(Invalid, SolverError):
+    """An input is invalid; ``code``, ``field``, ``expected``, ``got`` and ``hint`` are attributes."""
 
 
 class InvalidSettings(InvalidInput):

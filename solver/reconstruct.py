@@ -49,6 +49,7 @@ from pliant.solver.shapes.sparsely_observed import WELL_OBSERVED_SHARE, WellObse
 from pliant.solver.shapes.state import State
 from pliant.solver.shapes.uncertainty import bounded_by_neighbours, position_std
 from pliant.solver.tracks.completion import seen_again
+from pliant.solver.tracks.frame_order import as_they_came, content_order, differences, in_order, resolved_order
 from pliant.solver.tracks.noise import OUTLIER_SHARE
 from pliant.solver.tracks.normalization import Normalized, normalize
 
@@ -102,7 +103,24 @@ def solve(
     """
     settings = settings if settings is not None else Settings()
     _check_fit(tracks, mesh, cameras)
+    settings, why = resolved_order(tracks, settings)
     monitor = _monitored(tracks, cameras, settings, on_step, should_stop)
+    if settings.order == "film":
+        return _with_reason(_solved(tracks, mesh, cameras, settings, monitor), why)
+    order = content_order(differences(tracks))
+    moved, cameras = in_order(tracks, cameras, order)
+    return _with_reason(as_they_came(_solved(moved, mesh, cameras, settings, monitor), order), why)
+
+
+def _with_reason(solution: Solution, why: str) -> Solution:
+    choices = replace(solution.choices, reasons={**solution.choices.reasons, "order": why})
+    return replace(solution, choices=choices)
+
+
+def _solved(
+    tracks: Tracks, mesh: Mesh | None, cameras: KnownCamera | None, settings: Settings, monitor: Monitor
+) -> Solution:
+    """Solve frames in the order that they have; with `order` `any` no prior compares neighbours."""
     on_step, should_stop, report = monitor.report, monitor, monitor.report
     began = time.perf_counter()
     normalized = normalize(tracks)
@@ -245,7 +263,7 @@ def _learned(
     if not settings.gaussian:
         if lens is not None:
             estimate = settled(
-                estimate, normalized, learned_frames(shown), model_order=ModelOrder(),
+                estimate, normalized, learned_frames(shown), model_order=ModelOrder(ordered=estimate.ordered),
                 turning=cameras is None and settings.refine_rotations,
                 should_stop=should_stop,
             )  # fmt: skip

@@ -25,6 +25,7 @@ Preset = Literal["auto", "paper"]
 Loss = Literal["l1", "l2", "huber"]
 Prior = Literal["gaussian", "smooth+low_rank", "smooth"]
 Surface = Literal["auto", "isometric", "free"]
+Order = Literal["auto", "film", "any"]
 Laplacian = Literal["auto", "grid8", "uniform", "cotangent"]
 
 
@@ -50,7 +51,8 @@ class Settings:
     """c as (x, y) in the tracks' unit; None: the centre of the picture, or of the tracks where `image_size` is not given."""
 
     image_size: tuple[float, float] | None = None
-    """(width, height) of the picture in the tracks' unit."""
+    """(width, height) of the picture in pixels. The centres of its pixels lie at whole numbers, the first at (0, 0): the picture reaches
+    from −½ to width − ½, and its centre is ((width − 1)/2, (height − 1)/2)."""
 
     y_up: bool = False
     """True: y of the tracks grows upwards. The third axis of the camera then points to the viewer instead of away."""
@@ -59,6 +61,10 @@ class Settings:
     """`isometric`: a sheet that bends without stretching, seen in perspective; `free`: any surface; `auto`: isometric if the tracks
     are those of a sheet and its edge lengths determine a focal length. `auto` tests this only if `image_size` or the focal length is
     given, with the default camera model, method and prior."""
+
+    order: Order = "auto"
+    """`film`: neighbouring frames are alike; `any`: photographs in no order, of which no prior compares neighbours (Gaussian prior only);
+    `auto`: `film` where the tracks are more probable as a walk from frame to frame than as independent frames."""
 
     basis_size: int | None = None
     """K of the rank-3K factorization; None selects it from the data and reports the reason."""
@@ -118,6 +124,13 @@ class Settings:
         return self.image_size[0] / (2 * tan(radians(self.field_of_view) / 2))
 
     @property
+    def centre(self) -> tuple[float, float] | None:
+        """The principal point if it is given, else the picture's centre; None if neither is known."""
+        if self.principal_point is None and self.image_size is not None:
+            return ((self.image_size[0] - 1) / 2, (self.image_size[1] - 1) / 2)
+        return self.principal_point
+
+    @property
     def gaussian(self) -> bool:
         """Whether the shapes have the Gaussian prior."""
         return self.prior == "gaussian" and self.method == "robust" and self.preset == "auto"
@@ -132,6 +145,7 @@ class Settings:
         _check_choice("method", self.method, Method)
         _check_choice("camera", self.camera, CameraModel)
         _check_choice("surface", self.surface, Surface)
+        _check_choice("order", self.order, Order)
         _check_choice("preset", self.preset, Preset)
         _check_choice("loss", self.loss, Loss)
         _check_choice("laplacian", self.laplacian, Laplacian)
@@ -151,6 +165,11 @@ class Settings:
             raise _out_of_range("max_reweightings", "a whole number from 1 to 1000", self.max_reweightings)
         if not 0 < self.tolerance < 1:
             raise _out_of_range("tolerance", "a number between 0 and 1", self.tolerance)
+        if self.order == "any" and not self.gaussian:
+            raise _contradiction(
+                "order", "prior gaussian with method robust and preset auto beside order any",
+                f"prior {self.prior}, method {self.method}, preset {self.preset}", "The other priors compare neighbouring frames.",
+            )  # fmt: skip
         if not 0 <= self.seed < 2**32:
             raise _out_of_range("seed", "a whole number from 0 to 4294967295", self.seed)
 

@@ -27,6 +27,7 @@ MARGIN = 32
 """Pixels around the points within which flow is computed: twice the largest patch that DIS searches at its coarsest scale."""
 
 Read = Callable[[int], Grey]
+OnFrame = Callable[[int, Floats, Bools], None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,7 +60,7 @@ def chain(
     appearance: Appearance,
     *,
     pool: ThreadPoolExecutor,
-    on_frame: Callable[[], None],
+    on_frame: OnFrame,
     should_stop: Callable[[], bool],
 ) -> Chain:
     """Track the points of a template to both ends of the film.
@@ -75,7 +76,7 @@ def chain(
     pool
         Threads for the flows of one frame.
     on_frame
-        Called after every tracked frame.
+        Called after every tracked frame with its index, the points `(P, 2)` in pixels of the tracker's frames, and which are visible.
     should_stop
         Asked before every frame.
 
@@ -100,7 +101,7 @@ def chain(
             recent[t] = _advance(read, t, direction, recent, template, appearance, pool)
             _store(result, t, recent[t])
             recent = {s: state for s, state in recent.items() if s == template or abs(t - s) < max(DELTAS)}
-            on_frame()
+            on_frame(t, recent[t].points, recent[t].visible)
     return result
 
 

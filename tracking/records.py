@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -12,6 +12,23 @@ from numpy.typing import NDArray
 from pliant.tracking.contact_sheet import Sheet, draw_contact_sheet
 
 Stage = Literal["read", "locate", "track"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Followed:
+    """Points in one frame, to be shown while tracking runs."""
+
+    index: int
+    """Number of the frame in the whole film, from 0."""
+
+    time: float
+    """Seconds from the film's start."""
+
+    points: NDArray[np.float32]
+    """In the film's pixels, shape `(P, 2)`."""
+
+    visible: NDArray[np.bool_]
+    """Shape `(P,)`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +43,9 @@ class TrackingStep:
 
     total: int | None
     """Frames of this stage; None while the film's length is not known."""
+
+    followed: Followed | None = field(default=None, compare=False)
+    """Where the points are in the frame just done; only of "track"."""
 
 
 OnStep = Callable[[TrackingStep], None]

@@ -18,9 +18,9 @@ from pliant.tracking.chaining import Chain, chain
 from pliant.tracking.decoding.film import Film, open_film
 from pliant.tracking.decoding.limits import FilmLimits
 from pliant.tracking.errors import FilmError, TrackingStopped
-from pliant.tracking.flow import Bools, opencv_serial
+from pliant.tracking.flow import Bools, Floats, opencv_serial
 from pliant.tracking.frame_store import FrameStore
-from pliant.tracking.records import FilmInfo, OnStep, TrackedFilm, TrackingStep
+from pliant.tracking.records import FilmInfo, Followed, OnStep, TrackedFilm, TrackingStep
 from pliant.tracking.region import Region, read_region, transport
 from pliant.tracking.seeding import default_step, keep, neighbours, place, quads
 from pliant.tracking.survey import Survey, sharpest, survey
@@ -186,10 +186,12 @@ def _track(run: _Run, found: Survey, plan: _Plan, step: float | None, *, whole: 
     length = plan.stop - plan.start
     done = 1
 
-    def on_frame() -> None:
+    def on_frame(t: int, points: Floats, visible: Bools) -> None:
         nonlocal done
         done += 1
-        run.on_step(TrackingStep("track", done, length))
+        row = plan.start + t
+        followed = Followed(int(found.indices[row]), float(found.times[row]), _in_film(points, found.scale), visible)
+        run.on_step(TrackingStep("track", done, length, followed))
 
     chained = chain(
         lambda row: run.store.read(plan.start + row), length, plan.template - plan.start, appearance,
@@ -220,7 +222,7 @@ def _assemble(
     width, height = run.film.size
     indices, times = found.indices[rows], found.times[rows]
     visible = chained.visible[:, kept]
-    tracks = (chained.points[:, kept] + np.float32(0.5)) / np.float32(found.scale) - np.float32(0.5)
+    tracks = _in_film(chained.points[:, kept], found.scale)
     confidence = np.where(visible, 1 / (1 + chained.variance[:, kept]), 0).astype(np.float32)
     template = plan.template - plan.start
     picked = np.unique(np.linspace(0, len(indices) - 1, THUMBNAILS).round().astype(np.int64))
@@ -235,6 +237,11 @@ def _assemble(
     return TrackedFilm(
         info, tracks, visible, confidence, grid, quads(grid), template, image, uv, thumbnails, picked, tuple(notes)
     )
+
+
+def _in_film(points: Floats, scale: float) -> Floats:
+    """Return places in the film's own pixels, from those in the tracker's frames, which are `scale` times as large."""
+    return (points + np.float32(0.5)) / np.float32(scale) - np.float32(0.5)
 
 
 def _pictures(

@@ -93,7 +93,7 @@ def main(arguments: list[str]) -> int:
         sys.stderr.write(f"{USAGE}\n")
         return 2
     try:
-        settings = Settings.from_environment(os.environ)
+        settings = Settings.from_environment()
         with suppress(StoreUnavailable):  # each task deals with a store that is away
             prepare(settings)
         return task(settings)

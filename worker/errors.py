@@ -29,6 +29,7 @@ Every one carries a stable `code`, a whole sentence (`str(error)`) and whether t
 
 from __future__ import annotations
 
+from pliant.schemas.invalid import Invalid
 from pliant.schemas.job import Status
 
 
@@ -132,22 +133,19 @@ class Conflict(WorkerError):
         self.id = id
 
 
-class OffsetMismatch(Conflict):
+class OffsetMismatch(Invalid, Conflict):
     """The offset of the bytes is not the current size of the upload."""
 
     def __init__(self, id: str, *, expected: int, got: int) -> None:
-        sentence = f"Upload {id!r} has {expected} bytes, but the data sent starts at {got}. Continue at {expected}."
-        super().__init__("upload_offset_mismatch", id=id, sentence=sentence)
-        self.field, self.offset = "Upload-Offset", expected
-        self.expected, self.got = str(expected), str(got)
+        hint = f"Continue at {expected}."
+        super().__init__(
+            "upload_offset_mismatch", field="Upload-Offset", expected=str(expected), got=str(got), hint=hint
+        )
+        self.id, self.offset = id, expected
 
 
-class InvalidRequest(WorkerError):
+class InvalidRequest(Invalid, WorkerError):
     """A malformed id, cursor or key."""
-
-    def __init__(self, code: str, *, field: str, expected: str, got: str, hint: str) -> None:
-        super().__init__(f"{field}: expected {expected}, got {got}. {hint}")
-        self.code, self.field, self.expected, self.got, self.hint = code, field, expected, got, hint
 
 
 class UploadTooLarge(InvalidRequest):
@@ -182,14 +180,13 @@ class TooManyShares(WorkerError):
         self.id, self.most = id, most
 
 
-class InvalidSetting(WorkerError):
-    """A setting does not parse or is out of range."""
+class InvalidSetting(Invalid, WorkerError):
+    """A setting does not parse, is out of range, or leaves an installation that cannot be used."""
 
-    code = "invalid_setting"
-
-    def __init__(self, name: str, *, expected: str, got: str) -> None:
-        super().__init__(f"{name}: expected {expected}, got {got!r}. Correct the variable or leave it unset.")
-        self.name, self.expected, self.got = name, expected, got
+    def __init__(
+        self, variable: str, *, expected: str, got: str, hint: str = "Correct the variable or leave it unset."
+    ) -> None:
+        super().__init__("invalid_setting", field=variable, expected=expected, got=got, hint=hint)
 
 
 class TooManyQueued(WorkerError):

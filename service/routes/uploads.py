@@ -15,7 +15,7 @@ import binascii
 import re
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated
 
 import anyio
 from anyio import to_thread
@@ -25,7 +25,7 @@ from pliant.schemas.problems import ProblemCode
 from pliant.service.dependencies import Bounds, Core, MyUploads, Service, bounds_of
 from pliant.service.multipart import batches
 from pliant.service.openapi import problems
-from pliant.service.problems import Refusal, wrong_input
+from pliant.service.problems import refused, wrong_input
 from pliant.worker.errors import OffsetMismatch
 from pliant.worker.uploads.service import Capacity, Uploads, Writer
 
@@ -202,8 +202,7 @@ async def _receive(request: Request, core: Service, *, uploads: Uploads, id: str
         writer: Writer = await to_thread.run_sync(held.__enter__)
     except OffsetMismatch as error:
         headers = {"Upload-Offset": error.expected, "Upload-Complete": "?0"}
-        members: dict[str, Any] = {"type": MISMATCH, "field": error.field, "expected": error.expected, "got": error.got}
-        raise Refusal(ProblemCode.UPLOAD_OFFSET_MISMATCH, detail=str(error), headers=headers, **members) from error
+        raise refused(error, type=MISMATCH, headers=headers) from error
     try:
         # The writer holds the limit, over all requests together.
         async for batch in batches(request, max_bytes=ANY, stall_seconds=core.settings.stall_seconds):

@@ -70,7 +70,6 @@ class InMemoryService(httpx.BaseTransport, httpx.AsyncBaseTransport):
         # Any Host header is answered: the address of an in-memory service is arbitrary.
         settings = ServiceSettings(
             host="0.0.0.0",  # noqa: S104 - nothing is bound
-            incoming=self.folder / "incoming",
             auth=auth,
             requests_per_minute=0,
         )

@@ -34,8 +34,24 @@ const bundled = await build({
   logLevel: "warning",
 });
 
+// The viewer that a saved page holds: one classic script, because a page opened from a disk cannot load modules.
+const alone = await build({
+  absWorkingDir: here,
+  entryPoints: ["src/standalone.ts"],
+  entryNames: "[name]-[hash]",
+  outdir: next,
+  bundle: true,
+  minify: true,
+  format: "iife",
+  target: ["es2022"],
+  legalComments: "inline",
+  metafile: true,
+  logLevel: "warning",
+});
+entries.push("src/standalone.ts");
+
 const produced = {};
-for (const [path, output] of Object.entries(bundled.metafile.outputs)) {
+for (const [path, output] of Object.entries({ ...bundled.metafile.outputs, ...alone.metafile.outputs })) {
   if (!entries.includes(output.entryPoint)) continue;
   produced[basename(output.entryPoint)] = basename(path);
   // A script that imports a stylesheet has a second output beside it.

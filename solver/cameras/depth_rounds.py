@@ -7,31 +7,24 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from pliant.solver.cameras.depth_alternation import alternated, factorized_again
 from pliant.solver.cameras.estimation import CameraEstimate
-from pliant.solver.cameras.focal_length import refined_with_focal, search
+from pliant.solver.cameras.focal_length import search
 from pliant.solver.cameras.learned import Learned
-from pliant.solver.cameras.perspective import (
-    MIRROR,
-    Perspective,
-    centred,
-    columns,
-    corrected,
-    corrected_moments,
-    depth_map,
-    depths_of,
-    mirrored,
-)
+from pliant.solver.cameras.perspective import MIRROR, Perspective, corrected_moments, depth_map, mirrored
+from pliant.solver.cameras.planar_ambiguity import is_planar
 from pliant.solver.model.model_order import ModelOrder
-from pliant.solver.model.shape_covariance import ShapeCovariance, annealed
+from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import exponential, logarithm
 from pliant.solver.records import Floats, read_only
 from pliant.solver.tracks.normalization import Normalized
 
-ROUNDS = 3
-"""Updates of depths, covariance, cameras and κ every time that cameras were found or refined."""
+RESTARTS = 3
+"""Maximum number of times that the alternation starts again from cameras of the corrected tracks; the evidence settles after one or two."""
 
-LEARNING = 60
-"""Rounds of expectation maximisation of an update."""
+MIN_GAIN = 0.01
+"""Decrease of the energy, per point and frame, below which another restart is not tried: equal solutions from different starts differ by
+as much (`focal_length.GAIN`)."""
 
 
 def settled(
@@ -76,13 +69,47 @@ def settled(
         covariance = mirrored(rotations, covariance)[1]
         rotations = MIRROR @ rotations @ MIRROR
         estimate = replace(estimate, rotations=rotations)
-    found = Learned(rotations[used], scales[used], covariance, np.inf)
-    for _ in range(ROUNDS):
-        if should_stop is not None and should_stop():
+    found, view = alternated(
+        view, Learned(rotations[used], scales[used], covariance, np.inf), used,
+        model_order=model_order, turning=turning, should_stop=should_stop,
+    )  # fmt: skip
+    settled_estimate = _applied(estimate, normalized, used, found, view)
+    if not turning or is_planar(settled_estimate.gram):
+        return settled_estimate
+    return _restarted(settled_estimate, normalized, used, found, model_order=model_order, should_stop=should_stop)
+
+
+def _restarted(
+    estimate: CameraEstimate,
+    normalized: Normalized,
+    used: NDArray[np.intp],
+    found: Learned,
+    *,
+    model_order: ModelOrder,
+    should_stop: Callable[[], bool] | None = None,
+) -> CameraEstimate:
+    """Return the estimate after alternations from cameras of the corrected tracks, for as long as the evidence rises.
+
+    `found` holds cameras and covariance of the frames used that belong to the estimate.
+    """
+    wide = np.repeat(np.asarray(estimate.scales), 2)
+    for _ in range(RESTARTS):
+        view = estimate.perspective
+        assert view is not None
+        rotations = factorized_again(
+            estimate.gram / np.outer(wide, wide), view, found, used, model_order=model_order, should_stop=should_stop
+        )
+        if rotations is None:
             break
-        found = _relearned(view, found, used, model_order)
-        found, view = _with_focal(view, found, used, turning=turning)
-    return _applied(estimate, normalized, used, found, view)
+        start = replace(found, rotations=rotations[used])
+        other, moved = alternated(view, start, used, model_order=model_order, turning=True, should_stop=should_stop)
+        gain = found.energy - other.energy
+        if gain <= 0:
+            break
+        estimate, found = _applied(replace(estimate, rotations=rotations), normalized, used, other, moved), other
+        if gain < MIN_GAIN:
+            break
+    return estimate
 
 
 def settled_again(
@@ -102,11 +129,7 @@ def settled_again(
     view = estimate.perspective
     assert view is not None
     whole = replace(found, scales=found.scales * scales)
-    for _ in range(ROUNDS):
-        if should_stop is not None and should_stop():
-            break
-        whole = _relearned(view, whole, used, model_order)
-        whole, view = _with_focal(view, whole, used, turning=True)
+    whole, view = alternated(view, whole, used, model_order=model_order, turning=True, should_stop=should_stop)
     return _applied(estimate, normalized, used, whole, view), replace(whole, scales=whole.scales / scales)
 
 
@@ -117,31 +140,6 @@ def with_depth_map(estimate: CameraEstimate, covariance: ShapeCovariance) -> Cam
         return estimate
     depth = depth_map(np.asarray(estimate.rotations), np.asarray(estimate.scales), covariance)
     return replace(estimate, perspective=replace(view, depth=depth))
-
-
-def _relearned(view: Perspective, found: Learned, used: NDArray[np.intp], model_order: ModelOrder) -> Learned:
-    views = view.sample[used]
-    depths = depths_of(depth_map(found.rotations, found.scales, found.covariance), views, view.curvature)
-    rows = columns(centred(corrected(views, depths, view.curvature)))
-    projections = found.rotations[:, :2] * found.scales[:, None, None]
-    covariance = annealed(
-        rows @ rows.T / rows.shape[1],
-        projections,
-        max_modes=model_order.max_modes,
-        noisy_start=model_order.noisy_start,
-        iterations=LEARNING,
-    )
-    return replace(found, covariance=covariance)
-
-
-def _with_focal(
-    view: Perspective, found: Learned, used: NDArray[np.intp], *, turning: bool
-) -> tuple[Learned, Perspective]:
-    zooms = bool((found.scales != 1).any())
-    found, curvature = refined_with_focal(
-        view.sample[used], found, view.curvature, free=view.given is None, turning=turning, with_scales=zooms
-    )
-    return found, replace(view, curvature=curvature)
 
 
 def _applied(

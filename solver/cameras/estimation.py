@@ -81,6 +81,9 @@ class CameraEstimate:
     """The perspective correction; None if perspective is not considered. With κ ≠ 0, `gram`, `sample` and
     `translations` are those of the corrected tracks."""
 
+    ordered: bool = True
+    """Whether the frames are those of a film, or photographs in no order."""
+
     reasons: dict[str, str] = field(default_factory=dict)
     """One sentence for each choice."""
 
@@ -111,7 +114,7 @@ def estimate_cameras(
     rank : int
         Of the completion, as an earlier estimate from these tracks had it; 0 chooses it.
     """
-    report = on_step if on_step is not None else _silent
+    report, ordered = on_step if on_step is not None else _silent, settings.order != "any"
     completed = complete(normalized, seed=settings.seed, rank=rank)
     report(Step("cameras", 0.4 * PROGRESS_SHARE))
     scales, scale_reason = rigid_evidence(completed.gram, settings)
@@ -126,19 +129,24 @@ def estimate_cameras(
         upgrades.append(upgrade(gram, size))
         entries.append(
             with_fixed_rotations(
-                part, _thinned(upgrades[-1], used), np.ones(len(part) // 2), with_scales=False, should_stop=should_stop
+                part,
+                _thinned(upgrades[-1], used),
+                np.ones(len(part) // 2),
+                with_scales=False,
+                ordered=ordered,
+                should_stop=should_stop,
             )
         )
         report(Step("cameras", (0.4 + 0.04 * len(entries)) * PROGRESS_SHARE))
     best, ran = min(entries, key=lambda candidate: candidate.energy), entries
     if settings.refine_rotations:
-        best, ran = run_multistart(part, entries, should_stop=should_stop)
+        best, ran = run_multistart(part, entries, ordered=ordered, should_stop=should_stop)
     own = next(each for each in upgrades if each.basis_size == best.basis_size)
     report(Step("cameras", 0.8 * PROGRESS_SHARE))
     rotations, refined = _everywhere(own.rotations, best, used, settings)
     hypotheses: tuple[tuple[int, Floats], ...] = ()
     if settings.refine_rotations and is_planar(gram):
-        rotations, sheet = resolve_pose_signs(gram, rotations, should_stop=should_stop)
+        rotations, sheet = resolve_pose_signs(gram, rotations, ordered=ordered, should_stop=should_stop)
         refined = f"{refined} {sheet}"
     elif settings.refine_rotations:
         hypotheses = _hypotheses(upgrades, ran, part, used)
@@ -148,7 +156,7 @@ def estimate_cameras(
     reasons = {"basis_size": _why(ran, best, settings), "scales": scale_reason, "rotations": refined}
     return CameraEstimate(
         rotations, scales, completed.translations, best.basis_size, completed.gram, completed.sample,
-        hypotheses, completed.outliers, completed.rank, completed.filling, None, reasons, _warnings(rotations),
+        hypotheses, completed.outliers, completed.rank, completed.filling, None, ordered, reasons, _warnings(rotations),
     )  # fmt: skip
 
 
@@ -227,6 +235,7 @@ def given_cameras(normalized: Normalized, known: KnownCamera, settings: Settings
         outliers=completed.outliers,
         rank=completed.rank,
         filling=completed.filling,
+        ordered=settings.order != "any",
         reasons={"camera": reason},
     )
 

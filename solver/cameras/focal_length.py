@@ -165,7 +165,8 @@ def _learn(
 ) -> ShapeCovariance:
     rows = columns(centred(corrected(views, depths, curvature)))
     return annealed(
-        rows @ rows.T / rows.shape[1], projections, max_modes=model_order.max_modes, noisy_start=model_order.noisy_start, iterations=ROUNDS
+        rows @ rows.T / rows.shape[1], projections, max_modes=model_order.max_modes, noisy_start=model_order.noisy_start,
+        ordered=model_order.ordered, iterations=ROUNDS,
     )  # fmt: skip
 
 
@@ -287,7 +288,7 @@ class corrected_energy:  # noqa: N801
         plain, along = columns(centred(views)), columns(centred(views * depths[..., None]))
         self.depths = depths
         self.grams = (plain @ plain.T / count, (plain @ along.T + along @ plain.T) / count, along @ along.T / count)
-        self.scene = scene_at(self.grams[0], found.rotations, with_scales=with_scales)
+        self.scene = scene_at(self.grams[0], found.rotations, with_scales=with_scales, ordered=found.covariance.ordered)
 
     def __call__(self, flat: Floats) -> tuple[float, Floats]:
         """Return E and its gradient."""

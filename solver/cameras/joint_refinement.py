@@ -99,6 +99,7 @@ def learn(
         sample,
         np.asarray(estimate.rotations)[used, :2],
         spoiled=spoiled and not turning,
+        ordered=estimate.ordered,
         seed=seed,
         should_stop=should_stop,
     )
@@ -134,7 +135,7 @@ def learn(
 
         if bends:
             estimate, found, unscaled, sample = again(found)
-        if model_order == ModelOrder() and full_mode_covariance.is_identifiable(
+        if model_order == ModelOrder(ordered=estimate.ordered) and full_mode_covariance.is_identifiable(
             found.covariance, estimate.sample.shape[1]
         ):
             found = _coupled(unscaled, found, with_scales=start_scales is not None, should_stop=should_stop)
@@ -148,7 +149,9 @@ def learn(
         # Learn from scratch: modes learned along the way to these cameras overstate their likelihood.
         projections = rotations[:, :2] * scales[:, None, None]
         if spoiled and turning:
-            model_order = select_model_order(sample, projections, spoiled=True, seed=seed, should_stop=should_stop)
+            model_order = select_model_order(
+                sample, projections, spoiled=True, ordered=estimate.ordered, seed=seed, should_stop=should_stop
+            )
         covariance, modes = learn_with_early_stopping(
             sample, unscaled, projections, model_order, seed=seed, should_stop=should_stop
         )
@@ -189,7 +192,12 @@ def refined(
     """Return cameras and covariance after rounds of alternating refinement; scales stay 1 without `with_scales`."""
     projections = rotations[:, :2] * scales[:, None, None]
     covariance = learned(
-        gram, projections, max_modes=model_order.max_modes, noisy_start=model_order.noisy_start, should_stop=should_stop
+        gram,
+        projections,
+        max_modes=model_order.max_modes,
+        noisy_start=model_order.noisy_start,
+        ordered=model_order.ordered,
+        should_stop=should_stop,
     )
     found = Learned(rotations, scales, covariance, np.inf)
     for _ in range(rounds):
@@ -258,9 +266,8 @@ def _free_scales(
             None,
             f"Every scale is 1: those found, from {least:.3f} to {largest:.3f}, are wider apart than any camera's.",
         )
-    if not (
-        gain > MIN_SCALE_GAIN * _scale_gain_share(np.log(best.scales)) and np.log(best.scales).std() > MIN_SCALE_STD
-    ):
+    share = _scale_gain_share(np.log(best.scales)) if model_order.ordered else 1.0
+    if not (gain > MIN_SCALE_GAIN * share and np.log(best.scales).std() > MIN_SCALE_STD):
         return None, (
             f"Every scale is 1: free ones, from {least:.3f} to {largest:.3f}, would gain {gain:.3f} in the logarithm of the "
             "likelihood, no more than deformation alone does."
@@ -303,17 +310,18 @@ def informative_frames(visible: Floats) -> NDArray[np.bool_]:
 
 def _turn(gram: Floats, found: Learned, *, with_scales: bool, should_stop: Callable[[], bool] | None) -> Learned:
     """Return cameras and covariance of higher likelihood."""
-    scene = scene_at(gram, found.rotations, with_scales=with_scales)
+    scene = scene_at(gram, found.rotations, with_scales=with_scales, ordered=found.covariance.ordered)
     moved = fit(scene, motion_of(scene, found), iterations=ROTATION_ITERATIONS, turning=True, should_stop=should_stop)
     return moved_to(scene, found, *moved)
 
 
 def _coupled(gram: Floats, found: Learned, *, with_scales: bool, should_stop: Callable[[], bool] | None) -> Learned:
     """Return the cameras refined with modes that have axes of their own (`model.full_mode_covariance`), if they are more probable."""
-    scene = scene_at(gram, found.rotations, with_scales=with_scales)
+    scene = scene_at(gram, found.rotations, with_scales=with_scales, ordered=found.covariance.ordered)
     rotations, scales = full_mode_covariance.refined(scene, found.scales, found.covariance, should_stop=should_stop)
     again = refined(
-        gram, rotations, scales, with_scales=with_scales, rounds=START_ROUNDS, model_order=ModelOrder(), should_stop=should_stop
+        gram, rotations, scales, with_scales=with_scales, rounds=START_ROUNDS,
+        model_order=ModelOrder(ordered=scene.ordered), should_stop=should_stop,
     )  # fmt: skip
     return again if again.energy < found.energy else found
 

@@ -32,11 +32,11 @@ class Learned:
     """Of `model.marginal_likelihood`, without a penalty on modes; infinite before the first refinement."""
 
 
-def scene_at(gram: Floats, rotations: Floats, *, with_scales: bool) -> Scene:
-    """Return the scene whose cameras at zero turn are these."""
+def scene_at(gram: Floats, rotations: Floats, *, with_scales: bool, ordered: bool) -> Scene:
+    """Return the scene whose cameras at zero turn are these; if unordered, without the camera-motion prior."""
     return Scene(
-        gram, rotations, with_scales=with_scales, prior_weight=STEADY,
-        noise_std_floor=NOISE_VARIANCE_FLOOR**0.5, smoothness=0.0,
+        gram, rotations, with_scales=with_scales, prior_weight=STEADY if ordered else 0.0,
+        noise_std_floor=NOISE_VARIANCE_FLOOR**0.5, smoothness=0.0, ordered=ordered,
     )  # fmt: skip
 
 

@@ -28,7 +28,7 @@ def given_lens(
     """
     check_picture(tracks, settings)
     given = settings.focal_length
-    centre = settings.principal_point
+    centre = settings.centre
     if cameras is not None and cameras.focal is not None:
         if settings.camera in ("orthographic", "scaled_orthographic") or given not in (None, cameras.focal):
             raise InvalidInput(
@@ -44,8 +44,6 @@ def given_lens(
         return None
     if centre is not None:
         point = np.array(centre, dtype=np.float64)
-    elif settings.image_size is not None:
-        point = np.array(settings.image_size, dtype=np.float64) / 2
     else:
         point = normalized.centroid.mean(axis=0)
     offsets = (normalized.centroid - point) / normalized.unit
@@ -75,13 +73,13 @@ def check_picture(tracks: Tracks, settings: Settings) -> None:
     if settings.image_size is None:
         return
     seen = tracks.points[tracks.visible > 0]
-    inside = np.asarray(((seen >= 0) & (seen <= np.array(settings.image_size))).all(axis=1))
+    inside = np.asarray(((seen >= -0.5) & (seen <= np.array(settings.image_size) - 0.5)).all(axis=1))
     if 2 * np.count_nonzero(inside) > len(inside):
         return
     low, high = seen.min(axis=0), seen.max(axis=0)
     raise InvalidInput(
         "outside_picture", field="options.image_size",
-        expected=f"most positions within 0 … {settings.image_size[0]:g} and 0 … {settings.image_size[1]:g}",
+        expected=f"most positions within 0 … {settings.image_size[0] - 1:g} and 0 … {settings.image_size[1] - 1:g}",
         got=f"{np.count_nonzero(inside)} of {len(inside)}; x from {low[0]:.5g} to {high[0]:.5g}, y from {low[1]:.5g} to {high[1]:.5g}",
         hint="Correct image_size, or leave it out where tracks are not in pixels from the picture's corner.",
     )  # fmt: skip

@@ -89,17 +89,18 @@ def with_fixed_rotations(
     scales: Floats,
     *,
     with_scales: bool,
+    ordered: bool = True,
     should_stop: Callable[[], bool] | None = None,
 ) -> Candidate:
     """Return the cameras of a factorization, and their energy with the rotations fixed."""
     return _entered(
         gram, upgrade.rotations, scales, upgrade.basis_size,
-        with_scales=with_scales, smooth_start=False, should_stop=should_stop,
+        with_scales=with_scales, smooth_start=False, ordered=ordered, should_stop=should_stop,
     )  # fmt: skip
 
 
 def run_multistart(
-    gram: Floats, entries: list[Candidate], *, should_stop: Callable[[], bool] | None = None
+    gram: Floats, entries: list[Candidate], *, ordered: bool = True, should_stop: Callable[[], bool] | None = None
 ) -> tuple[Candidate, list[Candidate]]:
     """Return the best candidate, refined, and all candidates after the first round.
 
@@ -109,15 +110,17 @@ def run_multistart(
         W Wᵀ / P of the completed tracks, of the frames used.
     entries : list of Candidate
         From `with_fixed_rotations`; at least one.
+    ordered : bool
+        False leaves out smooth starts and closed forms that are smooth in time.
     should_stop : callable, optional
         Called before every refinement; once it returns True, the best so far is returned.
     """
 
     def rating(candidate: Candidate) -> float:
-        return _rating(gram, candidate)
+        return _rating(gram, candidate) if ordered else candidate.energy
 
-    ordered = sorted(entries, key=rating)
-    running = ordered + [smooth_start(gram, each, should_stop=should_stop) for each in ordered[:SMOOTH_STARTS]]
+    best = sorted(entries, key=rating)
+    running = best + [smooth_start(gram, each, should_stop=should_stop) for each in best[: SMOOTH_STARTS * ordered]]
     first: list[Candidate] = []
     for iterations, left in MULTISTART_ROUNDS:
         finished: list[Candidate] = []
@@ -157,7 +160,7 @@ def smooth_start(gram: Floats, candidate: Candidate, *, should_stop: Callable[[]
     )
     return _entered(
         gram, *cameras_of(calm, motion), candidate.basis_size,
-        with_scales=with_scales, smooth_start=True, should_stop=should_stop,
+        with_scales=with_scales, smooth_start=True, ordered=True, should_stop=should_stop,
     )  # fmt: skip
 
 
@@ -191,9 +194,10 @@ def _entered(
     *,
     with_scales: bool,
     smooth_start: bool,
+    ordered: bool,
     should_stop: Callable[[], bool] | None,
 ) -> Candidate:
-    scene = Scene.of(gram, rotations, with_scales=with_scales, prior_weight=scaled_prior_weight(gram))
+    scene = Scene.of(gram, rotations, with_scales=with_scales, prior_weight=scaled_prior_weight(gram), ordered=ordered)
     motion, energy = fit(
         scene, start(scene, scales), iterations=FIXED_ROTATION_ITERATIONS, turning=False, should_stop=should_stop
     )

@@ -92,7 +92,7 @@ def planar_frames(count: int) -> slice:
 
 
 def resolve_pose_signs(
-    gram: Floats, rotations: Floats, *, should_stop: Callable[[], bool] | None = None
+    gram: Floats, rotations: Floats, *, ordered: bool = True, should_stop: Callable[[], bool] | None = None
 ) -> tuple[Floats, str]:
     """Return the rotations of a planar object, given or with more probable pose signs, and a sentence.
 
@@ -102,14 +102,23 @@ def resolve_pose_signs(
         W Wᵀ / P of centred, complete tracks.
     rotations : shape (F, 3, 3)
         The best that is known otherwise.
+    ordered : bool
+        False for photographs in no order: no camera-motion prior, no smooth starts, and frames are reversed one by one.
     should_stop : callable, optional
         Called between fits; once it returns True, the best so far is returned.
     """
     used = planar_frames(len(rotations))
     part, given = gram_of(gram, used), rotations[used]
     planes, scales = poses(gram)
-    baseline = fitted(part, given, rigid_scales(part, given), np.zeros(len(given), dtype=bool), should_stop=should_stop)
-    found = search_pose_signs(part, planes[used], scales[used], should_stop=should_stop)
+    baseline = fitted(
+        part,
+        given,
+        rigid_scales(part, given),
+        np.zeros(len(given), dtype=bool),
+        ordered=ordered,
+        should_stop=should_stop,
+    )
+    found = search_pose_signs(part, planes[used], scales[used], ordered=ordered, should_stop=should_stop)
     if found.energy >= baseline.energy:
         return rotations, "The tracks are those of a sheet; its sides are as they were."
     pose_signs = np.repeat(found.pose_signs, used.step)[: len(rotations)]
@@ -122,7 +131,12 @@ def resolve_pose_signs(
 
 
 def search_pose_signs(
-    gram: Floats, rotations: Floats, scales: Floats, *, should_stop: Callable[[], bool] | None = None
+    gram: Floats,
+    rotations: Floats,
+    scales: Floats,
+    *,
+    ordered: bool = True,
+    should_stop: Callable[[], bool] | None = None,
 ) -> PlanarCameras:
     """Return the cameras with the most probable pose signs.
 
@@ -132,17 +146,26 @@ def search_pose_signs(
         W Wᵀ / P of centred, complete tracks.
     rotations, scales
         From `poses`.
+    ordered : bool
+        As for `resolve_pose_signs`.
     should_stop : callable, optional
         Called before every fit; once it returns True, the best so far is returned.
     """
     best: PlanarCameras | None = None
-    for pose_signs in _starts(rotations):
+    for pose_signs in _starts(rotations, ordered=ordered):
         if best is not None and should_stop is not None and should_stop():
             return best
-        found = fitted(gram, reversed_at(rotations, MIRROR, pose_signs), scales, pose_signs, should_stop=should_stop)
+        found = fitted(
+            gram,
+            reversed_at(rotations, MIRROR, pose_signs),
+            scales,
+            pose_signs,
+            ordered=ordered,
+            should_stop=should_stop,
+        )
         best = found if best is None or found.energy < best.energy else best
     assert best is not None
-    return _reverse_greedily(gram, best, should_stop)
+    return _reverse_greedily(gram, best, should_stop, ordered=ordered)
 
 
 def fitted(
@@ -152,12 +175,13 @@ def fitted(
     pose_signs: PoseSigns,
     *,
     iterations: int = FULL_ITERATIONS,
+    ordered: bool = True,
     should_stop: Callable[[], bool] | None = None,
 ) -> PlanarCameras:
     """Return the cameras of highest likelihood near the given ones."""
     scene = Scene(
-        gram, rotations, with_scales=True, prior_weight=PLANAR_PRIOR_WEIGHT, noise_std_floor=PLANAR_NOISE_STD,
-        smoothness=0.0,
+        gram, rotations, with_scales=True, prior_weight=PLANAR_PRIOR_WEIGHT * ordered,
+        noise_std_floor=PLANAR_NOISE_STD, smoothness=0.0, ordered=ordered,
     )  # fmt: skip
     begun = replace(start(scene, scales, num_modes=PLANAR_MODES), logs=np.log([0.01, 0.05]))
     motion, energy = fit(scene, begun, iterations=iterations, turning=True, should_stop=should_stop)
@@ -200,14 +224,11 @@ def _lower(values: Floats) -> Floats:
     return np.array([[np.exp(values[0]), 0.0], [values[1], np.exp(values[2])]])
 
 
-def _starts(rotations: Floats) -> list[PoseSigns]:
+def _starts(rotations: Floats, *, ordered: bool) -> list[PoseSigns]:
     """Return choices of pose signs without duplicates: as given, least rotation, least change of rotation."""
     kept: list[PoseSigns] = []
-    for pose_signs in (
-        np.zeros(len(rotations), dtype=bool),
-        smoothest_signs(rotations, 1),
-        smoothest_signs(rotations, 2),
-    ):
+    smooth = [smoothest_signs(rotations, 1), smoothest_signs(rotations, 2)] if ordered else []
+    for pose_signs in (np.zeros(len(rotations), dtype=bool), *smooth):
         if not any((pose_signs == other).all() or (pose_signs != other).all() for other in kept):
             kept.append(pose_signs)
     return kept
@@ -236,11 +257,13 @@ def smoothest_signs(rotations: Floats, order: int) -> PoseSigns:
     return np.array(pose_signs[::-1])
 
 
-def _reverse_greedily(gram: Floats, found: PlanarCameras, should_stop: Callable[[], bool] | None) -> PlanarCameras:
+def _reverse_greedily(
+    gram: Floats, found: PlanarCameras, should_stop: Callable[[], bool] | None, *, ordered: bool
+) -> PlanarCameras:
     """Return the cameras after greedy reversals, as long as each improves the likelihood."""
     for _ in range(PASSES):
         plane, tried = _plane(found.motion), []
-        for run in _runs(found.rotations @ plane[1]):
+        for run in _runs(found.rotations @ plane[1]) if ordered else np.eye(len(found.rotations), dtype=bool):
             if should_stop is not None and should_stop():
                 return found
             turned = reversed_at(found.rotations, plane[0], run)
@@ -251,13 +274,14 @@ def _reverse_greedily(gram: Floats, found: PlanarCameras, should_stop: Callable[
                     found.scales,
                     found.pose_signs ^ run,
                     iterations=TRIAL_ITERATIONS,
+                    ordered=ordered,
                     should_stop=should_stop,
                 )
             )
         tried.sort(key=lambda each: each.energy)
         better = None
         for each in tried[:MAX_FULL_FITS]:
-            deep = fitted(gram, each.rotations, each.scales, each.pose_signs, should_stop=should_stop)
+            deep = fitted(gram, each.rotations, each.scales, each.pose_signs, ordered=ordered, should_stop=should_stop)
             if deep.energy < found.energy - MIN_REVERSAL_GAIN:
                 better = deep
                 break

@@ -277,7 +277,7 @@ def _centre(
     if principal_point is not None:
         return np.array(principal_point, dtype=np.float64)
     if image_size is not None:
-        return np.array(image_size, dtype=np.float64) / 2
+        return (np.array(image_size, dtype=np.float64) - 1) / 2
     return np.asarray(np.median(tracks.points[tracks.visible > 0], axis=0))
 
 

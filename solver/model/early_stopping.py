@@ -84,7 +84,9 @@ def learn_with_early_stopping(
         best = min(paths, key=min)
         if min(best) < min(path[-1] for path in paths) - MIN_NLL_GAIN:
             max_modes, floors = ways[paths.index(best)]
-            start = scratch(gram, projections, max_modes, noisy_start=model_order.noisy_start)
+            start = scratch(
+                gram, projections, max_modes, noisy_start=model_order.noisy_start, ordered=model_order.ordered
+            )
             path = rounds(start, gram, projections, floors=floors, max_modes=max_modes)
             number = best.index(min(best)) + 1
             reason = f"learned in {number} rounds, for more would make points that are not learned from less probable."
@@ -92,7 +94,12 @@ def learn_with_early_stopping(
             return covariance, described(covariance, reason)
     reason = f"more than {model_order.max_modes} modes, learned from some points, do not make the others more probable."
     covariance = learned(
-        gram, projections, max_modes=model_order.max_modes, noisy_start=model_order.noisy_start, should_stop=should_stop
+        gram,
+        projections,
+        max_modes=model_order.max_modes,
+        noisy_start=model_order.noisy_start,
+        ordered=model_order.ordered,
+        should_stop=should_stop,
     )
     return covariance, described(covariance, reason if model_order.max_modes < MAX_MODES else "")
 
@@ -117,7 +124,9 @@ def _judged(
     for fold in range(FOLDS):
         own = points[:, part != fold]
         gram = own @ own.T / own.shape[1]
-        start = scratch(gram, projections, model_order.max_modes, noisy_start=model_order.noisy_start)
+        start = scratch(
+            gram, projections, model_order.max_modes, noisy_start=model_order.noisy_start, ordered=model_order.ordered
+        )
         paths.append(rounds(start, gram, projections, floors=floors, max_modes=model_order.max_modes))
         others.append(points[:, part == fold])
     found: list[float] = []

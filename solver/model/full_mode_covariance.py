@@ -123,8 +123,9 @@ def energy(scene: Scene, axis_covariance: Floats, basis: Basis) -> tuple[float, 
     shapes = np.einsum("fk,fid->fikd", basis.weights, projections).reshape(2 * frames, 3 * size)
     noise, walk_variance = np.exp(2 * basis.logs)
     model = ImageModel(
-        shapes @ basis.root, projections @ root, float(noise) + scene.noise_std_floor**2, float(walk_variance)
-    )
+        shapes @ basis.root, projections @ root, float(noise) + scene.noise_std_floor**2, float(walk_variance),
+        scene.ordered,
+    )  # fmt: skip
     try:
         found = terms(model, scene.factor)
     except np.linalg.LinAlgError:

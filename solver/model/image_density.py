@@ -54,11 +54,14 @@ class ImageModel:
     walk_variance: float
     """τ."""
 
+    ordered: bool = True
+    """Whether T is a random walk over frames, or the identity."""
+
     def covariance(self) -> Floats:
         """Return V, shape `(2F, 2F)`."""
         rows = self.walk.reshape(-1, 3)
         image: Floats = self.columns @ self.columns.T
-        image += (rows @ rows.T) * _doubled(self.walk_variance * random_walk(len(self.walk)))
+        image += (rows @ rows.T) * _doubled(self.walk_variance * random_walk(len(self.walk), self.ordered))
         image[np.diag_indices(len(rows))] += self.noise_variance
         return image
 
@@ -115,7 +118,7 @@ def dense_terms(model: ImageModel, factor: Floats) -> Terms:
     explained = inverse @ factor
     value = 0.5 * (log_det + float(np.einsum("ij,ij->", explained, factor))) / frames
     slope = (inverse - explained @ explained.T) * (0.5 / frames)
-    walked = slope * _doubled(model.walk_variance * random_walk(frames))
+    walked = slope * _doubled(model.walk_variance * random_walk(frames, model.ordered))
     by_walk = 2 * (walked @ model.walk.reshape(-1, 3)).reshape(frames, 2, 3)
     return Terms(
         value, 2 * slope @ model.columns, by_walk, float(np.trace(slope)),
@@ -166,7 +169,9 @@ class Explained:
             V is not positive definite to rounding, or not finite.
         """
         frames, noise, columns = len(model.walk), model.noise_variance, model.columns
-        walk = WalkPosterior.of(model.walk, noise_variance=noise, walk_variance=model.walk_variance)
+        walk = WalkPosterior.of(
+            model.walk, noise_variance=noise, walk_variance=model.walk_variance, ordered=model.ordered
+        )
         solved, walked = _solved(walk, model, columns)
         root = np.asarray(np.linalg.cholesky(np.eye(columns.shape[1]) + columns.T @ solved), dtype=np.float64)
         means = linalg.cho_solve((root, True), solved.T @ factor, check_finite=False)

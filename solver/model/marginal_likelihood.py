@@ -110,6 +110,9 @@ class Scene:
     smoothness: float = SMOOTHNESS
     """κ."""
 
+    ordered: bool = True
+    """Whether T is a random walk over frames, or the identity."""
+
     factor: Floats = field(init=False)
     """F₀ with F₀F₀ᵀ = G, shape `(2F, r)`."""
 
@@ -126,8 +129,11 @@ class Scene:
         with_scales: bool,
         prior_weight: float = CAMERA_PRIOR_WEIGHT,
         noise_std_floor: float = NOISE_STD_FLOOR,
+        ordered: bool = True,
     ) -> Scene:
-        """Return the scene for a Gram matrix and starting cameras."""
+        """Return the scene for a Gram matrix and starting cameras; if unordered, without penalties on differences between frames."""
+        if not ordered:
+            return cls(gram, rotations, with_scales, 0.0, noise_std_floor, 0.0, ordered=False)
         return cls(gram, rotations, with_scales, prior_weight, noise_std_floor)
 
 
@@ -187,8 +193,9 @@ def image_of(scene: Scene, motion: Motion) -> ImageModel:
         [(projections @ root0)[:, :, None], motion.modes[:, None, :, None] * walk[:, :, None]], axis=2
     )
     return ImageModel(
-        columns.reshape(2 * len(projections), -1), walk, float(noise) + scene.noise_std_floor**2, float(walk_variance)
-    )
+        columns.reshape(2 * len(projections), -1), walk, float(noise) + scene.noise_std_floor**2, float(walk_variance),
+        scene.ordered,
+    )  # fmt: skip
 
 
 def energy_with_inverse(scene: Scene, motion: Motion) -> tuple[float, Motion, Floats | None]:

@@ -46,12 +46,16 @@ class ModelOrder:
     noisy_start: bool = False
     """Whether EM starts with the roughness of the tracks as its noise, instead of a low noise."""
 
+    ordered: bool = True
+    """Whether the frames are those of a film, or photographs in no order."""
+
 
 def select_model_order(
     sample: Floats,
     projections: Floats,
     *,
     spoiled: bool = False,
+    ordered: bool = True,
     seed: int = 0,
     should_stop: Callable[[], bool] | None = None,
 ) -> ModelOrder:
@@ -65,6 +69,8 @@ def select_model_order(
         s_f times the first two rows of R_f.
     spoiled : bool
         Whether outliers were found; undetected ones may remain in the sample.
+    ordered : bool
+        False for photographs in no order.
     seed : int
         Seed of the split into halves.
     should_stop : callable, optional
@@ -72,22 +78,22 @@ def select_model_order(
     """
     frames, count = sample.shape[:2]
     if count < MIN_JUDGED_POINTS or not (spoiled or typical_roughness(sample) >= NOISE_STD_FLOOR):
-        return ModelOrder()
+        return ModelOrder(ordered=ordered)
     used = np.unique(np.linspace(0, frames - 1, min(frames, JUDGED_FRAMES)).round().astype(np.intp))
     rows = sample[used].transpose(0, 2, 1).reshape(2 * len(used), count)
     order = np.random.default_rng(seed).permutation(count)
     one, other = rows[:, order[0::2]], rows[:, order[1::2]]
     quiet_start, noisy_start = (
         (
-            _judged(one, other, projections[used], noisy_start=each, should_stop=should_stop)
-            + _judged(other, one, projections[used], noisy_start=each, should_stop=should_stop)
+            _judged(one, other, projections[used], noisy_start=each, ordered=ordered, should_stop=should_stop)
+            + _judged(other, one, projections[used], noisy_start=each, ordered=ordered, should_stop=should_stop)
         )
         / 2
         for each in (False, True)
     )
     enough = min(float(quiet_start.min()), float(noisy_start.min())) + MIN_NLL_GAIN
     better = noisy_start if noisy_start.min() <= enough else quiet_start
-    return ModelOrder(_counts(len(used))[int(np.flatnonzero(better <= enough)[-1])], better is noisy_start)
+    return ModelOrder(_counts(len(used))[int(np.flatnonzero(better <= enough)[-1])], better is noisy_start, ordered)
 
 
 def _counts(frames: int) -> list[int]:
@@ -96,7 +102,13 @@ def _counts(frames: int) -> list[int]:
 
 
 def _judged(
-    points: Floats, other: Floats, projections: Floats, *, noisy_start: bool, should_stop: Callable[[], bool] | None
+    points: Floats,
+    other: Floats,
+    projections: Floats,
+    *,
+    noisy_start: bool,
+    ordered: bool,
+    should_stop: Callable[[], bool] | None,
 ) -> Floats:
     """Return the held-out negative log likelihood for each number of modes."""
     frames = len(projections)
@@ -111,6 +123,7 @@ def _judged(
             projections,
             max_modes=max_modes,
             noisy_start=noisy_start,
+            ordered=ordered,
             iterations=JUDGED_ITERATIONS,
             should_stop=should_stop,
         )

@@ -8,6 +8,8 @@ of T's diagonal is 1; its images are w = B x + N(0, σ² I), B = blockdiag(B_f) 
 block tridiagonal with 3×3 blocks. With D = σ²I + τ B (T ⊗ I₃) Bᵀ, the covariance of w, Woodbury's identity and the matrix determinant lemma
 give D⁻¹ = (I − B Λ⁻¹ Bᵀ/σ²)/σ² and log det D = 2F log σ² + log det Λ + log det τT ⊗ I₃. Golub and Van Loan, Matrix Computations,
 2.1.4 and 4.5.1.
+
+Photographs in no order have no walk: with `ordered` False T is the identity, an independent deviation of every frame, and all else stays.
 """
 
 from __future__ import annotations
@@ -28,9 +30,16 @@ LEVEL = 10.0
 
 
 @lru_cache(maxsize=32)
-def walk_bands(num_frames: int) -> tuple[Floats, float]:
-    """Return HᵀH + 10/F² I by its upper bands, shape `(2, F)`, and n, the mean of its inverse's diagonal."""
+def walk_bands(num_frames: int, ordered: bool = True) -> tuple[Floats, float]:
+    """Return HᵀH + 10/F² I by its upper bands, shape `(2, F)`, and n, the mean of its inverse's diagonal.
+
+    Unordered: the identity and 1.
+    """
     bands = np.zeros((2, num_frames))
+    if not ordered:
+        bands[0] = 1.0
+        read_only(bands)
+        return bands, 1.0
     differences = difference_bands(num_frames, 1)
     bands[: len(differences)] = differences
     bands[0] += LEVEL / num_frames**2
@@ -50,18 +59,18 @@ def _pivots(diagonal: Floats, beside: Floats) -> Floats:
 
 
 @lru_cache(maxsize=8)
-def random_walk(num_frames: int) -> Floats:
+def random_walk(num_frames: int, ordered: bool = True) -> Floats:
     """Return T, the covariance of the random walk, mean of the diagonal 1, shape `(F, F)`; read-only."""
-    inverse, norm = walk_precision(num_frames)
+    inverse, norm = walk_precision(num_frames, ordered)
     walk = np.asarray(np.linalg.inv(inverse) / norm, dtype=np.float64)
     read_only(walk)
     return walk
 
 
 @lru_cache(maxsize=8)
-def whitener(num_frames: int) -> Floats:
+def whitener(num_frames: int, ordered: bool = True) -> Floats:
     """Return the lower triangular root with T⁻¹ = root rootᵀ, shape `(F, F)`; read-only."""
-    inverse, norm = walk_precision(num_frames)
+    inverse, norm = walk_precision(num_frames, ordered)
     root = np.asarray(np.linalg.cholesky(inverse * norm), dtype=np.float64)
     read_only(root)
     return root
@@ -76,30 +85,34 @@ def whitener_bands(num_frames: int) -> Floats:
     return root
 
 
-def whitened(columns: Floats) -> Floats:
+def whitened(columns: Floats, *, ordered: bool = True) -> Floats:
     """Return rootᵀ times columns of shape `(F, k)`: in these coordinates the walk is white."""
+    if not ordered:
+        return columns
     bands = whitener_bands(len(columns))
     result: Floats = bands[0][:, None] * columns
     result[:-1] += bands[1, :-1, None] * columns[1:]
     return result
 
 
-def coloured(columns: Floats, *, transposed: bool = False) -> Floats:
+def coloured(columns: Floats, *, ordered: bool = True, transposed: bool = False) -> Floats:
     """Return root⁻ᵀ times columns of shape `(F, k)`, the inverse of `whitened`; `transposed`: root⁻¹ times them."""
+    if not ordered:
+        return columns
     bands = whitener_bands(len(columns))
     return np.asarray(lapack.dtbtrs(bands, columns, uplo="L", trans="N" if transposed else "T")[0])
 
 
 @lru_cache(maxsize=32)
-def log_det_walk(num_frames: int) -> float:
+def log_det_walk(num_frames: int, ordered: bool = True) -> float:
     """Return log det T."""
-    bands, norm = walk_bands(num_frames)
+    bands, norm = walk_bands(num_frames, ordered)
     return -num_frames * float(np.log(norm)) - float(np.log(_pivots(bands[0], bands[1])).sum())
 
 
-def walk_precision(num_frames: int) -> tuple[Floats, float]:
+def walk_precision(num_frames: int, ordered: bool = True) -> tuple[Floats, float]:
     """Return HᵀH + 10/F² I, shape `(F, F)`, and n."""
-    bands, norm = walk_bands(num_frames)
+    bands, norm = walk_bands(num_frames, ordered)
     return np.diag(bands[0]) + np.diag(bands[1, :-1], 1) + np.diag(bands[1, :-1], -1), norm
 
 
@@ -121,7 +134,7 @@ class WalkPosterior:
     """log det Λ + log det τT ⊗ I₃."""
 
     @classmethod
-    def of(cls, images: Floats, *, noise_variance: float, walk_variance: float) -> WalkPosterior:
+    def of(cls, images: Floats, *, noise_variance: float, walk_variance: float, ordered: bool = True) -> WalkPosterior:
         """Eliminate for B_f of shape `(F, 2, 3)`, σ² and τ.
 
         Raises
@@ -130,14 +143,14 @@ class WalkPosterior:
             Rounding left Λ indefinite, or it is not finite.
         """
         frames = len(images)
-        bands, norm = walk_bands(frames)
+        bands, norm = walk_bands(frames, ordered)
         coupling = -norm * float(bands[1, 0]) / walk_variance if frames > 1 else 0.0
         blocks = np.einsum("fic,fid->fcd", images, images) / noise_variance
         blocks += (bands[0] * norm / walk_variance)[:, None, None] * np.eye(3)
         ahead, log_det = _block_pivots(blocks, coupling)
         back, _ = _block_pivots(blocks[::-1], coupling)
         variances = np.linalg.inv(ahead + back[::-1] - blocks)
-        log_det += 3 * (frames * float(np.log(walk_variance)) + log_det_walk(frames))
+        log_det += 3 * (frames * float(np.log(walk_variance)) + log_det_walk(frames, ordered))
         return cls(_gathered(blocks, ahead, coupling), coupling, variances, log_det)
 
     def solve(self, columns: Floats) -> Floats:

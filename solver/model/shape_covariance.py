@@ -101,9 +101,12 @@ class ShapeCovariance:
     nll: float
     """Negative log likelihood per point and frame of the covariance that EM improved to this one; ∞ at the start."""
 
+    ordered: bool = True
+    """Whether T is a random walk over frames, or the identity: photographs in no order."""
+
     def over_frames(self) -> Floats:
         """Return C, shape `(F, F)`."""
-        covariance: Floats = self.modes @ self.modes.T + self.walk_variance * random_walk(len(self.modes))
+        covariance: Floats = self.modes @ self.modes.T + self.walk_variance * random_walk(len(self.modes), self.ordered)
         return covariance
 
     def of_image(self, projections: Floats) -> Floats:
@@ -119,7 +122,7 @@ class ShapeCovariance:
         frames, walk = len(projections), projections @ root_matrix(self.axis_covariance)
         middle = (projections @ root_matrix(self.mean_covariance))[:, :, None]
         columns = np.concatenate([middle, self.modes[:, None, :, None] * walk[:, :, None]], axis=2)
-        return ImageModel(columns.reshape(2 * frames, -1), walk, self.noise_variance, self.walk_variance)
+        return ImageModel(columns.reshape(2 * frames, -1), walk, self.noise_variance, self.walk_variance, self.ordered)
 
     def axes(self) -> tuple[Floats, Floats]:
         """Return B (3×3) and a (3,) with A₁ = B Bᵀ and A₀ = B diag(a) Bᵀ: the coordinates of y, x = B y, are independent."""
@@ -129,7 +132,7 @@ class ShapeCovariance:
     def precisions(self) -> tuple[Floats, PathPrior]:
         """Return B (3×3) and the inverse covariance over frames of each coordinate of y = B⁻¹x."""
         basis, mean_moments = self.axes()
-        chain, norm = walk_bands(len(self.modes))
+        chain, norm = walk_bands(len(self.modes), self.ordered)
         first, second, third = (
             np.column_stack([self.modes, np.full(len(self.modes), mean_covariance**0.5)])
             for mean_covariance in mean_moments
@@ -152,6 +155,7 @@ def learned(
     *,
     max_modes: int = MAX_MODES,
     noisy_start: bool = False,
+    ordered: bool = True,
     should_stop: Callable[[], bool] | None = None,
 ) -> ShapeCovariance:
     """Return the more probable of two covariances learned by EM from scratch.
@@ -174,13 +178,19 @@ def learned(
     count = min(MAX_ITERATIONS, max(MIN_ITERATIONS, ITERATION_FRAMES // len(projections)))
     warm = freed(
         annealed(
-            gram, projections, max_modes=max_modes, noisy_start=noisy_start, iterations=count, should_stop=should_stop
+            gram,
+            projections,
+            max_modes=max_modes,
+            noisy_start=noisy_start,
+            ordered=ordered,
+            iterations=count,
+            should_stop=should_stop,
         )
     )
     runs = (
         improve(warm, gram, projections, iterations=count // 2, max_modes=max_modes, should_stop=should_stop),
         improve(
-            scratch(gram, projections, max_modes, noisy_start=noisy_start), gram, projections,
+            scratch(gram, projections, max_modes, noisy_start=noisy_start, ordered=ordered), gram, projections,
             iterations=count, max_modes=max_modes, should_stop=should_stop,
         ),
     )  # fmt: skip
@@ -193,11 +203,12 @@ def annealed(
     *,
     max_modes: int = MAX_MODES,
     noisy_start: bool = False,
+    ordered: bool = True,
     iterations: int,
     should_stop: Callable[[], bool] | None = None,
 ) -> ShapeCovariance:
     """Return the covariance after `iterations` annealed rounds from scratch."""
-    start = scratch(gram, projections, max_modes, noisy_start=noisy_start)
+    start = scratch(gram, projections, max_modes, noisy_start=noisy_start, ordered=ordered)
     return improve(
         start,
         gram,
@@ -215,20 +226,28 @@ def freed(covariance: ShapeCovariance) -> ShapeCovariance:
     return replace(covariance, modes=np.hstack([covariance.modes, constant]))
 
 
-def scratch(gram: Floats, projections: Floats, max_modes: int, *, noisy_start: bool) -> ShapeCovariance:
+def scratch(
+    gram: Floats, projections: Floats, max_modes: int, *, noisy_start: bool, ordered: bool = True
+) -> ShapeCovariance:
     """Return a starting covariance (`begin`) with the low or, with `noisy_start`, the high starting noise."""
     return begin(
         gram,
         projections,
         noise_variance=max(roughness(gram), START_NOISE_VARIANCE) if noisy_start else START_NOISE_VARIANCE,
         max_modes=max_modes,
+        ordered=ordered,
     )
 
 
 def begin(
-    gram: Floats, projections: Floats, *, noise_variance: float = START_NOISE_VARIANCE, max_modes: int = MAX_MODES
+    gram: Floats,
+    projections: Floats,
+    *,
+    noise_variance: float = START_NOISE_VARIANCE,
+    max_modes: int = MAX_MODES,
+    ordered: bool = True,
 ) -> ShapeCovariance:
-    """Return a starting covariance: that of the least-squares shapes with least acceleration.
+    """Return a starting covariance: that of the least-squares shapes with least acceleration; if unordered, with least deformation.
 
     Parameters
     ----------
@@ -240,19 +259,25 @@ def begin(
         σ² to start from.
     max_modes : int
         Maximum number of columns of L.
+    ordered : bool
+        False for photographs in no order.
     """
     frames, factor = len(projections), factor_of(gram)
-    seen = projections.transpose(0, 2, 1) @ factor.reshape(frames, 2, -1)
-    walk = WalkPosterior.of(projections, noise_variance=1.0, walk_variance=walk_bands(frames)[1] / START_SMOOTHNESS)
-    shapes = walk.solve(seen)
+    if ordered:
+        seen = projections.transpose(0, 2, 1) @ factor.reshape(frames, 2, -1)
+        walk = WalkPosterior.of(projections, noise_variance=1.0, walk_variance=walk_bands(frames)[1] / START_SMOOTHNESS)
+        shapes = walk.solve(seen)
+    else:
+        rigid = np.linalg.pinv(projections.reshape(-1, 3)) @ factor
+        shapes = rigid + np.linalg.pinv(projections) @ (factor.reshape(frames, 2, -1) - projections @ rigid)
     mean = shapes.mean(axis=0)
     mean_covariance = mean @ mean.T + 1e-6 * np.eye(3)
     flat = shapes.reshape(frames, -1)
     whole = flat @ flat.T / 3
     middle = whole.mean(axis=0)
     deformed = whole - middle - middle[:, None] + middle.mean()
-    modes, walk_variance = _split(deformed, ANNEALING_START, max_modes)
-    return ShapeCovariance(mean_covariance, np.eye(3), modes, walk_variance, noise_variance, np.inf)
+    modes, walk_variance = _split(deformed, ANNEALING_START, max_modes, ordered=ordered)
+    return ShapeCovariance(mean_covariance, np.eye(3), modes, walk_variance, noise_variance, np.inf, ordered)
 
 
 def improve(
@@ -317,7 +342,9 @@ def _round(
     wide *= surplus
     deform *= surplus
     moved = deform[0::2, 0::2] + deform[0::2, 1::2] + deform[1::2, 0::2] + deform[1::2, 1::2]
-    modes, walk_variance = _split(over_frames + over_frames @ moved @ over_frames / 3, floor, max_modes)
+    modes, walk_variance = _split(
+        over_frames + over_frames @ moved @ over_frames / 3, floor, max_modes, ordered=covariance.ordered
+    )
     return _improved(
         covariance, modes, walk_variance,
         mean_covariance=covariance.mean_covariance + by_mean.T @ surplus @ by_mean,
@@ -352,7 +379,7 @@ def _linear_round(
     mean_moments = np.einsum("fic,fid->cd", columns[:, :, 0], by_columns[:, :, 0])
     own, by_own = (each[:, :, 1:].transpose(2, 0, 1, 3).reshape(count, -1) for each in (columns, by_columns))
     axis_moments = own.reshape(-1, 3).T @ by_own.reshape(-1, 3) + np.einsum("fic,fid->cd", walk, by_walk)
-    along = whitened(covariance.modes)
+    along, ordered = whitened(covariance.modes, ordered=covariance.ordered), covariance.ordered
 
     def spread(vectors: Floats) -> Floats:  # C̃ times them
         result: Floats = along @ (along.T @ vectors) + covariance.walk_variance * vectors
@@ -360,9 +387,9 @@ def _linear_round(
 
     def product(vectors: Floats) -> Floats:
         wide = spread(vectors)
-        images = walk[:, :, :, None] * coloured(wide)[:, None, None]
+        images = walk[:, :, :, None] * coloured(wide, ordered=ordered)[:, None, None]
         moved = seen.surplus(images.reshape(2 * frames, -1)).reshape(frames, 6, -1)
-        return wide + spread(coloured((walk.reshape(frames, 1, 6) @ moved)[:, 0], transposed=True)) / 3
+        return wide + spread(coloured((walk.reshape(frames, 1, 6) @ moved)[:, 0], ordered=ordered, transposed=True)) / 3
 
     inner = own @ by_own.T
     square = along.T @ along + 2 * covariance.walk_variance * np.eye(count)
@@ -373,7 +400,7 @@ def _linear_round(
     )
     modes, walk_variance = _kept(values, vectors, total, floor, min(max_modes, frames - 1))
     better = _improved(
-        covariance, coloured(modes), walk_variance,
+        covariance, coloured(modes, ordered=ordered), walk_variance,
         mean_covariance=root0 @ (np.eye(3) + mean_moments) @ root0.T,
         axis_covariance=root1 @ (np.eye(3) + axis_moments / frames) @ root1.T,
         surplus=-found.by_noise_variance,
@@ -431,13 +458,14 @@ def _improved(
         walk_variance=walk_variance,
         noise_variance=max(covariance.noise_variance * (1 + covariance.noise_variance * surplus), NOISE_VARIANCE_FLOOR),
         nll=nll,
+        ordered=covariance.ordered,
     )
 
 
-def _split(over_frames: Floats, floor: float, max_modes: int) -> tuple[Floats, float]:
+def _split(over_frames: Floats, floor: float, max_modes: int, *, ordered: bool) -> tuple[Floats, float]:
     """Return L and τ with C ≈ L Lᵀ + τ T: principal components in coordinates in which the random walk is white."""
     frames = len(over_frames)
-    root = whitener(frames)
+    root = whitener(frames, ordered)
     values, vectors = np.linalg.eigh(_symmetric(root.T @ over_frames @ root))
     values, vectors = values[::-1], vectors[:, ::-1]
     max_modes = min(max_modes, frames - 1)

@@ -86,9 +86,7 @@ def downwards(tracks: Tracks) -> Tracks:
 
 def centre_downwards(settings: Settings) -> tuple[float, float] | None:
     """Return the given principal point, or the centre of the picture, where y grows downwards; None if neither is given."""
-    point = settings.principal_point
-    if point is None and settings.image_size is not None:
-        point = (settings.image_size[0] / 2, settings.image_size[1] / 2)
+    point = settings.centre
     return point if point is None or not settings.y_up else (point[0], -point[1])
 
 

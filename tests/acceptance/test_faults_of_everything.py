@@ -1,6 +1,6 @@
 """A whole installation, hit at every kind of moment; afterwards nothing is lost, doubled, half-written or left over.
 
-What `python -m benchmarks.faults` makes its table of. Faults that tests/worker commits on workers alone are not repeated here.
+What `python -m benchmarks.installation.faults` makes its table of. Faults that tests/worker commits on workers alone are not repeated here.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ def root() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def house(root: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    with import_module("benchmarks.house").House(tmp_path_factory.mktemp("house")) as house:
+    with import_module("benchmarks.installation.house").House(tmp_path_factory.mktemp("house")) as house:
         yield house
 
 
 @pytest.mark.parametrize("name", WANTED)
 def test_nothing_is_lost_doubled_half_written_or_left_over(house: Any, name: str) -> None:
-    listed = import_module("benchmarks.faults").FAULTS
+    listed = import_module("benchmarks.installation.faults").FAULTS
     _, commit = listed[name]
     told = commit(house)
     assert told.said
@@ -49,4 +49,4 @@ def test_nothing_is_lost_doubled_half_written_or_left_over(house: Any, name: str
 
 
 def test_every_fault_is_known(root: None) -> None:
-    assert set(WANTED) < set(import_module("benchmarks.faults").FAULTS)
+    assert set(WANTED) < set(import_module("benchmarks.installation.faults").FAULTS)

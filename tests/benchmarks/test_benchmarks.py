@@ -89,7 +89,7 @@ def test_aims_are_met_or_missed_by_what_was_measured(bench):
         row_of("facescan10_rot90", 0.039, method="robust"), row_of("akhter_drink", 0.0030),
         *(row_of("facescan10_rot90", value, corruption="outliers 10 %") for value in (0.048, 0.050)),
     ]  # fmt: skip
-    found = {aim.what: (round(aim.measured, 4), aim.met) for aim in bench("aims").aims(rows)}
+    found = {aim.what: (round(aim.measured, 4), aim.met) for aim in bench("accuracy.aims").aims(rows)}
     assert found == {
         "facescan10_rot90: default settings": (0.04, True),
         "akhter_drink: default settings": (0.003, False),
@@ -98,7 +98,7 @@ def test_aims_are_met_or_missed_by_what_was_measured(bench):
         "facescan10_rot90, 9 points: 10 % outliers": (0.049, True),
         "facescan10_rot90, 9 points: 10 % outliers over clean": (1.225, True),
     }
-    table = bench("aims").aims_table(rows).splitlines()
+    table = bench("accuracy.aims").aims_table(rows).splitlines()
     assert table[2] == "| akhter_drink: default settings | 0.0025 | 0.003 | missed by 20% |"
     assert table[-1].endswith("| met |")
 
@@ -118,7 +118,7 @@ def test_cells_of_another_commit_are_measured_anew_only_on_request(tmp_path):
 
 
 def test_the_plan_names_sequences_methods_and_corruptions_that_there_are(bench):
-    plan, cells, aims = bench("plan"), bench("cells"), bench("aims")
+    plan, cells, aims = bench("accuracy.plan"), bench("accuracy.cells"), bench("accuracy.aims")
     for part in plan.PARTS:
         assert set(part.methods) <= set(cells.METHODS)
         for word in part.corruptions:
@@ -164,7 +164,7 @@ def test_all_visible_puts_hidden_points_where_the_camera_would_see_them(bench):
 
 
 def test_a_regression_is_noticed_and_noise_is_not(bench):
-    gate = bench("gate")
+    gate = bench("accuracy.gate")
     baseline = {"a": 0.1, "b": 0.0, "c": 0.2}
     assert gate.regressions({"a": 0.1055, "b": 0.0009, "c": 0.05}, baseline) == set()
     assert gate.regressions({"a": 0.107, "b": 0.0011, "new": 9.0}, baseline) == {"a", "b"}
@@ -181,7 +181,7 @@ def small_problem():
 @pytest.mark.parametrize("name", ["gradient_descent", "conjugate_gradients", "direct"])
 def test_every_baseline_reaches_the_solver_s_energy(bench, small_problem, name):
     made, cameras, settings, solution = small_problem
-    baselines, side = bench("baselines"), bench("side_by_side")
+    baselines, side = bench("speed.baselines"), bench("speed.side_by_side")
     problem, start = side.prepare(made.tracks, made.mesh, cameras, settings)
     centred = normalize(made.tracks)
     translations = (solution.camera.translations - centred.centroid) / centred.unit
@@ -192,7 +192,7 @@ def test_every_baseline_reaches_the_solver_s_energy(bench, small_problem, name):
 
 
 def test_the_rasteriser_shows_the_nearer_surface_and_its_colour(bench):
-    raster = bench("raster")
+    raster = bench("figures.shading")
     square = np.array([(-1, -1, 0), (-1, 1, 0), (1, 1, 0), (1, -1, 0)], dtype=float)
     points = np.concatenate([square, square * 0.5 - (0, 0, 1)])
     faces = np.array([(0, 1, 2, 3), (4, 5, 6, 7)])
@@ -218,7 +218,7 @@ def test_every_result_file_is_measured() -> None:
 
 @pytest.mark.parametrize("y_up", [False, True])
 def test_pictures_show_what_the_camera_saw(bench, y_up: bool) -> None:
-    pictures, sequences = bench("pictures"), bench("sequences")
+    pictures, sequences = bench("figures.pictures"), bench("sequences")
     case = replace(sequences.from_gallery(face(6, 120, degrees=30), "face"), y_up=y_up)
     solution = solve(case.tracks, case.mesh, cameras=case.cameras, settings=Settings(max_reweightings=2))
     exact = replace(solution, shapes=case.shapes)
@@ -248,7 +248,7 @@ def test_pictures_are_drawn_of_anything(tmp_path: Path, given: str) -> None:
     command = [
         sys.executable,
         "-m",
-        "benchmarks.pictures",
+        "benchmarks.figures.pictures",
         "--data",
         tmp_path,
         "--at",
@@ -268,11 +268,11 @@ def test_pictures_are_drawn_of_anything(tmp_path: Path, given: str) -> None:
     ("value", "text"), [(0.03412, ".0341"), (1.254, "1.25"), (-0.5, "-.500"), (0.0, "0"), (float("nan"), "–")]
 )
 def test_numbers_are_written_in_the_field_s_manner(bench, value, text):
-    assert bench("tables").number(value) == text
+    assert bench("accuracy.tables").number(value) == text
 
 
 def test_the_committed_figures_are_drawn_from_the_committed_results(bench, tmp_path, monkeypatch):
-    plots = bench("plots")
+    plots = bench("figures.plots")
     drawn = {name for name, (source, _) in plots.FIGURES.items() if plots.read(source)}
     assert drawn
     assert drawn <= {path.stem for path in (ROOT / "docs" / "images").glob("*.png")}

@@ -17,7 +17,7 @@ pytestmark = [
 def test_the_load_loses_nothing_and_prints_its_tables() -> None:
     tiny = ["--jobs", "4", "--clients", "2", "--pollers", "20", "--seconds", "2", "--every", "1", "--megabytes", "70"]
     ran = subprocess.run(
-        [sys.executable, "-m", "benchmarks.load", *tiny],
+        [sys.executable, "-m", "benchmarks.installation.load", *tiny],
         cwd=Path(__file__).parents[2], capture_output=True, text=True, check=False, timeout=240,
     )  # fmt: skip
     assert ran.returncode == 0, ran.stdout + ran.stderr

@@ -53,6 +53,7 @@ def test_every_baseline_stands_beside_the_solver():
         assert 0.02 < float(memory.split()[0]) < 2
 
 
+@pytest.mark.slow
 def test_growth_prints_an_exponent_for_each_size():
     lines = speed("growth", "--against-points", "100,200", "--against-frames", "4,8")
     assert sum(line.startswith(("| 100 ", "| 200 ", "| 4 ", "| 8 ")) for line in lines) == 4
@@ -60,31 +61,35 @@ def test_growth_prints_an_exponent_for_each_size():
     assert sum(line.startswith("exponent in F of") for line in lines) == 3
 
 
-def test_mesh_bandwidth_and_profile_run():
+def test_a_mesh_is_timed_against_a_grid():
     assert any("× the grid's time" in line for line in speed("mesh", "--frames", "6", "--points", "100"))
+
+
+@pytest.mark.slow
+def test_bandwidth_and_profile_run():
     assert any(line.startswith("ratio: ") for line in speed("bandwidth", "--frames", "6", "--points", "100"))
     assert any("block_tridiagonal.py" in line for line in speed("profile", "--frames", "12", "--points", "1500"))
 
 
 def test_exponent_of_a_known_law(bench):
     sizes = np.array([10.0, 20.0, 80.0])
-    assert bench("growth").exponent(sizes, 3 * sizes**1.25) == pytest.approx(1.25)
+    assert bench("speed.growth").exponent(sizes, 3 * sizes**1.25) == pytest.approx(1.25)
 
 
 def test_memory_of_one_process_is_its_own(bench):
-    measured = bench("apart").apart(hold, 200_000_000)
+    measured = bench("speed.apart").apart(hold, 200_000_000)
     assert measured.value == 25_000_000
     assert 190e6 < measured.growth < 230e6
     assert measured.peak > measured.growth
 
 
 def test_too_little_memory_is_no_number(bench):
-    assert bench("apart").apart(hold, 1 << 40, limit=1 << 32) is None
+    assert bench("speed.apart").apart(hold, 1 << 40, limit=1 << 32) is None
 
 
 def test_an_unfinished_run_is_extrapolated_at_its_last_rate(bench):
     """The gap halves every second: from 64 % to 1 % in six."""
-    run = bench("baselines").Run([0.0, 1.0, 2.0], [1.64, 1.32, 1.16])
-    assert bench("side_by_side").extrapolated(run, best=1.0) == pytest.approx(6.0)
-    stuck = bench("baselines").Run([0.0, 1.0, 2.0], [1.64, 1.64, 1.64])
-    assert bench("side_by_side").extrapolated(stuck, best=1.0) == float("inf")
+    run = bench("speed.baselines").Run([0.0, 1.0, 2.0], [1.64, 1.32, 1.16])
+    assert bench("speed.side_by_side").extrapolated(run, best=1.0) == pytest.approx(6.0)
+    stuck = bench("speed.baselines").Run([0.0, 1.0, 2.0], [1.64, 1.64, 1.64])
+    assert bench("speed.side_by_side").extrapolated(stuck, best=1.0) == float("inf")

@@ -51,6 +51,14 @@ def test_solve_ends_with_the_verdict(capsys: pytest.CaptureFixture[str]) -> None
     assert (printed["verdict"], printed["verdict_reasons"], printed["trust_sentence"]) == ("with_care", [REASON], TRUST)
 
 
+def test_solve_states_the_camera(capsys: pytest.CaptureFixture[str]) -> None:
+    lens = "Perspective camera, focal length 901 px ± 12, horizontal field of view 70.8° ± 0.72°."
+    show_finished(finished(camera_sentence=lens), Path("out"), as_json=False)
+    assert capsys.readouterr().out.splitlines()[-3:] == [lens, *LAST]
+    show_finished(finished(camera_sentence=lens), Path("out"), as_json=True)
+    assert json.loads(capsys.readouterr().out)["camera_sentence"] == lens
+
+
 def test_a_job_ends_with_the_verdict_and_an_old_one_with_its_outcome(capsys: pytest.CaptureFixture[str]) -> None:
     show_job(job(verdict="with_care", verdict_reasons=[REASON], trust_sentence=TRUST), as_json=False)
     shown = capsys.readouterr().out

@@ -34,7 +34,10 @@ from pliant.client import (
 from pliant.service.testing import InMemoryService
 
 PATIENT = Retry(shortest_pause=0.01, poll_interval=0.02)
-FAST = {"prior": "smooth+low_rank", "max_reweightings": 2, "tolerance": 0.1}
+FAST = {
+    "prior": "smooth+low_rank", "max_reweightings": 2, "tolerance": 0.1, "refine_rotations": False, "surface": "free",
+    "camera": "orthographic",
+}  # fmt: skip
 """Options with which a tiny job ends within a second."""
 
 

@@ -105,6 +105,7 @@ def killing(installation: Installation) -> Iterator[Callable[[str], None]]:
         restart.join(60)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="finds the service's process through /proc")
 @pytest.mark.parametrize("what", ["everything", "service"])
 def test_kill_9_in_mid_wait_and_mid_download(

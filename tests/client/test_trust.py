@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -29,3 +30,7 @@ def test_deviations_and_verdict_come_from_the_files_and_the_record(tmp_path: Pat
     np.testing.assert_array_equal(new.shapes_std, deviations)
     assert old.shapes_std is None
     assert new.verdict == "good"
+    for result, camera in ((new, {"focal": 900.0, "field_of_view": 70.8}), (old, {"focal": None})):
+        (result.folder / "report.json").write_text(json.dumps({"camera": {"model": "perspective", **camera}}))
+        assert result.camera["model"] == "perspective"
+        assert (result.focal, result.field_of_view) == (camera["focal"], camera.get("field_of_view"))

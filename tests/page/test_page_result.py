@@ -38,21 +38,27 @@ def test_every_view_of_a_result_shows_something_else(page: Page, url: str, finis
     def different() -> float:
         return differing_pixels(page, plain, canvas.screenshot())
 
-    for colour in ("displacement", "residual", "3-D error"):
+    for colour in ("displacement", "residual", "3-D error", "expected error", "how often seen"):
         page.get_by_label("Colour", exact=True).select_option(label=colour)
         expect(page.locator(".legend")).to_be_visible()
         until(lambda: different() > 0.02)
     page.get_by_label("Colour", exact=True).select_option("plain")
     expect(page.locator(".legend")).to_be_hidden()
     until(lambda: different() == 0)
-    for name in ("Wireframe", "Input tracks", "Ground truth", "Flip depth"):
+    for name in ("Wireframe", "Input tracks", "Ground truth"):
         page.get_by_role("checkbox", name=name).click()
         until(lambda: different() > 0.005)
         page.get_by_role("checkbox", name=name).click()
         until(lambda: different() == 0)
+    seek(page, 9)
+    from_front = canvas.screenshot()
     page.get_by_role("checkbox", name="Camera's view").check()
-    until(lambda: different() > 0.01)
-    page.get_by_role("button", name="Reset view").click()
+    until(lambda: differing_pixels(page, from_front, canvas.screenshot()) > 0.01)
+    seek(page, 3)
+    for side in ("Side", "Top"):
+        page.get_by_role("button", name=side).click()
+        until(lambda: different() > 0.01)
+    page.get_by_role("button", name="Front").click()
     until(lambda: different() == 0)
 
 
@@ -145,6 +151,7 @@ def test_a_dense_result_plays_within_time_and_memory(page: Page, tmp_path: Path)
     page.get_by_label("Refine rotations").uncheck()
     page.get_by_role("button", name="Reconstruct").click()
     page.locator(".view canvas").wait_for(timeout=DONE)
+    seek(page, 0)
     expect(page.locator(".clock")).to_have_text("1 / 99")
     first = page.locator(".view canvas").screenshot()
     began = time.monotonic()

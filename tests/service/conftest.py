@@ -40,7 +40,7 @@ def serve(valkey_url: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator
         data = tmp_path_factory.mktemp("data")
         queue = f"test-{secrets.token_hex(4)}"
         jobs = Jobs.open(Settings(data=data, redis_url=redis_url, queue=queue, disk_quota=quota))
-        settings = ServiceSettings(port=0, incoming=data / "incoming", **given)
+        settings = ServiceSettings(port=0, **given)
         tokens = Tokens.open(jobs.settings)
         app = create_app(jobs, settings, tokens=tokens, limits=limits)
         server = uvicorn.Server(

@@ -14,9 +14,10 @@ import httpx
 import pytest
 from pliant.schemas.job import Status
 from pliant.service.app import STATUS_OF
-from pliant.service.settings import MB, InvalidServiceSetting, ServiceSettings
+from pliant.service.settings import MB
 from pliant.service.spool import Incoming
 from pliant.worker import errors
+from pliant.worker.errors import InvalidSetting
 from pliant.worker.records import utc_now
 from serving import Running, Serve, finish, settings_from, submit, until
 
@@ -230,33 +231,5 @@ def test_settings_come_from_the_environment() -> None:
         ("MAX_BODY_MB", "0"),
         ("LOG_FORMAT", "xml"),
     ):
-        with pytest.raises(InvalidServiceSetting, match=f"PLIANT_{name}"):
+        with pytest.raises(InvalidSetting, match=f"PLIANT_{name}"):
             settings_from(**{name: value})
-
-
-def test_an_empty_variable_counts_as_unset() -> None:
-    names = (
-        "HOST",
-        "PORT",
-        "DATA",
-        "MAX_BODY_MB",
-        "MAX_QUEUED",
-        "REQUESTS_PER_MINUTE",
-        "AUTH",
-        "ALLOWED_HOSTS",
-        "LOG_LEVEL",
-    )
-    assert settings_from(**dict.fromkeys(names, "")) == ServiceSettings()
-
-
-def test_a_dotenv_file_and_secret_files_are_read_the_environment_first(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / ".env").write_text("PLIANT_PORT=1001\nPLIANT_MAX_QUEUED=7\nSOMETHING_ELSE=x\n")
-    secrets = tmp_path / "secrets"
-    secrets.mkdir()
-    (secrets / "PLIANT_MAX_QUEUED").write_text("8")
-    (secrets / "PLIANT_PARSERS").write_text("3")
-    found = settings_from(PORT="1002", SECRETS_DIR=str(secrets))
-    assert (found.port, found.max_queued, found.parsers) == (1002, 7, 3)

@@ -24,7 +24,15 @@ from serving import Running, tracks, until
 from typer.testing import CliRunner
 
 PICTURES = films.textured_pictures(10, (96, 72))
-QUICK = {"outputs": [], "max_reweightings": 2, "grid_step": 6, "refine_rotations": False}
+QUICK = {
+    "outputs": [],
+    "prior": "smooth",
+    "max_reweightings": 1,
+    "grid_step": 8,
+    "refine_rotations": False,
+    "surface": "free",
+    "camera": "orthographic",
+}
 
 
 @pytest.fixture(scope="module")

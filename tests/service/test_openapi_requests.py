@@ -27,7 +27,7 @@ from schemathesis.specs.openapi import checks
 from schemathesis.transport.serialization import Binary
 from serving import Running, Serve, finish, form, tracks
 
-EXAMPLES = int(os.environ.get("PLIANT_EXAMPLES", "8"))
+EXAMPLES = int(os.environ.get("PLIANT_EXAMPLES", "4"))
 """Requests of each kind for each operation."""
 
 UNASKED = [

@@ -10,7 +10,7 @@ import httpx
 import pytest
 from pliant.schemas.job import Problem
 from pliant.schemas.problems import ProblemCode, find_code
-from pliant.service.problems import Refusal, problem
+from pliant.service.problems import Refusal
 
 ROOT = Path(__file__).parents[2]
 FOLDERS = ("solver", "tracking", "worker", "service", "client", "cli")
@@ -25,11 +25,14 @@ def sources() -> Iterator[tuple[Path, ast.Module]]:
 
 def code_parameters() -> dict[str, int]:
     """Return, by qualified name, the position of the parameter `code` of every function and class that has one."""
-    found: dict[str, int] = {}
+    found = {"pliant.schemas.invalid.Invalid": 0}
+    heirs: dict[str, list[str]] = {}
     for path, tree in sources():
         module = "pliant." + ".".join(path.relative_to(ROOT).with_suffix("").parts)
         for node in ast.walk(tree):
             if isinstance(node, ast.ClassDef):
+                if not any(isinstance(each, ast.FunctionDef) and each.name == "__init__" for each in node.body):
+                    heirs[f"{module}.{node.name}"] = [ast.unparse(base) for base in node.bases]
                 for method in node.body:
                     if isinstance(method, ast.FunctionDef) and method.name == "__init__":
                         names = [arg.arg for arg in method.args.args]
@@ -37,8 +40,13 @@ def code_parameters() -> dict[str, int]:
                             found[f"{module}.{node.name}"] = names.index("code") - 1
             elif isinstance(node, ast.FunctionDef):
                 names = [arg.arg for arg in node.args.args]
-                if "code" in names and names[0] != "self":
+                if "code" in names and names[0] not in ("self", "cls"):
                     found[f"{module}.{node.name}"] = names.index("code")
+    for _ in range(3):  # a class without a constructor of its own has its base's
+        at = {name.rsplit(".", 1)[1]: position for name, position in found.items()}
+        for name, bases in heirs.items():
+            if bases and bases[0] in at:
+                found.setdefault(name, at[bases[0]])
     return found
 
 
@@ -80,7 +88,7 @@ def raised_codes() -> dict[str, str]:
             if isinstance(node, ast.Call):
                 called = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
                 codes += [keyword.value for keyword in node.keywords if keyword.arg == "code"]
-                position = parameters.get(names.get(called, ""))
+                position = 0 if ast.unparse(node.func) == "Problem.of" else parameters.get(names.get(called, ""))
                 if position is not None and len(node.args) > position:
                     codes.append(node.args[position])
                 if ast.unparse(node.func) == "super().__init__" and node.args and is_name(node.args[0]):
@@ -145,7 +153,7 @@ def test_an_explanation_of_no_code_is_refused(http: httpx.Client) -> None:
 
 
 def test_a_code_of_a_newer_version_is_still_a_problem() -> None:
-    made = problem("from_the_future", 418, detail="Something new. Update.")
+    made = Problem.of("from_the_future", 418, detail="Something new. Update.")
     assert (made.title, made.type, made.retryable) == ("I'm a Teapot", "/errors/from_the_future", False)
     assert Problem(title="T", status=500, detail="D.", code="out_of_memory").type == "/errors/out_of_memory"
 

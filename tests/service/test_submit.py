@@ -135,7 +135,7 @@ def test_a_body_that_is_no_form_is_refused(
 
 @pytest.fixture(scope="module")
 def small(serve: Serve) -> Running:
-    return serve(max_body_bytes=200_000, limits=Limits(max_frames=10))
+    return serve(max_body_mb=0.2, limits=Limits(max_frames=10))
 
 
 def test_a_body_beyond_the_limit_is_refused_however_it_is_sent(small: Running) -> None:

@@ -151,3 +151,16 @@ def test_a_rigid_object_comes_out_rigid(cameras: KnownCamera | None) -> None:
     assert metrics.e3d_frame(found.shapes, still) < 0.02
     spread = np.linalg.norm(found.shapes - found.shapes.mean(axis=0)) / np.linalg.norm(found.shapes)
     assert spread < 0.02
+
+
+@pytest.mark.parametrize("given", [{}, {"image_size": (640.0, 480.0), "focal": 700.0}])
+def test_points_on_one_line_give_a_finite_result_and_no_trust(given: dict[str, object]) -> None:
+    """A line has no depth of its own and no surface: whatever is made of it, it is not called good."""
+    along = np.linspace(-1, 1, 14)[None, :, None]
+    angle = np.linspace(0.2, 1.0, 7)[:, None, None]
+    line = np.concatenate([along * np.cos(angle), along * np.sin(angle)], axis=2)
+    found = solve(Tracks.from_arrays(320 + 150 * line), settings=Settings(max_reweightings=5, **given))  # type: ignore[arg-type]
+    assert np.isfinite(found.shapes).all()
+    assert found.trust is not None
+    assert found.trust.verdict != "good"
+    assert found.choices.warnings or found.trust.reasons

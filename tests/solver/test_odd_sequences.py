@@ -9,6 +9,12 @@ from pliant.solver.cameras.planar_ambiguity import poses
 from pliant.solver.cameras.scale import rigid_scales
 from pliant.solver.model.marginal_likelihood import LOWER, root_of
 
+SEEDS = (2, 3, 6, 10, 12, 13, 17, 18, 19, 21, 22, 23)
+"""Refused sequences, sequences whose cameras are given, and two whose cameras are estimated, which takes ten times as long."""
+
+MORE_SEEDS = tuple(set(range(24)) - set(SEEDS))
+"""Sequences whose cameras are estimated."""
+
 
 @pytest.mark.parametrize("known", [True, False])
 def test_too_little_seen_is_said(known: bool) -> None:
@@ -22,7 +28,7 @@ def test_too_little_seen_is_said(known: bool) -> None:
     assert (caught.value.code, caught.value.field, caught.value.got) == ("too_little_seen", "visibility", "3")
 
 
-@pytest.mark.parametrize("seed", range(24))
+@pytest.mark.parametrize("seed", [*SEEDS, *(pytest.param(seed, marks=pytest.mark.slow) for seed in MORE_SEEDS)])
 def test_odd_little_sequences_give_finite_shapes_or_a_sentence(seed: int) -> None:
     random = np.random.default_rng(seed)
     frames, points = int(random.integers(3, 10)), int(random.integers(4, 30))

@@ -67,7 +67,7 @@ def test_estimated_cameras_and_a_mesh_run_end_to_end() -> None:
 
 
 def test_the_same_call_gives_the_same_bits() -> None:
-    _, _, tracks, mesh = scene()
+    _, _, tracks, mesh = scene(5)
     one, two = solve(tracks, mesh), solve(tracks, mesh)
     assert np.array_equal(one.shapes, two.shapes)
 

@@ -1,46 +1,122 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from pliant.service.settings import ServiceSettings
+from pliant.worker.environment import expected_of, fields_of, variable_of
 from pliant.worker.errors import InvalidSetting
 from pliant.worker.paths import LONGEST_SOCKET_PATH, socket_path
-from pliant.worker.settings import VARIABLES, Settings, usable_cores
+from pliant.worker.settings import Settings, usable_cores
 
 
-def test_an_empty_environment_gives_the_defaults() -> None:
-    assert Settings.from_environment({"PLIANT_WORKERS": "", "HOME": "/x"}) == Settings()
+@pytest.fixture
+def set_variables(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., None]:
+    """Set variables of Pliant and no others; the working directory is empty."""
+    for name in [name for name in os.environ if name.startswith("PLIANT_")]:
+        monkeypatch.delenv(name)
+    monkeypatch.chdir(tmp_path)
+
+    def assign(**variables: str) -> None:
+        for name, value in variables.items():
+            monkeypatch.setenv(f"PLIANT_{name}", value)
+
+    return assign
 
 
-def test_the_environment_round_trips() -> None:
+def test_empty_variables_give_the_defaults(set_variables: Callable[..., None]) -> None:
+    names = [variable_of(name).removeprefix("PLIANT_") for name in (*fields_of(Settings), *fields_of(ServiceSettings))]
+    set_variables(**dict.fromkeys(names, ""))
+    assert Settings.from_environment() == Settings()
+    assert ServiceSettings.from_environment() == ServiceSettings()
+
+
+def test_the_environment_round_trips(set_variables: Callable[..., None]) -> None:
     settings = Settings(
         data=Path("/some/where"), redis_url="redis://h/1", blob_url="s3://b/p", queue="q", workers=3, threads=2,
         time_limit=1.5, memory_limit=10, cancel_grace=2, stop_grace=3, lost_after=4, max_attempts=5, retention=0, disk_quota=7,
-        upload_expiry=8, max_running=9, webhook_networks="10.0.0.0/8,::1/128",
+        upload_expiry=8, max_running=9, webhook_networks="10.0.0.0/8,::1/128", read_memory=1 << 31,
     )  # fmt: skip
-    assert Settings.from_environment(settings.to_environment()) == settings
-    assert len(settings.to_environment()) == len(VARIABLES) == len(Settings.__dataclass_fields__)
+    told = settings.to_environment()
+    set_variables(**{name.removeprefix("PLIANT_"): value for name, value in told.items()})
+    assert Settings.from_environment() == settings
+    assert set(told) == {variable_of(name) for name in fields_of(Settings)}
 
 
 @pytest.mark.parametrize(
-    ("variable", "text"),
+    ("name", "text"),
     [
-        ("PLIANT_WORKERS", "0"), ("PLIANT_WORKERS", "many"), ("PLIANT_TIME_LIMIT", "-1"), ("PLIANT_TIME_LIMIT", "nan"),
-        ("PLIANT_RETENTION", "inf"), ("PLIANT_LOST_AFTER", "0.5"), ("PLIANT_DISK_QUOTA", "1.5"),
+        ("WORKERS", "0"), ("WORKERS", "many"), ("TIME_LIMIT", "-1"), ("TIME_LIMIT", "nan"),
+        ("RETENTION", "inf"), ("LOST_AFTER", "0.5"), ("DISK_QUOTA", "1.5"),
     ],
 )  # fmt: skip
-def test_a_wrong_value_names_the_variable_and_both_sides(variable: str, text: str) -> None:
-    with pytest.raises(InvalidSetting, match=f"{variable}: expected a .*, at least .*, got '{text}'"):
-        Settings.from_environment({variable: text})
+def test_a_wrong_value_names_the_variable_and_both_sides(
+    set_variables: Callable[..., None], name: str, text: str
+) -> None:
+    set_variables(**{name: text})
+    with pytest.raises(InvalidSetting, match=f"PLIANT_{name}: expected a .*, at least .*, got '{text}'") as caught:
+        Settings.from_environment()
+    assert (caught.value.code, caught.value.field) == ("invalid_setting", f"PLIANT_{name}")
 
 
-def test_networks_are_networks() -> None:
-    given = Settings.from_environment({"PLIANT_WEBHOOK_NETWORKS": " 10.0.0.0/8, ::1 ,"})
-    assert given.webhook_networks == "10.0.0.0/8,::1/128"
+def test_networks_are_networks(set_variables: Callable[..., None]) -> None:
+    set_variables(WEBHOOK_NETWORKS=" 10.0.0.0/8, ::1 ,")
+    assert Settings.from_environment().webhook_networks == "10.0.0.0/8,::1/128"
     for wrong in ("10.0.0.1/8", "localhost", "10/8/8"):
+        set_variables(WEBHOOK_NETWORKS=wrong)
         with pytest.raises(InvalidSetting, match="PLIANT_WEBHOOK_NETWORKS: expected networks"):
-            Settings.from_environment({"PLIANT_WEBHOOK_NETWORKS": wrong})
+            Settings.from_environment()
+
+
+def test_environment_env_file_and_secret_files_in_this_order(
+    set_variables: Callable[..., None], tmp_path: Path
+) -> None:
+    (tmp_path / ".env").write_text("PLIANT_WORKERS=2\nPLIANT_QUEUE=filed\nPLIANT_PORT=7000\nOTHER=1\nPLIANT_DATA=\n")
+    secrets = tmp_path / "secrets"
+    secrets.mkdir()
+    (secrets / "pliant_redis_url").write_text("redis://:secret@h/1\n")
+    (secrets / "PLIANT_QUEUE").write_text("secret")
+    (secrets / "pliant_blob_url").write_text("\n")
+    set_variables(WORKERS="4", SECRETS_DIR=str(secrets))
+    found = Settings.from_environment()
+    assert (found.workers, found.queue, found.redis_url) == (4, "filed", "redis://:secret@h/1")
+    assert (found.data, found.blob_url) == (Settings().data, None)
+    assert ServiceSettings.from_environment().port == 7000
+
+
+def test_a_folder_of_secrets_that_is_named_exists(set_variables: Callable[..., None], tmp_path: Path) -> None:
+    set_variables(SECRETS_DIR=str(tmp_path / "none"))
+    with pytest.raises(InvalidSetting, match="PLIANT_SECRETS_DIR: expected a folder"):
+        Settings.from_environment()
+
+
+def test_what_a_variable_may_hold_is_stated_by_its_type_and_bounds() -> None:
+    known = fields_of(Settings) | fields_of(ServiceSettings)
+    assert expected_of(known["port"]) == "a whole number, at least 0, at most 65535"
+    assert expected_of(known["stall_seconds"]) == "a number, more than 0"
+    assert expected_of(known["log_level"]) == "'debug', 'info', 'warning' or 'error'"
+    assert expected_of(known["retention"]) == "a number of seconds, at least 0"
+
+
+def test_a_worker_needs_no_fastapi_and_the_base_install_no_pydantic_settings() -> None:
+    code = """
+import sys
+for name in {absent}: sys.modules[name] = None
+import {module}
+from pliant.worker.settings import Settings
+Settings{read}
+"""
+    worker = code.format(
+        absent=("fastapi", "starlette", "uvicorn"), module="pliant.worker.__main__", read=".from_environment()"
+    )
+    base = code.format(absent=("pydantic_settings", "fastapi", "rq", "redis"), module="pliant.cli", read="()")
+    for text in (worker, base):
+        ran = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=False)
+        assert ran.returncode == 0, ran.stderr
 
 
 def test_urls_default_to_the_data_directory() -> None:

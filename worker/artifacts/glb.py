@@ -1,4 +1,4 @@
-"""Write an animated binary glTF 2.0 (.glb): one mesh, morph targets, one animation of their weights.
+"""Write an animated binary glTF 2.0 (.glb): one mesh, morph targets, a camera, one animation of their weights and its motion.
 
 The file is streamed: the JSON comes first, so sizes, offsets, minima and maxima are computed before any array is written.
 """
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.worker.artifacts.animation import Animation
 from pliant.worker.artifacts.geometry import Ints, Singles, vertex_normals
+from pliant.worker.artifacts.view import View
 from pliant.worker.formats import Texture
 
 COMPONENTS = {"int8": 5120, "uint8": 5121, "int16": 5122, "uint16": 5123, "uint32": 5125, "float32": 5126}
@@ -95,7 +96,7 @@ class Buffer:
 def write_glb(
     file: IO[bytes], animation: Animation, triangles: Ints, *, fps: float, node: dict[str, Any], normals: str = "static",
     quantized: bool = False, colours: NDArray[np.uint16] | None = None, texture: Texture | None = None,
-    on_progress: Callable[[float], None] | None = None,
+    view: View | None = None, on_progress: Callable[[float], None] | None = None,
 ) -> None:  # fmt: skip
     """Write the animation.
 
@@ -119,6 +120,8 @@ def write_glb(
         RGBA of every point, linear light, 65535 for 1.
     texture : Texture, optional
         Base colour; embedded as JPEG.
+    view : View, optional
+        Camera, whose node follows that of the mesh and moves with it.
     on_progress : callable, optional
         Called with the share of bytes written.
     """
@@ -172,18 +175,34 @@ def write_glb(
         ],
         "materials": [_material(coloured=colours is not None, textured=texture is not None)],
         "animations": [{"name": "motion", "samplers": [sampler], "channels": [{"sampler": 0, "target": {"node": 0, "path": "weights"}}]}],
-        "buffers": [{"byteLength": buffer.bytes}],
         "bufferViews": buffer.views,
         "accessors": buffer.accessors,
     }  # fmt: skip
+    if view is not None:
+        _add_camera(document, buffer, view)
     if texture is not None:
         document["images"] = [{"name": "film", "mimeType": "image/jpeg", "bufferView": buffer.attach(texture.jpeg)}]
         document["samplers"] = [{"magFilter": LINEAR, "minFilter": MIPMAPS, "wrapS": CLAMPED, "wrapT": CLAMPED}]
         document["textures"] = [{"source": 0, "sampler": 0}]
-        document["buffers"] = [{"byteLength": buffer.bytes}]
+    document["buffers"] = [{"byteLength": buffer.bytes}]
     if quantized:
         document["extensionsUsed"] = document["extensionsRequired"] = ["KHR_mesh_quantization"]
     _write(file, document, buffer, on_progress)
+
+
+def _add_camera(document: dict[str, Any], buffer: Buffer, view: View) -> None:
+    """Add camera, node and the two channels of its motion; their times are those of the weights."""
+    document["cameras"] = [view.lens]
+    document["nodes"].append(
+        {"name": "camera", "camera": 0, "rotation": view.rotations[0].tolist(), "translation": view.translations[0].tolist()}
+    )  # fmt: skip
+    document["scenes"][0]["nodes"].append(1)
+    motion = document["animations"][0]
+    for path, values in (("rotation", view.rotations), ("translation", view.translations)):
+        motion["channels"].append({"sampler": len(motion["samplers"]), "target": {"node": 1, "path": path}})
+        motion["samplers"].append(
+            {"input": motion["samplers"][0]["input"], "output": buffer.add(values), "interpolation": "LINEAR"}
+        )
 
 
 def _targets(

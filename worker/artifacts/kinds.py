@@ -19,6 +19,7 @@ from pliant.worker.artifacts.glb import write_glb
 from pliant.worker.artifacts.mdd import write_mdd
 from pliant.worker.artifacts.result import Result
 from pliant.worker.artifacts.tables import write_frames_csv, write_points_csv
+from pliant.worker.artifacts.view import view_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,11 +115,13 @@ def _glb(result: Result, file: IO[bytes], on_progress: OnProgress) -> dict[str, 
         colours = _rgba(painted.mean())
     elif result.texture is None and result.picture_colours is not None:
         colours = _rgba(result.picture_colours)
+    scale = viewer_scale(shapes)
+    view = view_of(result.solution.camera, shapes, y_axis=result.y_axis, scale=scale, image_size=result.image_size)
     on_progress(0.4)
     write_glb(
-        file, animation, triangles_of(result.faces), fps=options.fps, node={"scale": [viewer_scale(shapes)] * 3},
+        file, animation, triangles_of(result.faces), fps=options.fps, node={"scale": [scale] * 3},
         normals=options.normals, quantized=options.glb_quantized, colours=colours,
-        texture=result.texture, on_progress=lambda part: on_progress(0.4 + 0.6 * part),
+        texture=result.texture, view=view, on_progress=lambda part: on_progress(0.4 + 0.6 * part),
     )  # fmt: skip
     return animation.extras
 
@@ -156,12 +159,13 @@ def _preview(result: Result, file: IO[bytes]) -> None:
         truth=None if inputs.ground_truth is None else inputs.ground_truth.shapes,
         y_axis=inputs.interpretation.y_axis,
         fps=result.options.fps,
+        image_size=result.options.image_size,
     )
 
 
 KINDS = (
     Kind("shapes.npz", None, "application/zip", "All arrays: shapes (F, P, 3), deviations, cameras, faces, residuals, weights.", 2, _npz),
-    Kind("shapes.glb", "glb", "model/gltf-binary", "The moving mesh as animated glTF, y up.", 2, _glb),
+    Kind("shapes.glb", "glb", "model/gltf-binary", "The moving mesh and its camera as animated glTF, y up.", 2, _glb),
     Kind("shapes_ply.zip", "ply", "application/zip", "One binary PLY for each frame.", 6, _painted(write_ply_zip)),
     Kind("shapes_obj.zip", "obj", "application/zip", "One OBJ for each frame.", 30, _painted(write_obj_zip)),
     Kind("shapes.usdc", "usd", "application/octet-stream", "The moving mesh as USD, y up.", 3, _painted(usd.write_usd), textured=False),

@@ -16,7 +16,14 @@ cameras    float32 (F, 10)     rotation row by row, camera from world; then the 
 positions  int16 (F, P, 3)     world = origin + step · value
 residuals  int16 (F, P, 2)     track − projection = residual_step · value; both −32768 where hidden
 truth      int16 (F, P, 3)     as positions, aligned with the result as for `e3d_frame`; only with ground truth
+frames     float32 (F, 6)      translation x, y; hidden share; expected error and `e3d_frame` as shares of the object's
+                               size; median residual. NaN where unknown
+points     uint32 (P, 2)       in how many of all frames each point was seen, and in how many of these it was rejected
+spread     uint16 (F, P)       standard deviation of a position = spread_step · value. Only with a posterior
+rejected   uint8 (F, ⌈P/8⌉)    bits, the lowest first: seen observations that the solver rejected as outliers
 =========  ==================  ===================================================================================
+
+Readers skip sections that they do not know; all after `residuals` may be missing.
 """
 
 from __future__ import annotations
@@ -30,6 +37,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.solver import Mesh, Solution, Tracks
 from pliant.solver.evaluation.alignment import align
+from pliant.solver.evaluation.metrics import frame_errors
+from pliant.worker.artifacts.geometry import size_of
 
 NAME = "preview.bin"
 MEDIA_TYPE = "application/octet-stream"
@@ -38,7 +47,10 @@ DESCRIPTION = "Compact int16 copy that the web page plays; not for measuring."
 MAGIC = b"PLIANTPV"
 VERSION = 1
 LARGEST = 32767
+LARGEST_COUNT = 65535
 HIDDEN = -32768
+LEAST_TRUE = 3
+"""Points with truth that an alignment needs."""
 MOST_OBSERVATIONS = 16_000_000
 """Number of points × frames (96 MB of positions) above which only every n-th frame is written."""
 
@@ -73,6 +85,7 @@ def write_preview(
     truth: Floats | None = None,
     y_axis: str = "down",
     fps: float = 25.0,
+    image_size: str | None = None,
 ) -> None:
     """Write the file.
 
@@ -88,6 +101,8 @@ def write_preview(
         Direction of the image's y axis.
     fps : float
         Frames per second of the animation, before frames are skipped.
+    image_size : str, optional
+        Width and height of the picture that the tracks refer to, pixels, as the option `image_size` has it.
     """
     stride = max(1, -(-solution.shapes[..., 0].size // MOST_OBSERVATIONS))
     kept = range(0, len(solution.shapes), stride)
@@ -96,13 +111,21 @@ def write_preview(
     residual_step = _largest_residual(tracks, solution) / LARGEST or 1.0
     faces = triangles(mesh)
     points = solution.shapes.shape[1]
+    seen = tracks.visible > 0
+    rejected = seen & (solution.weights == 0)
+    spread_step = 0.0 if solution.shapes_std is None else float(solution.shapes_std.max()) / LARGEST_COUNT or 1.0
     sizes = {
         "faces": faces.nbytes,
         "cameras": 40 * len(kept),
         "positions": 6 * points * len(kept),
         "residuals": 4 * points * len(kept),
         **({} if facing is None else {"truth": 6 * points * len(kept)}),
+        "frames": 24 * len(kept),
+        "points": 8 * points,
+        **({} if solution.shapes_std is None else {"spread": 2 * points * len(kept)}),
+        "rejected": -(-points // 8) * len(kept),
     }
+    camera = solution.camera
     header = {
         "version": VERSION,
         "num_frames": len(kept),
@@ -115,16 +138,43 @@ def write_preview(
         "origin": box.origin.tolist(),
         "step": box.step,
         "residual_step": residual_step,
+        "spread_step": spread_step,
+        "size": size_of(solution.shapes),
+        "all_frames": len(solution.shapes),
+        "focal": camera.focal,
+        "principal_point": camera.principal_point.tolist(),
+        "image_size": None if image_size is None else [float(side) for side in image_size.split("x")],
     }
     _begin(file, header, sizes)
     _section(file, faces.tobytes())
-    camera = solution.camera
     table = np.column_stack([camera.rotations.reshape(-1, 9), camera.scales])[kept]
     _section(file, table.astype("<f4").tobytes())
     _section(file, *(box.rounded(solution.shapes[frame]).tobytes() for frame in kept))
     _section(file, *(_residuals(tracks, solution, frame, residual_step).tobytes() for frame in kept))
     if facing is not None:
         _section(file, *(box.rounded(facing[frame]).tobytes() for frame in kept))
+    _section(file, _frames_table(tracks, solution, truth)[kept].astype("<f4").tobytes())
+    _section(file, np.column_stack([seen.sum(axis=0), rejected.sum(axis=0)]).astype("<u4").tobytes())
+    if (std := solution.shapes_std) is not None:
+        _section(file, *(np.rint(std[frame] / spread_step).astype("<u2").tobytes() for frame in kept))
+    _section(file, np.packbits(rejected[kept], axis=1, bitorder="little").tobytes())
+
+
+def _frames_table(tracks: Tracks, solution: Solution, truth: Floats | None) -> Floats:
+    """Return one row for each frame, see the section `frames`; shape `(F, 6)`."""
+    count = len(solution.shapes)
+    table = np.full((count, 6), np.nan)
+    table[:, :2] = solution.camera.translations
+    table[:, 2] = 1 - (tracks.visible > 0).mean(axis=1)
+    if solution.shapes_std is not None:
+        table[:, 3] = np.sqrt(np.square(solution.shapes_std).mean(axis=1)) / size_of(solution.shapes)
+    if truth is not None and (known := np.isfinite(truth).all(axis=(0, 2))).sum() >= LEAST_TRUE:
+        table[:, 4] = frame_errors(solution.shapes[:, known], truth[:, known], kind="frame")
+    for frame in range(count):
+        lengths = np.linalg.norm(_residual(tracks, solution, frame)[tracks.visible[frame] > 0], axis=1)
+        if len(lengths):
+            table[frame, 5] = np.median(lengths)
+    return table
 
 
 def triangles(mesh: Mesh | None) -> NDArray[np.uint32]:
@@ -143,7 +193,7 @@ def _onto(shapes: Floats, truth: Floats) -> tuple[Floats | None, bool]:
     Points without truth are excluded from the alignment and take the position of the result.
     """
     known = np.isfinite(truth).all(axis=(0, 2))
-    if known.sum() < 3:
+    if known.sum() < LEAST_TRUE:
         return None, False
     aligned = align(shapes[:, known], truth[:, known], kind="frame")
     turned = shapes.copy()
@@ -172,7 +222,7 @@ def _residuals(tracks: Tracks, solution: Solution, frame: int, step: float) -> N
 
 def _begin(file: IO[bytes], header: dict[str, object], sizes: dict[str, int]) -> None:
     """Write magic, version and header, padded to a fixed length because its offsets depend on its length."""
-    room = 1024
+    room = 2048
     offset = 16 + room
     sections = {}
     for name, size in sizes.items():

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import platform
-import resource
 import sys
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -54,7 +53,7 @@ def build_report(
             for name, value in choices.items()
         },
         "reasons": reasons,
-        "camera": _camera(solution),
+        "camera": described_camera(solution, options),
         "options": options.model_dump(mode="json"),
         "interpretation": inputs.interpretation.model_dump(mode="json"),
         "trace": {
@@ -70,18 +69,41 @@ def build_report(
     return plain
 
 
-def _camera(solution: Solution) -> dict[str, Any]:
-    """Return what all frames share: camera model, focal length in the tracks' unit, principal point, and how they were chosen."""
+def described_camera(solution: Solution, options: Options) -> dict[str, Any]:
+    """Return what is the same in all frames: model, lens, how they were chosen, and a sentence.
+
+    The horizontal field of view of a picture W wide is 2 atan(W / 2φ), in degrees; its standard deviation is that of φ times |dθ/dφ|.
+    """
     camera, choices = solution.camera, solution.choices
+    angle, angle_std = None, None
+    if camera.focal is not None and options.image_size is not None:
+        half = float(options.image_size.split("x")[0]) / 2
+        angle = math.degrees(2 * math.atan2(half, camera.focal))
+        angle_std = math.degrees(2 * half / (camera.focal**2 + half**2)) * (camera.focal_std or 0.0)
     return {
         "model": choices.camera,
         "focal": camera.focal,
         "focal_std": camera.focal_std,
+        "field_of_view": angle,
+        "field_of_view_std": angle_std,
+        "sentence": _camera_sentence(choices.camera, camera.focal, camera.focal_std, angle, angle_std),
         "principal_point": camera.principal_point.tolist(),
         "depth_sign": choices.depth_sign,
         "candidates": [asdict(each) for each in choices.focal_candidates],
         "reason": choices.reasons.get("camera_model"),
     }
+
+
+def _camera_sentence(
+    model: str, focal: float | None, focal_std: float | None, angle: float | None, angle_std: float | None
+) -> str:
+    name = model.replace("_", " ").capitalize()
+    if focal is None:
+        return f"{name} camera."
+    known = " (given)" if focal_std == 0 else "" if focal_std is None else f" ± {focal_std:.2g}"
+    view = "" if angle is None else f", horizontal field of view {angle:.1f}°"
+    view += "" if angle is None or not angle_std else f" ± {angle_std:.2g}°"
+    return f"{name} camera, focal length {focal:.4g} px{known}{view}."
 
 
 def _trust(trust: Trust | None) -> dict[str, Any]:
@@ -98,8 +120,12 @@ def _trust(trust: Trust | None) -> dict[str, Any]:
     }
 
 
-def peak_memory() -> int:
-    """Return the peak resident size of this process, bytes."""
+def peak_memory() -> int | None:
+    """Return the peak resident size of this process, bytes; None on Windows."""
+    try:
+        import resource
+    except ModuleNotFoundError:
+        return None
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024
 

@@ -27,6 +27,14 @@ class Result:
         """Direction of the tracks' y axis: `down` or `up`."""
         return self.inputs.interpretation.y_axis
 
+    @property
+    def image_size(self) -> tuple[float, float] | None:
+        """Width and height of the picture, pixels; None where the options do not state them."""
+        if self.options.image_size is None:
+            return None
+        width, height = self.options.image_size.split("x")
+        return float(width), float(height)
+
     @cached_property
     def faces(self) -> Ints:
         """Faces of the mesh, `(0, 3)` without one."""

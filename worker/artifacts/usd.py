@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import shutil
 import tempfile
 from collections.abc import Callable
@@ -17,6 +18,9 @@ from pliant.worker.formats import Texture
 
 PICTURE = "texture.jpg"
 """Name of the texture in the package."""
+
+PACKED_AT = 315_619_200
+"""Time stamp of the package's files, seconds since 1970 (2 January 1980, which ZIP can state): equal results are equal files."""
 
 
 def available() -> bool:
@@ -48,6 +52,8 @@ def write_usdz(result: Result, file: IO[bytes], on_progress: Callable[[float], N
         assert result.texture is not None
         (Path(folder) / PICTURE).write_bytes(result.texture.jpeg)
         _build(stage, result, on_progress)
+        for path in Path(folder).iterdir():
+            os.utime(path, (PACKED_AT, PACKED_AT))
         if not UsdUtils.CreateNewUsdzPackage(str(stage), str(package)):
             raise OSError(f"USD could not write the package {package}.")
         with package.open("rb") as made:

@@ -14,6 +14,7 @@ from pliant.worker.artifacts import described, kinds_for
 from pliant.worker.errors import Interrupted
 from pliant.worker.execution.pipeline import Finished, Halt, silent, solve_and_write
 from pliant.worker.execution.progress import FILM_SHARES, Reporter
+from pliant.worker.films import frame_strip
 from pliant.worker.films.inputs import read_tracked
 from pliant.worker.films.sources import FilmBounds, FilmSource
 from pliant.worker.films.tracker import track_film
@@ -24,8 +25,9 @@ FILES = {
         "The film's tracks (F, P, 2) in its pixels, visibility, confidence, grid, faces, texture coordinates and times.",
     ),
     "contact_sheet.jpg": ("image/jpeg", "The tracks drawn over some frames of the film."),
+    frame_strip.NAME: (frame_strip.MEDIA_TYPE, frame_strip.DESCRIPTION),
 }
-"""Files of a film besides those of its reconstruction: media type and description."""
+"""Files of a film besides those of its reconstruction: media type and description. The last is missing for very long films."""
 
 
 def reconstruct_film(
@@ -73,7 +75,8 @@ def reconstruct_film(
     try:
         tracked = track_film(
             source, options, scratch, bounds=bounds, threads=threads,
-            on_progress=lambda done: reporter.part("track", done), should_stop=halt.requested,
+            on_progress=lambda done, followed: reporter.part("track", done, followed=followed),
+            should_stop=halt.requested,
         )  # fmt: skip
     except Interrupted:
         halt.check()
@@ -81,7 +84,7 @@ def reconstruct_film(
     inputs = read_tracked(scratch / "tracks.npz", tracked, options)
     spent = {"track": time.perf_counter() - began}
     directory.mkdir(parents=True, exist_ok=True)
-    artifacts = [_moved(scratch / name, directory) for name in FILES]
+    artifacts = [_moved(scratch / name, directory) for name in FILES if (scratch / name).exists()]
     finished = solve_and_write(inputs, options, directory, reporter=reporter, halt=halt, spent=spent)
     return replace(
         finished,

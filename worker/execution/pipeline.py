@@ -49,6 +49,9 @@ class Finished:
     trust_sentence: str | None = None
     """A sentence with the expected error and the evidence for depth."""
 
+    camera_sentence: str | None = None
+    """The camera model, and of a perspective camera focal length and field of view."""
+
 
 def solver_settings(options: Options, *, y_up: bool = False) -> Settings:
     """Return the solver settings of a job's options; `y_up` as the tracks were read."""
@@ -165,6 +168,7 @@ def solve_and_write(
         verdict=None if trust is None else trust.verdict.value,
         verdict_reasons=() if trust is None else trust.reasons,
         trust_sentence=None if trust is None else trust.sentence,
+        camera_sentence=report["camera"]["sentence"],
         warnings=tuple(solution.choices.warnings),
         artifacts=tuple(artifacts),
     )

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 
-from pliant.schemas.job import Progress
+from pliant.schemas.job import FollowedPoints, Progress
 
 SHARES = {"loading": (0.0, 0.02), "solving": (0.02, 0.85), "exporting": (0.85, 1.0)}
 """Start and end of each part of a job as fractions of the whole."""
@@ -50,6 +50,7 @@ class Reporter:
         max_reweightings: int | None = None,
         objective: float | None = None,
         residual: float | None = None,
+        followed: FollowedPoints | None = None,
     ) -> None:
         """Report that the share `done` (0 to 1) of a part is done; omitted numbers keep their last value.
 
@@ -59,6 +60,8 @@ class Reporter:
             A key of `shares`.
         stage : str, optional
             Stage to report; the name of the part by default.
+        followed : FollowedPoints, optional
+            Points of the film that were just tracked; not repeated later.
         """
         now = self.clock()
         if self._began is None:
@@ -76,6 +79,7 @@ class Reporter:
                 {
                     **self._last,
                     "stage": stage or part,
+                    "followed": followed,
                     "fraction": fraction,
                     "seconds_left": None if left is None else round(left, 1),
                     "updated_at": datetime.now(UTC),

@@ -13,8 +13,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pliant.solver.errors import InvalidInput
+from pliant.worker.films import frame_strip
+from pliant.worker.films.frame_strip import write_frames
 from pliant.worker.films.sources import FilmBounds
-from pliant.worker.formats.errors import refusal, too_large
+from pliant.worker.formats.errors import too_large
 from pliant.worker.processes.contained import limit_process, serve
 from pliant.worker.processes.no_network import forbid_network
 
@@ -26,6 +28,9 @@ OPEN_FILES = 256
 
 PROGRESS_EVERY = 0.2
 """Minimum seconds between two lines of progress."""
+
+SHOWN = 150
+"""Points that are shown while tracking runs: about 1.5 kB in a record that is rewritten twice a second."""
 
 SHARES = {"read": (0.0, 0.15), "locate": (0.15, 0.25), "track": (0.25, 1.0)}
 """Start and end of each stage of the tracker as fractions of the whole, from typical timings."""
@@ -50,8 +55,8 @@ def _answer(request: dict[str, Any]) -> str:
     try:
         import pliant.tracking as tracking
     except ImportError as error:
-        raise refusal(
-            "film_unavailable", "film", expected="tracks, or a service with OpenCV", got="a film",
+        raise InvalidInput(
+            "film_unavailable", field="film", expected="tracks, or a service with OpenCV", got="a film",
             hint="Install OpenCV beside service and worker (pip install 'pliant[film]'), or send tracks.",
         ) from error  # fmt: skip
     bounds = FilmBounds(**request["bounds"])
@@ -114,22 +119,24 @@ def _check(request: dict[str, Any], bounds: FilmBounds) -> dict[str, Any]:
 
 
 def _track(request: dict[str, Any], bounds: FilmBounds) -> dict[str, Any]:
-    """Track the film; write `tracks.npz` and `contact_sheet.jpg` into the scratch folder."""
+    """Track the film; write `tracks.npz`, `contact_sheet.jpg` and `film_frames.bin` into the scratch folder."""
     from pliant.tracking import track_film
 
     options, folder = request["options"], Path(request["folder"])
+    film = _opened(request, bounds)
     tracked = track_film(
-        _opened(request, bounds),
+        film,
         region=_region(request),
         region_frame=options["region_frame"],
         template_frame=options["template_frame"],
         grid_step=options["grid_step"],
         longest_side=options["longest_side"],
         threads=request["threads"],
-        on_step=_reporter(request["progress"]),
+        on_step=_reporter(request["progress"], film.size),
     )
     tracked.save_npz(folder / "tracks.npz")
     (folder / "contact_sheet.jpg").write_bytes(tracked.contact_sheet())
+    write_frames(film, tracked.film.frame_indices, folder / frame_strip.NAME)
     return {"container": tracked.film.container, "warnings": list(tracked.warnings)}
 
 
@@ -153,8 +160,8 @@ def _region(request: dict[str, Any]) -> Path | list[list[float]] | None:
     return polygon if request["region"] is None else Path(request["region"])
 
 
-def _reporter(target: int) -> Callable[[TrackingStep], None]:
-    """Return a callback that writes the completed share to a descriptor, at most every `PROGRESS_EVERY` seconds."""
+def _reporter(target: int, size: tuple[int, int]) -> Callable[[TrackingStep], None]:
+    """Return a callback that writes the completed share, and points, to a descriptor, at most every `PROGRESS_EVERY` seconds."""
     after = 0.0
 
     def report(step: TrackingStep) -> None:
@@ -165,9 +172,21 @@ def _reporter(target: int) -> Callable[[TrackingStep], None]:
         after = now + PROGRESS_EVERY
         low, high = SHARES[step.stage]
         done = low if not step.total else low + (high - low) * min(1.0, step.done / step.total)
-        os.write(target, json.dumps({"done": done}).encode() + b"\n")
+        os.write(target, json.dumps({"done": done, "followed": _followed(step, size)}).encode() + b"\n")
 
     return report
+
+
+def _followed(step: TrackingStep, size: tuple[int, int]) -> dict[str, Any] | None:
+    """Return at most `SHOWN` of the visible points of the frame just tracked, as the schema `FollowedPoints`."""
+    if step.followed is None:
+        return None
+    points = step.followed.points[step.followed.visible]
+    some = points[:: max(1, -(-len(points) // SHOWN))]
+    return {
+        "frame": step.followed.index, "seconds": step.followed.time, "width": size[0], "height": size[1],
+        "points": some.round().astype(int).ravel().tolist(),
+    }  # fmt: skip
 
 
 def _refused(error: FilmError, request: dict[str, Any]) -> InvalidInput:

@@ -9,12 +9,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any, TypeVar
 
-from pliant.schemas.job import Interpretation
+from pliant.schemas.job import FollowedPoints, Interpretation
 from pliant.schemas.options import Options
 from pliant.solver.errors import InvalidInput
 from pliant.worker.errors import Interrupted
 from pliant.worker.films.sources import FilmBounds, FilmSource
-from pliant.worker.formats.errors import damaged, refusal, too_large
+from pliant.worker.formats.errors import damaged, too_large
 from pliant.worker.processes.contained import DONE, REFUSED, Ended, refusal_in, run_contained
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -105,7 +105,7 @@ def track_film(
     *,
     bounds: FilmBounds = FilmBounds(),  # noqa: B008 - frozen
     threads: int = 1,
-    on_progress: Callable[[float], None] | None = None,
+    on_progress: Callable[[float, FollowedPoints | None], None] | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> Tracked:
     """Track a film; `tracks.npz` and `contact_sheet.jpg` are then in the scratch folder.
@@ -119,7 +119,7 @@ def track_film(
     threads : int
         Threads for optical flow.
     on_progress : callable, optional
-        Called with the completed share, in [0, 1].
+        Called with the completed share, in [0, 1], and the points that were just tracked, if any.
     should_stop : callable, optional
         Called ten times a second; the film process is killed once it returns True.
 
@@ -135,12 +135,20 @@ def track_film(
     def on_line(stated: dict[str, Any]) -> None:
         done = stated.get("done")
         if on_progress is not None and isinstance(done, int | float) and 0 <= done <= 1:
-            on_progress(float(done))
+            on_progress(float(done), _followed(stated.get("followed")))
 
     ended = _run("track", source, options, bounds, scratch, threads=threads, on_line=on_line, should_stop=should_stop)
     if ended.stopped:
         raise Interrupted
     return _answer(Tracked, ended, bounds, bounds.track_seconds)
+
+
+def _followed(stated: object) -> FollowedPoints | None:
+    """Take over points that the film process states; None for anything else."""
+    try:
+        return FollowedPoints.model_validate(stated)
+    except ValidationError:
+        return None
 
 
 def described(facts: FilmFacts, options: Options) -> Interpretation:
@@ -166,8 +174,8 @@ def film_options(options: Options, facts: FilmFacts) -> Options:
 
 def _check_region(source: FilmSource, options: Options) -> None:
     if source.region is not None and options.region_polygon is not None:
-        raise refusal(
-            "conflicting_parts", "options.region_polygon", expected="a mask picture or a polygon", got="both",
+        raise InvalidInput(
+            "conflicting_parts", field="options.region_polygon", expected="a mask picture or a polygon", got="both",
             hint="Omit one of them.",
         )  # fmt: skip
 
@@ -213,8 +221,8 @@ def _fault(ended: Ended, bounds: FilmBounds, seconds: float) -> Exception:
         del parts["choices"]
         return InvalidInput(parts.pop("code"), **parts)
     if ended.overdue or ended.code == -signal.SIGXCPU:
-        return refusal(
-            "too_slow", "film", expected=f"a film that is decoded and tracked within {seconds:g} s", got="one that takes longer",
+        return InvalidInput(
+            "too_slow", field="film", expected=f"a film that is decoded and tracked within {seconds:g} s", got="one that takes longer",
             hint="Select fewer frames, lower longest_side, or convert the film: ffmpeg -i FILM -vf scale=1280:-2 film.mp4",
         )  # fmt: skip
     if ended.code == -signal.SIGKILL:

@@ -31,21 +31,16 @@ class AmbiguousInput(InvalidInput):
         self.choices = choices
 
 
-def refusal(code: str, field: str, *, expected: str, got: str, hint: str) -> InvalidInput:
-    """Return the error; the caller raises it, so that the traceback starts where the fault was found."""
-    return InvalidInput(code, field=field, expected=expected, got=got, hint=hint)
-
-
 def too_large(field: str, *, expected: str, got: str) -> InvalidInput:
     """Return the error for an input that exceeds a limit of this installation."""
-    return refusal(
-        "too_large", field, expected=expected, got=got,
+    return InvalidInput(
+        "too_large", field=field, expected=expected, got=got,
         hint="Reduce the input, e.g. fewer frames or points, or ask the operator to raise the limit.",
     )  # fmt: skip
 
 
 def damaged(field: str, what: str) -> InvalidInput:
     """Return the error for a file whose content does not match its format."""
-    return refusal(
-        "damaged_file", field, expected="a complete, consistent file", got=what, hint="Write the file again."
+    return InvalidInput(
+        "damaged_file", field=field, expected="a complete, consistent file", got=what, hint="Write the file again."
     )

@@ -14,8 +14,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.solver import KnownCamera
-from pliant.worker.formats.errors import refusal
+from pliant.solver import InvalidInput, KnownCamera
 from pliant.worker.formats.reading.containers import read_arrays
 from pliant.worker.formats.records import FARTHEST, Arrays, Limits
 from pliant.worker.formats.tracks.interpretation import Understood
@@ -57,8 +56,8 @@ def read_truth(path: Path | None, understood: Understood, *, limits: Limits) -> 
         arrays = {"shapes": arrays["array"]}
     truth = _truth_of(arrays, understood)
     if truth is None:
-        raise refusal(
-            "missing_array", "ground_truth", expected="shapes (F, P, 3) or S (3F, P)",
+        raise InvalidInput(
+            "missing_array", field="ground_truth", expected="shapes (F, P, 3) or S (3F, P)",
             got=", ".join(sorted(arrays)[:20]) or "no array of a known name",
             hint="Save as numpy.savez('truth.npz', shapes=shapes).",
         )  # fmt: skip
@@ -76,15 +75,15 @@ def read_rotations(path: Path, *, num_frames: int, frames: NDArray[np.intp], lim
     arrays = short_names(read_arrays(path, field="rotations", limits=limits, wanted=CAMERA_NAMES))
     name = next((name for name in ("array", *TRUE_ROTATIONS) if name in arrays), None)
     if name is None:
-        raise refusal(
-            "missing_array", "rotations", expected="rotations (F, 3, 3)",
+        raise InvalidInput(
+            "missing_array", field="rotations", expected="rotations (F, 3, 3)",
             got=", ".join(sorted(arrays)[:20]) or "no array of a known name",
             hint="Save as numpy.savez('rotations.npz', rotations=rotations).",
         )  # fmt: skip
     turned = as_rotations(arrays[name], num_frames)
     if turned.dtype.kind not in "fiu" or turned.ndim != 3 or len(turned) != num_frames:
-        raise refusal(
-            "wrong_shape", "rotations", expected=f"({num_frames}, 2, 3) or ({num_frames}, 3, 3), real",
+        raise InvalidInput(
+            "wrong_shape", field="rotations", expected=f"({num_frames}, 2, 3) or ({num_frames}, 3, 3), real",
             got=f"{turned.dtype} {arrays[name].shape}", hint="Give one rotation for each frame of the tracks.",
         )  # fmt: skip
     scales = arrays.get("scales")

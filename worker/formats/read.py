@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pliant.schemas.job import Interpretation
 from pliant.schemas.options import Options
 from pliant.solver import InvalidInput, Mesh, Tracks
-from pliant.worker.formats.errors import refusal, too_large
+from pliant.worker.formats.errors import too_large
 from pliant.worker.formats.ground_truth import read_rotations, read_truth
 from pliant.worker.formats.meshes.surface import Surface, read_surface, whole_grid
 from pliant.worker.formats.meshes.triangulation import triangulate
@@ -157,8 +157,8 @@ def _check_range(points: NDArray[np.generic], visible: NDArray[np.float64] | Non
     if visible is not None:
         far &= visible > 0
     if far.any():
-        raise refusal(
-            "out_of_range", "tracks", expected=f"visible coordinates within ±{FARTHEST:g}", got=f"{int(far.sum())} points beyond",
+        raise InvalidInput(
+            "out_of_range", field="tracks", expected=f"visible coordinates within ±{FARTHEST:g}", got=f"{int(far.sum())} points beyond",
             hint="Mark them as hidden, or set them to NaN.",
         )  # fmt: skip
 
@@ -169,8 +169,8 @@ def _check_extent(tracks: Tracks) -> None:
     low = np.where(seen, tracks.points, np.inf).min(axis=1)
     high = np.where(seen, tracks.points, -np.inf).max(axis=1)
     if not (high > low).any():
-        raise refusal(
-            "no_extent", "tracks", expected="points that differ from each other", got="one position for all points",
+        raise InvalidInput(
+            "no_extent", field="tracks", expected="points that differ from each other", got="one position for all points",
             hint="Check that the points' axis is the second one and that the tracks are not all zero.",
         )  # fmt: skip
 

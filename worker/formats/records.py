@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pliant.solver import KnownCamera, Mesh, Tracks
-from pliant.worker.formats.errors import refusal
+from pliant.solver import InvalidInput, KnownCamera, Mesh, Tracks
 
 if TYPE_CHECKING:  # a contained child needs none of it
     from pliant.schemas.job import Interpretation
@@ -88,29 +87,32 @@ class GroundTruth:
         given = np.asarray(shapes)
         expected = f"({like[0]}, {like[1]}, 3)"
         if given.dtype.kind not in "fiu":
-            raise refusal(
-                "wrong_type", "ground_truth.shapes", expected="real numbers", got=f"dtype {given.dtype}",
+            raise InvalidInput(
+                "wrong_type", field="ground_truth.shapes", expected="real numbers", got=f"dtype {given.dtype}",
                 hint="Convert the array to float.",
             )  # fmt: skip
         if given.shape != (*like, 3):
-            raise refusal(
-                "wrong_shape", "ground_truth.shapes", expected=expected, got=str(given.shape),
+            raise InvalidInput(
+                "wrong_shape", field="ground_truth.shapes", expected=expected, got=str(given.shape),
                 hint="Ground truth is (frames, points, 3), with frames and points in the order of the tracks.",
             )  # fmt: skip
         points = np.array(given, dtype=np.float64, order="C")
         if not np.isfinite(points).all():
-            raise refusal(
-                "not_finite", "ground_truth.shapes", expected="finite coordinates", got=f"{int((~np.isfinite(points)).sum())} that are not",
+            raise InvalidInput(
+                "not_finite", field="ground_truth.shapes",
+                expected="finite coordinates", got=f"{int((~np.isfinite(points)).sum())} that are not",
                 hint="Give truth for every point and frame, or omit it.",
             )  # fmt: skip
         if np.abs(points).max() > FARTHEST:
-            raise refusal(
-                "out_of_range", "ground_truth.shapes", expected=f"coordinates within ±{FARTHEST:g}", got=f"{np.abs(points).max():.3g}",
+            raise InvalidInput(
+                "out_of_range", field="ground_truth.shapes",
+                expected=f"coordinates within ±{FARTHEST:g}", got=f"{np.abs(points).max():.3g}",
                 hint="Check the file, or choose a larger unit.",
             )  # fmt: skip
         if not (np.ptp(points, axis=1) > 0).any(axis=1).all():
-            raise refusal(
-                "no_extent", "ground_truth.shapes", expected="points that differ in every frame", got="a frame whose points are all one",
+            raise InvalidInput(
+                "no_extent", field="ground_truth.shapes",
+                expected="points that differ in every frame", got="a frame whose points are all one",
                 hint="Omit the ground truth if it is not known.",
             )  # fmt: skip
         points.flags.writeable = False
@@ -118,8 +120,8 @@ class GroundTruth:
             return cls(points)
         turned = np.asarray(rotations)
         if turned.ndim != 3 or len(turned) != like[0]:
-            raise refusal(
-                "wrong_shape", "ground_truth.rotations", expected=f"({like[0]}, 2, 3) or ({like[0]}, 3, 3)",
+            raise InvalidInput(
+                "wrong_shape", field="ground_truth.rotations", expected=f"({like[0]}, 2, 3) or ({like[0]}, 3, 3)",
                 got=str(turned.shape), hint="Give one rotation a frame.",
             )  # fmt: skip
         return cls(points, KnownCamera.from_arrays(turned).rotations)

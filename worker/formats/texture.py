@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pliant.worker.formats.errors import refusal
+from pliant.solver import InvalidInput
 
 QUALITY = 90
 """JPEG quality, 1 to 95. Pillow's documentation puts high quality at 90; above 95 files grow without visible gain."""
@@ -46,17 +46,17 @@ class Texture:
 
         picture, places = np.asarray(template_rgb), np.array(uv, dtype=np.float32, order="C")
         if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3 or picture.size == 0:
-            raise refusal(
-                "wrong_shape", "texture", expected="a picture (H, W, 3) of uint8", got=f"{picture.dtype} {picture.shape}",
+            raise InvalidInput(
+                "wrong_shape", field="texture", expected="a picture (H, W, 3) of uint8", got=f"{picture.dtype} {picture.shape}",
                 hint="Give the template frame as RGB.",
             )  # fmt: skip
         if places.ndim != 2 or places.shape[1] != 2:
-            raise refusal(
-                "wrong_shape", "texture.uv", expected="(P, 2)", got=str(places.shape), hint="Give u and v of every point.",
+            raise InvalidInput(
+                "wrong_shape", field="texture.uv", expected="(P, 2)", got=str(places.shape), hint="Give u and v of every point.",
             )  # fmt: skip
         if not ((places >= 0) & (places <= 1)).all():
-            raise refusal(
-                "out_of_range", "texture.uv", expected="coordinates from 0 to 1",
+            raise InvalidInput(
+                "out_of_range", field="texture.uv", expected="coordinates from 0 to 1",
                 got=f"{int((~((places >= 0) & (places <= 1))).any(axis=1).sum())} points outside",
                 hint="Divide pixel coordinates by the picture's size, and clip them.",
             )  # fmt: skip

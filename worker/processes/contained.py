@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import os
-import resource
 import select
 import subprocess
 import sys
@@ -21,7 +20,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
-from pliant.solver.errors import InvalidInput
+from pliant.schemas.invalid import SIDES, Invalid, members_of
 from pliant.worker.processes.containment import die_with_parent
 
 DONE, REFUSED = 0, 3
@@ -38,9 +37,6 @@ MAX_LINE = 4096
 
 POLL = 0.1
 """Seconds between two calls of `should_stop`."""
-
-PARTS = ("code", "field", "expected", "got", "hint")
-"""Attributes of `InvalidInput` that are transferred."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,7 +186,7 @@ def refusal_in(ended: Ended) -> dict[str, Any] | None:
     """Return the attributes of the error that a process wrote, including `choices`; None if they cannot be read."""
     try:
         stated = json.loads(ended.answer)
-        parts: dict[str, Any] = {name: str(stated[name]) for name in PARTS}
+        parts: dict[str, Any] = {name: str(stated[name]) for name in ("code", *SIDES)}
     except (ValueError, KeyError, TypeError):
         return None
     return parts | {"choices": stated.get("choices")}
@@ -201,9 +197,8 @@ def serve(handle: Callable[[dict[str, Any]], str]) -> int:
     die_with_parent(int(sys.argv[1]))
     try:
         answer, code = handle(json.load(sys.stdin)), DONE
-    except InvalidInput as error:
-        stated = {name: getattr(error, name) for name in PARTS}
-        answer, code = json.dumps({**stated, "choices": getattr(error, "choices", None)}), REFUSED
+    except Invalid as error:
+        answer, code = json.dumps({"code": error.code, **members_of(error)}), REFUSED
     sys.stdout.write(answer)
     sys.stdout.flush()
     return code
@@ -211,6 +206,8 @@ def serve(handle: Callable[[dict[str, Any]], str]) -> int:
 
 def limit_process(limits: Mapping[int, int]) -> None:
     """Set resource limits for the rest of the process's life; limits that the system lacks are skipped."""
+    import resource  # here, because Windows does not have it: `pliant solve` reads npz files there
+
     for name, bound in limits.items():
         with suppress(ValueError, OSError):  # macOS has no limit on the address space
             _, hard = resource.getrlimit(name)

@@ -2,6 +2,7 @@
 
 import { type Example, Refusal, exampleFile, getOptions, listExamples, newKey, submit } from "./api";
 import { button, h } from "./dom";
+import { rememberFilm } from "./live";
 import { OptionsForm, nameOf } from "./options";
 import { refusalBox } from "./refusal";
 import { PLACES, Slots } from "./slots";
@@ -169,6 +170,7 @@ export class Compose {
       const job = await submit(form, this.key, onSent, this.sending.signal);
       this.key = null;
       this.answer.replaceChildren();
+      rememberFilm(job.id, this.slots.file("film"));
       this.onJob(job);
     } catch (error) {
       if (!(error instanceof Refusal && error.problem.status === 0)) this.key = null;

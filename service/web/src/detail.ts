@@ -1,18 +1,22 @@
 // One job: where it stands, what it was understood as, and what came of it.
 
-import { Refusal, artifactPath, cancelJob, deleteJob, getReport, retryJob } from "./api";
+import { Refusal, artifactPath, cancelJob, deleteJob, getReport, listJobs, retryJob } from "./api";
 import { Afterwards } from "./afterwards";
+import { Countdown } from "./countdown";
 import { Curves } from "./curves";
 import { button, fill, h, say } from "./dom";
 import { follow } from "./events";
 import { refusalBox } from "./refusal";
 import { Figures } from "./figures";
+import { LiveTracks } from "./live";
 import { newer, progressed } from "./news";
-import { Files, Metrics, Sheet, saveLink } from "./results";
+import { Files, Metrics, Sheet, Warnings, saveLink } from "./results";
 import { Snippets } from "./snippets";
+import { Tab } from "./tab";
 import { type Job, type Progress, isFinal } from "./types";
 import { Understood } from "./understood";
 import { VerdictBox } from "./verdict";
+import type { Sources } from "./viewer/viewer";
 import { STATUS_WORDS, ago, bytes, percent, standing, title } from "./words";
 
 export interface DetailEvents {
@@ -21,6 +25,8 @@ export interface DetailEvents {
 }
 
 const PREVIEW = "preview.bin";
+const FILM = "film_frames.bin";
+const USDZ = "shapes.usdz";
 const ANIMATION = "shapes.glb";
 
 export class Detail {
@@ -40,6 +46,10 @@ export class Detail {
   private readonly curves = new Curves();
   private readonly understood = new Understood();
   private readonly metrics = new Metrics();
+  private readonly warnings = new Warnings();
+  private readonly tab = new Tab();
+  private readonly live: LiveTracks;
+  private readonly countdown = new Countdown((job) => this.showProgress(job));
   private readonly sheet = new Sheet();
   private readonly files = new Files();
   private readonly snippets = new Snippets();
@@ -52,18 +62,21 @@ export class Detail {
     readonly id: string,
     private readonly events: DetailEvents,
   ) {
+    this.live = new LiveTracks(id);
     this.element = h(
       "article",
       { class: "detail", "aria-labelledby": "job-title" },
       h("header", { class: "detail-head" }, h("div", {}, this.heading, h("p", { class: "row" }, this.status, this.when)), this.actions),
       this.verdict.element,
-      this.figures.element,
-      this.afterwards.element,
+      this.warnings.element,
       this.standing,
-      h("div", { class: "meter" }, this.meter, this.share),
+      h("div", { class: "meter" }, this.meter, this.share, this.tab.element),
       this.trouble,
       this.failure,
+      this.live.element,
       this.stage,
+      this.afterwards.element,
+      this.figures.element,
       this.sheet.element,
       this.curves.element,
       h("div", { class: "panels" }, h("div", {}, this.metrics.element), h("div", {}, this.understood.element, this.files.element)),
@@ -75,6 +88,9 @@ export class Detail {
   /** Stop following and give the graphics card back. */
   close(): void {
     this.leaving.abort();
+    this.countdown.stop();
+    this.tab.leave();
+    this.live.close();
   }
 
   focus(): void {
@@ -119,12 +135,14 @@ export class Detail {
     say(this.status, STATUS_WORDS[job.status]);
     this.status.dataset["status"] = job.status;
     say(this.when, `${ago(job.created_at)}${job.expires_at ? `, kept until ${new Date(job.expires_at).toLocaleDateString()}` : ""}`);
-    say(this.standing, job.status === "failed" ? "" : standing(job));
+    this.countdown.show(job);
+    this.tab.show(job);
+    this.live.show(job);
     this.showMeter(job);
     this.showActions(job);
     fill(this.failure, JSON.stringify(job.error), () => (job.error ? [refusalBox(job.error)] : []));
     this.verdict.show(job);
-    this.figures.show(job);
+    this.warnings.show(job);
     this.understood.show(job);
     this.metrics.show(job);
     this.sheet.show(job);
@@ -137,6 +155,12 @@ export class Detail {
       void this.showResult(job);
     }
     if (!isFinal(job.status)) this.finished = false;
+  }
+
+  /** Show what a clock changes: the record's progress with the seconds that are left now. */
+  private showProgress(job: Job): void {
+    say(this.standing, job.status === "failed" ? "" : standing(job));
+    this.figures.show(job);
   }
 
   private showMeter(job: Job): void {
@@ -219,12 +243,28 @@ export class Detail {
     try {
       const { Viewer } = await import("./viewer/viewer");
       if (this.leaving.signal.aborted) return;
-      await Viewer.open(this.stage, artifactPath(job.id, PREVIEW), this.leaving.signal);
+      await Viewer.open(this.stage, this.sources(job), this.leaving.signal);
     } catch (error) {
       if (this.leaving.signal.aborted) return;
       const words = error instanceof Error ? error.message : String(error);
       const sentence = `The mesh cannot be displayed here (${words}). The files below are complete; shapes.glb opens in any 3-D viewer.`;
       this.stage.replaceChildren(h("p", { class: "view waiting" }, sentence));
     }
+  }
+
+  private sources(job: Job): Sources {
+    const path = (name: string): string | undefined =>
+      job.artifacts.some((artifact) => artifact.name === name) ? artifactPath(job.id, name) : undefined;
+    return {
+      title: title(job),
+      preview: artifactPath(job.id, PREVIEW),
+      film: path(FILM),
+      usdz: path(USDZ),
+      others: async () => {
+        const { jobs } = await listJobs();
+        const finished = jobs.filter((one) => one.id !== job.id && one.artifacts.some(({ name }) => name === PREVIEW));
+        return finished.map((one) => ({ id: one.id, title: title(one), preview: artifactPath(one.id, PREVIEW) }));
+      },
+    };
   }
 }

@@ -20,8 +20,8 @@ function figures(job: Job): [string, string][] {
   const { num_frames: frames, num_points: points } = job.interpretation;
   if (frames > 0) rows.push(["Frames", whole.format(frames)]);
   if (points > 0) rows.push(["Points", whole.format(points)]); // none before a film is tracked
-  const { e3d_sequence: error, reprojection_median: residual } = job.metrics ?? {};
-  if (error !== undefined) rows.push(["3-D error", percent(error)]);
+  const { e3d_frame: error, reprojection_median: residual } = job.metrics ?? {};
+  if (error !== undefined) rows.push(["3-D error", `${percent(error)} of the size`]);
   if (residual !== undefined) rows.push(["Reprojection", number(residual)]);
   if (job.started_at && job.finished_at) rows.push(["Took", duration((Date.parse(job.finished_at) - Date.parse(job.started_at)) / 1000)]);
   const { progress } = job;

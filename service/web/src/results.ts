@@ -2,15 +2,16 @@
 
 import { Refusal, artifactPath, call, headers } from "./api";
 import { fill, h } from "./dom";
+import { saveWithToken } from "./links";
 import type { Artifact, Job } from "./types";
 import { bytes, number } from "./words";
 
 /** What people call a metric, and what exactly it is; the name of the record stands beside it. */
 const METRICS: Record<string, [string, string]> = {
-  e3d_sequence: ["3-D error", "one orthogonal alignment for the whole sequence; relative"],
-  e3d_frame: ["3-D error, frame by frame", "each frame turned to fit best; relative"],
-  e3d_frame_similarity: ["Shape error, frame by frame", "after rotating, mirroring and scaling each frame to fit; relative"],
-  e3d_mocap: ["3-D error, motion capture", "as that literature has it; relative to the shape's spread"],
+  e3d_frame: ["3-D error", "distance from the ground truth, each frame turned to fit best; share of the object's size"],
+  e3d_sequence: ["3-D error, one alignment", "one orthogonal alignment for the whole sequence; share of the object's size"],
+  e3d_frame_similarity: ["Shape error", "after rotating, mirroring and scaling each frame to fit; share of the object's size"],
+  e3d_mocap: ["3-D error, motion capture", "as that literature defines it; share of the shape's spread"],
   reprojection_median: ["Reprojection, median", "from a visible track to the projected shape; in the tracks' unit"],
   reprojection_rms: ["Reprojection, root mean square", "sensitive to outliers; in the tracks' unit"],
   rotation_degrees: ["Camera error", "mean angle between estimated and true cameras, in degrees"],
@@ -19,12 +20,10 @@ const METRICS: Record<string, [string, string]> = {
 /** The panel "Metrics". */
 export class Metrics {
   private readonly rows = h("tbody", {});
-  private readonly warnings = h("ul", { class: "notes warn" });
   readonly element = h(
     "section",
     { class: "panel", "aria-labelledby": "metrics-title" },
     h("h3", { id: "metrics-title" }, "Metrics"),
-    this.warnings,
     h("table", {}, h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "name"), h("th", { scope: "col", class: "figure" }, "value"))), this.rows),
   );
 
@@ -32,7 +31,7 @@ export class Metrics {
     const order = Object.keys(METRICS);
     const place = (name: string): number => (order.includes(name) ? order.indexOf(name) : order.length);
     const metrics = Object.entries(job.metrics ?? {}).sort(([one], [other]) => place(one) - place(other));
-    this.element.hidden = metrics.length === 0 && job.warnings.length === 0;
+    this.element.hidden = metrics.length === 0;
     fill(this.rows, JSON.stringify(metrics), () =>
       metrics.map(([name, value]) =>
         h(
@@ -43,8 +42,6 @@ export class Metrics {
         ),
       ),
     );
-    fill(this.warnings, job.warnings.join("\n"), () => job.warnings.map((warning) => h("li", {}, warning)));
-    this.warnings.hidden = job.warnings.length === 0;
   }
 }
 
@@ -53,6 +50,20 @@ function metricHead(name: string): HTMLElement {
   if (known === undefined) return h("th", { scope: "row" }, h("code", {}, name));
   const [title, meaning] = known;
   return h("th", { scope: "row" }, h("span", { class: "metric" }, title), h("span", { class: "hint" }, h("code", {}, name), ` ${meaning}`));
+}
+
+/** What to know before using a result; stands above the viewer. */
+export class Warnings {
+  private readonly items = h("ul", { class: "notes warn" });
+  readonly element = h("section", { class: "warnings", "aria-label": "Warnings", hidden: true }, this.items);
+
+  show(job: Job): void {
+    // A reason of the verdict stands there already.
+    const reasons = new Set(job.verdict_reasons ?? []);
+    const warnings = job.warnings.filter((warning) => !reasons.has(warning));
+    this.element.hidden = warnings.length === 0;
+    fill(this.items, warnings.join("\n"), () => warnings.map((warning) => h("li", {}, warning)));
+  }
 }
 
 const SHEET = "contact_sheet.jpg";
@@ -127,10 +138,4 @@ export function saveLink(job: Job, artifact: Artifact, words: string, kind: stri
     void saveWithToken(path, artifact.name);
   });
   return link;
-}
-
-async function saveWithToken(path: string, name: string): Promise<void> {
-  const url = URL.createObjectURL(await (await call(path)).blob());
-  h("a", { href: url, download: name }).click();
-  setTimeout(() => URL.revokeObjectURL(url), 60_000);
 }

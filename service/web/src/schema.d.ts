@@ -88,6 +88,37 @@ export interface components {
             examples: components["schemas"]["Example"][];
         };
         /**
+         * FollowedPoints
+         * @description Some points of a film in the frame that was tracked last.
+         */
+        FollowedPoints: {
+            /**
+             * Frame
+             * @description Number of the frame in the film, from 0.
+             */
+            frame: number;
+            /**
+             * Seconds
+             * @description From the film's start.
+             */
+            seconds: number;
+            /**
+             * Width
+             * @description Of the film, pixels.
+             */
+            width: number;
+            /**
+             * Height
+             * @description Of the film, pixels.
+             */
+            height: number;
+            /**
+             * Points
+             * @description x and y of each visible point in turn, rounded to the film's pixels.
+             */
+            points: number[];
+        };
+        /**
          * Inspection
          * @description Interpretation of inputs, with a sample of them.
          */
@@ -417,7 +448,7 @@ export interface components {
             field_of_view: number | null;
             /**
              * Principal Point
-             * @description Principal point X,Y in pixels, e.g. 319.5,239.5; null: the centre of image_size, or of the tracks without it.
+             * @description Principal point X,Y in pixels, e.g. 319.5,239.5; null: the centre of image_size, ((width - 1) / 2, (height - 1) / 2), or that of the tracks without it.
              * @default null
              */
             principal_point: string | null;
@@ -428,6 +459,13 @@ export interface components {
              * @enum {string}
              */
             surface: "auto" | "isometric" | "free";
+            /**
+             * Order
+             * @description film: neighbouring frames are alike. any: photographs in no order; results do not depend on it. Needs prior gaussian and at most 360 frames. auto: any if neighbouring frames are no more alike than others.
+             * @default auto
+             * @enum {string}
+             */
+            order: "auto" | "film" | "any";
             /**
              * Basis Size
              * @description Number K of basis shapes in the factorization for the rotations; null: selected from the data.
@@ -609,7 +647,7 @@ export interface components {
             coordinates: "auto" | "pixels" | "unit" | "signed";
             /**
              * Image Size
-             * @description WIDTHxHEIGHT of the picture in pixels, e.g. 640x480; needed if coordinates are fractions of it. Its centre is the principal point of a perspective camera.
+             * @description WIDTHxHEIGHT of the picture in pixels, e.g. 640x480; needed if coordinates are fractions of it. Pixel centres lie at whole numbers from 0. The picture's centre is the principal point of a perspective camera.
              * @default null
              */
             image_size: string | null;
@@ -785,6 +823,8 @@ export interface components {
              * @description Estimate; null until one is possible.
              */
             seconds_left: number | null;
+            /** @description Points that the stage `track` tracked last. */
+            followed: components["schemas"]["FollowedPoints"] | null;
             /**
              * Updated At
              * Format: date-time

@@ -18,7 +18,7 @@ from pliant.solver.shapes import perspective_shapes
 from pliant.solver.tracks.normalization import normalize
 
 PICTURE = (1280.0, 720.0)
-CENTRE = np.array(PICTURE) / 2
+CENTRE = (np.array(PICTURE) - 1) / 2
 FOCAL = 900.0
 FACE = gallery.face(8, 60, degrees=70)
 
@@ -156,7 +156,7 @@ def test_mirrored_input_gives_mirrored_shapes(close: Solution) -> None:
 @pytest.mark.slow
 def test_tracks_with_y_up_are_the_same_scene_in_other_axes(close: Solution) -> None:
     tracks = pinhole(SEEN, FOCAL)
-    up = Tracks.from_arrays(np.array([0.0, PICTURE[1]]) + tracks.points * [1, -1])
+    up = Tracks.from_arrays(np.array([0.0, PICTURE[1] - 1]) + tracks.points * [1, -1])
     found = solve(up, settings=Settings(image_size=PICTURE, y_up=True))
     assert found.camera.focal == pytest.approx(close.camera.focal, rel=0.05)
     seen = SEEN * [1, -1, -1]
@@ -200,7 +200,7 @@ def test_orthographic_tracks_give_the_orthographic_result_to_the_bit() -> None:
 
 
 def test_given_cameras_may_be_perspective() -> None:
-    cameras = KnownCamera.from_arrays(FACE.rotations, np.ones(8), focal=FOCAL, principal_point=(640.0, 360.0))
+    cameras = KnownCamera.from_arrays(FACE.rotations, np.ones(8), focal=FOCAL, principal_point=(639.5, 359.5))
     found = solve(pinhole(SEEN, FOCAL), cameras=cameras)
     assert found.camera.focal == pytest.approx(FOCAL)
     assert found.choices.depth_sign == "settled"

@@ -68,7 +68,7 @@ def test_maximum_depth_respects_every_cone_and_is_about_the_sheet() -> None:
     assert maximum_depth(graph, seconds=1e-9) is None
 
 
-@pytest.mark.parametrize(("kind", "error"), [("cylinder", 0.015), ("cone", 0.08)])
+@pytest.mark.parametrize(("kind", "error"), [("cylinder", 0.015), pytest.param("cone", 0.08, marks=pytest.mark.slow)])
 def test_a_rolled_sheet_is_recovered_with_the_focal_length_known(kind: str, error: float) -> None:
     sheet = rolled(kind)
     # The cone's edges hardly tell one focal length from another, so that it is not taken unless it is required.
@@ -91,6 +91,7 @@ def test_a_rolled_sheet_is_recovered_with_the_focal_length_found() -> None:
     assert "isometric sheet" in verdict.reason
 
 
+@pytest.mark.slow
 def test_hidden_points_and_outliers_leave_the_sheet_where_it_is() -> None:
     sheet = rolled(side=24)
     random = np.random.default_rng(3)
@@ -117,13 +118,11 @@ def test_the_order_of_the_frames_has_no_effect() -> None:
     assert one_scale_error(other.points, plain.points[order]) < 2e-3
 
 
-@pytest.mark.parametrize("stretch", [0.2])
-def test_a_sheet_that_stretches_is_not_taken(stretch: float) -> None:
-    sheet = rolled("cone", stretch=stretch)
-    for focal in (FOCAL, None):
-        verdict = isometric_surface(sheet.tracks, focal=focal, image_size=SIZE)
-        assert verdict.surface is None
-        assert verdict.reason
+@pytest.mark.parametrize("focal", [FOCAL, pytest.param(None, marks=pytest.mark.slow)])
+def test_a_sheet_that_stretches_is_not_taken(focal: float | None) -> None:
+    verdict = isometric_surface(rolled("cone", stretch=0.2).tracks, focal=focal, image_size=SIZE)
+    assert verdict.surface is None
+    assert verdict.reason
 
 
 def test_what_is_no_sheet_is_not_even_tried() -> None:
@@ -132,6 +131,7 @@ def test_what_is_no_sheet_is_not_even_tried() -> None:
     assert verdict.candidates == ()
 
 
+@pytest.mark.slow
 def test_a_shallow_face_without_perspective_is_not_taken() -> None:
     verdict = isometric_surface(gallery.face(6, 60).tracks)
     assert verdict.surface is None
@@ -141,7 +141,7 @@ def test_a_shallow_face_without_perspective_is_not_taken() -> None:
 def test_outliers_only_end_with_a_warning_and_a_result() -> None:
     noise = Tracks.from_arrays(np.random.default_rng(0).uniform(0, 400, (4, 12, 2)))
     assert isometric_surface(noise).surface is None
-    solution = solve(noise, settings=Settings(surface="isometric", max_reweightings=2))
+    solution = solve(noise, settings=Settings(surface="isometric", prior="smooth", max_reweightings=1))
     assert np.isfinite(solution.shapes).all()
     assert any("isometric" in warning for warning in solution.choices.warnings)
 
@@ -218,7 +218,8 @@ def test_given_rotations_and_a_required_isometry_contradict() -> None:
 def test_a_free_surface_is_the_solve_without_isometry() -> None:
     tracks = gallery.sphere(5, 40).tracks
     free, auto = (
-        solve(tracks, settings=Settings(surface=kind, image_size=SIZE, max_reweightings=2)) for kind in ("free", "auto")
+        solve(tracks, settings=Settings(surface=kind, image_size=SIZE, prior="smooth", max_reweightings=1))
+        for kind in ("free", "auto")
     )
     np.testing.assert_array_equal(free.shapes, auto.shapes)
     assert "surface" not in free.choices.reasons

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -33,8 +34,8 @@ def solution_of(sequence: Sequence, *, mirrored: bool = False) -> Solution:
     translations = np.array([free[f][seen[f]].mean(axis=0) for f in range(len(shapes))])
     camera = Camera(rotations, sequence.scales, translations)
     # The writer reads nothing else of a solution.
-    rest: dict[str, Any] = dict.fromkeys(("residuals", "weights", "trace", "outcome", "choices", "seconds"))
-    return Solution(shapes=shapes, camera=camera, **rest)
+    rest: dict[str, Any] = dict.fromkeys(("residuals", "trace", "outcome", "choices", "seconds"))
+    return Solution(shapes=shapes, camera=camera, weights=seen.astype(float), **rest)
 
 
 def write(path: Path, **given: Any) -> None:
@@ -55,6 +56,10 @@ def read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         "positions": ("<i2", (frames, points, 3)),
         "residuals": ("<i2", (frames, points, 2)),
         "truth": ("<i2", (frames, points, 3)),
+        "frames": ("<f4", (frames, 6)),
+        "points": ("<u4", (points, 2)),
+        "spread": ("<u2", (frames, points)),
+        "rejected": ("u1", (frames, -1)),
     }
     arrays = {}
     for name, section in header["sections"].items():
@@ -120,6 +125,39 @@ def test_truth_stands_where_e3d_frame_compares_it(sequence: Sequence, tmp_path: 
     expected = align(solution.shapes[:, known], truth[:, known]).distances
     np.testing.assert_allclose(apart[:, known], expected, atol=2 * header["step"])
     assert (apart[:, 7] == 0).all()
+
+
+def test_tables_state_how_often_points_were_seen_and_what_is_uncertain(sequence: Sequence, tmp_path: Path) -> None:
+    exact = solution_of(sequence)
+    seen = sequence.tracks.visible > 0
+    weights = seen.astype(float)
+    weights[2, np.flatnonzero(seen[2])[:5]] = 0
+    std = np.random.default_rng(4).uniform(0.1, 2.0, size=(F, P))
+    solution = replace(exact, weights=weights, shapes_std=std)
+    path = tmp_path / preview.NAME
+    write(path, tracks=sequence.tracks, mesh=None, solution=solution, truth=sequence.shapes, image_size="320x240")
+    header, arrays = read(path)
+    assert (header["all_frames"], header["image_size"]) == (F, [320, 240])
+    np.testing.assert_array_equal(arrays["points"][:, 0], seen.sum(axis=0))
+    rejected = np.unpackbits(arrays["rejected"], axis=1, count=P, bitorder="little").astype(bool)
+    np.testing.assert_array_equal(rejected, seen & (weights == 0))
+    assert rejected.sum() == 5
+    np.testing.assert_array_equal(arrays["points"][:, 1], rejected.sum(axis=0))
+    np.testing.assert_allclose(header["spread_step"] * arrays["spread"], std, atol=0.51 * header["spread_step"])
+    table = arrays["frames"]
+    np.testing.assert_allclose(table[:, :2], exact.camera.translations, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(table[:, 2], 1 - seen.mean(axis=1), atol=1e-6)
+    np.testing.assert_allclose(table[:, 3] * header["size"], np.sqrt((std**2).mean(axis=1)), rtol=1e-5)
+    assert table[:, 4].max() < 1e-6
+
+
+def test_without_posterior_and_truth_their_columns_are_unknown(sequence: Sequence, tmp_path: Path) -> None:
+    path = tmp_path / preview.NAME
+    write(path, tracks=sequence.tracks, mesh=None, solution=solution_of(sequence))
+    header, arrays = read(path)
+    assert "spread" not in header["sections"]
+    assert np.isnan(arrays["frames"][:, 3:5]).all()
+    assert np.isfinite(arrays["frames"][:, 5]).all()
 
 
 def test_truth_of_too_few_points_is_left_out(sequence: Sequence, tmp_path: Path) -> None:

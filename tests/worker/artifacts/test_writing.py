@@ -311,7 +311,34 @@ def test_a_perspective_camera_is_in_the_arrays_and_the_report(tmp_path: Path) ->
         "model": "perspective", "focal": 900.0, "focal_std": 12.0, "depth_sign": "settled", "reason": "Perspective.",
     }  # fmt: skip
     assert report["principal_point"] == [640.0, 360.0]
+    assert (report["field_of_view"], report["sentence"]) == (None, "Perspective camera, focal length 900 px ± 12.")
     assert report["candidates"][0] == {"focal": None, "mirrored": False, "nll": -1.0}
+
+
+@pytest.mark.parametrize(
+    ("focal", "std", "size", "sentence"),
+    [
+        (
+            900.0,
+            12.0,
+            "1280x720",
+            "Perspective camera, focal length 900 px ± 12, horizontal field of view 70.8° ± 0.72°.",
+        ),
+        (900.0, 0.0, "1280x720", "Perspective camera, focal length 900 px (given), horizontal field of view 70.8°."),
+        (None, None, "1280x720", "Scaled orthographic camera."),
+    ],
+)
+def test_the_report_states_the_field_of_view(focal: float | None, std: float | None, size: str, sentence: str) -> None:
+    inputs, solution, _ = make_result()
+    camera = replace(solution.camera, focal=focal, focal_std=std)
+    model = "scaled_orthographic" if focal is None else "perspective"
+    solution = replace(solution, camera=camera, choices=replace(solution.choices, camera=model))
+    report = build_report(inputs, solution, Options(image_size=size), metrics={})["camera"]
+    assert report["sentence"] == sentence
+    if focal is not None:
+        views = [np.degrees(2 * np.arctan(640 / (focal + shift))) for shift in (0, 1e-3)]
+        assert report["field_of_view"] == pytest.approx(views[0])
+        assert report["field_of_view_std"] == pytest.approx((views[0] - views[1]) / 1e-3 * std, rel=1e-4)
 
 
 def test_the_report_says_how_it_came_to_be(tmp_path: Path) -> None:

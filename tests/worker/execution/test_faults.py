@@ -61,6 +61,7 @@ def test_the_queue_gives_the_same_bits_as_a_plain_call(house: House, tmp_path: P
     settled(house)
 
 
+@pytest.mark.slow
 def test_progress_tells_numbers(house: House) -> None:
     id = house.submit(long=True)
     house.until(lambda: (house.jobs.get(id).progress or SHORT) and house.solving(id).progress.reweighting, "reweights")  # type: ignore[union-attr]
@@ -114,6 +115,7 @@ def test_a_killed_job_process_fails_its_job_and_nothing_else(house: House) -> No
     settled(house)
 
 
+@pytest.mark.slow
 def test_a_crash_leaves_its_stack_in_the_log(house: House) -> None:
     id = house.submit(long=True)
     house.solving(id)
@@ -139,6 +141,7 @@ def test_the_job_of_a_killed_worker_is_done_by_another(house: House) -> None:
     assert house.final(id).status is Status.CANCELLED
 
 
+@pytest.mark.slow
 def test_an_attempt_that_lost_its_job_writes_nothing(house: House) -> None:
     id = house.submit(long=True)
     house.solving(id)
@@ -172,6 +175,7 @@ def test_a_worker_that_is_told_to_stop_puts_its_job_back(house: House) -> None:
     assert house.final(id).status is Status.CANCELLED
 
 
+@pytest.mark.slow
 def test_a_worker_that_is_told_to_stop_lets_a_short_job_end(house: House, tmp_path: Path) -> None:
     settings = dataclasses.replace(
         house.settings, data=tmp_path, queue=f"calm-{secrets.token_hex(3)}", workers=1, stop_grace=60.0
@@ -200,6 +204,7 @@ def test_a_foreign_delivery_is_refused(house: House, tmp_path: Path) -> None:
     raw.close()
 
 
+@pytest.mark.slow
 def test_a_second_delivery_of_an_attempt_is_dropped(house: House) -> None:
     id = house.submit(long=True)
     job = house.solving(id)
@@ -214,6 +219,7 @@ def test_a_second_delivery_of_an_attempt_is_dropped(house: House) -> None:
     house.final(id)
 
 
+@pytest.mark.slow
 def test_a_job_that_the_queue_forgot_is_done(house: House) -> None:
     first, second = house.submit(long=True), house.submit(long=True)
     house.solving(first)
@@ -227,6 +233,7 @@ def test_a_job_that_the_queue_forgot_is_done(house: House) -> None:
     house.final(second)
 
 
+@pytest.mark.slow
 def test_lost_inputs_are_an_internal_error_whose_trace_is_in_the_log(house: House) -> None:
     first, second = house.submit(long=True), house.submit(long=True)
     house.solving(first)
@@ -248,6 +255,7 @@ def test_lost_inputs_are_an_internal_error_whose_trace_is_in_the_log(house: Hous
     settled(house)
 
 
+@pytest.mark.slow
 def test_a_job_that_takes_too_long_says_so(house: House, tmp_path: Path) -> None:
     settings = dataclasses.replace(
         house.settings, data=tmp_path, queue=f"late-{secrets.token_hex(3)}", workers=1, time_limit=1.5, memory_limit=0
@@ -263,6 +271,7 @@ def test_a_job_that_takes_too_long_says_so(house: House, tmp_path: Path) -> None
         settled(late)
 
 
+@pytest.mark.slow
 def test_a_job_that_needs_too_much_memory_says_so(house: House, tmp_path: Path) -> None:
     make_inputs(tmp_path / "big.npz", frames=200, points=6000)
     settings = dataclasses.replace(

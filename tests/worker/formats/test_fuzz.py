@@ -23,7 +23,7 @@ from pliant.solver import InvalidInput
 from pliant.worker.formats import Limits, load_inputs, read_inputs, save_inputs
 from pliant.worker.formats.tracks.tracker_formats import KNOWN
 
-SUPPORT = Path(__file__).parents[2] / "support"
+SUPPORT = Path(__file__).parents[2] / "support" / "files"
 DOCUMENT = Path(__file__).parents[3] / "build" / "fuzzing.md"
 sys.path.insert(0, str(SUPPORT))  # where pytest finds it too
 
@@ -42,7 +42,7 @@ def fuzzed(parser: str, examples: int, number: int) -> dict[str, int]:
 
 @pytest.mark.parametrize("parser", READERS)
 def test_a_bent_file_is_read_or_refused(parser: str) -> None:
-    examples = 120 if parser in NATIVE else 300
+    examples = 40 if parser in NATIVE else 80
     answers = fuzzed(parser, examples, number=7)
     assert sum(answers.values()) >= examples
     assert "a refusal without a hint" not in answers
@@ -109,7 +109,7 @@ meshes = st.one_of(
 )  # fmt: skip
 
 
-@settings(max_examples=400, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=100, deadline=None, suppress_health_check=list(HealthCheck))
 @given(named, tracked, meshes, st.one_of(st.none(), named), st.one_of(st.none(), named), options)
 def test_arrays_of_any_kind_are_interpreted_or_refused(
     around: dict[str, np.ndarray],

@@ -74,6 +74,14 @@ def receiver() -> Iterator[Receiver]:
 
 
 @pytest.fixture
+def inputs_file(tmp_path: Path) -> Path:
+    """Small inputs, since these tests submit dozens of jobs."""
+    path = tmp_path / "small.npz"
+    path.write_bytes(b"x" * 1000)
+    return path
+
+
+@pytest.fixture
 def door(settings: Settings) -> Jobs:
     return Jobs.open(dataclasses.replace(settings, webhook_networks=LOOPBACK))
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.solver import Mesh
-from pliant.worker.formats.errors import refusal, too_large
+from pliant.solver import InvalidInput, Mesh
+from pliant.worker.formats.errors import too_large
 from pliant.worker.formats.reading.containers import read_arrays
 from pliant.worker.formats.reading.meshes import given_vertices, mismatch
 from pliant.worker.formats.records import Arrays, Limits
@@ -79,8 +79,8 @@ def _by_word(word: str, num_points: int, limits: Limits) -> Surface:
         return Surface(None, "none", ["No mesh was requested: no smoothness in space."])
     found = GRID_SIZE.fullmatch(word.strip())
     if found is None:
-        raise refusal(
-            "unknown_format", "mesh", expected="a mesh file, ROWSxCOLUMNS or none", got=repr(word[:60]),
+        raise InvalidInput(
+            "unknown_format", field="mesh", expected="a mesh file, ROWSxCOLUMNS or none", got=repr(word[:60]),
             hint="Give a file, or a grid size such as 48x64.",
         )  # fmt: skip
     rows, columns = int(found[1]), int(found[2])
@@ -110,8 +110,8 @@ def _mesh_of(arrays: Arrays, num_points: int) -> Mesh:
         if surface.num_points != num_points:
             raise mismatch("mesh", num_points, surface.num_points)
         return surface
-    raise refusal(
-        "missing_array", "mesh", expected="faces, or grid", got=", ".join(sorted(arrays)) or "no array of a known name",
+    raise InvalidInput(
+        "missing_array", field="mesh", expected="faces, or grid", got=", ".join(sorted(arrays)) or "no array of a known name",
         hint="Save the faces as numpy.savez('mesh.npz', faces=faces).",
     )  # fmt: skip
 

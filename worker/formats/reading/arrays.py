@@ -23,7 +23,7 @@ from typing import IO
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver import InvalidInput
-from pliant.worker.formats.errors import damaged, refusal, too_large
+from pliant.worker.formats.errors import damaged, too_large
 from pliant.worker.formats.records import Arrays, Limits
 
 NPY_MAGIC = b"\x93NUMPY"
@@ -161,19 +161,19 @@ def checked_members(
     members: dict[str, zipfile.ZipInfo] = {}
     for info in infos:
         if MEMBER.fullmatch(info.filename) is None or ".." in info.filename:
-            raise refusal(
-                "member_name", field, expected="members named like tracks.npy", got=repr(info.filename[:80]),
+            raise InvalidInput(
+                "member_name", field=field, expected="members named like tracks.npy", got=repr(info.filename[:80]),
                 hint="Write the file with numpy.savez and plain names.",
             )  # fmt: skip
         name = info.filename.removesuffix(".npy")
         if name in members:
-            raise refusal(
-                "duplicate_member", field, expected="each member once", got=f"{name!r} twice",
+            raise InvalidInput(
+                "duplicate_member", field=field, expected="each member once", got=f"{name!r} twice",
                 hint="Write the file again with numpy.savez.",
             )  # fmt: skip
         if info.flag_bits & 1 or info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise refusal(
-                "unsupported_feature", field, expected="stored or deflated members", got=f"{name!r} encrypted or packed otherwise",
+            raise InvalidInput(
+                "unsupported_feature", field=field, expected="stored or deflated members", got=f"{name!r} encrypted or packed otherwise",
                 hint="Write the file with numpy.savez or numpy.savez_compressed.",
             )  # fmt: skip
         members[name] = info
@@ -185,16 +185,16 @@ def checked_members(
 
 def film_as_tracks(got: str) -> InvalidInput:
     """Return the refusal of a film that was sent as tracks."""
-    return refusal(
-        "film_as_tracks", "tracks", expected="point tracks", got=got,
+    return InvalidInput(
+            "film_as_tracks", field="tracks", expected="point tracks", got=got,
         hint="Send it as the film instead (on the page: under Film; REST: -F film=@film.mp4): its points are tracked for you.",
     )  # fmt: skip
 
 
 def pickle_refusal(field: str) -> InvalidInput:
     """Return the error for pickles, which run code when they are read."""
-    return refusal(
-        "pickle_refused", field, expected="arrays that can be read without running code", got="a Python pickle",
+    return InvalidInput(
+        "pickle_refused", field=field, expected="arrays that can be read without running code", got="a Python pickle",
         hint="Convert it where it was made: numpy.savez('tracks.npz', tracks=..., visibility=...); for a torch tensor use .cpu().numpy().",
     )  # fmt: skip
 
@@ -228,13 +228,13 @@ def _checked(described: dict[str, object], field: str, limits: Limits) -> Header
     if len(shape) > MAX_DIMENSIONS or not isinstance(fortran, bool):
         raise damaged(field, f"a NumPy header of {len(shape)} dimensions, fortran_order {fortran!r}")
     if not isinstance(spelled, str) or re.fullmatch(r"[<>|=][a-zA-Z]\d{0,4}", spelled) is None:
-        raise refusal(
-            "wrong_type", field, expected="an array of numbers or bool", got=f"dtype {str(spelled)[:60]}",
+        raise InvalidInput(
+            "wrong_type", field=field, expected="an array of numbers or bool", got=f"dtype {str(spelled)[:60]}",
             hint="Give one plain array for each name.",
         )  # fmt: skip
     if spelled[1] == "O":
-        raise refusal(
-            "object_array", field, expected="an array of numbers", got="an array of Python objects",
+        raise InvalidInput(
+            "object_array", field=field, expected="an array of numbers", got="an array of Python objects",
             hint="Reading objects can run code, so they are refused: save plain arrays, e.g. numpy.asarray(x, dtype=float).",
         )  # fmt: skip
     try:
@@ -242,8 +242,8 @@ def _checked(described: dict[str, object], field: str, limits: Limits) -> Header
     except TypeError as error:
         raise damaged(field, f"an unknown dtype {spelled}") from error
     if dtype.kind not in "fiub" or dtype.itemsize > 8:
-        raise refusal(
-            "wrong_type", field, expected="real numbers or bool of at most 64 bits", got=f"dtype {dtype}",
+        raise InvalidInput(
+            "wrong_type", field=field, expected="real numbers or bool of at most 64 bits", got=f"dtype {dtype}",
             hint="Convert the array to float64.",
         )  # fmt: skip
     count = math.prod(shape) * dtype.itemsize

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection
 from pathlib import Path
 
-from pliant.worker.formats.errors import refusal, too_large
+from pliant.solver import InvalidInput
+from pliant.worker.formats.errors import too_large
 from pliant.worker.formats.reading.arrays import NPY_MAGIC, read_file
 from pliant.worker.formats.reading.parsers import recognise
 from pliant.worker.formats.reading.sandbox import parse_in_sandbox
@@ -28,7 +29,9 @@ def read_arrays(path: Path, *, field: str, limits: Limits, wanted: Collection[st
     with path.open("rb") as file:
         head = file.read(1024)
     if not head:
-        raise refusal("empty_file", field, expected="a file with content", got="0 bytes", hint="Send the file again.")
+        raise InvalidInput(
+            "empty_file", field=field, expected="a file with content", got="0 bytes", hint="Send the file again."
+        )
     if head.startswith((NPY_MAGIC, *ZIP)):
         return read_file(path, field=field, limits=limits, wanted=wanted)
     return parse_in_sandbox(recognise(head, field), path, field=field, limits=limits)

@@ -7,7 +7,8 @@ from collections.abc import Iterator
 from typing import IO
 
 import numpy as np
-from pliant.worker.formats.errors import damaged, refusal, too_large
+from pliant.solver import InvalidInput
+from pliant.worker.formats.errors import damaged, too_large
 from pliant.worker.formats.reading.pose_tables import (
     LONGEST_ROW,
     SEPARATORS,
@@ -90,8 +91,8 @@ def _observations(columns: list[str], rows: list[list[float]], *, field: str, li
         )
     places = frames * len(names) + points
     if len(np.unique(places)) != len(places):
-        raise refusal(
-            "duplicate_observation", field, expected="each point once in a frame", got="a frame and point twice",
+        raise InvalidInput(
+            "duplicate_observation", field=field, expected="each point once in a frame", got="a frame and point twice",
             hint="Keep one line for each frame and point.",
         )  # fmt: skip
     tracks = np.full((count * len(names), 2), np.nan)

@@ -13,7 +13,8 @@ from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.worker.formats.errors import damaged, refusal, too_large
+from pliant.solver import InvalidInput
+from pliant.worker.formats.errors import damaged, too_large
 from pliant.worker.formats.records import Arrays, Limits
 
 MAX_JSON = 64 << 20
@@ -58,8 +59,8 @@ def _mesh(text: bytes, binary: bytes, field: str, limits: Limits) -> Arrays:
         document = json.loads(text)
         primitives = [primitive for mesh in document["meshes"] for primitive in mesh["primitives"]]
         if len(primitives) != 1 or primitives[0].get("mode", TRIANGLES) != TRIANGLES:
-            raise refusal(
-                "unsupported_feature", field, expected="one mesh of triangles with one material", got=f"{len(primitives)} parts",
+            raise InvalidInput(
+                "unsupported_feature", field=field, expected="one mesh of triangles with one material", got=f"{len(primitives)} parts",
                 hint="Join the parts, or export OBJ or PLY, keeping the vertex order.",
             )  # fmt: skip
         vertices = _accessor(document, binary, primitives[0]["attributes"]["POSITION"], field, limits)
@@ -87,8 +88,8 @@ def _mesh(text: bytes, binary: bytes, field: str, limits: Limits) -> Arrays:
 def _accessor(document: dict[str, Any], binary: bytes, index: int, field: str, limits: Limits) -> NDArray[np.generic]:
     described = document["accessors"][index]
     if "sparse" in described or "bufferView" not in described:
-        raise refusal(
-            "unsupported_feature", field, expected="plain accessors", got="sparse or compressed data",
+        raise InvalidInput(
+            "unsupported_feature", field=field, expected="plain accessors", got="sparse or compressed data",
             hint="Export without compression, or as OBJ or PLY.",
         )  # fmt: skip
     view = document["bufferViews"][described["bufferView"]]

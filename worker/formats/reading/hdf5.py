@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import h5py
 import numpy as np
-from pliant.worker.formats.errors import refusal, too_large
+from pliant.solver import InvalidInput
+from pliant.worker.formats.errors import too_large
 from pliant.worker.formats.records import Arrays, Limits
 
 UNREADABLE = (OSError, ValueError, KeyError, RuntimeError, TypeError, AttributeError, OverflowError, IndexError)
@@ -40,8 +41,8 @@ def read_arrays(file: h5py.File, *, field: str, limits: Limits) -> Arrays:
     found: Arrays = {}
     _collect(file, "", found, field=field, limits=limits, depth=0)
     if not found:
-        raise refusal(
-            "missing_array", field, expected="a numeric matrix such as W", got="no plain array",
+        raise InvalidInput(
+            "missing_array", field=field, expected="a numeric matrix such as W", got="no plain array",
             hint="Save the 2F × P matrix: save('tracks.mat', 'W', '-v7').",
         )  # fmt: skip
     return found
@@ -144,7 +145,7 @@ def _check_stored(item: h5py.Dataset, name: str, declared: int, field: str, limi
 
 
 def _elsewhere(field: str, what: str) -> Exception:
-    return refusal(
-        "unsupported_feature", field, expected="data inside the file itself", got=what,
+    return InvalidInput(
+        "unsupported_feature", field=field, expected="data inside the file itself", got=what,
         hint="Save the matrix itself: save('tracks.mat', 'W', '-v7').",
     )  # fmt: skip

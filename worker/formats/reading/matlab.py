@@ -13,7 +13,8 @@ from typing import IO
 import numpy as np
 import scipy.io
 from numpy.typing import NDArray
-from pliant.worker.formats.errors import damaged, refusal, too_large
+from pliant.solver import InvalidInput
+from pliant.worker.formats.errors import damaged, too_large
 from pliant.worker.formats.records import Arrays, Limits
 
 UNREADABLE = (
@@ -55,8 +56,8 @@ def read_matlab5(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
         if not name.startswith("__"):
             _collect(name, value, found, 0)
     if not found:
-        raise refusal(
-            "missing_array", field, expected="a numeric matrix such as W", got=f"variables {', '.join(names[:20]) or 'none'}",
+        raise InvalidInput(
+            "missing_array", field=field, expected="a numeric matrix such as W", got=f"variables {', '.join(names[:20]) or 'none'}",
             hint="Save the 2F × P matrix: save('tracks.mat', 'W', '-v7').",
         )  # fmt: skip
     return found

@@ -14,7 +14,7 @@ import numpy as np
 import plyfile
 from numpy.typing import NDArray
 from pliant.solver import InvalidInput
-from pliant.worker.formats.errors import damaged, refusal, too_large
+from pliant.worker.formats.errors import damaged, too_large
 from pliant.worker.formats.records import Arrays, Limits
 
 MAX_LINE = 4096
@@ -57,7 +57,9 @@ def read_obj(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
                 field, expected=f"at most {limits.max_points} vertices, {limits.max_faces} faces", got="more"
             )
     if not vertices:
-        raise refusal("unknown_format", field, expected="a mesh file", got="text without vertices", hint=NOT_A_MESH)
+        raise InvalidInput(
+            "unknown_format", field=field, expected="a mesh file", got="text without vertices", hint=NOT_A_MESH
+        )
     if any(len(vertex) != 3 for vertex in vertices):
         raise damaged(field, "a vertex without three coordinates")
     return {"vertices": np.array(vertices, dtype=np.float64), "faces": join_polygons(polygons, field=field)}
@@ -94,8 +96,8 @@ def join_polygons(polygons: list[list[int]], *, field: str) -> NDArray[np.int64]
     """One array of faces: quads stay quads if all are; otherwise polygons become fans of triangles."""
     sizes = {len(polygon) for polygon in polygons}
     if sizes and min(sizes) < 3:
-        raise refusal(
-            "wrong_shape", f"{field}.faces", expected="faces of three vertices or more", got=f"a face of {min(sizes)}",
+        raise InvalidInput(
+            "wrong_shape", field=f"{field}.faces", expected="faces of three vertices or more", got=f"a face of {min(sizes)}",
             hint="Remove points and lines from the faces.",
         )  # fmt: skip
     if sizes not in ({3}, {4}):
@@ -122,8 +124,8 @@ def given_vertices(arrays: Arrays, *, num_points: int, field: str) -> None:
 
 def mismatch(field: str, num_points: int, num_vertices: int) -> InvalidInput:
     """Return the error for a mesh that does not match the tracks."""
-    return refusal(
-        "vertex_count_mismatch", field, expected=f"{num_points} vertices, as the tracks have points", got=f"{num_vertices}",
+    return InvalidInput(
+        "vertex_count_mismatch", field=field, expected=f"{num_points} vertices, as the tracks have points", got=f"{num_vertices}",
         hint="Vertex i of the mesh must be point i of the tracks, in the same order; omit the mesh to have one generated.",
     )  # fmt: skip
 

@@ -8,7 +8,7 @@ from importlib import import_module
 from typing import IO
 
 from pliant.solver import InvalidInput
-from pliant.worker.formats.errors import refusal, too_large
+from pliant.worker.formats.errors import too_large
 from pliant.worker.formats.reading.arrays import film_as_tracks, pickle_refusal
 from pliant.worker.formats.reading.csv import looks_like_csv
 from pliant.worker.formats.records import Arrays, Limits
@@ -86,8 +86,8 @@ def unknown_format(field: str, head: bytes) -> InvalidInput:
     """Return the error for a file of an unknown format."""
     mesh = "npz, npy, OBJ, PLY, glTF, GLB or a PNG mask"
     kinds = mesh if field == "mesh" else "npz, npy, MATLAB .mat, CSV, or DeepLabCut, SLEAP and MediaPipe exports"
-    return refusal(
-        "unknown_format", field, expected=f"{kinds}, recognised by content", got=f"a file that starts with {head[:16]!r}",
+    return InvalidInput(
+            "unknown_format", field=field, expected=f"{kinds}, recognised by content", got=f"a file that starts with {head[:16]!r}",
         hint="Convert it, e.g. numpy.savez('tracks.npz', tracks=points, visibility=visible).",
     )  # fmt: skip
 
@@ -99,8 +99,8 @@ def _refuse_pictures(head: bytes) -> None:
         raise film_as_tracks(f"a film ({kind})")
     kind = next((name for start, name in PICTURES.items() if head.startswith(start)), None)
     if kind is not None:
-        raise refusal(
-            "picture_as_tracks", "tracks", expected="point tracks over several frames", got=f"a single picture ({kind})",
+        raise InvalidInput(
+            "picture_as_tracks", field="tracks", expected="point tracks over several frames", got=f"a single picture ({kind})",
             hint="Depth comes from motion: send a film, or a zip of all its pictures, as the film.",
         )  # fmt: skip
 

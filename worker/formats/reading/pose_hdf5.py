@@ -11,7 +11,8 @@ from typing import IO
 import h5py
 import numpy as np
 from numpy.typing import NDArray
-from pliant.worker.formats.errors import damaged, refusal
+from pliant.solver import InvalidInput
+from pliant.worker.formats.errors import damaged
 from pliant.worker.formats.reading.hdf5 import UNREADABLE, check_before_reading, read_arrays, read_values
 from pliant.worker.formats.records import Arrays, Limits
 
@@ -74,8 +75,8 @@ def _columns(values: NDArray[np.float64], field: str) -> Arrays:
         or values.shape[1] % 3
         or not ((likelihood >= 0) & (likelihood <= 1) | np.isnan(likelihood)).all()
     ):
-        raise refusal(
-            "wrong_shape", field, expected="a DeepLabCut table: x, y and likelihood from 0 to 1 for each body part",
+        raise InvalidInput(
+            "wrong_shape", field=field, expected="a DeepLabCut table: x, y and likelihood from 0 to 1 for each body part",
             got=f"a table of shape {values.shape}", hint="Export it as csv: deeplabcut.analyze_videos_converth5_to_csv(folder).",
         )  # fmt: skip
     return {"deeplabcut": np.stack([values[:, 0::3], values[:, 1::3]], axis=2), "likelihood": likelihood}

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from pliant.solver import InvalidInput
-from pliant.worker.formats.errors import refusal, too_large
+from pliant.worker.formats.errors import too_large
 from pliant.worker.formats.records import Arrays, Limits
 
 SEPARATORS = "\t;,"
@@ -72,8 +72,8 @@ def number(cell: str, separator: str) -> float:
 
 def not_a_table(field: str, count: int, line: str) -> InvalidInput:
     """Return the refusal of a line, with the line."""
-    return refusal(
-        "unreadable_table", field, expected="a table with the columns frame, point, x and y, or with one row a frame",
+    return InvalidInput(
+            "unreadable_table", field=field, expected="a table with the columns frame, point, x and y, or with one row a frame",
         got=f"line {count}: {line.strip()[:80]!r}", hint=EXAMPLE,
     )  # fmt: skip
 

@@ -10,16 +10,16 @@ from __future__ import annotations
 
 import codecs
 import os
-import resource
 import signal
 import sys
 import tempfile
 from dataclasses import asdict
+from importlib.util import find_spec
 from pathlib import Path
 from typing import IO, Any
 
 from pliant.solver.errors import InvalidInput
-from pliant.worker.formats.errors import damaged, refusal
+from pliant.worker.formats.errors import damaged
 from pliant.worker.formats.records import Arrays, Limits
 from pliant.worker.processes.contained import DONE, REFUSED, Ended, limit_process, refusal_in, run_contained, serve
 
@@ -36,6 +36,12 @@ def parse_in_sandbox(parser: str, path: Path, *, field: str, limits: Limits) -> 
     """
     from pliant.worker.formats.reading.arrays import read_file
 
+    if find_spec("resource") is None:  # Windows
+        raise InvalidInput(
+            "unsupported_feature", field=field, expected="a .npz or .npy file on this system",
+            got="a format that is parsed in a sandbox, which needs Linux or macOS",
+            hint="Convert it, e.g. numpy.savez('tracks.npz', tracks=points), or send it to a service.",
+        )  # fmt: skip
     with tempfile.TemporaryDirectory(prefix="pliant-parse-") as empty, tempfile.NamedTemporaryFile() as output:
         with path.open("rb") as given:
             ended = _run(parser, given, output, field=field, limits=limits, directory=empty)
@@ -60,8 +66,8 @@ def _fault(ended: Ended, *, field: str, limits: Limits) -> InvalidInput:
         del parts["choices"]
         return InvalidInput(parts.pop("code"), **parts)
     if ended.overdue or ended.code in (-signal.SIGXCPU, -signal.SIGKILL):
-        return refusal(
-            "too_slow", field, expected=f"a file that is read within {limits.parse_seconds:g} s", got="one that takes longer",
+        return InvalidInput(
+            "too_slow", field=field, expected=f"a file that is read within {limits.parse_seconds:g} s", got="one that takes longer",
             hint="Convert it to npz: numpy.savez('tracks.npz', tracks=points).",
         )  # fmt: skip
     crash = f" (signal {-ended.code})" if ended.code < 0 else ""
@@ -74,6 +80,8 @@ def main() -> int:
 
 
 def _parse(request: dict[str, Any]) -> str:
+    import resource
+
     import numpy as np
     import numpy.ma  # np.unique loads it when first used, which is too late once no file can be opened
     from pliant.worker.formats.reading.parsers import PARSERS, parse

@@ -15,9 +15,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 from pliant.schemas.options import Options
-from pliant.solver import Mesh
+from pliant.solver import InvalidInput, Mesh
 from pliant.solver.records import MIN_POINTS
-from pliant.worker.formats.errors import refusal
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
@@ -85,8 +84,8 @@ def _thin_grid(grid: NDArray[np.int32], stride: int, limit: int) -> tuple[Indice
     coarse = grid[::stride, ::stride]
     kept = np.sort(coarse[coarse >= 0])
     if len(kept) < MIN_POINTS:
-        raise refusal(
-            "too_few_points", "options.stride", expected=f"a stride that leaves {MIN_POINTS} points or more",
+        raise InvalidInput(
+            "too_few_points", field="options.stride", expected=f"a stride that leaves {MIN_POINTS} points or more",
             got=f"{len(kept)} points at stride {stride}", hint="Use a smaller stride, or a larger max_points.",
         )  # fmt: skip
     numbers = np.full(int(grid.max()) + 1, -1)

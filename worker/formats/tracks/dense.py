@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.worker.formats.errors import refusal
+from pliant.solver import InvalidInput
 
 STEADY = 0.95
 """Share of neighbouring pixels whose coordinates must rise for two axes to count as rows and columns."""
@@ -43,8 +43,8 @@ def flatten(name: str, array: NDArray[np.generic], *, field: str) -> Flat:
             return _pictures(array)
         return Flat(_single(array, field))
     if array.ndim > 5:
-        raise refusal(
-            "wrong_shape", field, expected="(frames, points, 2)", got=f"{name} of shape {array.shape}",
+        raise InvalidInput(
+            "wrong_shape", field=field, expected="(frames, points, 2)", got=f"{name} of shape {array.shape}",
             hint="Reshape the array to three axes.",
         )  # fmt: skip
     return Flat(array)
@@ -64,8 +64,8 @@ def flatten_like(array: NDArray[np.generic], grid: tuple[int, int] | None) -> ND
 
 def _single(array: NDArray[np.generic], field: str) -> NDArray[np.generic]:
     if array.shape[0] != 1:
-        raise refusal(
-            "wrong_shape", field, expected="one video", got=f"a batch of {array.shape[0]}",
+        raise InvalidInput(
+            "wrong_shape", field=field, expected="one video", got=f"a batch of {array.shape[0]}",
             hint="Submit each element of the batch as its own job.",
         )  # fmt: skip
     return array.reshape(array.shape[1:])

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.schemas.options import Options
 from pliant.solver import InvalidInput
-from pliant.worker.formats.errors import refusal
 from pliant.worker.formats.records import Arrays
 from pliant.worker.formats.tracks.dense import flatten
 from pliant.worker.formats.tracks.layouts import Reading, choose
@@ -89,8 +88,8 @@ def _of_our_tracker(named: Arrays, name: str, options: Options) -> Understood:
     """Read tracks whose axes, unit and direction are known; visibility and mesh follow from the rest of the file."""
     points = _numeric(named[name], name)
     if points.ndim != 3 or points.shape[2] != 2:
-        raise refusal(
-            "wrong_shape", f"tracks.{name}", expected="(frames, points, 2), as pliant track writes it", got=str(points.shape),
+        raise InvalidInput(
+            "wrong_shape", field=f"tracks.{name}", expected="(frames, points, 2), as pliant track writes it", got=str(points.shape),
             hint="Save the file of pliant track as it is, or leave frame_indices out.",
         )  # fmt: skip
     y_axis = "down" if options.y_axis == "auto" else options.y_axis
@@ -126,8 +125,8 @@ def _two_numbers(
     inside = (third >= 0) & (third <= 1)
     if dialect.third == "visibility" and bool(inside[np.isfinite(third)].all()):
         return array[..., :2], None, {"visibility": third, **named}
-    raise refusal(
-        "unsupported_feature", "tracks", expected="two image coordinates for each point, or a third number from 0 to 1 as visibility",
+    raise InvalidInput(
+        "unsupported_feature", field="tracks", expected="two image coordinates for each point, or a third number from 0 to 1 as visibility",
         got=f"{name} of shape {array.shape}",
         hint="Save x and y as tracks (F, P, 2); for points in space before a camera, add intrinsics=[fx, fy, cx, cy].",
     )  # fmt: skip
@@ -146,8 +145,8 @@ def _projected(depths: NDArray[np.generic], reading: Reading, named: Arrays) -> 
 def _recognised(named: Arrays) -> tuple[Dialect, str]:
     found = recognise(named)
     if found is None:
-        raise refusal(
-            "missing_array", "tracks", expected="an array named tracks (F, P, 2), or W (2F, P)",
+        raise InvalidInput(
+            "missing_array", field="tracks", expected="an array named tracks (F, P, 2), or W (2F, P)",
             got=", ".join(sorted(named)[:20]) or "no array of a known name",
             hint="Save as numpy.savez('tracks.npz', tracks=points, visibility=visible).",
         )  # fmt: skip
@@ -162,6 +161,10 @@ def _numeric(array: NDArray[np.generic], name: str) -> NDArray[np.generic]:
 
 def wrong_numbers(field: str, array: NDArray[np.generic]) -> InvalidInput:
     """Not an array of real numbers."""
-    return refusal(
-        "wrong_type", field, expected="real numbers", got=f"dtype {array.dtype}", hint="Convert the array to float."
+    return InvalidInput(
+        "wrong_type",
+        field=field,
+        expected="real numbers",
+        got=f"dtype {array.dtype}",
+        hint="Convert the array to float.",
     )

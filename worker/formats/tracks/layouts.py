@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from pliant.schemas.options import Options
+from pliant.solver import InvalidInput
 from pliant.solver.records import MIN_FRAMES, MIN_POINTS
-from pliant.worker.formats.errors import AmbiguousInput, refusal
+from pliant.worker.formats.errors import AmbiguousInput
 from pliant.worker.formats.records import FARTHEST
 from pliant.worker.formats.tracks.tracker_formats import Dialect
 
@@ -138,8 +139,8 @@ def choose(
     """
     allowed = [one for one in readings(name, array) if _is_allowed(one, options)]
     if not allowed:
-        raise refusal(
-            "wrong_shape", field, expected="(frames, points, 2) or a matrix of 2·frames rows, with 3 frames and 4 points or more",
+        raise InvalidInput(
+            "wrong_shape", field=field, expected="(frames, points, 2) or a matrix of 2·frames rows, with 3 frames and 4 points or more",
             got=f"{name} of shape {array.shape}", hint="Transpose or reshape the array; check the options layout and rows.",
         )  # fmt: skip
     if len(allowed) == 1:

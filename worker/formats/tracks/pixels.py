@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from pliant.schemas.options import Options
-from pliant.worker.formats.errors import AmbiguousInput, refusal
+from pliant.solver import InvalidInput
+from pliant.worker.formats.errors import AmbiguousInput
 from pliant.worker.formats.records import FARTHEST
 
 SAMPLE = 100_000
@@ -57,8 +58,8 @@ def place(points: NDArray[np.generic], options: Options, *, picture: tuple[int, 
         return Placed(points, kind, notes + why)
     size = size or picture
     if size is None:
-        raise refusal(
-            "missing_image_size", "options.image_size", expected="the picture's WIDTHxHEIGHT, since coordinates are fractions of it",
+        raise InvalidInput(
+            "missing_image_size", field="options.image_size", expected="the picture's WIDTHxHEIGHT, since coordinates are fractions of it",
             got="none", hint="Set it, e.g. image_size=640x480.",
         )  # fmt: skip
     last = np.array([size[0] - 1, size[1] - 1], dtype=np.float64)
@@ -86,8 +87,8 @@ def project(
         Code missing_array or wrong_shape.
     """
     if intrinsics is None:
-        raise refusal(
-            "missing_array", "tracks.intrinsics", expected="fx, fy, cx, cy beside points in space", got="none",
+        raise InvalidInput(
+            "missing_array", field="tracks.intrinsics", expected="fx, fy, cx, cy beside points in space", got="none",
             hint="Save intrinsics=[fx, fy, cx, cy], or the image points as tracks (F, P, 2).",
         )  # fmt: skip
     matrix = np.asarray(intrinsics)
@@ -99,8 +100,8 @@ def project(
         or not np.isfinite(matrix).all()
         or (matrix.flat[:2] == 0).any()
     ):
-        raise refusal(
-            "wrong_shape", "tracks.intrinsics", expected="four finite numbers fx, fy, cx, cy, or a 3 × 3 matrix",
+        raise InvalidInput(
+            "wrong_shape", field="tracks.intrinsics", expected="four finite numbers fx, fy, cx, cy, or a 3 × 3 matrix",
             got=f"{matrix.dtype} {matrix.shape}", hint="Save intrinsics=[fx, fy, cx, cy].",
         )  # fmt: skip
     fx, fy, cx, cy = (float(value) for value in matrix.reshape(-1))

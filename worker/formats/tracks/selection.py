@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from pliant.schemas.options import Options
-from pliant.solver import Mesh
+from pliant.solver import InvalidInput, Mesh
 from pliant.solver.records import MIN_FRAMES
-from pliant.worker.formats.errors import refusal
 
 SHOWN = 10
 """Maximum number of point indices listed in a note."""
@@ -27,8 +26,8 @@ def chosen_frames(text: str | None, num_frames: int) -> tuple[NDArray[np.intp], 
     start, stop, step = (int(part) if part else None for part in [*text.split(":"), ""][:3])
     frames = everything[slice(start, stop, step)]
     if len(frames) < MIN_FRAMES:
-        raise refusal(
-            "no_frames_left", "options.frames", expected=f"at least {MIN_FRAMES} of the {num_frames} frames",
+        raise InvalidInput(
+            "no_frames_left", field="options.frames", expected=f"at least {MIN_FRAMES} of the {num_frames} frames",
             got=f"{len(frames)} by {text}", hint="Widen the range, or omit frames to use all of them.",
         )  # fmt: skip
     note = f"Frames {text}: {len(frames)} of {num_frames}, from {frames[0]} to {frames[-1]}"
@@ -73,8 +72,8 @@ def hide_sparsely_observed(
     if len(dropped) == 0:
         return confidence, dropped, []
     if len(dropped) == points.shape[1] and confidence.any():
-        raise refusal(
-            "nothing_visible", "options.min_seen", expected=f"points that are visible in {options.min_seen} or more frames",
+        raise InvalidInput(
+            "nothing_visible", field="options.min_seen", expected=f"points that are visible in {options.min_seen} or more frames",
             got=f"none of {len(dropped)}", hint="Set min_seen lower.",
         )  # fmt: skip
     confidence[:, dropped] = 0.0

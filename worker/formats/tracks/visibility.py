@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.worker.formats.errors import AmbiguousInput, refusal
+from pliant.solver import InvalidInput
+from pliant.worker.formats.errors import AmbiguousInput
 from pliant.worker.formats.records import Arrays
 from pliant.worker.formats.tracks.dense import flatten_like
 from pliant.worker.formats.tracks.layouts import Reading
@@ -75,8 +76,8 @@ def _check_number(name: str, array: NDArray[np.generic], reading: Reading) -> No
     """
     frames, points = reading.points.shape[:2]
     if array.size > 2 * frames * points:
-        raise refusal(
-            "wrong_shape", f"tracks.{name}", expected=f"({frames}, {points}), one value for each observation", got=str(array.shape),
+        raise InvalidInput(
+            "wrong_shape", field=f"tracks.{name}", expected=f"({frames}, {points}), one value for each observation", got=str(array.shape),
             hint="Visibility is (frames, points), in the order of the tracks.",
         )  # fmt: skip
 
@@ -87,8 +88,8 @@ def _confidence(
     if array.dtype.kind == "b":
         return np.array(flatten_like(array, grid), dtype=np.float64), "true or false"
     if array.dtype.kind not in "fiu":
-        raise refusal(
-            "wrong_type", f"tracks.{name}", expected="bool or numbers", got=f"dtype {array.dtype}",
+        raise InvalidInput(
+            "wrong_type", field=f"tracks.{name}", expected="bool or numbers", got=f"dtype {array.dtype}",
             hint="Convert the array to bool.",
         )  # fmt: skip
     values = np.array(array, dtype=np.float64)
@@ -113,8 +114,8 @@ def _meant(name: str, values: NDArray[np.float64], kind: str) -> tuple[NDArray[n
         with np.errstate(over="ignore"):
             return 1.0 / (1.0 + np.exp(-values)), f"logits (values from {low:.3g} to {high:.3g})"
     if low < 0 or high > 1:
-        raise refusal(
-            "out_of_range", f"tracks.{name}", expected="probabilities from 0 to 1", got=f"values from {low:.3g} to {high:.3g}",
+        raise InvalidInput(
+            "out_of_range", field=f"tracks.{name}", expected="probabilities from 0 to 1", got=f"values from {low:.3g} to {high:.3g}",
             hint="Set the option visibility to bool or logits.",
         )  # fmt: skip
     return values, "probabilities"
@@ -152,7 +153,7 @@ def _arranged(flat: NDArray[np.float64], reading: Reading, name: str) -> NDArray
             else flat.reshape(2, like[0], like[1]).swapaxes(0, 1)
         )
         return np.ascontiguousarray(pairs.min(axis=1))
-    raise refusal(
-        "wrong_shape", f"tracks.{name}", expected=f"{like}, one value for each observation", got=str(flat.shape),
+    raise InvalidInput(
+        "wrong_shape", field=f"tracks.{name}", expected=f"{like}, one value for each observation", got=str(flat.shape),
         hint="Visibility is (frames, points), in the order of the tracks.",
     )  # fmt: skip

@@ -21,25 +21,29 @@ import type { Preview } from "./preview";
 const VERTEX = `
 attribute vec4 a; attribute vec4 b; attribute vec4 na; attribute vec4 nb;
 uniform float mixing; uniform vec3 origin; uniform float unit; uniform float dot_size;
-varying vec3 normal_; varying float value;
+varying vec3 normal_; varying float value; varying float unknown;
 void main() {
   vec4 p = mix(a, b, mixing);
-  value = p.w / 32767.0;
+  unknown = p.w < 0.0 ? 1.0 : 0.0;
+  value = max(p.w, 0.0) / 32767.0;
   normal_ = normalMatrix * mix(na.xyz, nb.xyz, mixing);
   gl_Position = projectionMatrix * modelViewMatrix * vec4(origin + unit * p.xyz, 1.0);
   gl_PointSize = dot_size;
 }`;
 
 // A warm light from the upper left, a weak cool one from the right, more sky than ground, and a rim: all fixed to the viewer.
-// Both sides of a surface are lit.
+// Both sides of a surface are lit, the back less. Positions without a value are grey; towards them the colour of their
+// neighbours fades to grey and does not pass through the dark end of the scale.
 const FRAGMENT = `
-uniform vec3 plain; uniform vec3 scale[6]; uniform float coloured; uniform float lit;
-varying vec3 normal_; varying float value;
+uniform vec3 plain; uniform vec3 scale[6]; uniform float coloured; uniform float lit; uniform float reversed;
+varying vec3 normal_; varying float value; varying float unknown;
 void main() {
-  float at = clamp(value, 0.0, 1.0) * 5.0;
+  float at = clamp(value / max(1.0 - unknown, 0.001), 0.0, 1.0) * 5.0;
   vec3 shade = scale[0];
   for (int i = 0; i < 5; i++) shade = mix(shade, scale[i + 1], clamp(at - float(i), 0.0, 1.0));
+  shade = mix(shade, vec3(0.214), unknown);
   vec3 base = mix(plain, shade, coloured);
+  bool back = gl_FrontFacing == (reversed > 0.5);
   vec3 n = normalize(normal_ + vec3(1e-9));
   if (n.z < 0.0) n = -n;
   float key = max(dot(n, normalize(vec3(-0.5, 0.62, 0.6))), 0.0);
@@ -49,6 +53,7 @@ void main() {
   vec3 sky = mix(vec3(0.23, 0.25, 0.28), vec3(0.42, 0.41, 0.40), 0.5 + 0.5 * n.y);
   vec3 light = sky + 0.72 * key * vec3(1.0, 0.97, 0.93) + 0.20 * fill * vec3(0.86, 0.93, 1.0);
   vec3 c = mix(base, base * light + shine + 0.10 * edge * vec3(0.9, 0.95, 1.0), lit);
+  if (lit > 0.5 && back) c *= 0.55;
   gl_FragColor = vec4(c, 1.0);
   #include <colorspace_fragment>
 }`;
@@ -122,7 +127,10 @@ export class Body {
   colour(values: Values | null): void {
     this.values = values;
     for (const slot of this.slots) slot.frame = -1;
-    for (const material of this.materials) material.uniforms["coloured"]!.value = values === null ? 0 : 1;
+    for (const material of this.materials) {
+      material.uniforms["coloured"]!.value = values === null ? 0 : 1;
+      material.uniforms["scale"]!.value = (values?.scale ?? SCALE).map((hex) => new Color(hex));
+    }
     this.wire.material.uniforms["coloured"]!.value = 0;
   }
 
@@ -130,6 +138,11 @@ export class Body {
   theme(plain: string, wire: string): void {
     for (const material of this.materials) (material.uniforms["plain"]!.value as Color).set(plain);
     (this.wire.material.uniforms["plain"]!.value as Color).set(wire);
+  }
+
+  /** Take the other side of the faces for the front. */
+  reverse(reversed: boolean): void {
+    for (const material of this.materials) material.uniforms["reversed"]!.value = reversed ? 1 : 0;
   }
 
   /** Draw the mesh's edges over the surface. */
@@ -166,6 +179,7 @@ export class Body {
         scale: { value: SCALE.map((hex) => new Color(hex)) },
         coloured: { value: 0 },
         lit: { value: options.lit },
+        reversed: { value: 0 },
       },
     });
     this.materials.push(made);
@@ -225,8 +239,22 @@ export class Body {
   }
 }
 
-/** Each undirected edge of the triangles once. */
-function edges(faces: Uint32Array, points: number): Uint32Array {
+/** Return true if a frame's camera sees most of the mesh from behind, as the order of its faces' corners has it. */
+export function seenFromBehind(preview: Preview, frame: number): boolean {
+  const { faces } = preview;
+  let area = 0;
+  const corner = (index: number): [number, number] => preview.project(frame, ...preview.place(frame, faces[index] as number));
+  const stride = 3 * Math.max(1, Math.floor(faces.length / 3 / 20_000));
+  for (let i = 0; i < faces.length; i += stride) {
+    const [[ax, ay], [bx, by], [cx, cy]] = [corner(i), corner(i + 1), corner(i + 2)];
+    area += (bx - ax) * (cy - ay) - (by - ay) * (cx - ax);
+  }
+  // A counter-clockwise face has a positive area where y runs up, a negative one where it runs down.
+  return preview.header.y_axis === "up" ? area < 0 : area > 0;
+}
+
+/** Each undirected edge of the triangles once, as pairs of points. */
+export function edges(faces: Uint32Array, points: number): Uint32Array {
   const seen = new Set<number>();
   for (let i = 0; i < faces.length; i += 3) {
     for (let k = 0; k < 3; k += 1) {

@@ -1,28 +1,86 @@
 // Per-point values for colour, and the scale from dark to bright that shows them.
 
-import { type Preview, isHidden } from "./preview";
+import { type Preview, isHidden, isRejected } from "./preview";
 
-export type Colouring = "plain" | "displacement" | "error" | "residual";
+export type Colouring = "plain" | "expected" | "seen" | "displacement" | "error" | "residual" | "difference";
 
 /** Six colours, evenly spaced, rising in lightness all the way, so that they also read in grey and without red or green. */
 export const SCALE = ["#2b2f77", "#28608f", "#1f8f8a", "#58b96d", "#b5d44a", "#fbe94b"];
+/** From blue over light grey to red, for values of both signs. */
+export const DIVERGING = ["#2166ac", "#74add1", "#dfe6ea", "#f0e4dd", "#e08a66", "#b2182b"];
+/** Positions without a value: hidden in the frame, or unknown. */
+export const UNKNOWN = -32767;
+const TOP = 32767;
 
 export interface Values {
-  /** The value that gets the brightest colour, in the tracks' unit. */
-  top: number;
-  /** Write frame f's values, 0 … 32767 from 0 to top, one a point. */
+  /** What the colours mean, for the legend. */
+  words: string;
+  /** What the ends of the scale stand for, with units. */
+  low: string;
+  high: string;
+  scale: string[];
+  /** True where some positions have no value and are grey. */
+  hasUnknown: boolean;
+  /** Write frame f's values, 0 … 32767 from one end of the scale to the other, `UNKNOWN` for grey; one a point. */
   write: (frame: number, into: Int16Array, stride: number, at: number) => void;
 }
+
+/** A value of a point in a frame; NaN where there is none. */
+type Value = (frame: number, point: number) => number;
 
 /** Prepare a colouring; null for plain. */
 export async function valuesFor(colouring: Colouring, preview: Preview, signal: AbortSignal): Promise<Values | null> {
   if (colouring === "displacement") return displacement(preview);
-  if (colouring === "error") return distance(preview, await preview.field("truth", signal));
-  if (colouring === "residual") return residual(preview, await preview.field("residuals", signal));
+  if (colouring === "seen") return seen(preview);
+  if (colouring === "error") {
+    const value = distance(preview, await preview.field("truth", signal));
+    return scaled(preview, value, "Distance from the ground truth", percent, false);
+  }
+  if (colouring === "expected") {
+    const [spread, residuals] = await Promise.all([preview.field("spread", signal), preview.field("residuals", signal)]);
+    return scaled(preview, ifSeen(preview, residuals, deviation(preview, spread)), "Expected error", percent, hides(preview));
+  }
+  if (colouring === "residual") return residual(preview, signal);
   return null;
 }
 
-/** Distance of each point from its mean position over the frames that have arrived. */
+/** The colourings that a preview has data for, with people's names. */
+export function colourings(preview: Preview): [Colouring, string][] {
+  const all: [Colouring, string, boolean][] = [
+    ["plain", "plain", true],
+    ["expected", "expected error", preview.has("spread")],
+    ["error", "3-D error", preview.has("truth")],
+    ["seen", "how often seen", preview.counts(0) !== null],
+    ["residual", "residual", true],
+    ["displacement", "displacement", true],
+  ];
+  return all.filter(([, , has]) => has).map(([name, words]) => [name, words]);
+}
+
+/** The error of each job at each position, for two jobs of the same points and frames: 3-D errors where both have them. */
+export async function errorDifference(one: Preview, other: Preview, signal: AbortSignal): Promise<Values | null> {
+  if (one.points !== other.points || one.frames !== other.frames) return null;
+  const values = async (preview: Preview, field: "truth" | "spread"): Promise<Value> =>
+    field === "truth" ? distance(preview, await preview.field("truth", signal)) : deviation(preview, await preview.field("spread", signal));
+  const field = one.has("truth") && other.has("truth") ? "truth" : "spread";
+  if (!one.has(field) || !other.has(field)) return null;
+  const [here, there] = await Promise.all([values(one, field), values(other, field)]);
+  const value: Value = (frame, point) => here(frame, point) - there(frame, point);
+  const most = quantile(one, (frame, point) => Math.abs(value(frame, point)));
+  const words = `${field === "truth" ? "3-D error" : "Expected error"}, this job minus the other`;
+  const mapped: Value = (frame, point) => 0.5 + value(frame, point) / (2 * most);
+  return { words, low: `−${percent(most)}`, high: `+${percent(most)}`, scale: DIVERGING, hasUnknown: false, write: writer(one, mapped) };
+}
+
+export const percent = (share: number): string => `${(100 * share).toPrecision(2)} % of the size`;
+
+/** Standard deviation of each position as a share of the object's size. */
+export function deviation(preview: Preview, spread: Uint16Array): Value {
+  const unit = (preview.header.spread_step ?? 0) / preview.size;
+  return (frame, point) => unit * (spread[preview.points * frame + point] as number);
+}
+
+/** Distance of each point from its mean position over the frames that have arrived, as a share of the object's size. */
 function displacement(preview: Preview): Values {
   const { points, positions, ready } = preview;
   const mean = new Float32Array(3 * points);
@@ -30,51 +88,87 @@ function displacement(preview: Preview): Values {
     const at = 3 * points * frame;
     for (let i = 0; i < mean.length; i += 1) mean[i] = (mean[i] as number) + (positions[at + i] as number) / ready;
   }
-  const value = (frame: number, point: number): number => {
+  const unit = preview.header.step / preview.size;
+  const value: Value = (frame, point) => {
     const at = 3 * (points * frame + point);
-    const x = (positions[at] as number) - (mean[3 * point] as number);
-    const y = (positions[at + 1] as number) - (mean[3 * point + 1] as number);
-    const z = (positions[at + 2] as number) - (mean[3 * point + 2] as number);
-    return preview.header.step * Math.sqrt(x * x + y * y + z * z);
+    const offset = (axis: number): number => (positions[at + axis] as number) - (mean[3 * point + axis] as number);
+    return unit * Math.hypot(offset(0), offset(1), offset(2));
   };
-  return scaled(preview, ready, value);
+  return scaled(preview, value, "Distance from its mean position", percent, false);
 }
 
-function distance(preview: Preview, truth: Int16Array): Values {
-  const { points, positions, frames } = preview;
-  const value = (frame: number, point: number): number => {
+export function distance(preview: Preview, truth: Int16Array): Value {
+  const { points, positions } = preview;
+  const unit = preview.header.step / preview.size;
+  return (frame, point) => {
     const at = 3 * (points * frame + point);
-    const x = (positions[at] as number) - (truth[at] as number);
-    const y = (positions[at + 1] as number) - (truth[at + 1] as number);
-    const z = (positions[at + 2] as number) - (truth[at + 2] as number);
-    return preview.header.step * Math.sqrt(x * x + y * y + z * z);
+    const offset = (axis: number): number => (positions[at + axis] as number) - (truth[at + axis] as number);
+    return unit * Math.hypot(offset(0), offset(1), offset(2));
   };
-  return scaled(preview, Math.min(frames, preview.ready), value);
 }
 
-function residual(preview: Preview, residuals: Int16Array): Values {
-  const { points, frames } = preview;
-  const value = (frame: number, point: number): number => {
+/** Share of the frames that show a point; grey where none does. */
+function seen(preview: Preview): Values {
+  const value: Value = (_, point) => {
+    const count = preview.counts(point)?.seen ?? 0;
+    return count === 0 ? NaN : count / preview.allFrames;
+  };
+  const never = Array.from({ length: preview.points }, (_, point) => value(0, point)).some(Number.isNaN);
+  const high = `${preview.allFrames} of ${preview.allFrames} frames`;
+  return { words: "Seen in", low: "0", high, scale: SCALE, hasUnknown: never, write: writer(preview, value) };
+}
+
+async function residual(preview: Preview, signal: AbortSignal): Promise<Values> {
+  const residuals = await preview.field("residuals", signal);
+  const bits = preview.has("rejected") ? await preview.field("rejected", signal) : null;
+  const { points } = preview;
+  const unit = preview.header.residual_step;
+  const value: Value = (frame, point) => {
     const at = 2 * (points * frame + point);
-    const x = residuals[at] as number;
-    const y = residuals[at + 1] as number;
-    return isHidden(x) ? 0 : preview.header.residual_step * Math.sqrt(x * x + y * y);
+    return unit * Math.hypot(residuals[at] as number, residuals[at + 1] as number);
   };
-  return scaled(preview, frames, value);
+  const known = ifSeen(preview, residuals, value);
+  const counted: Value = (frame, point) => (bits && isRejected(bits, points, frame, point) ? NaN : known(frame, point));
+  const figure = new Intl.NumberFormat("en", { maximumSignificantDigits: 3 });
+  return scaled(preview, known, "From track to projection", (top) => `${figure.format(top)} (tracks' unit)`, hides(preview), counted);
 }
 
-/** The top of the scale is the 99th percentile of a sample, so that a few outliers do not make everything else dark. */
-function scaled(preview: Preview, frames: number, value: (frame: number, point: number) => number): Values {
+/** A position that the frame does not show has no value of its own: it follows from its neighbours. */
+function ifSeen(preview: Preview, residuals: Int16Array, value: Value): Value {
+  return (frame, point) => (isHidden(residuals[2 * (preview.points * frame + point)] as number) ? NaN : value(frame, point));
+}
+
+/** The 99th percentile of a sample, so that a few large values do not make everything else dark. */
+function quantile(preview: Preview, value: Value): number {
   const sample: number[] = [];
+  const frames = Math.max(1, Math.min(preview.frames, preview.ready));
   const total = preview.points * frames;
   const stride = Math.max(1, Math.floor(total / 20_000)) | 1;
-  for (let i = 0; i < total; i += stride) sample.push(value(Math.floor(i / preview.points), i % preview.points));
+  for (let i = 0; i < total; i += stride) {
+    const found = value(Math.floor(i / preview.points), i % preview.points);
+    if (!Number.isNaN(found)) sample.push(found);
+  }
   sample.sort((a, b) => a - b);
-  const top = sample[Math.floor(0.99 * sample.length)] || Number.MIN_VALUE;
-  const write = (frame: number, into: Int16Array, every: number, at: number): void => {
+  return sample[Math.floor(0.99 * sample.length)] || Number.MIN_VALUE;
+}
+
+/** `counted` are the values that decide the top of the scale. */
+function scaled(preview: Preview, value: Value, words: string, unit: (top: number) => string, hasUnknown: boolean, counted = value): Values {
+  const top = quantile(preview, counted);
+  return { words, low: "0", high: unit(top), scale: SCALE, hasUnknown, write: writer(preview, (frame, point) => value(frame, point) / top) };
+}
+
+/** True where some frame does not show every point. */
+function hides(preview: Preview): boolean {
+  for (let frame = 0; frame < preview.frames; frame += 1) if (preview.facts(frame).hidden !== 0) return true;
+  return false;
+}
+
+function writer(preview: Preview, share: Value): Values["write"] {
+  return (frame, into, stride, at) => {
     for (let point = 0; point < preview.points; point += 1) {
-      into[every * point + at] = Math.min(32767, (32767 * value(frame, point)) / top);
+      const found = share(frame, point);
+      into[stride * point + at] = Number.isNaN(found) ? UNKNOWN : Math.max(0, Math.min(TOP, TOP * found));
     }
   };
-  return { top, write };
 }

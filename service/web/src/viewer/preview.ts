@@ -27,10 +27,57 @@ interface Header {
   origin: [number, number, number];
   step: number;
   residual_step: number;
-  sections: { faces: Section; cameras: Section; positions: Section; residuals: Section; truth?: Section };
+  /** The standard deviation that one step of the section `spread` stands for. */
+  spread_step?: number;
+  /** Root mean square distance of the points from the centre of their frame: the size that errors are shares of. */
+  size?: number;
+  /** Frames of the job, of which every `frame_stride`-th is here. */
+  all_frames?: number;
+  /** Focal length, the tracks' unit; null for orthographic cameras. */
+  focal?: number | null;
+  principal_point?: [number, number];
+  image_size?: [number, number] | null;
+  sections: {
+    faces: Section;
+    cameras: Section;
+    positions: Section;
+    residuals: Section;
+    truth?: Section;
+    frames?: Section;
+    points?: Section;
+    spread?: Section;
+    rejected?: Section;
+  };
 }
 
-export type Field = "residuals" | "truth";
+/** Arrays that are fetched when they are first needed. */
+interface Fields {
+  residuals: Int16Array;
+  truth: Int16Array;
+  spread: Uint16Array;
+  rejected: Uint8Array;
+}
+export type Field = keyof Fields;
+
+const READ: { [Name in Field]: (raw: ArrayBuffer) => Fields[Name] } = {
+  residuals: (raw) => new Int16Array(raw),
+  truth: (raw) => new Int16Array(raw),
+  spread: (raw) => new Uint16Array(raw),
+  rejected: (raw) => new Uint8Array(raw),
+};
+
+/** What is known of one frame; null where it is not. */
+export interface FrameFacts {
+  /** Share of the points that the frame does not show. */
+  hidden: number | null;
+  /** Expected error, a share of the object's size. */
+  expected: number | null;
+  /** `e3d_frame`, where ground truth was given. */
+  error: number | null;
+  translation: [number, number];
+}
+
+const FRAME_COLUMNS = 6;
 
 export class Preview {
   /** Int16, 3 a point, frame after frame; world = origin + step · value. */
@@ -39,7 +86,7 @@ export class Preview {
   ready = 0;
   /** Called when more frames have arrived. */
   onFrames: () => void = () => undefined;
-  private readonly fields = new Map<Field, Promise<Int16Array>>();
+  private readonly fields = new Map<Field, Promise<unknown>>();
 
   private constructor(
     private readonly url: string,
@@ -48,6 +95,10 @@ export class Preview {
     readonly faces: Uint32Array,
     /** 10 a frame: rotation row by row, camera from world, then the scale. */
     readonly cameras: Float32Array,
+    /** 6 a frame, see worker/artifacts/preview.py; empty in files of older services. */
+    private readonly frameTable: Float32Array,
+    /** 2 a point: in how many frames it was seen, and in how many of these rejected; empty in files of older services. */
+    private readonly pointTable: Uint32Array,
   ) {
     this.positions = new Int16Array(3 * header.num_points * header.num_frames);
   }
@@ -72,28 +123,89 @@ export class Preview {
     const header = JSON.parse(new TextDecoder().decode(start.subarray(PREFIX, PREFIX + length))) as Header;
     if (header.version !== 1) throw new Error("The preview was written by a newer version; reload the page.");
     const { faces, cameras } = header.sections;
-    const tables = await range(url, faces.offset, cameras.offset + cameras.bytes - faces.offset, signal);
+    const none = { offset: faces.offset, bytes: 0 };
+    const { frames = none, points = none } = header.sections;
+    const [tables, frameTable, pointTable] = await Promise.all([
+      range(url, faces.offset, cameras.offset + cameras.bytes - faces.offset, signal),
+      frames.bytes > 0 ? range(url, frames.offset, frames.bytes, signal) : new Uint8Array(),
+      points.bytes > 0 ? range(url, points.offset, points.bytes, signal) : new Uint8Array(),
+    ]);
     const preview = new Preview(
       url,
       header,
       new Uint32Array(aligned(tables, 0, faces.bytes)),
       new Float32Array(aligned(tables, cameras.offset - faces.offset, cameras.bytes)),
+      new Float32Array(aligned(frameTable, 0, frames.bytes)),
+      new Uint32Array(aligned(pointTable, 0, points.bytes)),
     );
     void preview.stream(signal);
     return preview;
   }
 
-  /** Fetch a further array once: residuals (2 a point) or ground truth (3 a point). */
-  field(name: Field, signal: AbortSignal): Promise<Int16Array> {
+  /** Fetch a further array once: residuals (2 a point), ground truth (3 a point), deviations (1 a point) or rejections (bits). */
+  field<Name extends Field>(name: Name, signal: AbortSignal): Promise<Fields[Name]> {
     const section = this.header.sections[name];
     if (section === undefined) return Promise.reject(new Error(`The preview has no ${name}.`));
-    let asked = this.fields.get(name);
+    let asked = this.fields.get(name) as Promise<Fields[Name]> | undefined;
     if (asked === undefined) {
-      asked = range(this.url, section.offset, section.bytes, signal).then((raw) => new Int16Array(aligned(raw, 0, section.bytes)));
+      asked = range(this.url, section.offset, section.bytes, signal).then((raw) => READ[name](aligned(raw, 0, section.bytes)));
       asked.catch(() => this.fields.delete(name));
       this.fields.set(name, asked);
     }
     return asked;
+  }
+
+  /** The object's size, the tracks' unit: what errors are shares of. */
+  get size(): number {
+    return this.header.size ?? 1;
+  }
+
+  /** Frames of the whole job. */
+  get allFrames(): number {
+    return this.header.all_frames ?? this.frames * this.header.frame_stride;
+  }
+
+  /** What is known of a frame. */
+  facts(frame: number): FrameFacts {
+    const at = (column: number): number | null => {
+      const value = this.frameTable[FRAME_COLUMNS * frame + column];
+      return value === undefined || Number.isNaN(value) ? null : value;
+    };
+    return { hidden: at(2), expected: at(3), error: at(4), translation: [at(0) ?? 0, at(1) ?? 0] };
+  }
+
+  /** In how many frames a point was seen, and in how many of these rejected; null in files of older services. */
+  counts(point: number): { seen: number; rejected: number } | null {
+    const seen = this.pointTable[2 * point];
+    return seen === undefined ? null : { seen, rejected: this.pointTable[2 * point + 1] ?? 0 };
+  }
+
+  /** The frame that shows most points. */
+  get clearest(): number {
+    let best = 0;
+    for (let frame = 1; frame < this.frames; frame += 1) {
+      if ((this.facts(frame).hidden ?? 0) < (this.facts(best).hidden ?? 0)) best = frame;
+    }
+    return best;
+  }
+
+  /** Project a point of the world `(x, y, z)` into a frame's picture, the tracks' unit. */
+  project(frame: number, x: number, y: number, z: number): [number, number] {
+    const { rotation: r, scale } = this.camera(frame);
+    const [tx, ty] = this.facts(frame).translation;
+    const across = (row: number): number => scale * (r[3 * row]! * x + r[3 * row + 1]! * y + r[3 * row + 2]! * z);
+    const [u, v] = [across(0) + tx, across(1) + ty];
+    const { focal, principal_point: centre, y_axis: upright } = this.header;
+    if (!focal || !centre) return [u, v];
+    const nearer = 1 + ((upright === "up" ? -1 : 1) * across(2)) / focal;
+    return [centre[0] + (u - centre[0]) / nearer, centre[1] + (v - centre[1]) / nearer];
+  }
+
+  /** A point's place in the world. */
+  place(frame: number, point: number): [number, number, number] {
+    const at = 3 * (this.points * frame + point);
+    const axis = (k: number): number => (this.header.origin[k] as number) + this.header.step * (this.positions[at + k] as number);
+    return [axis(0), axis(1), axis(2)];
   }
 
   /** Rotation (9 numbers, row by row) and scale of a frame's camera. */
@@ -138,6 +250,11 @@ export class Preview {
 }
 
 export const isHidden = (value: number): boolean => value === HIDDEN;
+
+/** Whether the solver rejected an observation as an outlier; `bits` is the section `rejected`. */
+export function isRejected(bits: Uint8Array, points: number, frame: number, point: number): boolean {
+  return ((bits[Math.ceil(points / 8) * frame + (point >> 3)] as number) & (1 << (point & 7))) !== 0;
+}
 
 function aligned(raw: Uint8Array, from: number, length: number): ArrayBuffer {
   return raw.slice(from, from + length).buffer as ArrayBuffer;

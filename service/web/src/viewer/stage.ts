@@ -6,6 +6,14 @@ import { Group, Matrix4, type Object3D, OrthographicCamera, Quaternion, Scene, V
 import { Orbit } from "./orbit";
 import type { Preview } from "./preview";
 
+/** Directions to look from, relative to the camera of the frame that shows most points. */
+export type Side = "front" | "side" | "top";
+
+/** The part of a view that the fitted mesh takes. */
+const FILLED = 0.9;
+/** A click this close to a point, in CSS pixels, means the point. */
+const NEAR = 22;
+
 export class Stage {
   readonly canvas: HTMLCanvasElement;
   readonly orbit: Orbit;
@@ -25,18 +33,23 @@ export class Stage {
   private radius = 1;
   private requested = 0;
   private divided = false;
+  /** True until a person moves the camera: the mesh goes on filling the view when its size changes. */
+  private fitted = true;
 
   /** Throws when the browser has no WebGL 2. */
   constructor(
     private readonly holder: HTMLElement,
-    preview: Preview,
+    private readonly preview: Preview,
   ) {
     this.renderer = new WebGLRenderer({ antialias: true, alpha: true });
     this.renderer.setPixelRatio(Math.min(2, devicePixelRatio));
     this.renderer.setScissorTest(true);
     this.canvas = this.renderer.domElement;
     this.orbit = new Orbit(this.camera, this.canvas, (byHand) => {
-      if (byHand) this.onTurn();
+      if (byHand) {
+        this.fitted = false;
+        this.onTurn();
+      }
       this.redraw();
     });
     this.down = preview.header.y_axis !== "up";
@@ -44,8 +57,7 @@ export class Stage {
       if (this.down) world.rotation.x = Math.PI;
       (this.scenes[index] as Scene).add(world);
     });
-    this.frameOn(preview);
-    this.reset();
+    this.frameOn();
     this.canvas.addEventListener("webglcontextrestored", () => this.redraw());
     this.resizing.observe(holder);
   }
@@ -82,16 +94,105 @@ export class Stage {
     this.redraw();
   }
 
-  /** Look along the first frame's camera, a little from the side, so that depth shows at once. */
-  reset(): void {
-    this.orbit.target.copy(this.centre);
-    this.orbit.orientation.identity();
-    this.camera.zoom = 1;
-    this.orbit.turn(0.42, -0.1);
+  get isFlipped(): boolean {
+    return this.flipped;
+  }
+
+  /** Look as the camera of the frame that shows most points, or from its right, or from above; the mesh fills the view. */
+  look(side: Side): void {
+    this.through(this.preview.camera(this.preview.clearest).rotation);
+    const turned = { front: [0, 0], side: [Math.PI / 2, 0], top: [0, -Math.PI / 2] }[side] as [number, number];
+    const about = (x: number, y: number, angle: number): Quaternion =>
+      new Quaternion().setFromAxisAngle(new Vector3(x, y, 0), angle);
+    this.orbit.orientation.multiply(about(0, 1, turned[0])).multiply(about(1, 0, turned[1]));
+    this.fit();
+  }
+
+  /** Zoom and move so that the mesh just fills the view in all frames that have arrived. */
+  fit(): void {
+    this.fitted = true;
+    const inverse = this.orbit.orientation.clone().invert();
+    const [low, high] = [new Vector3(Infinity, Infinity, Infinity), new Vector3(-Infinity, -Infinity, -Infinity)];
+    this.sample((point) => {
+      this.onScreen(point).applyQuaternion(inverse);
+      low.min(point);
+      high.max(point);
+    });
+    this.orbit.target.copy(low.clone().add(high).multiplyScalar(0.5).applyQuaternion(this.orbit.orientation));
+    this.aspect();
+    const room = Math.min((this.camera.right - this.camera.left) / (high.x - low.x || 1), (this.camera.top - this.camera.bottom) / (high.y - low.y || 1));
+    this.camera.zoom = Math.min(60, Math.max(0.2, FILLED * room));
+    this.redraw();
+  }
+
+  /** Fit again when more frames have arrived, unless a person has moved the camera. */
+  refit(): void {
+    if (this.fitted) this.fit();
+    else this.redraw();
+  }
+
+  /** Stand at a share of one turn around the upright, from the front. */
+  turntable(share: number): void {
+    const upright = new Quaternion().setFromAxisAngle(new Vector3(0, 1, 0), 2 * Math.PI * share);
+    this.orbit.orientation.copy(this.front().multiply(upright));
+  }
+
+  /** Return a function that brings the camera back to where it is now. */
+  remember(): () => void {
+    const [orientation, target, zoom, fitted] = [this.orbit.orientation.clone(), this.orbit.target.clone(), this.camera.zoom, this.fitted];
+    return () => {
+      this.orbit.orientation.copy(orientation);
+      this.orbit.target.copy(target);
+      this.camera.zoom = zoom;
+      this.fitted = fitted;
+      this.redraw();
+    };
+  }
+
+  /** Return the point under a place of the canvas, in CSS pixels from its upper left corner; null if none is near. */
+  pick(x: number, y: number, frame: number): number | null {
+    this.draw();
+    const view = this.views()[0] as Vector4;
+    const [width, height] = [view.z, view.w];
+    const top = this.holder.clientHeight - view.y - view.w;
+    let best: { point: number; depth: number; away: number } | null = null;
+    for (let point = 0; point < this.preview.points; point += 1) {
+      const at = this.onScreen(new Vector3(...this.preview.place(frame, point))).project(this.camera);
+      const away = Math.hypot(view.x + ((at.x + 1) / 2) * width - x, top + ((1 - at.y) / 2) * height - y);
+      if (away > NEAR) continue;
+      // Of several under the finger the nearest on the picture wins, unless it lies behind the surface.
+      const score = away / NEAR + (at.z + 1) * 4;
+      if (best === null || score < best.away / NEAR + (best.depth + 1) * 4) best = { point, depth: at.z, away };
+    }
+    return best?.point ?? null;
+  }
+
+  /** Draw at once, so that the canvas can be copied in the same task. */
+  drawNow(): void {
+    this.draw();
+  }
+
+  /** A second stage shows its own scene from the same side: relative to the cameras of one frame. */
+  mirror(other: Stage): void {
+    const frame = Math.min(other.preview.clearest, this.preview.frames - 1);
+    const [mine, theirs] = [this, other].map((one) => one.orientationOf(one.preview.camera(frame).rotation)) as [Quaternion, Quaternion];
+    const turned = theirs.clone().invert().multiply(other.orbit.orientation);
+    this.orbit.orientation.copy(mine.multiply(turned));
+    this.camera.zoom = other.camera.zoom;
+    this.redraw();
   }
 
   /** Look through a frame's own camera; `rotation` is camera from world, row by row. */
   through(rotation: Float32Array): void {
+    this.orbit.orientation.copy(this.orientationOf(rotation));
+  }
+
+  /** The orientation of the camera of the frame that shows most points. */
+  private front(): Quaternion {
+    return this.orientationOf(this.preview.camera(this.preview.clearest).rotation);
+  }
+
+  private orientationOf(rotation: Float32Array): Quaternion {
     const row = (index: number, sign: number): Vector3 => {
       const axis = new Vector3(rotation[3 * index], rotation[3 * index + 1], rotation[3 * index + 2]).multiplyScalar(sign);
       // With the mirror J = diag(1, 1, −1), the camera R that saw S sees J S as J R J.
@@ -101,7 +202,7 @@ export class Stage {
     // The camera's rows are right, down and away where y runs down; right, up and towards the viewer where it runs up.
     const sign = this.down ? -1 : 1;
     const basis = new Matrix4().makeBasis(row(0, 1), row(1, sign), row(2, sign));
-    this.orbit.orientation.copy(new Quaternion().setFromRotationMatrix(basis));
+    return new Quaternion().setFromRotationMatrix(basis);
   }
 
   /** Draw soon; many calls before then make one picture. */
@@ -120,35 +221,47 @@ export class Stage {
     this.canvas.remove();
   }
 
-  /** Find the middle and the size of all frames that have arrived. */
-  private frameOn(preview: Preview): void {
-    const { header, positions, points, ready } = preview;
-    const low = [Infinity, Infinity, Infinity];
-    const high = [-Infinity, -Infinity, -Infinity];
+  /** From the data's axes to those of the scene. */
+  private onScreen(point: Vector3): Vector3 {
+    if (this.flipped) point.z *= -1;
+    return this.down ? point.set(point.x, -point.y, -point.z) : point;
+  }
+
+  /** Call `use` with points of the frames that have arrived, at most about 100,000. */
+  private sample(use: (point: Vector3) => void): void {
+    const { points, ready } = this.preview;
     const total = points * Math.max(1, ready);
-    const stride = Math.max(1, Math.floor(total / 200_000));
-    for (let i = 0; i < total; i += stride) {
-      for (let axis = 0; axis < 3; axis += 1) {
-        const value = positions[3 * i + axis] as number;
-        low[axis] = Math.min(low[axis] as number, value);
-        high[axis] = Math.max(high[axis] as number, value);
-      }
-    }
-    const middle = header.origin.map((at, axis) => at + (header.step * ((low[axis] as number) + (high[axis] as number))) / 2);
-    this.centre.fromArray(middle);
-    if (this.down) this.centre.set(this.centre.x, -this.centre.y, -this.centre.z);
-    this.radius = (header.step * Math.hypot(...low.map((value, axis) => (high[axis] as number) - value))) / 2 || 1;
+    const stride = Math.max(1, Math.floor(total / 100_000)) | 1;
+    const point = new Vector3();
+    for (let i = 0; i < total; i += stride) use(point.set(...this.preview.place(Math.floor(i / points), i % points)));
+  }
+
+  /** Find the middle and the size of all frames that have arrived. */
+  private frameOn(): void {
+    const [low, high] = [new Vector3(Infinity, Infinity, Infinity), new Vector3(-Infinity, -Infinity, -Infinity)];
+    this.sample((point) => {
+      low.min(this.onScreen(point));
+      high.max(point);
+    });
+    this.centre.copy(low).add(high).multiplyScalar(0.5);
+    this.radius = high.distanceTo(low) / 2 || 1;
+  }
+
+  /** Give the camera the shape of a view. */
+  private aspect(): void {
+    const view = this.views()[0] as Vector4;
+    if (view.z === 0 || view.w === 0) return;
+    const wide = this.radius * Math.max(1, view.z / view.w);
+    const tall = this.radius * Math.max(1, view.w / view.z);
+    Object.assign(this.camera, { left: -wide, right: wide, top: tall, bottom: -tall });
   }
 
   private resize(): void {
     const { clientWidth: width, clientHeight: height } = this.holder;
     if (width === 0 || height === 0) return;
     this.renderer.setSize(width, height);
-    const view = this.views()[0] as Vector4;
-    const half = 0.84 * this.radius;
-    const wide = half * Math.max(1, view.z / view.w);
-    const tall = half * Math.max(1, view.w / view.z);
-    Object.assign(this.camera, { left: -wide, right: wide, top: tall, bottom: -tall });
+    if (this.fitted) this.fit();
+    else this.aspect();
     this.draw();
   }
 
@@ -164,6 +277,7 @@ export class Stage {
     this.onDraw();
     Object.assign(this.camera, { near: 0, far: 40 * this.radius });
     this.orbit.apply(20 * this.radius);
+    this.camera.updateMatrixWorld();
     this.views().forEach((view, index) => {
       this.renderer.setViewport(view);
       this.renderer.setScissor(view);

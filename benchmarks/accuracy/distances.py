@@ -1,0 +1,152 @@
+"""Error against the distance of the camera: sequences with known cameras seen by a pinhole.
+
+    python -m benchmarks.accuracy.distances --data DIR [--only NAME] [--points N] [--out FILE]
+
+The true shapes, seen by their cameras, are scaled to a half-size (largest |coordinate| in the camera frame) of 300 px and projected from
+d half-sizes away into a picture of 1280 × 720 px: u = c + x/(1 + z/φ) with φ = 300·d px and c the centre. All points count as seen; the
+solver gets `image_size`, not φ. Distance `inf` is orthography. Every measurement is appended to FILE as one line of JSON
+{method, sequence, metric, value, trial, distance, seconds}, and measured only once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pliant.solver import Settings, Tracks, solve
+from pliant.solver.evaluation.metrics import evaluate
+from pliant.solver.gallery import corrupt_tracks
+
+from benchmarks.sequences import Case, cases
+
+HALF_SIZE = 300.0
+"""Largest coordinate of a shape in the camera frame, px."""
+
+PICTURE = (1280.0, 720.0)
+"""Width and height, px."""
+
+DISTANCES = ("3", "5", "10", "inf")
+"""Of the camera, in half-sizes."""
+
+CAMERAS = {"auto": "auto", "orthographic": "scaled_orthographic"}
+"""Camera model of each method."""
+
+METRICS = (
+    "e3d_frame_scaled", "e3d_frame_similarity", "e3d_frame", "rotation_degrees", "focal_error", "reprojection_rms",
+)  # fmt: skip
+"""Metrics that are kept; `mirrored` is 1 where the shapes came out with the wrong sign of depth."""
+
+DOWN = np.diag([1.0, -1.0, -1.0])
+"""From camera axes with y up and z towards the camera to axes with y down and z away from it."""
+
+
+def seen_from(case: Case, distance: float) -> tuple[Tracks, np.ndarray, np.ndarray]:
+    """Return tracks in pixels, true shapes (F, P, 3) in pixels, and true rotations (F, 3, 3), y down.
+
+    Parameters
+    ----------
+    case : Case
+        With shapes and cameras.
+    distance : float
+        In half-sizes; infinite for orthography.
+    """
+    if case.shapes is None or case.cameras is None:
+        raise ValueError(f"{case.name} has no true shapes and cameras")
+    rotations = DOWN @ case.cameras.rotations if case.y_up else np.asarray(case.cameras.rotations)
+    shapes = case.shapes - case.shapes.mean(axis=1, keepdims=True)
+    seen = shapes @ rotations.transpose(0, 2, 1)
+    unit = HALF_SIZE / float(np.abs(seen).max())
+    shapes, seen = unit * shapes, unit * seen
+    nearer = 1 + seen[..., 2:] / (HALF_SIZE * distance)
+    return Tracks.from_arrays((np.array(PICTURE) - 1) / 2 + seen[..., :2] / nearer), shapes, rotations
+
+
+def mirrored(shapes: np.ndarray, truth: np.ndarray) -> bool:
+    """Whether mirrored shapes fit the truth better than the shapes do, a rotation free in every frame."""
+    products = np.einsum("fpi,fpj->fij", truth - truth.mean(axis=1, keepdims=True), shapes)
+    values = np.linalg.svd(products, compute_uv=False)
+    sign = np.sign(np.linalg.det(products))
+    return float((sign * values[:, 2]).sum()) < 0
+
+
+def measure(case: Case, distance: str, method: str, *, noise: float = 0.0, trial: int = 0) -> dict[str, float]:
+    """Solve and compare; `noise` is the standard deviation in pixels."""
+    tracks, shapes, rotations = seen_from(case, float(distance))
+    if noise > 0:
+        largest = float(np.abs(tracks.points).max())
+        tracks, _ = corrupt_tracks(tracks, noise=noise / largest, seed=trial)
+    began = time.perf_counter()
+    solution = solve(tracks, case.mesh, settings=Settings(camera=CAMERAS[method], image_size=PICTURE))  # type: ignore[arg-type]
+    seconds = time.perf_counter() - began
+    focal = None if distance == "inf" else HALF_SIZE * float(distance)
+    values = evaluate(solution, tracks, shapes, rotations, focal)
+    values["mirrored"] = float(mirrored(solution.shapes, shapes)) if solution.camera.focal is not None else 0.0
+    values["settled"] = float(solution.choices.depth_sign == "settled")
+    values["seconds"] = seconds
+    return values
+
+
+def rows(path: Path) -> Iterator[dict[str, Any]]:
+    """Yield the measurements there are; a line that was cut off is skipped."""
+    for line in path.read_text().splitlines() if path.exists() else []:
+        try:
+            yield json.loads(line)
+        except json.JSONDecodeError:
+            continue
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Measure what is missing, and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, help="directory of recorded sequences; the gallery without it")
+    parser.add_argument("--only", action="append", default=[], help="names that hold this word")
+    parser.add_argument("--points", type=int, help="keep at most so many points")
+    parser.add_argument("--distances", default=",".join(DISTANCES), help="half-sizes, comma-separated")
+    parser.add_argument("--methods", default=",".join(CAMERAS), help="comma-separated: " + ", ".join(CAMERAS))
+    parser.add_argument("--noise", type=float, default=0.0, help="standard deviation of the tracks' noise, px")
+    parser.add_argument("--out", type=Path, default=Path("benchmarks/results/distances.jsonl"))
+    given = parser.parse_args(arguments)
+    suffix = f" noise {given.noise:g} px" if given.noise else ""
+    done = {(row["sequence"], row["distance"], row["method"]) for row in rows(given.out)}
+    given.out.parent.mkdir(parents=True, exist_ok=True)
+    print(
+        f"{'sequence':26} {'d':>4} {'method':14} {'scaled':>8} {'similar':>8} {'rotation':>9} {'focal':>7} {'mirror':>6} {'s':>7}"
+    )
+    for case in cases(given.data, points=given.points, visibility="all", only=given.only):
+        if case.shapes is None or case.cameras is None:
+            continue
+        name = f"{case.name} P={case.tracks.num_points}{suffix}"
+        for distance in given.distances.split(","):
+            for method in given.methods.split(","):
+                if (name, distance, method) in done:
+                    continue
+                values = measure(case, distance, method, noise=given.noise)
+                _keep(given.out, name, distance, method, values)
+                print(
+                    f"{name:26} {distance:>4} {method:14} {values['e3d_frame_scaled']:8.4f} {values['e3d_frame_similarity']:8.4f} "
+                    f"{values['rotation_degrees']:8.2f}° {values.get('focal_error', np.nan):7.3f} {values['mirrored']:6.0f} "
+                    f"{values['seconds']:7.1f}",
+                    flush=True,
+                )  # fmt: skip
+
+
+def _keep(path: Path, name: str, distance: str, method: str, values: dict[str, float]) -> None:
+    with path.open("a") as file:
+        for metric in (*METRICS, "mirrored", "settled"):
+            value = values.get(metric)
+            if value is None:
+                continue
+            row = {
+                "method": method, "sequence": name, "metric": metric, "value": value if np.isfinite(value) else None,
+                "trial": 0, "distance": distance, "seconds": values["seconds"],
+            }  # fmt: skip
+            file.write(json.dumps(row) + "\n")
+
+
+if __name__ == "__main__":
+    main()

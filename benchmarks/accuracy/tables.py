@@ -1,0 +1,108 @@
+"""Markdown tables out of measured cells."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from benchmarks.accuracy.cells import CORRUPTIONS, METHODS
+
+METRICS = (
+    "e3d_frame", "e3d_sequence", "e3d_frame_similarity", "e3d_mocap", "rotation_degrees", "reprojection_median",
+    "reprojection_rms",
+)  # fmt: skip
+
+Rows = Iterable[dict[str, Any]]
+
+
+def clean_table(rows: Rows, metric: str) -> str:
+    """Sequences down, true and estimated cameras × methods across, without corruption."""
+    found = [row for row in rows if row["corruption"] == "clean" and metric in row["metrics"]]
+    columns = [(cameras, method) for cameras in ("true", "estimated") for method in METHODS]
+    columns = [column for column in columns if any(_column(row) == column for row in found)]
+    head = ["sequence", *(f"{method}, {cameras}" for cameras, method in columns)]
+    if metric == "e3d_frame":
+        head += ["K", "seconds"]
+    body = []
+    for sequence in _ordered(found):
+        cells = {_column(row): row for row in found if _name(row) == sequence}
+        line = [sequence, *(number(cells[c]["metrics"][metric]) if c in cells else "–" for c in columns)]
+        if metric == "e3d_frame":
+            last = cells.get(columns[-1], next(iter(cells.values())))
+            line += [str(last["chosen"]["basis_size"]), f"{last['seconds']:.1f}"]
+        body.append(line)
+    return _markdown(head, body)
+
+
+def corruption_table(rows: Rows, metric: str, cameras: str) -> str:
+    """Sequences and corruptions down, methods across; mean ± standard deviation over the trials."""
+    found = [row for row in rows if row["cameras"] == cameras and metric in row["metrics"]]
+    groups: dict[tuple[str, str, str], list[float]] = defaultdict(list)
+    for row in found:
+        groups[_name(row), row["corruption"], row["method"]].append(row["metrics"][metric])
+    spoilt = {sequence for sequence, corruption, _ in groups if corruption != "clean"}
+    methods = [method for method in METHODS if any(key[2] == method and key[0] in spoilt for key in groups)]
+    body = []
+    for sequence in _ordered(found):
+        for corruption in CORRUPTIONS:
+            values = [groups.get((sequence, corruption, method), []) for method in methods]
+            if sequence in spoilt and any(values):
+                trials = str(max(len(v) for v in values))
+                body.append([sequence, corruption, trials, *(_spread(v) for v in values)])
+    return _markdown(["sequence", "corruption", "trials", *methods], body)
+
+
+def cost_table(rows: Rows, metric: str) -> str:
+    """What estimating the cameras costs: estimated over true, for every method, clean."""
+    found = {
+        (_name(row), *_column(row)): row for row in rows if row["corruption"] == "clean" and metric in row["metrics"]
+    }
+    names = list(dict.fromkeys(case for case, cameras, _ in found if cameras == "true"))
+    methods = [method for method in METHODS if any(key[2] == method for key in found)]
+    body = []
+    for name in names:
+        line = [name]
+        for method in methods:
+            pair = [found.get((name, cameras, method)) for cameras in ("estimated", "true")]
+            both = [row["metrics"][metric] for row in pair if row is not None]
+            line.append(f"{both[0] / both[1]:.2f}" if len(both) == 2 and both[1] > 0 else "–")
+        body.append(line)
+    return _markdown(["sequence", *methods], body)
+
+
+def number(value: float) -> str:
+    """Three significant digits in the field's manner: .0341, 1.25, 12.5; a dash where there is no truth to compare with."""
+    if value == 0 or not np.isfinite(value):
+        return "0" if value == 0 else "–"
+    digits = max(0, 2 - int(np.floor(np.log10(abs(value)))))
+    text = f"{value:.{min(digits, 5)}f}"
+    return text.replace("0.", ".", 1) if text.startswith(("0.", "-0.")) else text
+
+
+def _spread(values: list[float]) -> str:
+    if not values:
+        return "–"
+    mean = number(float(np.mean(values)))
+    return mean if len(values) == 1 else f"{mean} ± {number(float(np.std(values, ddof=1)))}"
+
+
+def _column(row: dict[str, Any]) -> tuple[str, str]:
+    return row["cameras"], row["method"]
+
+
+def _name(row: dict[str, Any]) -> str:
+    return f"{row['case']}, {row['frames']} × {row['points']}"
+
+
+def _ordered(rows: list[dict[str, Any]]) -> list[str]:
+    return list(dict.fromkeys(_name(row) for row in rows))
+
+
+def _markdown(head: list[str], body: list[list[str]]) -> str:
+    if not body:
+        return "(nothing measured)"
+    lines = [head, ["---"] * len(head), *body]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)

@@ -1,0 +1,210 @@
+"""Figures drawn from `benchmarks/results/*.jsonl`: `python -m benchmarks.figures.plots [--into docs/images]` (needs matplotlib)."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections import defaultdict
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+RESULTS = Path(__file__).parents[1] / "results"
+Records = list[dict[str, Any]]
+
+NAMES = {
+    "pseudo_inverse": "pseudo-inverse",
+    "temporal": "smooth in time (Dai et al.)",
+    "spatio_temporal": "smooth in time and space (Dai et al.)",
+    "robust": "robust (Dai et al.)",
+    "robust+low_rank": "robust, low rank",
+    "default": "Pliant's default",
+}
+COLOURS = {
+    "pseudo_inverse": "#bbbbbb",
+    "temporal": "#88ccee",
+    "spatio_temporal": "#44aa99",
+    "robust": "#117733",
+    "robust+low_rank": "#ddaa33",
+    "default": "#cc3311",
+}
+SEQUENCES = {
+    "facescan10_rot90": "face scans, 10 frames",
+    "facescan99_rot30": "face scans, 99 frames",
+    "aura_anim_rot45": "animated head",
+    "ict_beat_9k_rot30": "speaking head",
+    "horse_gallop": "galloping horse",
+    "samba": "dancer",
+    "mp_face37": "face landmarks",
+    "shark_objframe": "shark",
+    "akhter_drink": "mocap, drink",
+    "akhter_pickup": "mocap, pick-up",
+    "akhter_dance": "mocap, dance",
+    "torresani_walking": "mocap, walking",
+    "dinosaur_real": "animatronic dinosaur",
+    "kinect_paper_dense23": "bending paper, real",
+    "hulk21_px": "comic page, real",
+}
+
+
+def main() -> None:
+    """Draw every figure whose results exist."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--into", type=Path, default=Path("docs/images"))
+    into = parser.parse_args().into
+    mpl.use("Agg")
+    plt.rcParams.update(
+        {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "svg.hashsalt": "pliant"}
+    )
+    for name, (source, draw) in FIGURES.items():
+        records = read(source)
+        if records:
+            figure = draw(records)
+            figure.savefig(into / f"{name}.png", dpi=110, bbox_inches="tight", metadata={"Software": None})
+            plt.close(figure)
+
+
+def read(name: str) -> Records:
+    """Return the records of one results file; none if it does not exist."""
+    path = RESULTS / f"{name}.jsonl"
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def error_by_sequence(records: Records) -> Figure:
+    """Error of every method on every sequence; published figures are ticks."""
+    chosen = [
+        r for r in records
+        if r["metric"] == "e3d_frame" and r["cameras"] == "estimated" and r["corruption"] == "clean"
+        and r["visibility"] == "file" and r["points"] <= 1000
+    ]  # fmt: skip
+    names = [name for name in SEQUENCES if any(r["sequence"] == name for r in chosen)]
+    figure, axes = plt.subplots(figsize=(8, 4.2))
+    for method, label in NAMES.items():
+        found = {r["sequence"]: r["mean"] for r in chosen if r["method"] == method}
+        at = [i for i, name in enumerate(names) if name in found]
+        size, layer = (60, 3) if method == "default" else (26, 2)
+        axes.scatter([found[names[i]] for i in at], at, s=size, color=COLOURS[method], label=label, zorder=layer)
+    published = [r for r in read("published") if r["metric"] == "e3d_frame" and r["sequence"] in names]
+    if published:
+        at = [names.index(r["sequence"]) for r in published]
+        axes.scatter([r["value"] for r in published], at, marker="|", s=160, color="black", label="published")
+    axes.set_xscale("log")
+    axes.set_yticks(range(len(names)), [SEQUENCES[name] for name in names])
+    axes.invert_yaxis()
+    axes.grid(axis="x", which="both", alpha=0.25)
+    axes.set_xlabel("e3d_frame (error / size), estimated cameras, exactly orthographic tracks but for the real ones")
+    axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5), frameon=False)
+    return figure
+
+
+def error_by_corruption(records: Records) -> Figure:
+    """Error against noise, outliers and hidden points on the sequences that were corrupted."""
+    chosen = [
+        r for r in records
+        if r["metric"] == "e3d_frame" and r["cameras"] == "estimated" and r["visibility"] == "file" and r["points"] <= 1000
+    ]  # fmt: skip
+    kinds: dict[str, dict[str, float]] = {
+        "noise (share of the size)": {"clean": 0, "noise .01": 0.01, "noise .03": 0.03, "noise .05": 0.05},
+        "outliers (%)": {"clean": 0, "outliers 2 %": 2, "outliers 6 %": 6, "outliers 10 %": 10},
+        "more hidden (%)": {"clean": 0, "hidden 30 %": 30},
+    }
+    names = [n for n in SEQUENCES if any(r["sequence"] == n and r["corruption"] == "noise .01" for r in chosen)]
+    figure, grid = plt.subplots(len(names), len(kinds), figsize=(9, 2.1 * len(names)), squeeze=False, sharey="row")
+    for row, name in zip(grid, names, strict=True):
+        for axes, (kind, levels) in zip(row, kinds.items(), strict=True):
+            _against(axes, [r for r in chosen if r["sequence"] == name], levels)
+            axes.set_xlabel(kind, fontsize=8)
+        row[0].set_ylabel(f"{SEQUENCES[name]}\ne3d_frame", fontsize=8)
+    handles, labels = grid[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False, fontsize=8)
+    figure.tight_layout()
+    return figure
+
+
+def _against(axes: Axes, records: Records, levels: dict[str, float]) -> None:
+    for method, label in NAMES.items():
+        points = sorted(
+            (levels[r["corruption"]], r["mean"], r.get("std", 0.0))
+            for r in records
+            if r["method"] == method and r["corruption"] in levels
+        )
+        if points:
+            x, y, spread = np.array(points).T
+            axes.errorbar(x, y, spread, color=COLOURS[method], label=label, marker=".", lw=1, capsize=2)
+    axes.set_yscale("log")
+    axes.grid(alpha=0.25)
+
+
+def growth(records: Records) -> Figure:
+    """Time and memory against points and frames, with the fitted exponents."""
+    figure, grid = plt.subplots(1, 2, figsize=(8, 3.2))
+    for axes, quantity, label in zip(grid, ("seconds", "gigabytes"), ("wall time, s", "peak memory, GB"), strict=True):
+        series: dict[tuple[str, str], list[tuple[float, float]]] = defaultdict(list)
+        for r in records:
+            if quantity in r:
+                series[r["against"], r["prior"]].append((r[r["against"]], r[quantity]))
+        for (against, prior), points in sorted(series.items()):
+            x, y = np.array(sorted(points)).T
+            label_of = f"{against}, prior {prior}"
+            if quantity == "seconds":  # memory holds a constant, so that a slope says little about it
+                label_of += f": slope {np.polyfit(np.log(x), np.log(y), 1)[0]:.2f}"
+            axes.loglog(x, y, marker="o", ms=4, label=label_of)
+        axes.set_xlabel("points at 10 frames, or frames at 2,000 points")
+        axes.set_ylabel(label)
+        axes.grid(alpha=0.25, which="both")
+        axes.legend(fontsize=7, frameon=False)
+    figure.tight_layout()
+    return figure
+
+
+def baselines(records: Records) -> Figure:
+    """Time to within 1 % of the final energy beside other minimisers."""
+    figure, axes = plt.subplots(figsize=(6.5, 1.8))
+    axes.barh([r["solver"] for r in records], [r["seconds"] for r in records], color="#4477aa")
+    for at, r in enumerate(records):
+        axes.text(r["seconds"] * 1.05, at, f"{r['seconds']:g} s, {r['gigabytes']:g} GB", va="center", fontsize=8)
+    axes.set_xscale("log")
+    axes.set_xlim(1, 1500)
+    axes.invert_yaxis()
+    axes.set_xlabel("wall time, s (99 × 29,299 points, 10 % outliers, known cameras, two cores)")
+    return figure
+
+
+def distance(records: Records) -> Figure:
+    """Error against the distance of the camera."""
+    chosen = [r for r in records if r["metric"] == "e3d_frame_scaled"]
+    methods = list(dict.fromkeys(r["method"] for r in chosen))
+    figure, grid = plt.subplots(1, len(methods), figsize=(4 * len(methods), 3.2), sharey=True, squeeze=False)
+    for axes, method in zip(grid[0], methods, strict=True):
+        for name in SEQUENCES:
+            points = sorted(
+                (r["distance"], r["value"]) for r in chosen if r["sequence"] == name and r["method"] == method
+            )
+            if points:
+                axes.loglog(*np.array(points).T, marker="o", ms=4, label=SEQUENCES[name])
+        axes.set_title(method, fontsize=9)
+        axes.set_xlabel("camera distance / half-size of the object")
+        axes.grid(alpha=0.25, which="both")
+    grid[0, 0].set_ylabel("e3d_frame_scaled")
+    grid[0, -1].legend(fontsize=7, frameon=False, loc="center left", bbox_to_anchor=(1, 0.5))
+    return figure
+
+
+FIGURES: dict[str, tuple[str, Callable[[Records], Figure]]] = {
+    "error-by-sequence": ("accuracy", error_by_sequence),
+    "error-by-corruption": ("accuracy", error_by_corruption),
+    "growth": ("growth", growth),
+    "baselines": ("baselines", baselines),
+    "error-by-distance": ("distances", distance),
+}
+"""Name of the picture → results it is drawn from, and how."""
+
+
+if __name__ == "__main__":
+    main()

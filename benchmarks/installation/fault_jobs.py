@@ -1,0 +1,243 @@
+"""Faults that hit those who do the work: job_processes, workers, the reconciler, Valkey, the job itself."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from contextlib import suppress
+from dataclasses import replace
+from threading import Thread
+
+from pliant.client import Status
+from pliant.solver.gallery import face
+
+from benchmarks.installation.fault_list import LARGE, SHORT, Fault, Told, cancelled, fault, said, submitted
+from benchmarks.installation.house import SOON, House, children, running
+from benchmarks.installation.long_jobs import LONG
+
+
+@fault("kill -9 the job process in mid solve")
+def job_process(house: House) -> Told:
+    id = submitted(house, options=LONG)
+    house.midst(id, "reweight")
+    house.kill("job process")
+    began = time.monotonic()
+    job = house.final(id)
+    assert job.status is Status.FAILED
+    assert job.error is not None
+    assert (job.error.code, job.error.retryable, job.artifacts) == ("worker_lost", True, [])
+    return Told(said(job), time.monotonic() - began)
+
+
+@fault("kill -9 the job process while it writes its files")
+def job_process_writing(house: House) -> Told:
+    id = submitted(house, frames=60, points=8000, options=LARGE)
+    attempt_id = house.jobs.records.get(id).attempt_id
+    house.until(lambda: any((house.settings.work / attempt_id).glob("artifacts/*")), "a file is begun")
+    house.kill("job process")
+    began = time.monotonic()
+    job = house.final(id)
+    assert (job.status, job.artifacts) == (Status.FAILED, [])
+    return Told(f"{said(job)}, no file visible", time.monotonic() - began)
+
+
+TRIES = 8
+"""Jobs of which at least one is hit in the moment in which it stores its files."""
+
+
+@fault("kill -9 the job process while it stores its files")
+def job_process_storing(house: House) -> Told:
+    for _ in range(TRIES):
+        id = submitted(house, frames=60, points=8000, options=LARGE)
+        prefix = f"jobs/{id}/"
+        blobs = house.settings.data / "blobs"
+        attempt = house.settings.work / house.jobs.records.get(id).attempt_id
+        house.until(lambda at=attempt: any(at.glob("artifacts/*")), "a file is begun")
+        # Storing takes milliseconds: the process is let run by the half of one, until its first file is seen.
+        for process in house.look()["job process"]:
+            with suppress(ProcessLookupError):
+                while not any(blobs.glob(f"{prefix}*/artifacts/*")):
+                    os.kill(process, signal.SIGCONT)
+                    time.sleep(0.0005)
+                    os.kill(process, signal.SIGSTOP)
+                os.kill(process, signal.SIGKILL)
+        began = time.monotonic()
+        job = house.final(id)
+        if job.status is Status.FAILED:
+            assert job.artifacts == []
+            return Told(f"{said(job)}, no file visible", time.monotonic() - began)
+        assert job.status is Status.SUCCEEDED  # it was done before it was hit
+        assert job.artifacts != []
+    raise AssertionError(f"none of {TRIES} jobs was hit while it stored its files")
+
+
+@fault("kill -9 a worker in mid solve")
+def worker(house: House) -> Told:
+    id = submitted(house, options=LONG)
+    house.midst(id, "reweight")
+    (pid,) = [pid for pid in house.look()["worker"] if children(pid)]
+    os.kill(pid, signal.SIGKILL)
+    seconds = house.until(lambda: house.jobs.get(id).attempt == 2, "another worker has it")
+    cancelled(house, id)
+    return Told("running, attempt 2 (cancelled then)", seconds)
+
+
+@fault("kill -9 the reconciler in mid solve")
+def reconciler(house: House) -> Told:
+    id = submitted(house, options={"max_reweightings": 30})
+    house.midst(id, "reweight")
+    old = house.kill("reconciler")
+    seconds = house.until(lambda: house.look()["reconciler"] not in ([], [old]), "another reconciler")
+    job = house.final(id)
+    assert (job.status, job.attempt) == (Status.SUCCEEDED, 1)
+    return Told(said(job), seconds)
+
+
+@fault("kill -9 Valkey in mid solve")
+def valkey(house: House) -> Told:
+    id = submitted(house, options=LONG)
+    house.midst(id, "reweight")
+    house.kill("valkey")
+    time.sleep(0.1)
+    seconds = house.until(lambda: house.jobs.get(id).status is Status.RUNNING, "it answers again")
+    before = house.jobs.get(id).progress
+    house.until(lambda: house.jobs.get(id).progress != before, "the job goes on telling")
+    assert house.jobs.get(id).attempt == 1
+    cancelled(house, id)
+    return Told("running, attempt 1 (cancelled then)", seconds)
+
+
+AWAY = [4.0]
+"""Seconds that Valkey is away; the command sets it."""
+
+
+@fault("Valkey hangs (SIGSTOP) in mid solve")
+def valkey_hangs(house: House) -> Told:
+    id = submitted(house, options=LONG)
+    house.midst(id, "reweight")
+    pid = house.kill("valkey", signal.SIGSTOP)
+    began = time.monotonic()
+    time.sleep(AWAY[0])
+    os.kill(pid, signal.SIGCONT)
+    before = house.jobs.get(id).progress
+    house.until(lambda: house.jobs.get(id).progress != before, "the job goes on telling")
+    assert house.jobs.get(id).attempt == 1, "an outage is no reason to begin a job anew"
+    seconds = time.monotonic() - began
+    cancelled(house, id)
+    return Told(f"running, attempt 1, after {AWAY[0]:g} s away (cancelled then)", seconds)
+
+
+@fault("Valkey is killed again and again, while clients wait and submit")
+def valkey_down(house: House) -> Told:
+    id = submitted(house, options={"max_reweightings": 30})
+    house.midst(id, "reweight")
+    ends: list[Status] = []
+
+    def wait() -> None:
+        with house.client() as client:
+            ends.append(client.wait(id, load=False, timeout=240).job.status)
+
+    waiting = Thread(target=wait)
+    waiting.start()
+    began = time.monotonic()
+    while time.monotonic() < began + AWAY[0]:
+        for pid in house.look()["valkey"]:
+            with suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        time.sleep(0.05)
+    other = submitted(house, options=SHORT)
+    job = house.final(id)
+    waiting.join(240)
+    assert (job.status, ends, house.final(other).status) == (Status.SUCCEEDED, [job.status], Status.SUCCEEDED)
+    return Told(f"{said(job)}, {AWAY[0]:g} s away; both clients noticed nothing", time.monotonic() - began)
+
+
+@fault(
+    "worker and job process frozen beyond the lease while the files are written, thawed when another has finished the job"
+)
+def frozen(house: House) -> Told:
+    id = submitted(house, frames=60, points=8000, options=LARGE)
+    stale = house.jobs.records.get(id).attempt_id
+    house.until(lambda: any((house.settings.work / stale).glob("artifacts/*")), "a file is begun")
+    (old,) = [pid for pid in house.look()["worker"] if children(pid)]
+    pids = [old, *children(old)]
+    for pid in pids:
+        os.kill(pid, signal.SIGSTOP)
+    began = time.monotonic()
+    job = house.final(id)
+    seconds = time.monotonic() - began
+    held = house.jobs.records.get(id)
+    for pid in reversed(pids):
+        os.kill(pid, signal.SIGCONT)
+    house.until(lambda: not any(running(pid) for pid in pids[1:]), "the stale job process ends")
+    time.sleep(0.5)
+    assert house.jobs.records.get(id) == held, "the stale attempt wrote nothing"
+    assert (job.status, job.attempt) == (Status.SUCCEEDED, 2)
+    return Told(f"{said(job)}; the first one wrote nothing", seconds)
+
+
+@fault("one attempt delivered to two workers at once")
+def twice(house: House) -> Told:
+    id = submitted(house, options={"max_reweightings": 30})
+    house.midst(id, "reweight")
+    began = time.monotonic()
+    house.jobs.queue.push(id, house.jobs.records.get(id).attempt_id)
+    job = house.final(id)
+    assert (job.status, job.attempt) == (Status.SUCCEEDED, 1), f"{said(job)}\n{house.jobs.log(id)}"
+    return Told(said(job), time.monotonic() - began)
+
+
+def cancel_at(stage: str) -> Fault:
+    """Return the fault of cancelling a job in a stage."""
+
+    def cancel(house: House) -> Told:
+        blockers = [submitted(house, options=LONG) for _ in range(2)] if stage == "queued" else []
+        for blocker in blockers:
+            house.midst(blocker, "reweight")
+        id = _in_stage(house, stage)
+        there = "queued" if stage == "queued" else house.midst(id, stage)
+        began = time.monotonic()
+        job = cancelled(house, id)
+        seconds = time.monotonic() - began
+        assert job.status is (Status.SUCCEEDED if there == "succeeded" else Status.CANCELLED), said(job)
+        assert (job.artifacts == []) is (job.status is Status.CANCELLED)
+        for blocker in blockers:
+            cancelled(house, blocker)
+        return Told(said(job) if there == stage else f"{said(job)} (was {there} already)", seconds)
+
+    cancel.__name__ = f"cancel_{stage}"
+    return fault(f"cancel in stage `{stage}`")(cancel)
+
+
+def _in_stage(house: House, stage: str) -> str:
+    """Submit a job that is long enough in a stage to be met there."""
+    if stage == "cameras":
+        with house.client() as client:
+            job = client.submit(face(80, 6000).tracks.points, mesh="none", options=SHORT, timeout=120)
+        house.acknowledged.append(job.id)
+        return job.id
+    if stage == "reweight":
+        return submitted(house, options=LONG)
+    return submitted(house, frames=80, points=12_000, options=LARGE)
+
+
+for _stage in ("queued", "loading", "cameras", "reweight", "exporting"):
+    cancel_at(_stage)
+
+
+@fault("an array larger than the memory that a job may take (RLIMIT_AS)")
+def memory(house: House) -> Told:
+    """On an installation of its own, with PLIANT_MEMORY_LIMIT."""
+    lean = House(house.folder / "lean", chosen=replace(SOON, memory_limit=700 << 20), workers=1)
+    with lean:
+        began = time.monotonic()
+        id = submitted(lean, frames=200, points=9000, options=SHORT)
+        job = lean.final(id)
+        seconds = time.monotonic() - began
+        assert job.error is not None
+        assert (job.status, job.error.code) == (Status.FAILED, "out_of_memory"), job.error
+        after = submitted(lean, frames=6, points=50, options=SHORT)
+        assert lean.final(after).status is Status.SUCCEEDED
+        assert lean.misfits() == []
+    return Told(f"{said(job)}; the next job succeeded", seconds)

@@ -1,0 +1,237 @@
+"""A whole installation, `pliant up` in processes of its own, that can be looked into and have its processes killed."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+
+from pliant.client import Client, Job, Retry
+from pliant.service.spool import Incoming
+from pliant.worker.errors import StoreUnavailable
+from pliant.worker.jobs.service import Jobs
+from pliant.worker.maintenance.fsck import findings
+from pliant.worker.processes.containment import die_with_parent
+from pliant.worker.settings import Settings
+
+SOON = Settings(lost_after=2, stop_grace=1, cancel_grace=3, threads=1, max_attempts=1000)
+"""Settings under which faults are noticed within seconds."""
+
+PATIENT = Retry(first_contact=60, shortest_pause=0.05, longest_pause=0.5)
+
+ROLES = {"service": b"pliant.service", "worker": b"pliant.worker\0work", "reconciler": b"pliant.worker\0reconcile"}
+
+
+@dataclass
+class House:
+    """`pliant up` on one data directory; in `with`. It is started again at the same port after `kill_all` or `stop`."""
+
+    folder: Path
+    chosen: Settings = SOON
+    of_service: Mapping[str, str] = field(default_factory=dict)
+    """Variables of the service itself."""
+    workers: int = 2
+    port: int = 0
+    url: str = ""
+    acknowledged: list[str] = field(default_factory=list)
+    """Every job that was accepted."""
+    seen: set[int] = field(default_factory=set)
+    """Every process that was started, as far as anybody looked."""
+    _process: subprocess.Popen[str] | None = None
+
+    def __enter__(self) -> House:
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.look()
+        self.stop()
+        alive = [pid for pid in self.seen if running(pid)]
+        assert not alive, f"processes left behind: {alive}"
+
+    @property
+    def settings(self) -> Settings:
+        """How it is set up."""
+        return replace(self.chosen, data=self.folder / "data")
+
+    @property
+    def jobs(self) -> Jobs:
+        """The jobs, asked of the stores themselves."""
+        return Jobs.open(self.settings)
+
+    def client(self) -> Client:
+        """A client that waits for a service which is being started again."""
+        return Client(self.url, retries=PATIENT)
+
+    def start(self) -> None:
+        """Start it; while the children of a killed one still hold the port or the directory, again, as a service manager does."""
+        command = [sys.executable, "-m", "pliant.cli", "up", "--json", "--port", str(self.port)]
+        command += ["--data", str(self.folder / "data"), "--workers", str(self.workers)]
+        environment = {name: value for name, value in os.environ.items() if not name.startswith("PLIANT_")}
+        environment |= {**self.settings.to_environment(), **self.of_service}
+        self.folder.mkdir(parents=True, exist_ok=True)
+        deadline = time.monotonic() + 90
+        while time.monotonic() < deadline:
+            with (self.folder / "log").open("ab") as log:
+                self._process = subprocess.Popen(
+                    command, env=environment, stdout=subprocess.PIPE, stderr=log, text=True,
+                    preexec_fn=partial(die_with_parent, os.getpid(), how=signal.SIGTERM),
+                )  # fmt: skip
+            assert self._process.stdout is not None
+            text = ""
+            for line in self._process.stdout:
+                text += line
+                if line.rstrip() == "}":
+                    self.url = json.loads(text)["url"]
+                    self.port = int(self.url.rpartition(":")[2])
+                    self.look()
+                    return
+            self._end()
+        raise AssertionError((self.folder / "log").read_text()[-3000:])
+
+    def stop(self) -> None:
+        """SIGTERM to the supervisor, as a service manager or Ctrl-C does."""
+        if self._process is not None:
+            self._process.send_signal(signal.SIGTERM)
+            self._end()
+
+    def kill_all(self) -> None:
+        """Kill -9 to the supervisor; its children go with it."""
+        self.look()
+        assert self._process is not None
+        self._process.kill()
+        self._end()
+
+    def _end(self) -> None:
+        assert self._process is not None
+        self._process.wait(90)
+        assert self._process.stdout is not None
+        self._process.stdout.close()
+        self._process = None
+
+    def look(self) -> dict[str, list[int]]:
+        """Return the processes by role, `job process` among them."""
+        assert self._process is not None
+        found: dict[str, list[int]] = {role: [] for role in (*ROLES, "valkey", "job process")}
+        for pid in children(self._process.pid):
+            command = _command(pid)
+            role = next((role for role, words in ROLES.items() if words in command), "valkey")
+            found[role].append(pid)
+        found["job process"] = [pid for worker in found["worker"] for pid in children(worker)]
+        self.seen |= {pid for pids in found.values() for pid in pids}
+        return found
+
+    def kill(self, role: str, number: signal.Signals = signal.SIGKILL) -> int:
+        """Signal one process of a role, waiting until there is one; return its id."""
+        seen: list[int] = []
+
+        def there() -> bool:
+            seen[:] = self.look()[role]  # one look: at the next one it may be gone
+            return bool(seen)
+
+        self.until(there, f"there is a {role}")
+        pid = seen[0]
+        os.kill(pid, number)
+        return pid
+
+    def until(self, holds: Callable[[], object], what: str, *, seconds: float = 60.0) -> float:
+        """Wait for something, a store that is away counting as not yet; return how long it took."""
+        began = time.monotonic()
+        while True:
+            try:
+                if holds():
+                    return time.monotonic() - began
+            except StoreUnavailable:
+                pass
+            assert time.monotonic() - began < seconds, f"not within {seconds:g} s: {what}"
+            time.sleep(0.01)
+
+    def midst(self, id: str, *stages: str, seconds: float = 60.0) -> str:
+        """Wait until a job is in one of these stages, or over; return its stage or status."""
+
+        def there() -> bool:
+            job = self.jobs.get(id)
+            return job.status.final or (job.progress is not None and job.progress.stage in stages)
+
+        self.until(there, f"job {id} is in {stages}", seconds=seconds)
+        job = self.jobs.get(id)
+        return job.progress.stage if job.progress is not None and not job.status.final else job.status.value
+
+    def final(self, id: str, *, seconds: float = 120.0) -> Job:
+        """Wait for a job's end."""
+        self.until(lambda: self.jobs.get(id).status.final, f"job {id} ends", seconds=seconds)
+        return self.jobs.get(id)
+
+    def misfits(self, *, seconds: float = 60.0) -> list[str]:
+        """Say what was lost, doubled, half-written or left over, once everything has had time to settle."""
+        deadline = time.monotonic() + seconds
+        while True:
+            found = self._misfits()
+            if not found or time.monotonic() > deadline:
+                return found
+            time.sleep(0.5)
+
+    def _misfits(self) -> list[str]:
+        jobs = self.jobs
+        listed, cursor = [], None
+        while True:
+            page = jobs.page(limit=200, cursor=cursor)
+            listed += [job.id for job in page.jobs]
+            cursor = page.next
+            if cursor is None:
+                break
+        found = [f"Job {id} is lost." for id in set(self.acknowledged) - set(listed)]
+        found += [f"Job {id} was never acknowledged." for id in set(listed) - set(self.acknowledged)]
+        found += [f"Job {id} is there twice." for id in {id for id in listed if listed.count(id) > 1}]
+        found += [
+            f"Folder incoming/{name} is left." for name in Incoming(self.folder / "data" / "incoming").abandoned()
+        ]
+        found += [f"Upload {path.name} is left." for path in self.settings.uploads.glob("*/*")]
+        found += [f"Job process {pid} has nothing to do." for pid in self.look()["job process"] if not self._at_work()]
+        return found + findings(jobs, pause=0.3)
+
+    def _at_work(self) -> bool:
+        return any(not job.status.final for job in self.jobs.page(limit=200).jobs)
+
+
+def children(parent: int) -> list[int]:
+    """Return the ids of the child processes that are not zombies, from the process table."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            state = _state(int(entry.name))
+            if state is not None and state[0] != "Z" and int(state[1]) == parent:
+                found.append(int(entry.name))
+    return found
+
+
+def running(pid: int) -> bool:
+    """Tell whether a process is there and no zombie."""
+    state = _state(pid)
+    return state is not None and state[0] != "Z"
+
+
+def resident(pid: int) -> int:
+    """Return the bytes of memory that a process has to itself or shares."""
+    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def _state(pid: int) -> list[str] | None:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+    except OSError:
+        return None
+
+
+def _command(pid: int) -> bytes:
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_bytes()
+    except OSError:
+        return b""

@@ -1,0 +1,281 @@
+"""Load: many small jobs, many pollers, one large upload, on a real installation of two workers.
+
+    python -m benchmarks.installation.load [jobs] [pollers] [upload]
+
+Prints a table for each. Exits with 1 if a request was lost: one that got no answer, or another than it should.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import sys
+import tempfile
+import time
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from threading import Event, Thread
+
+import httpx
+import numpy as np
+from pliant.client import AsyncClient, Status
+from pliant.client.multipart import LARGE
+from pliant.solver.gallery import face
+from pliant.worker.errors import NotAllowedNow
+
+from benchmarks.installation.house import House, children, resident
+
+UNLIMITED = {"PLIANT_REQUESTS_PER_MINUTE": "0", "PLIANT_MAX_QUEUED": "0"}
+MB = 2**20
+
+
+def percentiles(seconds: list[float]) -> str:
+    """Return median, 99th percentile and largest in milliseconds."""
+    p50, p99 = np.percentile(seconds, [50, 99])
+    return f"{1000 * p50:.0f} / {1000 * p99:.0f} / {1000 * max(seconds):.0f}"
+
+
+@contextmanager
+def watched(pid: int) -> Iterator[Callable[[], float]]:
+    """Sample a process's memory; the function gives the largest so far, in MB."""
+    largest, ended = [resident(pid)], Event()
+
+    def sample() -> None:
+        while not ended.wait(0.02):
+            largest.append(max(largest[-1], resident(pid)))
+
+    thread = Thread(target=sample)
+    thread.start()
+    try:
+        yield lambda: largest[-1] / MB
+    finally:
+        ended.set()
+        thread.join()
+
+
+def jobs(house: House, *, number: int, clients: int) -> int:
+    """Let clients submit small jobs and wait for each, while one more reads the status of a job without pause."""
+    sequence = face(20, 200)  # with its cameras: what is measured is the way of a job, not the solver
+    submits: list[float] = []
+    reads: list[float] = []
+    ends: list[Status] = []
+    left = iter(range(number))
+
+    async def work(client: AsyncClient) -> None:
+        for _ in left:
+            began = time.monotonic()
+            job = await client.submit(
+                sequence.tracks.points, mesh="none", rotations=sequence.rotations, options={"max_reweightings": 3}
+            )
+            submits.append(time.monotonic() - began)
+            house.acknowledged.append(job.id)
+            ends.append((await job.wait(load=False, timeout=600)).job.status)
+
+    async def read(http: httpx.AsyncClient) -> None:
+        while len(ends) < number:
+            if house.acknowledged:
+                began = time.monotonic()
+                answer = await http.get(f"/v1/jobs/{house.acknowledged[-1]}")
+                assert answer.status_code == 200, answer.text
+                reads.append(time.monotonic() - began)
+            await asyncio.sleep(0.02)
+
+    async def everything() -> None:
+        async with httpx.AsyncClient(base_url=house.url, timeout=60) as http:
+            each = [AsyncClient(house.url) for _ in range(clients)]
+            await asyncio.gather(read(http), *(work(client) for client in each))
+            for client in each:
+                await client.close()
+
+    (service,) = house.look()["service"]
+    began = time.monotonic()
+    with watched(service) as largest:
+        asyncio.run(everything())
+    seconds = time.monotonic() - began
+    lost = number - ends.count(Status.SUCCEEDED)
+    print(f"| {number} jobs of 20 × 200, {clients} clients, {house.workers} workers | |\n|---|---|")
+    print(f"| seconds, jobs a second | {seconds:.1f}, {number / seconds:.1f} |")
+    print(f"| submissions, ms: median / p99 / largest | {percentiles(submits)} |")
+    print(f"| status reads meanwhile ({len(reads)}), ms | {percentiles(reads)} |")
+    print(f"| API memory at most | {largest():.0f} MB |")
+    print(f"| lost | {lost} |\n")
+    return lost
+
+
+class Poller:
+    """One connection that is kept, and nothing else: a thousand in one pool of httpx cost more than the service does."""
+
+    def __init__(self, url: str) -> None:
+        self._host, port = url.removeprefix("http://").split(":")
+        self._port = int(port)
+        self._streams: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
+
+    async def get(self, path: str, headers: dict[str, str]) -> int:
+        """Send a GET, read the answer, return its status."""
+        if self._streams is None:
+            self._streams = await asyncio.open_connection(self._host, self._port)
+        reader, writer = self._streams
+        lines = [f"GET {path} HTTP/1.1", f"Host: {self._host}:{self._port}", *(f"{k}: {v}" for k, v in headers.items())]
+        writer.write("\r\n".join([*lines, "", ""]).encode())
+        head = (await reader.readuntil(b"\r\n\r\n")).decode().lower()
+        await reader.readexactly(int(head.split("content-length: ")[1].split("\r\n")[0]))
+        return int(head.split()[1])
+
+    def close(self) -> None:
+        """Give the connection up."""
+        if self._streams is not None:
+            self._streams[1].close()
+
+
+def pollers(house: House, *, number: int, seconds: float, every: float) -> int:
+    """Let many clients look at jobs at their own pace, and then all wait for one job at once (`Prefer: wait`)."""
+    ids = house.acknowledged or [_one(house)]
+    reads: list[float] = []
+    lost: list[str] = []
+
+    async def ask(poller: Poller, path: str, wait: int | None = None) -> None:
+        began = time.monotonic()
+        try:
+            status = await poller.get(path, {} if wait is None else {"Prefer": f"wait={wait}"})
+            if status != 200:
+                lost.append(str(status))
+        except (OSError, EOFError) as fault:
+            lost.append(type(fault).__name__)
+        reads.append(time.monotonic() - began)
+
+    async def poll(poller: Poller, index: int, until: float) -> None:
+        await asyncio.sleep(every * index / number)
+        while time.monotonic() < until:
+            await ask(poller, f"/v1/jobs/{ids[index % len(ids)]}")
+            await asyncio.sleep(every)
+
+    async def all_of_them(one: Callable[[Poller, int], Awaitable[None]]) -> None:
+        each = [Poller(house.url) for _ in range(number)]
+        await asyncio.gather(*(one(poller, index) for index, poller in enumerate(each)))
+        for poller in each:
+            poller.close()
+
+    (service,) = house.look()["service"]
+    with watched(service) as largest:
+        until = time.monotonic() + seconds
+        asyncio.run(all_of_them(lambda poller, index: poll(poller, index, until)))
+        print(f"| {number} pollers | |\n|---|---|")
+        print(
+            f"| each every {every:g} s for {seconds:g} s: reads, a second | {len(reads)}, {len(reads) / seconds:.0f} |"
+        )
+        print(f"| status reads, ms: median / p99 / largest | {percentiles(reads)} |")
+        reads.clear()
+        long = _one(house, options={"max_reweightings": 1000, "tolerance": 1e-15}, frames=40, points=1200)
+        began = time.monotonic()
+        asyncio.run(all_of_them(lambda poller, _: ask(poller, f"/v1/jobs/{long}", wait=15)))
+        print(f"| all waiting for one job, `Prefer: wait=15`: all answered after | {time.monotonic() - began:.1f} s |")
+        with suppress(NotAllowedNow):
+            house.jobs.cancel(long)
+        house.final(long)
+    print(f"| API memory at most | {largest():.0f} MB |")
+    print(f"| lost | {len(lost)}{' ' + str(sorted(set(lost))) if lost else ''} |\n")
+    return len(lost)
+
+
+def upload(house: House, *, size: int) -> int:
+    """Send a large file with the SDK, and watch the memory of the API while it arrives and while a job is made of it."""
+    frames, points = 100, size * MB // (100 * 2 * 8)
+    tracks = np.random.default_rng(0).normal(size=(frames, points, 2))
+    assert tracks.nbytes > LARGE
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "tracks.npz"
+        np.savez(path, tracks=tracks)
+        del tracks
+        house.client().limits()
+        (service,) = house.look()["service"]
+        before = resident(service) / MB
+        apart: list[float] = []
+        moments: dict[str, float] = {}
+
+        with watched(service) as largest, house.client() as client, _children_of(service, apart):
+            began = time.monotonic()
+
+            def told(done: int, _: int) -> None:
+                if done >= path.stat().st_size and "sent" not in moments:
+                    moments.update(sent=time.monotonic() - began, memory=largest())
+
+            job = client.submit(path, mesh="none", options={"method": "pseudo_inverse"}, on_upload=told, timeout=600)
+            accepted = time.monotonic() - began
+            house.acknowledged.append(job.id)
+            client.cancel(job.id)
+            peak = largest()
+    house.final(job.id)
+    rate = size / moments["sent"]
+    print(f"| {size} MB of tracks ({frames} × {points:,}), by the SDK | |\n|---|---|")
+    print(f"| sent in, MB a second | {moments['sent']:.1f} s, {rate:.0f} |")
+    print(f"| accepted (read, checked, stored) after | {accepted:.1f} s |")
+    memory = f"{before:.0f} / {moments['memory']:.0f} / {peak:.0f} MB"
+    print(f"| API memory before / at most while it arrives / at most until accepted | {memory} |")
+    print(f"| the process that reads it, at most | {max(apart, default=0):.0f} MB |")
+    print("| lost | 0 |\n")
+    return int(peak - before > 100)
+
+
+@contextmanager
+def _children_of(pid: int, largest: list[float]) -> Iterator[None]:
+    """Note how large the children of a process become, in MB."""
+    ended = Event()
+
+    def sample() -> None:
+        while not ended.wait(0.05):
+            for child in children(pid):
+                try:
+                    largest.append(resident(child) / MB)
+                except OSError:
+                    continue
+
+    thread = Thread(target=sample)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
+def _one(house: House, *, options: dict[str, object] | None = None, frames: int = 20, points: int = 200) -> str:
+    with house.client() as client:
+        sequence = face(frames, points)
+        job = client.submit(
+            sequence.tracks.points,
+            mesh="none",
+            rotations=sequence.rotations,
+            options=options or {"max_reweightings": 5},
+        )
+    house.acknowledged.append(job.id)
+    return job.id
+
+
+def main() -> int:
+    """Run the loads that are asked for; return the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("loads", nargs="*", default=["jobs", "pollers", "upload"], help="jobs, pollers, upload")
+    parser.add_argument("--jobs", type=int, default=200)
+    parser.add_argument("--clients", type=int, default=20)
+    parser.add_argument("--pollers", type=int, default=1000)
+    parser.add_argument("--seconds", type=float, default=30.0)
+    parser.add_argument("--every", type=float, default=10.0, help="seconds between two looks of one poller")
+    parser.add_argument("--megabytes", type=int, default=300)
+    given = parser.parse_args()
+    wrong = 0
+    with tempfile.TemporaryDirectory() as folder, House(Path(folder), of_service=UNLIMITED) as house:
+        for load in given.loads:
+            if load == "jobs":
+                wrong += jobs(house, number=given.jobs, clients=given.clients)
+            elif load == "pollers":
+                wrong += pollers(house, number=given.pollers, seconds=given.seconds, every=given.every)
+            else:
+                wrong += upload(house, size=given.megabytes)
+        misfits = house.misfits()
+        print("Audit: " + (" ".join(misfits) or "everything stored is as the records say"))
+    return 1 if wrong or misfits else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,148 @@
+"""The page on a real service: time from `pliant up` to the first playing mesh, and the pictures in docs/images.
+
+    python -m benchmarks.installation.page                      # times, as JSON
+    python -m benchmarks.installation.page --pictures docs/images
+
+Needs a Chromium, the built page (`make page`) and, for pictures, Pillow.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from playwright.sync_api import Page
+from pliant.client import Client
+from pliant.solver.gallery import face
+
+ROOT = Path(__file__).parents[2]
+sys.path.insert(0, str(ROOT / "tests" / "support" / "page"))
+
+from browsing import Browsing  # noqa: E402
+
+MOST_BYTES = 320_000
+
+
+@contextmanager
+def service() -> Iterator[str]:
+    """Run `pliant up` on a free port and an empty directory; yield its address."""
+    with tempfile.TemporaryDirectory(prefix="pliant-page-") as data:
+        command = [sys.executable, "-m", "pliant.cli", "up", "--port", "0", "--json", "--data", data]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as up:
+            assert up.stdout is not None
+            said = ""
+            while not said.endswith("}\n"):
+                line = up.stdout.readline()
+                assert line, "pliant up ended at once"
+                said += line
+            try:
+                yield json.loads(said)["url"]
+            finally:
+                up.send_signal(signal.SIGINT)
+                up.wait(30)
+
+
+def frame(page: Page) -> float:
+    return float(page.get_by_role("slider", name="Frame").input_value())
+
+
+def play_example(page: Page) -> None:
+    """Click once, wait until the mesh moves."""
+    page.get_by_role("button", name="Try it with a synthetic face").click()
+    page.locator(".view canvas").wait_for(timeout=300_000)
+    while frame(page) == 0:
+        time.sleep(0.02)
+
+
+def first_mesh() -> dict[str, float]:
+    """Seconds from the start of `pliant up` until it is ready, the page stands, and the built-in example plays."""
+    began = time.perf_counter()
+    with service() as url, Browsing() as browser:
+        ready = time.perf_counter() - began
+        page = browser.new_page(viewport={"width": 1280, "height": 900})
+        page.goto(url)
+        page.get_by_role("button", name="Try it with a synthetic face").wait_for()
+        stands = time.perf_counter() - began
+        play_example(page)
+        plays = time.perf_counter() - began
+    return {
+        "ready_seconds": ready,
+        "page_stands_seconds": stands,
+        "mesh_plays_seconds": plays,
+        "cores": os.cpu_count() or 0,
+    }
+
+
+def talking_face(url: str) -> str:
+    """Have a face reconstructed; return the job's id. Clean tracks, so the closed form in time does: it takes seconds."""
+    sequence = face(40, 5000, degrees=50)
+    client = Client(url)
+    job = client.submit(
+        sequence.tracks.points,
+        mesh=sequence.mesh.faces,
+        ground_truth=sequence.shapes,
+        options={"method": "temporal"},
+        name="talking face",
+    )
+    job.wait(timeout=300)
+    return job.id
+
+
+def pictures(folder: Path) -> None:
+    """Take the page at 1280 and 390 pixels, light and dark."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with service() as url, Browsing() as browser:
+        address = f"{url}/#job={talking_face(url)}"
+        for width, height, density in ((1280, 900, 1), (390, 844, 2)):
+            for scheme in ("light", "dark"):
+                view = browser.new_context(
+                    viewport={"width": width, "height": height},
+                    color_scheme=scheme,
+                    device_scale_factor=density,
+                    reduced_motion="reduce",
+                )
+                page = view.new_page()
+                page.goto(address)
+                page.locator(".view canvas").wait_for(timeout=60_000)
+                slider = page.get_by_role("slider", name="Frame")
+                slider.evaluate("(it) => { it.value = 12; it.dispatchEvent(new Event('input')); }")
+                if width > 1000:
+                    page.get_by_role("checkbox", name="Ground truth").check()
+                    page.get_by_label("Colour", exact=True).select_option("error")
+                else:
+                    page.locator(".detail").scroll_into_view_if_needed()
+                    page.evaluate("document.querySelector('.detail').scrollIntoView()")
+                page.wait_for_timeout(1500)
+                save(page.screenshot(), folder / f"page-{width}-{scheme}.png")
+                view.close()
+
+
+def save(png: bytes, path: Path) -> None:
+    """Write a picture, with a palette of its own where all its colours would take too many bytes."""
+    from PIL import Image
+
+    picture = Image.open(io.BytesIO(png)).convert("RGB")
+    picture.save(path, optimize=True)
+    if path.stat().st_size > MOST_BYTES:
+        picture.quantize(256, kmeans=4).save(path, optimize=True)
+    print(path, path.stat().st_size)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--pictures", type=Path, metavar="DIR")
+    given = parser.parse_args()
+    if given.pictures is None:
+        print(json.dumps(first_mesh(), indent=2))
+    else:
+        pictures(given.pictures)

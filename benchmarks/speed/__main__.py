@@ -1,0 +1,85 @@
+"""Time and memory: side by side with what else there is, against the size, against the machine.
+
+    python -m benchmarks.speed compare --data DIR --only facescan99   the solver and the baselines on one energy
+    python -m benchmarks.speed growth                                 against P and against F, with fitted exponents
+    python -m benchmarks.speed mesh --frames 30 --points 10000        a mesh and a grid of equal F and P
+    python -m benchmarks.speed bandwidth --frames 30 --points 30000   an iteration against the machine's copying
+    python -m benchmarks.speed profile --data DIR --only facescan99   where the time goes
+
+Without `--data` the sequence is a gallery face. Every number comes from a process of its own. Wall time is what counts on a quiet
+machine; CPU time of all threads stands beside it because it stays comparable where other work shares the cores.
+
+`compare`: every baseline is given the normalised problem and the final translations, which are not charged to it, begins at the
+pseudo-inverse (`--start ours`: at the solver's own start, as free of charge), and runs until it is within 1 % of the solver's last
+energy or `--cap` seconds have gone; then its time is extrapolated at its last rate, and the table says so.
+"""
+
+from __future__ import annotations
+
+import argparse
+import cProfile
+import pstats
+from pathlib import Path
+
+from benchmarks.speed.growth import FRAMES, POINTS, bandwidth, growth, mesh_against_grid
+from benchmarks.speed.side_by_side import BASELINES, Workload, compare, solved
+
+
+def main() -> None:
+    """Measure what is asked for."""
+    options = _parser().parse_args()
+    work = Workload(
+        data=options.data, only=options.only, frames=options.frames, points=options.points, outliers=options.outliers,
+        noise=options.noise, known=options.cameras == "true", settings=options.settings,
+        start=options.start,
+    )  # fmt: skip
+    if options.what == "compare":
+        compare(work, names=options.baselines, cap=options.cap, limit=int(options.memory * 1e9))
+    elif options.what == "growth":
+        growth(work, points=options.against_points, frames=options.against_frames)
+    elif options.what == "mesh":
+        mesh_against_grid(work)
+    elif options.what == "bandwidth":
+        bandwidth(work)
+    else:
+        profile(work)
+
+
+def profile(work: Workload, *, lines: int = 20) -> None:
+    """Print the functions that take the most time themselves."""
+    profiler = cProfile.Profile()
+    solution = profiler.runcall(solved, work)
+    print({stage: round(seconds, 2) for stage, seconds in solution.seconds.items()})
+    print("iterations", solution.trace.iterations.tolist())
+    pstats.Stats(profiler).strip_dirs().sort_stats("tottime").print_stats(lines)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+
+    def words(text: str) -> list[str]:
+        return [word for word in text.split(",") if word]
+
+    def sizes(text: str) -> tuple[int, ...]:
+        return tuple(int(word) for word in words(text))
+
+    parser.add_argument("what", choices=("compare", "growth", "mesh", "bandwidth", "profile"))
+    parser.add_argument("--data", type=Path, help="directory of sequences; a gallery face when not given")
+    parser.add_argument("--only", default="facescan99", help="the first sequence whose name holds this word")
+    parser.add_argument("--frames", type=int, default=20, help="of the gallery face")
+    parser.add_argument("--points", type=int, help="of the gallery face, or to thin a sequence to")
+    parser.add_argument("--outliers", type=float, default=0.10)
+    parser.add_argument("--noise", type=float, default=0.0)
+    parser.add_argument("--cameras", choices=("true", "estimated"), default="true")
+    parser.add_argument("--settings", default="prior=smooth", help="name=value,…")
+    parser.add_argument("--start", choices=("tracks", "ours"), default="tracks", help="what the baselines begin with")
+    parser.add_argument("--baselines", type=words, default=list(BASELINES))
+    parser.add_argument("--cap", type=float, default=1800.0, help="seconds a baseline may take")
+    parser.add_argument("--memory", type=float, default=14.0, help="gigabytes of address space a baseline may take")
+    parser.add_argument("--against-points", type=sizes, default=POINTS, help="values of P for growth")
+    parser.add_argument("--against-frames", type=sizes, default=FRAMES, help="values of F for growth")
+    return parser
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,151 @@
+"""Time and memory against the size of a sequence, and against what the machine can move."""
+
+from __future__ import annotations
+
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+from pliant.solver.threads import available_cores
+
+from benchmarks.speed.apart import Measured, apart
+from benchmarks.speed.side_by_side import Ours, Workload, run_ours
+
+POINTS = (5_000, 10_000, 30_000, 100_000, 300_000)
+"""At `FIXED_FRAMES` frames."""
+FRAMES = (10, 25, 50, 100, 200, 400, 800)
+"""At `FIXED_POINTS` points."""
+FIXED_FRAMES, FIXED_POINTS = 10, 2_000
+
+NUMBERS_MOVED, BYTES = 65, 4
+"""Numbers for each of the F·P observations that one iteration of conjugate gradients moves at least, operation by operation, and the
+size of one, corrections being solved in single precision: the operator reads x and the weights and writes 𝒜x (3 + 2 + 3), the
+preconditioner reads and writes (3 + 3) and reads its factors on the way there and back (6 + 6), three vector updates read two and write
+one (27), two inner products read two (12), and x and its neighbours in time are taken from the cache."""
+
+
+def growth(work: Workload, *, points: tuple[int, ...] = POINTS, frames: tuple[int, ...] = FRAMES) -> list[str]:
+    """Measure; returns the lines of two Markdown tables with the fitted exponents."""
+    lines: list[str] = []
+    for name, sizes in (("P", points), ("F", frames)):
+        _say(
+            lines,
+            f"\n| {name} | cameras | shapes (CPU, whole) | iterations | an iteration | peak memory | bytes a F·P |",
+        )
+        _say(lines, "| --- | --- | --- | --- | --- | --- | --- |")
+        done: list[Measured] = []
+        for size in sizes:
+            sized = replace(
+                work,
+                **(
+                    {"frames": FIXED_FRAMES, "points": size}
+                    if name == "P"
+                    else {"frames": size, "points": FIXED_POINTS}
+                ),
+            )
+            measured = best_of(sized)
+            done.append(measured)
+            _say(lines, f"| {size} {_row(measured)}")
+        _say(lines, "")
+        for label, seconds in _series(done).items():
+            _say(lines, f"exponent in {name} of {label}: {exponent(np.array(sizes, float), np.array(seconds)):.2f}")
+    return lines
+
+
+def best_of(work: Workload, *, repeats: int = 3, enough: float = 10.0) -> Measured:
+    """Measure up to three times, or until it has taken 10 s; the quickest is the least disturbed."""
+    taken: list[Measured] = []
+    while len(taken) < repeats and sum(each.seconds for each in taken) < enough:
+        measured = apart(run_ours, work)
+        assert measured is not None, f"{work} ran out of memory"
+        taken.append(measured)
+    return min(taken, key=lambda each: each.cpu_seconds)
+
+
+def _series(done: list[Measured]) -> dict[str, list[float]]:
+    series = {
+        "the whole, wall": [each.seconds for each in done],
+        "the whole, CPU": [each.cpu_seconds for each in done],
+        "an iteration, wall": [per_iteration(each.value) for each in done],
+    }
+    if any(each.value.stages["cameras"] > 0.1 for each in done):
+        series["the cameras, wall"] = [each.value.stages["cameras"] for each in done]
+    return series
+
+
+def per_iteration(ours: Ours) -> float:
+    """Seconds of the shape step for each iteration of conjugate gradients, reweighting included."""
+    return ours.stages["shapes"] / max(ours.iterations, 1)
+
+
+def _row(measured: Measured) -> str:
+    ours: Ours = measured.value
+    frames, points = ours.size
+    return (
+        f"| {ours.stages['cameras']:.2f} s | {ours.stages['shapes']:.2f} s ({measured.cpu_seconds:.2f} s) "
+        f"| {ours.iterations} in {ours.reweightings} | {1e3 * per_iteration(ours):.1f} ms "
+        f"| {measured.peak / 1e9:.2f} GB | {measured.growth / (frames * points):.0f} |"
+    )
+
+
+def mesh_against_grid(work: Workload) -> list[str]:
+    """Measure a triangle mesh and a grid of equal F and P."""
+    lines: list[str] = []
+    _say(
+        lines, "| neighbours | cameras | shapes (CPU, whole) | iterations | an iteration | peak memory | bytes a F·P |"
+    )
+    _say(lines, "| --- | --- | --- | --- | --- | --- | --- |")
+    taken: dict[str, tuple[float, float]] = {}
+    for kind in ("grid", "triangles"):
+        measured = best_of(replace(work, mesh=kind))
+        taken[kind] = measured.value.stages["shapes"], measured.cpu_seconds
+        _say(lines, f"| {kind} {_row(measured)}")
+    wall, cpu = (mesh / grid for mesh, grid in zip(taken["triangles"], taken["grid"], strict=True))
+    _say(lines, f"\nthe mesh takes {wall:.2f} × the grid's time ({cpu:.2f} × its CPU time)")
+    return lines
+
+
+def bandwidth(work: Workload) -> list[str]:
+    """Compare what an iteration must move with what the machine can move in the time that it takes."""
+    copied = copying()
+    ours: Ours = best_of(work).value
+    frames, points = ours.size
+    must = NUMBERS_MOVED * BYTES * frames * points
+    seconds = per_iteration(ours)
+    lines: list[str] = []
+    _say(
+        lines,
+        f"{frames} × {points}: an iteration takes {1e3 * seconds:.1f} ms, reweighting included ({ours.iterations} iterations)",
+    )
+    _say(lines, f"it moves at least {must / 1e6:.0f} MB ({NUMBERS_MOVED} numbers of {BYTES} bytes for each of F·P)")
+    _say(
+        lines,
+        f"copying on {available_cores()} threads: {copied / 1e9:.1f} GB/s; the iteration: {must / seconds / 1e9:.1f} GB/s",
+    )
+    _say(lines, f"ratio: {must / seconds / copied:.2f} of the copy bandwidth")
+    return lines
+
+
+def copying(size: int = 1 << 28, repeats: int = 5) -> float:
+    """Bytes read and written a second by copying `size` bytes on every core, best of some."""
+    count = available_cores()
+    source, target = np.ones(size // 8), np.zeros(size // 8)
+    parts = [slice(size // 8 * i // count, size // 8 * (i + 1) // count) for i in range(count)]
+    best = 0.0
+    with ThreadPoolExecutor(count) as pool:
+        for _ in range(repeats):
+            began = time.perf_counter()
+            list(pool.map(lambda part: np.copyto(target[part], source[part]), parts))
+            best = max(best, 2 * size / (time.perf_counter() - began))
+    return best
+
+
+def exponent(sizes: np.ndarray, seconds: np.ndarray) -> float:
+    """Slope of log time over log size."""
+    return float(np.polyfit(np.log(sizes), np.log(seconds), 1)[0])
+
+
+def _say(lines: list[str], line: str) -> None:
+    print(line, flush=True)
+    lines.append(line)

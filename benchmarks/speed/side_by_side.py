@@ -1,0 +1,194 @@
+"""The solver beside what a competent reader of the paper would write, on one energy."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from pliant.solver import KnownCamera, Mesh, Settings, Solution, Tracks, solve
+from pliant.solver.cameras.estimation import CameraEstimate
+from pliant.solver.energy.problem import Problem
+from pliant.solver.evaluation.metrics import e3d_frame
+from pliant.solver.gallery import corrupt_tracks, face
+from pliant.solver.shapes.initialization import pseudo_inverse, uniform_solution
+from pliant.solver.shapes.setup import build_problem
+from pliant.solver.tracks.normalization import normalize
+
+from benchmarks.accuracy.cells import parse_settings
+from benchmarks.sequences import Case, cases, from_gallery
+from benchmarks.speed import baselines
+from benchmarks.speed.apart import Measured, Stopwatch, apart
+
+GAP = 1.01
+"""A baseline is done when its energy is within 1 % of the solver's last."""
+
+BASELINES = ("conjugate_gradients", "gradient_descent", "direct")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Workload:
+    """A sequence with outliers, by name, so that every process can make it anew."""
+
+    data: Path | None = None
+    only: str = "face"
+    frames: int = 20
+    points: int | None = None
+    outliers: float = 0.10
+    noise: float = 0.0
+    mesh: str = "grid"
+    known: bool = True
+    """True cameras are given: the shapes alone are measured."""
+    settings: str = "prior=smooth"
+    start: str = "tracks"
+    """What the baselines begin with: `tracks`, the pseudo-inverse R†(W − t), or `ours`, the solver's own start."""
+
+    def case(self) -> Case:
+        """Read the sequence, or make a gallery face, and spoil it."""
+        if self.data is None:
+            made = from_gallery(face(self.frames, self.points or 1500, mesh=self.mesh), "face")  # type: ignore[arg-type]
+        else:
+            made = next(iter(cases(self.data, points=self.points, visibility="file", only=[self.only])))
+        tracks, _ = corrupt_tracks(made.tracks, outliers=self.outliers, noise=self.noise)
+        return replace(made, tracks=tracks)
+
+    def chosen(self) -> Settings:
+        """Return the solver's settings."""
+        return Settings(**parse_settings(self.settings))
+
+
+@dataclass(frozen=True, slots=True)
+class Ours:
+    """What the solver did."""
+
+    reached: tuple[float, float]
+    """Wall and CPU seconds after which its energy was within 1 % of its last, everything included."""
+    started: tuple[float, float]
+    """Of these, what had gone before the start that the baselines are given: normalising, cameras, weights, the start itself."""
+    objective: float
+    translations: np.ndarray
+    """Final, normalised units; the baselines are given them."""
+    iterations: int
+    reweightings: int
+    stages: dict[str, float]
+    error: float | None
+    size: tuple[int, int]
+
+
+def run_ours(watch: Stopwatch, work: Workload) -> Ours:
+    """Solve, after a tiny solve that loads what is loaded once."""
+    solved(Workload(frames=4, points=50, settings=work.settings))
+    case, history = work.case(), []
+    watch.start()
+    solution = solve(
+        case.tracks, case.mesh, cameras=case.cameras if work.known else None, settings=work.chosen(),
+        on_step=lambda step: history.append((time.perf_counter() - watch.began, time.process_time() - watch.cpu, step.objective)),
+    )  # fmt: skip
+    best = float(solution.trace.objective[-1])
+    valued = [entry for entry in history if entry[2] is not None]
+    reached = next((wall, cpu) for wall, cpu, value in valued if value <= GAP * best)
+    normalized = normalize(case.tracks)
+    return Ours(
+        reached, valued[0][:2], best, (solution.camera.translations - normalized.centroid) / normalized.unit,
+        int(solution.trace.iterations.sum()), len(solution.trace.objective) - 1, dict(solution.seconds),
+        None if case.shapes is None else e3d_frame(solution.shapes, case.shapes), case.tracks.points.shape[:2],
+    )  # fmt: skip
+
+
+def run_baseline(watch: Stopwatch, work: Workload, name: str, ours: Ours, cap: float) -> baselines.Run:
+    """Run one baseline until it is within 1 % of the solver's energy, or `cap` seconds have gone."""
+    case = work.case()
+    assert case.cameras is not None
+    problem, start = prepare(case.tracks, case.mesh, case.cameras, work.chosen())
+    if work.start == "tracks":
+        start = pseudo_inverse(problem, ours.translations)
+    watch.start()
+    run: baselines.Run = getattr(baselines, name)(
+        problem, start, ours.translations, target=GAP * ours.objective, cap=cap
+    )
+    return run
+
+
+def prepare(tracks: Tracks, mesh: Mesh | None, cameras: KnownCamera, settings: Settings) -> tuple[Problem, np.ndarray]:
+    """Build the solver's problem and its start, normalised units."""
+    still = np.zeros((tracks.num_frames, 2))
+    scales = np.ones(tracks.num_frames) if cameras.scales is None else cameras.scales
+    estimate = CameraEstimate(cameras.rotations, scales, still, 0, np.zeros((0, 0)), np.zeros((len(scales), 0, 2)))
+    problem, _ = build_problem(normalize(tracks), estimate, mesh, settings)
+    return problem, uniform_solution(problem, still)
+
+
+def compare(work: Workload, *, names: list[str], cap: float, limit: int) -> list[str]:
+    """Measure the solver and every baseline; returns the lines of a Markdown table."""
+    measured = apart(run_ours, work)
+    assert measured is not None, "the solver ran out of memory"
+    ours: Ours = measured.value
+    (wall, cpu), (late, busy) = ours.reached, from_start(ours)
+    frames, points = ours.size
+    lines = [
+        f"{frames} × {points}, {work.outliers:.0%} outliers, `{work.settings}`, baselines from "
+        f"{'the pseudo-inverse' if work.start == 'tracks' else 'our start'}; load {measured.load:.1f}",
+        "",
+        "| | energy / ours | seconds (CPU) | × our whole time (CPU) | × ours from the start (CPU) | iterations | peak memory |",
+        "| --- | --- | --- | --- | --- | --- | --- |",
+        f"| ours, within 1 %, whole | {GAP:g} | {wall:.1f} ({cpu:.1f}) | 1 | | | |",
+        f"| ours, within 1 %, from the start | {GAP:g} | {late:.1f} ({busy:.1f}) | | 1 | | |",
+        f"| ours, to the end | 1 | {measured.seconds:.1f} ({measured.cpu_seconds:.1f}) | {measured.seconds / wall:.1f} "
+        f"({measured.cpu_seconds / cpu:.1f}) | | {ours.iterations} in {ours.reweightings} | {measured.peak / 1e9:.2f} GB |",
+    ]
+    for line in lines:
+        print(line, flush=True)
+    for name in names:
+        lines.append(_line(name, apart(run_baseline, work, name, ours, cap, limit=limit), ours, limit))
+        print(lines[-1], flush=True)
+    return lines
+
+
+def _line(name: str, done: Measured | None, ours: Ours, limit: int) -> str:
+    label = name.replace("_", " ")
+    if done is None:
+        return f"| {label} | – | does not fit | – | – | – | > {limit / 1e9:.0f} GB |"
+    run: baselines.Run = done.value
+    (wall, cpu), (late, busy) = ours.reached, from_start(ours)
+    ending = ""
+    energy = run.objective[-1] / ours.objective
+    seconds, cpu_seconds = done.seconds, done.cpu_seconds
+    if not run.reached:
+        whole = extrapolated(run, best=ours.objective)
+        ending = f"; not there after {done.seconds:.0f} s, extrapolated"
+        cpu_seconds *= whole / seconds
+        seconds = whole
+    if not np.isfinite(seconds):
+        label, ending = f"{label}; not there after {done.seconds:.0f} s, no rate to go by", ""
+    return (
+        f"| {label}{ending} | {energy:.3f} | {seconds:.1f} ({cpu_seconds:.1f}) | {seconds / wall:.1f} ({cpu_seconds / cpu:.1f}) "
+        f"| {seconds / late:.1f} ({cpu_seconds / busy:.1f}) | {run.iterations} | {done.peak / 1e9:.2f} GB |"
+    )
+
+
+def from_start(ours: Ours) -> tuple[float, float]:
+    """Wall and CPU seconds from the start that the baselines are given to within 1 %."""
+    wall, cpu = (max(end - begin, 1e-3) for end, begin in zip(ours.reached, ours.started, strict=True))
+    return wall, cpu
+
+
+def extrapolated(run: baselines.Run, *, best: float) -> float:
+    """Seconds at which the run would have been within 1 % of `best`, had it gone on at the rate of its last half.
+
+    The gap to the best energy falls geometrically at the end of a descent, and slower and slower before: the estimate errs low.
+    Infinite if the gap does not fall.
+    """
+    seconds, gap = np.array(run.seconds), np.array(run.objective) / best - 1
+    late = seconds >= seconds[-1] / 2
+    if late.sum() < 2:
+        return float("inf")
+    slope, _ = np.polyfit(seconds[late], np.log(gap[late]), 1)
+    falls = slope * np.ptp(seconds[late]) < -1e-9
+    return float(seconds[-1] + np.log((GAP - 1) / gap[-1]) / slope) if falls else float("inf")
+
+
+def solved(work: Workload) -> Solution:
+    """Solve in this process."""
+    case = work.case()
+    return solve(case.tracks, case.mesh, cameras=case.cameras if work.known else None, settings=work.chosen())

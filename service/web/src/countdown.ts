@@ -1,0 +1,40 @@
+// The time that is left, counted down between two messages of the service.
+
+import type { Job } from "./types";
+
+const EVERY = 1000;
+
+export class Countdown {
+  private timer = 0;
+  private job: Job | null = null;
+  private heard = 0;
+
+  /** `onTick` gets the record with the seconds that are left now. */
+  constructor(private readonly onTick: (job: Job) => void) {}
+
+  /** Take a record; messages without another time of progress do not start the count anew. */
+  show(job: Job): void {
+    if (job.progress?.updated_at !== this.job?.progress?.updated_at) this.heard = performance.now();
+    this.job = job;
+    this.tick();
+  }
+
+  stop(): void {
+    clearTimeout(this.timer);
+    this.job = null;
+  }
+
+  private readonly tick = (): void => {
+    clearTimeout(this.timer);
+    const { job } = this;
+    if (job === null) return;
+    const left = job.progress?.seconds_left ?? null;
+    if (job.status !== "running" || job.progress === null || left === null) {
+      this.onTick(job);
+      return;
+    }
+    const seconds = Math.max(0, left - (performance.now() - this.heard) / 1000);
+    this.onTick({ ...job, progress: { ...job.progress, seconds_left: seconds } });
+    this.timer = setTimeout(this.tick, EVERY);
+  };
+}

@@ -1,0 +1,99 @@
+// A film's job while it is tracked: its picture at once, and the points as the service reports them.
+//
+// The picture comes from the file that this tab has sent, decoded by the browser; after a reload only the points are known.
+
+import { h, say } from "./dom";
+import { firstFrame } from "./film";
+import type { Job } from "./types";
+
+type Followed = NonNullable<NonNullable<Job["progress"]>["followed"]>;
+
+const sent = new Map<string, File>();
+
+/** Keep the film of a job that has just been sent, for as long as the tab is open. */
+export function rememberFilm(id: string, film: File | null): void {
+  if (film) sent.set(id, film);
+}
+
+export class LiveTracks {
+  private readonly canvas = h("canvas", { role: "img", "aria-label": "The film with the points that are tracked" });
+  private readonly words = h("figcaption", { class: "hint" });
+  readonly element = h("figure", { class: "live", hidden: true }, this.canvas, this.words);
+  private picture: ImageBitmap | HTMLVideoElement | null = null;
+  private video: HTMLVideoElement | null = null;
+  private url = "";
+  private followed: Followed | null = null;
+  private started = false;
+
+  constructor(private readonly id: string) {
+    new ResizeObserver(() => this.draw()).observe(this.element);
+  }
+
+  /** Take a record of the job. */
+  show(job: Job): void {
+    const { status, progress } = job;
+    const pending = job.interpretation.mesh_source === "film" && (status === "queued" || status === "running");
+    this.element.hidden = !pending;
+    if (!pending) return this.close();
+    if (!this.started) {
+      this.started = true;
+      void this.begin();
+    }
+    const followed = progress?.followed ?? null;
+    if (followed && followed.frame !== this.followed?.frame) this.move(followed);
+    const count = this.followed ? this.followed.points.length / 2 : 0;
+    say(this.words, count > 0 ? `Frame ${this.followed?.frame}: ${count} of the tracked points.` : "The points appear as soon as they are tracked.");
+  }
+
+  close(): void {
+    if (this.picture instanceof ImageBitmap) this.picture.close();
+    this.video?.removeAttribute("src");
+    this.video?.load();
+    if (this.url) URL.revokeObjectURL(this.url);
+    this.picture = this.video = null;
+    this.url = "";
+  }
+
+  private async begin(): Promise<void> {
+    const film = sent.get(this.id);
+    if (film === undefined) return this.draw();
+    this.picture = await firstFrame(film);
+    this.draw();
+    if (/\.(gif|zip)$/i.test(film.name) || this.picture === null) return;
+    const video = h("video", { muted: true, playsinline: true, preload: "auto" });
+    video.muted = true;
+    this.url = URL.createObjectURL(film);
+    video.src = this.url;
+    video.addEventListener("seeked", () => {
+      this.picture = video;
+      this.draw();
+    });
+    this.video = video;
+  }
+
+  private move(followed: Followed): void {
+    this.followed = followed;
+    // The points are drawn with the picture that they belong to, once the browser has it.
+    if (this.video && this.video.readyState > 0) this.video.currentTime = followed.seconds;
+    else this.draw();
+  }
+
+  private draw(): void {
+    const { canvas, picture, followed } = this;
+    const size = followed ?? (picture instanceof HTMLVideoElement ? { width: picture.videoWidth, height: picture.videoHeight } : picture);
+    if (size === null || canvas.clientWidth === 0) return;
+    const scale = Math.min(2, devicePixelRatio) * Math.min(canvas.clientWidth / size.width, canvas.clientHeight / size.height);
+    Object.assign(canvas, { width: Math.round(scale * size.width), height: Math.round(scale * size.height) });
+    const context = canvas.getContext("2d") as CanvasRenderingContext2D;
+    if (picture) context.drawImage(picture, 0, 0, canvas.width, canvas.height);
+    const dot = Math.max(3, 0.007 * canvas.width);
+    const colour = getComputedStyle(canvas).getPropertyValue("--dots").trim();
+    for (let i = 0; followed && i < followed.points.length; i += 2) {
+      const [x, y] = [scale * ((followed.points[i] as number) + 0.5), scale * ((followed.points[i + 1] as number) + 0.5)];
+      context.fillStyle = "#ffffff";
+      context.fillRect(x - dot / 2 - 1, y - dot / 2 - 1, dot + 2, dot + 2);
+      context.fillStyle = colour;
+      context.fillRect(x - dot / 2, y - dot / 2, dot, dot);
+    }
+  }
+}

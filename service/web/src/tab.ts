@@ -1,0 +1,52 @@
+// What the tab shows of a job while another one is in front: progress in its title, and a notification at the end.
+
+import { button, say } from "./dom";
+import { type Job, isFinal } from "./types";
+import { VERDICTS, verdictOf } from "./verdict";
+import { STATUS_WORDS, percent, title } from "./words";
+
+const PLAIN = "Pliant";
+
+export class Tab {
+  /** Asks for permission when it is pressed: browsers refuse pages that ask unasked. */
+  readonly element = button("Notify me at the end", () => void this.ask(), { class: "quiet", hidden: true });
+  private wanted = false;
+  private job: Job | null = null;
+
+  show(job: Job): void {
+    const before = this.job;
+    this.job = job;
+    document.title = `${lead(job)}${title(job)} – ${PLAIN}`;
+    const pending = !isFinal(job.status);
+    this.element.hidden = !pending || typeof Notification === "undefined" || Notification.permission === "denied";
+    if (!pending && before !== null && !isFinal(before.status) && this.wanted) this.notify(job);
+  }
+
+  /** Another job is shown, or none. */
+  leave(): void {
+    document.title = PLAIN;
+  }
+
+  private async ask(): Promise<void> {
+    const permission = Notification.permission === "default" ? await Notification.requestPermission() : Notification.permission;
+    this.wanted = permission === "granted";
+    say(this.element, this.wanted ? "You will be notified" : "Notifications are blocked for this page");
+    this.element.disabled = true;
+  }
+
+  private notify(job: Job): void {
+    this.wanted = false;
+    const note = new Notification(`${STATUS_WORDS[job.status]}: ${title(job)}`, { body: job.trust_sentence ?? job.sentence ?? "", tag: job.id });
+    note.addEventListener("click", () => {
+      window.focus();
+      note.close();
+    });
+  }
+}
+
+/** The part of the title that is read first, since tabs are narrow. */
+function lead(job: Job): string {
+  const verdict = verdictOf(job);
+  if (job.status === "running") return `${percent(job.progress?.fraction ?? 0)} – `;
+  return `${verdict ? VERDICTS[verdict] : STATUS_WORDS[job.status]} – `;
+}

@@ -1,0 +1,71 @@
+// Another job's result beside this one: the same moment, the same direction.
+
+import { Body, seenFromBehind } from "./body";
+import { Preview } from "./preview";
+import { Stage } from "./stage";
+
+export interface Other {
+  id: string;
+  title: string;
+  preview: string;
+}
+
+export class Companion {
+  readonly element = document.createElement("div");
+  readonly stage: Stage;
+  private readonly body: Body;
+
+  static async open(other: Other, signal: AbortSignal): Promise<Companion> {
+    const preview = await Preview.open(other.preview, signal);
+    if (preview.ready === 0) await new Promise<void>((resolve) => (preview.onFrames = resolve));
+    return new Companion(preview);
+  }
+
+  private constructor(readonly preview: Preview) {
+    this.element.className = "view other";
+    this.stage = new Stage(this.element, preview);
+    this.body = new Body(preview, preview.positions);
+    this.body.reverse(seenFromBehind(preview, preview.clearest) !== preview.header.mirrored);
+    this.stage.flip(preview.header.mirrored);
+    this.stage.add(this.body.group);
+    this.stage.canvas.style.pointerEvents = "none"; // the other view turns both
+    this.stage.canvas.setAttribute("role", "img");
+    this.stage.canvas.setAttribute("aria-label", "The other job's result, from the same side");
+    this.element.append(this.stage.canvas);
+    this.stage.look("front");
+    preview.onFrames = () => this.stage.redraw();
+  }
+
+  theme(clay: string, wire: string): void {
+    this.body.theme(clay, wire);
+    this.stage.redraw();
+  }
+
+  wireframe(on: boolean): void {
+    this.body.wireframe(on);
+    this.stage.redraw();
+  }
+
+  /** Show the same frame; sequences of different lengths end at their own last one. */
+  show(time: number, main: Stage): void {
+    this.body.show(Math.min(time, this.preview.frames - 1));
+    this.stage.mirror(main);
+  }
+
+  dispose(): void {
+    this.body.dispose();
+    this.stage.dispose();
+    this.element.remove();
+  }
+}
+
+/** Mean error of a job's frames, a share of the object's size: against ground truth, or the expected one; null where unknown. */
+export function meanError(preview: Preview, name: "error" | "expected"): number | null {
+  let sum = 0;
+  for (let frame = 0; frame < preview.frames; frame += 1) {
+    const value = preview.facts(frame)[name];
+    if (value === null) return null;
+    sum += value * value;
+  }
+  return Math.sqrt(sum / Math.max(1, preview.frames));
+}

@@ -1,0 +1,145 @@
+"""Alternation under perspective: depths, covariance, cameras and κ by turns, and new cameras from the corrected tracks.
+
+Cameras that were found under orthography are off by degrees where perspective is strong, and with little noise the likelihood cannot move
+them back, since every mode would have to move along. A factorization of the corrected tracks has no such memory: it gives cameras from
+nothing, with most of the perspective gone. The alternation goes on from the most probable of them for as long as the evidence rises.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from pliant.solver.cameras.factorization import upgrade
+from pliant.solver.cameras.focal_length import refined_with_focal
+from pliant.solver.cameras.learned import Learned
+from pliant.solver.cameras.multistart import CANDIDATES
+from pliant.solver.cameras.perspective import MIRROR, Perspective, centred, columns, corrected, depth_map, depths_of
+from pliant.solver.model.model_order import ModelOrder
+from pliant.solver.model.shape_covariance import annealed
+from pliant.solver.model.so3 import nearest
+from pliant.solver.records import Floats
+
+ROUNDS = 3
+"""Updates of depths, covariance, cameras and κ every time that cameras were found or refined."""
+
+LEARNING = 60
+"""Rounds of expectation maximisation of an update."""
+
+COMPARED_FRAMES = 40
+"""Frames on which the cameras of factorizations are compared, as in `joint_refinement.START_FRAMES`."""
+
+
+def alternated(
+    view: Perspective,
+    found: Learned,
+    used: NDArray[np.intp],
+    *,
+    model_order: ModelOrder,
+    turning: bool,
+    rounds: int = ROUNDS,
+    should_stop: Callable[[], bool] | None = None,
+) -> tuple[Learned, Perspective]:
+    """Return cameras, covariance and κ after rounds of alternation.
+
+    Parameters
+    ----------
+    view : Perspective
+        With κ to start from and the sample of all frames.
+    found : Learned
+        Cameras and covariance of the frames used to start from.
+    used : array of int, shape (F',)
+        Frames.
+    model_order : ModelOrder
+        Modes at most, and the noise to begin with.
+    turning : bool
+        False keeps the rotations.
+    rounds : int
+        Number of rounds.
+    should_stop : callable, optional
+        Called between rounds; once it returns True, the best so far is returned.
+    """
+    for _ in range(rounds):
+        if should_stop is not None and should_stop():
+            break
+        found = _relearned(view, found, used, model_order)
+        found, view = _with_focal(view, found, used, turning=turning)
+    return found, view
+
+
+def factorized_again(
+    gram: Floats,
+    view: Perspective,
+    found: Learned,
+    used: NDArray[np.intp],
+    *,
+    model_order: ModelOrder,
+    should_stop: Callable[[], bool] | None = None,
+) -> Floats | None:
+    """Return the rotations `(F, 3, 3)` of the most probable factorization of the corrected tracks; None if `found` is more probable.
+
+    Parameters
+    ----------
+    gram : array, shape (2F, 2F)
+        Of the corrected tracks, divided by the scales.
+    view, found, used, model_order, should_stop
+        As for `alternated`. The factorizations get the world axes and the sign of depth of `found`.
+    """
+    places = np.unique(np.linspace(0, len(used) - 1, min(len(used), COMPARED_FRAMES)).round().astype(np.intp))
+    some = used[places]
+    part = replace(
+        found, rotations=found.rotations[places], scales=found.scales[places],
+        covariance=replace(found.covariance, modes=found.covariance.modes[places]),
+    )  # fmt: skip
+
+    def energy(start: Learned) -> float:
+        moved, _ = alternated(view, start, some, model_order=model_order, turning=True, rounds=1)
+        return moved.energy
+
+    limit = min(len(gram) // 3, view.sample.shape[1] // 3)
+    best, lowest = None, energy(part)
+    for size in CANDIDATES:
+        if size > limit or (should_stop is not None and should_stop()):
+            break
+        rotations = aligned(upgrade(gram, size).rotations, found.rotations, used)
+        reached = energy(replace(part, rotations=rotations[some]))
+        if reached < lowest:
+            best, lowest = rotations, reached
+    return best
+
+
+def aligned(rotations: Floats, like: Floats, used: NDArray[np.intp]) -> Floats:
+    """Return rotations `(F, 3, 3)` in the world axes and with the sign of depth in which those of the frames used are nearest to `like`."""
+    choices = []
+    for each in (rotations, MIRROR @ rotations @ MIRROR):
+        moved = each @ nearest((each[used].transpose(0, 2, 1) @ like).sum(axis=0)[None])[0]
+        choices.append((float(np.square(moved[used] - like).sum()), moved))
+    return np.asarray(min(choices, key=lambda choice: choice[0])[1])
+
+
+def _relearned(view: Perspective, found: Learned, used: NDArray[np.intp], model_order: ModelOrder) -> Learned:
+    views = view.sample[used]
+    depths = depths_of(depth_map(found.rotations, found.scales, found.covariance), views, view.curvature)
+    rows = columns(centred(corrected(views, depths, view.curvature)))
+    projections = found.rotations[:, :2] * found.scales[:, None, None]
+    covariance = annealed(
+        rows @ rows.T / rows.shape[1],
+        projections,
+        max_modes=model_order.max_modes,
+        noisy_start=model_order.noisy_start,
+        ordered=model_order.ordered,
+        iterations=LEARNING,
+    )
+    return replace(found, covariance=covariance)
+
+
+def _with_focal(
+    view: Perspective, found: Learned, used: NDArray[np.intp], *, turning: bool
+) -> tuple[Learned, Perspective]:
+    zooms = bool((found.scales != 1).any())
+    found, curvature = refined_with_focal(
+        view.sample[used], found, view.curvature, free=view.given is None, turning=turning, with_scales=zooms
+    )
+    return found, replace(view, curvature=curvature)

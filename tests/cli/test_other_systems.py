@@ -1,0 +1,45 @@
+"""What must work where Linux's and macOS's own modules are absent, as on Windows: the SDK, and `pliant solve` of an npz file."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+WITHOUT = """
+import sys
+for name in ("resource", "fcntl", "pwd", "grp", "termios"):
+    sys.modules[name] = None
+"""
+IMPORTS = """
+import pliant
+pliant.Client, pliant.AsyncClient, pliant.solve, pliant.__version__
+import pliant.client, pliant.solver, pliant.tracking
+"""
+COMMAND = """
+from pliant.cli import main
+sys.argv = ["pliant", "solve", sys.argv[1], "-o", "out", "--option", "prior=smooth", "--option", "max_reweightings=1"]
+sys.exit(main())
+"""
+
+
+def run(code: str, *arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", WITHOUT + code, *arguments]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120, check=False)
+
+
+def test_the_sdk_imports_and_an_npz_file_is_solved(tmp_path: Path) -> None:
+    random = np.random.default_rng(3)
+    np.savez(tmp_path / "tracks.npz", tracks=random.normal(size=(16, 2)) * 50 + random.normal(size=(5, 16, 2)))
+    ran = run(IMPORTS + COMMAND, "tracks.npz", folder=tmp_path)
+    assert ran.returncode == 0, ran.stderr
+    assert (tmp_path / "out" / "shapes.npz").exists()
+
+
+def test_what_needs_the_sandbox_is_refused_with_what_to_do(tmp_path: Path) -> None:
+    (tmp_path / "tracks.csv").write_text("frame,point,x,y\n0,0,1,2\n")
+    ran = run(COMMAND, "tracks.csv", folder=tmp_path)
+    assert ran.returncode != 0
+    assert "numpy.savez" in ran.stderr

