@@ -131,7 +131,7 @@ def result(
         list[str] | None,
         typer.Option(
             "--make",
-            help="Have this written of the stored result first: glb, ply, obj, usd, mdd, mat or csv; may be repeated. "
+            help="Have this written of the stored result first: glb, ply, obj, usd, abc, mdd, mat or csv; may be repeated. "
             "Only these files are downloaded then.",
         ),
     ] = None,
