@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 from pliant.cli.films import is_film
@@ -23,7 +23,6 @@ from pliant.cli.session import (
     Rotations,
     Session,
     Timeout,
-    Tracks,
     Url,
     parse_options,
 )  # fmt: skip
@@ -37,13 +36,24 @@ Folder = Annotated[Path | None, typer.Option("--output", "-o", help="Wait, then 
 
 def submit(
     ctx: typer.Context,
-    tracks: Tracks,
+    files: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Track files in any format `pliant inspect` reads, or a film. Several files, a folder of track files or a quoted "
+            "pattern such as 'takes/*.npz' make a job each.",
+            metavar="FILE...",
+            show_default=False,
+        ),
+    ],
     mesh: Mesh = None,
     ground_truth: GroundTruth = None,
     rotations: Rotations = None,
     region: Region = None,
     option: OptionPairs = None,
     name: Annotated[str, typer.Option("--name", "-n", help="Your own label.")] = "",
+    priority: Annotated[
+        Literal["high", "normal", "low"], typer.Option("--priority", help="Order among your own waiting jobs.")
+    ] = "normal",
     job_id: Annotated[
         str | None,
         typer.Option("--id", help="Your own id. Submitting the same content under it again creates no second job."),
@@ -64,12 +74,28 @@ def submit(
     timeout: Timeout = None,
     as_json: Json = False,
 ) -> None:
-    """Submit tracks or a film to a service and print the job."""
+    """Submit tracks or a film to a service and print the job; of several files a table.
+
+    Repeating the command for several files finds the jobs that exist already: each is known by the content of its file and the options.
+    """
+    from pliant.cli.commands.batch import Batch, expanded
     from pliant.client.progress import progress_bar
 
     session: Session = ctx.obj
     session.json = as_json
     options = parse_options(option)
+    chosen = expanded(files, region)
+    if chosen != files or len(chosen) > 1:
+        batch = Batch(
+            files=chosen, shared={"mesh": mesh, "ground_truth": ground_truth, "rotations": rotations, "webhook": webhook},
+            options=options, key=key or "", priority=priority, timeout=timeout, output=output, wait=wait or output is not None,
+        )  # fmt: skip
+        batch.check(name=name, job_id=job_id, region=region, force=force)
+        with session.client(url, as_json=as_json) as client:
+            batch.run(client)
+        batch.show(as_json=as_json)
+        raise typer.Exit(batch.exit_code)
+    tracks = chosen[0]
     if output is not None:
         output_folder(output, force=force)
     film = is_film(tracks, region)
@@ -88,6 +114,7 @@ def submit(
                 idempotency_key=key,
                 webhook=webhook,
                 webhook_secret=None if webhook is None else os.environ.get("PLIANT_WEBHOOK_SECRET"),
+                priority=priority,
                 on_upload=bar.on_upload,
                 timeout=timeout,
             )

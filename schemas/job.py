@@ -28,6 +28,10 @@ class Status(StrEnum):
         return self in (Status.SUCCEEDED, Status.FAILED, Status.CANCELLED)
 
 
+Priority = Literal["high", "normal", "low"]
+"""Order among the waiting jobs of one owner."""
+
+
 class Record(BaseModel):
     """Base of all models: unknown fields are ignored, so that older clients work with newer services."""
 
@@ -114,6 +118,13 @@ class Artifact(Record):
     description: str = ""
 
 
+class Estimate(Record):
+    """What a job is expected to need, from the numbers of its frames and points. Right within a factor of about two."""
+
+    memory_bytes: int = Field(description="Largest memory of the process that works on the job.")
+    seconds: float = Field(description="Processor seconds on one core of a usual machine.")
+
+
 class Interpretation(Record):
     """Interpretation of the inputs."""
 
@@ -157,6 +168,10 @@ class Interpretation(Record):
         default_factory=list, description="Their indices in the result, the first thousand."
     )
     notes: list[str] = Field(default_factory=list, description="Sentences with evidence, exclusions and assumptions.")
+    estimate: Estimate | None = Field(
+        None,
+        description="Memory and time the job will need; null for films, whose points are not known before they are tracked.",
+    )
 
 
 class Inspection(Interpretation):
@@ -182,6 +197,9 @@ class Job(Record):
     retry_of: str | None = Field(None, description="The finished job that this one repeats.")
     outputs_of: str | None = Field(
         None, description="The finished job whose result this one writes in further files, without solving again."
+    )
+    priority: Priority = Field(
+        "normal", description="Order among the waiting jobs of one owner; jobs of others are not passed."
     )
     place_in_queue: int | None = Field(None, description="Number of queued jobs ahead; null if not queued.")
     options: Options

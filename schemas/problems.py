@@ -105,6 +105,9 @@ class ProblemCode(StrEnum):
     NOT_UTF8 = ("not_utf8", 422, "Not UTF-8",
      "A text part is not valid UTF-8.",
      "Encode it as UTF-8.")
+    INVALID_PRIORITY = ("invalid_priority", 422, "Invalid priority",
+     "The part `priority` is not one of high, normal and low.",
+     "Leave it out for normal.")
     NAME_TOO_LONG = ("name_too_long", 422, "Name too long",
      "The job's `name` has more than 200 characters.",
      "Shorten it.")
@@ -323,6 +326,9 @@ class ProblemCode(StrEnum):
     TOO_LARGE = ("too_large", 422, "Input too large",
      "The file declares or contains more than this installation accepts.",
      "Use fewer frames or points, or ask the operator; `GET /v1/limits` has the numbers.")
+    NEEDS_MORE_MEMORY = ("needs_more_memory", 422, "Needs more memory than any worker has",
+     "The job's estimated memory exceeds that of every running worker.",
+     "Use the `max_points` or `frames` that the hint names, or ask the operator for a larger worker.")
     TOO_SLOW = ("too_slow", 422, "Parsing took too long",
      "The file could not be parsed within the time limit.",
      "Convert it to npz.")

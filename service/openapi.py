@@ -142,6 +142,11 @@ SUBMIT_BODY: dict[str, Any] = {
                         "maxLength": 2000,
                         "description": "URL that receives a POST once the job has ended, signed as in Standard Webhooks 1.0.",
                     },
+                    "priority": {
+                        "type": "string",
+                        "enum": ["high", "normal", "low"],
+                        "description": "Order among your own waiting jobs; `normal` where it is absent.",
+                    },
                     "webhook_secret": {
                         "type": "string",
                         "pattern": "^whsec_[A-Za-z0-9+/=]{32,}$",

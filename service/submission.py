@@ -6,9 +6,9 @@ import hashlib
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
-from pliant.schemas.job import Interpretation, Job
+from pliant.schemas.job import Interpretation, Job, Priority
 from pliant.schemas.options import Options
 from pliant.schemas.problems import ProblemCode
 from pliant.service.multipart import File, Form, FormRules
@@ -33,7 +33,7 @@ UPLOADS = {f"{part}_upload": part for part in sorted(FILES)}
 """Text parts that name an upload, and the part that each stands for."""
 KEPT = "inputs_of"
 """Text part that names a job whose kept inputs are used again."""
-TEXTS = frozenset({"mesh", "options", "name", "webhook", "webhook_secret", KEPT, *UPLOADS})
+TEXTS = frozenset({"mesh", "options", "name", "priority", "webhook", "webhook_secret", KEPT, *UPLOADS})
 READING = (
     "layout", "rows", "y_axis", "coordinates", "coordinate_order", "visibility", "frames", "stride", "max_points", "min_seen",
 )  # fmt: skip
@@ -111,6 +111,7 @@ def accept(
         idempotency_key=idempotency_key,
         fingerprint=fingerprint,
         webhook=webhook,
+        priority=_priority(form.texts.get("priority", "")),
     )
     known = jobs.known(submission)
     if known is not None:
@@ -313,6 +314,16 @@ def parse_options(text: str) -> Options:
 def _not_an_object(got: str) -> Refusal:
     hint = 'For example {"method": "robust"}; the schema is at /v1/options.'
     return wrong_input(ProblemCode.INVALID_OPTION, field="options", expected="a JSON object", got=got, hint=hint)
+
+
+def _priority(text: str) -> Priority:
+    """Return the priority of a job; empty text means normal."""
+    given = text.strip() or "normal"
+    for each in get_args(Priority):
+        if given == each:
+            return each  # type: ignore[no-any-return]
+    code, names = ProblemCode.INVALID_PRIORITY, ", ".join(get_args(Priority))
+    raise wrong_input(code, field="priority", expected=names, got=repr(given[:40]), hint="Leave it out for normal.")
 
 
 def _name(text: str) -> str:

@@ -14,6 +14,7 @@ from typing import Any, Self
 import httpx
 from numpy.typing import ArrayLike
 from pliant.client._async import operations
+from pliant.client._async.batch import OnFailure, mapped
 from pliant.client._async.job import AsyncRemoteJob, AsyncResult
 from pliant.client._async.operations import OnJob
 from pliant.client._async.transport import Exchange
@@ -22,7 +23,7 @@ from pliant.client.multipart import Inputs, OnBytes, Source
 from pliant.client.requests import further, sharing
 from pliant.client.result import finished, loaded, succeeded
 from pliant.client.retry import Attempts, Contact, Retry
-from pliant.schemas.job import Interpretation, Job, ServiceLimits, Status
+from pliant.schemas.job import Interpretation, Job, Priority, ServiceLimits, Status
 from pliant.schemas.options import Options, Output
 from pliant.schemas.shares import Share
 
@@ -109,6 +110,7 @@ class AsyncClient:
         idempotency_key: str | None = None,
         webhook: str | None = None,
         webhook_secret: str | None = None,
+        priority: Priority = "normal",
         on_upload: OnBytes | None = None,
         timeout: float | None = None,
     ) -> AsyncRemoteJob:
@@ -148,6 +150,8 @@ class AsyncClient:
             URL that receives the finished job; check messages with `pliant.client.webhooks.verified`.
         webhook_secret : str, optional
             Signs the webhook; create one with `pliant.client.webhooks.new_secret`.
+        priority : str
+            ``"high"``, ``"normal"`` or ``"low"``: the order of your own waiting jobs; those of others are not passed.
         on_upload : callable, optional
             Called with (bytes sent, total bytes).
         timeout : float, optional
@@ -175,9 +179,53 @@ class AsyncClient:
                 idempotency_key=idempotency_key,
                 webhook=webhook,
                 webhook_secret=webhook_secret,
+                priority=priority,
                 on_upload=on_upload,
             )
         return AsyncRemoteJob(self, job)
+
+    async def map(
+        self,
+        inputs: Iterable[Source | Mapping[str, Any]],
+        *,
+        at_once: int = 8,
+        key: str | None = None,
+        on_failure: OnFailure | None = None,
+        load: bool = True,
+        timeout: float | None = None,
+        **submission: Any,
+    ) -> AsyncGenerator[AsyncResult, None]:
+        """Submit many inputs and yield their results in the order of the inputs.
+
+        Parameters
+        ----------
+        inputs : iterable
+            Each as the first parameter of `submit`.
+        at_once : int
+            Jobs that are submitted ahead of the result that is waited for.
+        key : str, optional
+            Makes the whole call idempotent: repeated with the same key and inputs, it finds the jobs of the first time.
+        on_failure : callable, optional
+            Called with the number of an input, from 0, and the error, where an input is refused or its job fails; the others go on.
+            Without it that error ends the iteration.
+        load : bool
+            Download the arrays and the report of each.
+        timeout : float, optional
+            Seconds to wait for each result.
+        **submission
+            Further parameters of `submit`, the same for all: `mesh`, `options`, `priority`, …
+
+        Raises
+        ------
+        PliantError
+            An input was refused or its job failed, and there is no `on_failure`.
+        """
+        results = mapped(
+            self, inputs, at_once=at_once, key=key, on_failure=on_failure, load=load, timeout=timeout, submission=submission
+        )  # fmt: skip
+        async with aclosing(results):
+            async for result in results:
+                yield result
 
     async def inspect(
         self,

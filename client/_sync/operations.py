@@ -43,10 +43,14 @@ def submit(
     idempotency_key: str | None,
     webhook: str | None,
     webhook_secret: str | None,
+    priority: str,
     on_upload: OnBytes | None,
 ) -> Job:
     """Submit inputs and return the new job. Temporary files are written to `folder`, which the caller removes."""
-    texts = {"name": name, "webhook": webhook or "", "webhook_secret": webhook_secret or ""}
+    texts = {
+        "name": name, "webhook": webhook or "", "webhook_secret": webhook_secret or "",
+        "priority": "" if priority == "normal" else priority,  # a service that does not know it accepts the usual one
+    }  # fmt: skip
     fields = _fields(options) | {key: text for key, text in texts.items() if text != ""}
     whole = in_place(partial(inputs.form, folder, fields, on_upload))
     key = idempotency_key if idempotency_key is not None else secrets.token_urlsafe(16)

@@ -25,6 +25,7 @@ from pliant.worker.execution.monitor import Patience, Watch, finalize
 from pliant.worker.execution.workdir import clean_up
 from pliant.worker.jobs.lifecycle import ACTIVE
 from pliant.worker.processes.containment import die_with_parent
+from pliant.worker.processes.memory import memory_for_a_job
 from pliant.worker.records import Records
 from pliant.worker.settings import Settings
 from pliant.worker.store.queue import FUNCTION, Queue, alive_key
@@ -48,6 +49,9 @@ RSS_UNIT = 1 if sys.platform == "darwin" else 1024
 
 AWAY = (redis.ConnectionError, redis.TimeoutError)
 """Exceptions of an unavailable Redis."""
+
+LEAVE_FOR = 1.0
+"""Seconds that a worker which has put back a job that is too large leaves to the others."""
 
 POLL = 0.05
 """Seconds between checks of a running job process."""
@@ -98,6 +102,7 @@ class PliantWorker(Worker):
         self._records = records
         self._deliveries = queue
         self._stop_by: float | None = None
+        self._memory = memory_for_a_job(settings)
 
     def subscribe(self) -> None:
         """Do not listen for commands: jobs are cancelled through their record, and forking is safer without threads."""
@@ -128,18 +133,39 @@ class PliantWorker(Worker):
         target: Any = pipeline if pipeline is not None else self.connection
         try:
             super().heartbeat(timeout, pipeline)
-            target.set(alive_key(self._settings.queue, self.name), os.getpid(), ex=ALIVE_FOR)
+            sign = f"{os.getpid()} {self._memory}"
+            target.set(alive_key(self._settings.queue, self.name), sign, ex=ALIVE_FOR)
         except AWAY as error:
             logger.warning("heartbeat not written: %s", error)
 
     def execute_job(self, job: RqJob, queue: RqQueue) -> None:
         """Run a delivery. If the store becomes unavailable before the fork, the reconciler delivers the job again."""
         try:
+            if self._leave_to_a_larger(job):
+                return
             super().execute_job(job, queue)
         except AWAY as error:
             if self.horse_pid:
                 raise
             logger.warning("delivery %s: %s", job.id, error)
+
+    def _leave_to_a_larger(self, job: RqJob) -> bool:
+        """Put a job back that needs more memory than this worker has, if another one has it; True if so."""
+        id, attempt_id = (str(each) for each in (*job.args, "", "")[:2])
+        try:
+            held = self._records.get(id)
+            estimate = held.job.interpretation.estimate
+            if held.attempt_id != attempt_id or estimate is None or estimate.memory_bytes <= self._memory:
+                return False
+            memories = self._deliveries.memories()
+            if not any(size >= estimate.memory_bytes for name, size in memories.items() if name != self.name):
+                return False  # it may succeed all the same, and fails with a reason if it does not
+            self._deliveries.remove(attempt_id)
+            self._deliveries.push(id, attempt_id)
+        except (StoreUnavailable, UnknownJob):
+            return False
+        time.sleep(LEAVE_FOR)
+        return True
 
     def request_stop(self, signum: int, frame: FrameType | None) -> None:  # noqa: ARG002
         """Handle SIGTERM: end if idle; else let the job continue for the grace period, which a second signal ends."""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pliant.schemas.job import Interpretation
 from pliant.schemas.options import Options
 from pliant.solver import InvalidInput, Mesh, Tracks
+from pliant.worker.formats.cost import estimated
 from pliant.worker.formats.errors import too_large
 from pliant.worker.formats.ground_truth import read_rotations, read_truth
 from pliant.worker.formats.meshes.surface import Surface, read_surface, whole_grid
@@ -80,6 +81,7 @@ def read_inputs(
         given_frames=understood.points.shape[0], given_points=understood.points.shape[1],
         num_left_out=len(chosen.left_out), left_out_points=chosen.left_out[:LISTED].tolist(),
         notes=[*understood.notes, *chosen.notes, *truth_notes],
+        estimate=estimated(checked.num_frames, checked.num_points, options),
         **({} if film is None else _stated(film, chosen.selection)),
     )  # fmt: skip
     texture = None if film is None or film.texture is None else film.texture.at_points(chosen.selection.points)

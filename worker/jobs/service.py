@@ -20,6 +20,7 @@ from pliant.worker.errors import (
 )
 from pliant.worker.ids import check_id, is_id, new_attempt_id, new_job_id
 from pliant.worker.jobs import lifecycle
+from pliant.worker.jobs.admission import check_fits
 from pliant.worker.jobs.submission import Acceptance, Submission, copy_beside, key_digest, result_beside
 from pliant.worker.jobs.validation import LARGEST_PAGE as LARGEST_PAGE
 from pliant.worker.jobs.validation import check_event_id, check_key, check_page
@@ -86,7 +87,7 @@ class Jobs:
         Conflict
             The id or the key belongs to a different request.
         InvalidRequest
-            The id or the key is malformed.
+            The id or the key is malformed, or no worker has the memory that the job needs.
         QuotaExceeded
             Jobs and uploads have reached the disk quota.
         TooManyQueued
@@ -98,11 +99,13 @@ class Jobs:
         job = Job(
             id=submission.id or new_job_id(),
             name=submission.name,
+            priority=submission.priority,
             status=Status.QUEUED,
             created_at=self.clock(),
             options=submission.options,
             interpretation=interpretation,
         )
+        check_fits(interpretation, submission.options, self.queue.memories().values())
         size = inputs_file.stat().st_size
         return self.create(job, submission, lambda key: self.blobs.put(key, inputs_file), size=size)
 
@@ -177,6 +180,7 @@ class Jobs:
             created_at=self.clock(),
             retry_of=id,
             outputs_of=job.outputs_of,
+            priority=job.priority,
             options=job.options,
             interpretation=job.interpretation,
         )

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
-from pliant.schemas.job import Status
+from pliant.schemas.job import Priority, Status
 from pliant.schemas.options import Options
-from pliant.worker.errors import QuotaExceeded, StoreUnavailable, TooManyQueued
+from pliant.worker.errors import QuotaExceeded, StoreUnavailable, TooManyQueued, UnknownJob
 from pliant.worker.records import Records, Stored, Webhook
 from pliant.worker.settings import Settings
 from pliant.worker.store.blobs import Blobs
 from pliant.worker.store.queue import Queue
 from pliant.worker.uploads.service import Uploads
+
+RANKS: dict[Priority, int] = {"high": 0, "normal": 1, "low": 2}
+"""Smaller comes first."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,6 +41,9 @@ class Submission:
 
     webhook: Webhook | None = None
     """Called when the job has ended."""
+
+    priority: Priority = "normal"
+    """Order among the waiting jobs of the owner."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -98,9 +105,22 @@ class Acceptance:
                 self.queue.hold(stored.attempt_id)
             else:
                 self.queue.push(stored.job.id, stored.attempt_id)
+                if stored.job.priority != "normal":
+                    self._order(stored.owner)
         except StoreUnavailable:
             return kept  # the record is stored, and the reconciler adds the missing queue entry
         return kept
+
+    def _order(self, owner: str) -> None:
+        """Order the waiting jobs of one owner by priority, on the places that they hold: nobody else's job moves."""
+        waiting = set(self.queue.waiting())
+        ranks: dict[str, int] = {}
+        for id in self.records.ids(Status.QUEUED):
+            with suppress(UnknownJob):
+                held = self.records.get(id)
+                if held.owner == owner and held.attempt_id in waiting:
+                    ranks[held.attempt_id] = RANKS[held.job.priority]
+        self.queue.order(ranks)
 
     def _uploaded(self) -> int:
         return Uploads.open(self.settings).used()

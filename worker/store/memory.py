@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import weakref
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
 
 from pliant.schemas.job import Status
@@ -253,6 +253,17 @@ class MemoryQueue(Queue):
     def workers(self) -> list[str]:
         """See `Queue.workers`."""
         return ["memory"]
+
+    def order(self, ranks: Mapping[str, int]) -> None:
+        """See `Queue.order`."""
+        places = [place for place, each in enumerate(self._attempt_ids) if each in ranks]
+        ordered = sorted((self._attempt_ids[place] for place in places), key=ranks.__getitem__)
+        for place, each in zip(places, ordered, strict=True):
+            self._attempt_ids[place] = each
+
+    def memories(self) -> dict[str, int]:
+        """See `Queue.memories`."""
+        return {}
 
 
 class MemoryHash:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from typing import Any
 
 import redis
@@ -16,6 +17,20 @@ from rq.serializers import JSONSerializer
 
 FUNCTION = "pliant.worker.execution.attempt.run"
 """The only function a delivery may name."""
+
+# KEYS: 1 the list; ARGV: attempt, rank, attempt, rank, …
+_ORDER = """
+local rank, places, found = {}, {}, {}
+for i = 1, #ARGV, 2 do rank[ARGV[i]] = tonumber(ARGV[i + 1]) end
+for place, attempt in ipairs(redis.call('LRANGE', KEYS[1], 0, -1)) do
+  if rank[attempt] then
+    places[#places + 1] = place - 1
+    found[#found + 1] = {attempt, rank[attempt], place}
+  end
+end
+table.sort(found, function(a, b) if a[2] ~= b[2] then return a[2] < b[2] end return a[3] < b[3] end)
+for i, each in ipairs(found) do redis.call('LSET', KEYS[1], places[i], each[1]) end
+"""
 
 FAILURE_KEPT = 60
 """Seconds RQ keeps its entry of a failed delivery; the authority is the job record."""
@@ -58,12 +73,20 @@ class Queue(ABC):
         """Return the number of attempts ahead of this one, None if it is not queued."""
 
     @abstractmethod
+    def order(self, ranks: Mapping[str, int]) -> None:
+        """Order these attempts by rank, smaller first and else as they are, on the places that they hold together."""
+
+    @abstractmethod
     def tidy(self) -> None:
         """Remove entries of ended workers from RQ's records."""
 
     @abstractmethod
     def workers(self) -> list[str]:
         """Return the names of the workers with a recent heartbeat."""
+
+    @abstractmethod
+    def memories(self) -> dict[str, int]:
+        """Return the bytes that a job may take on each of these workers, by name; those that state none are left out."""
 
 
 class RedisQueue(Queue):
@@ -73,6 +96,7 @@ class RedisQueue(Queue):
         self._redis: Any = client
         self._name = name
         self._held = f"{name}:held"
+        self._order = client.register_script(_ORDER)
         self._queue = RqQueue(name, connection=client, serializer=JSONSerializer)
 
     def push(self, id: str, attempt_id: str, *, front: bool = False) -> None:
@@ -130,6 +154,11 @@ class RedisQueue(Queue):
             place: int | None = self._redis.lpos(self._queue.key, attempt_id)
         return place
 
+    def order(self, ranks: Mapping[str, int]) -> None:
+        """See `Queue.order`."""
+        with reachable():
+            self._order(keys=[self._queue.key], args=[part for each in ranks.items() for part in each])
+
     def tidy(self) -> None:
         """See `Queue.tidy`."""
         with reachable():
@@ -149,3 +178,13 @@ class RedisQueue(Queue):
             for name in names:
                 pipe.exists(alive_key(self._name, name))
             return [name for name, alive in zip(names, pipe.execute(), strict=True) if alive]
+
+    def memories(self) -> dict[str, int]:
+        """See `Queue.memories`."""
+        names = self.workers()
+        with reachable():
+            signs = self._redis.mget([alive_key(self._name, name) for name in names]) if names else []
+        stated = {
+            name: sign.decode().partition(" ")[2] for name, sign in zip(names, signs, strict=True) if sign is not None
+        }
+        return {name: int(size) for name, size in stated.items() if size.isdigit()}

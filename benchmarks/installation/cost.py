@@ -1,0 +1,67 @@
+"""Memory and processor time of whole jobs against their size, beside the estimate: `python -m benchmarks.installation.cost`."""
+
+from __future__ import annotations
+
+import json
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from pliant.schemas.job import Interpretation
+from pliant.schemas.options import Options
+from pliant.solver import gallery, threads_limited
+from pliant.worker.execution.pipeline import reconstruct
+from pliant.worker.formats import Inputs
+from pliant.worker.formats.cost import estimated
+
+SIZES = (
+    (10, 500),
+    (10, 5_000),
+    (10, 40_000),
+    (50, 500),
+    (50, 2_000),
+    (50, 10_000),
+    (100, 500),
+    (100, 2_000),
+    (200, 500),
+)
+"""Frames and points."""
+
+
+def measure(frames: int, points: int) -> None:
+    """Run one job in this process, and print what it took."""
+    sequence = gallery.corrupt(gallery.face(frames, points), noise=0.5)
+    count = sequence.tracks.num_points
+    stated = Interpretation(
+        num_frames=frames, num_points=count, num_faces=0, hidden_fraction=0, mesh_source="given", has_ground_truth=False,
+        has_rotations=False, layout="",
+    )  # fmt: skip
+    began = time.process_time()
+    with threads_limited(1), tempfile.TemporaryDirectory() as folder:
+        reconstruct(Inputs(sequence.tracks, sequence.mesh, None, None, stated), Options(), Path(folder))
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    print(json.dumps({"points": count, "peak": peak, "seconds": time.process_time() - began}))
+
+
+def main() -> None:
+    """Measure every size in a process of its own."""
+    print(f"{'frames × points':>17} {'peak, MB':>9} {'estimate':>9} {'seconds':>9} {'estimate':>9}")
+    for frames, points in SIZES:
+        command = [sys.executable, "-m", "benchmarks.installation.cost", str(frames), str(points)]
+        found = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+        guess = estimated(frames, found["points"], Options())
+        print(
+            f"{frames:>6} × {found['points']:<8,} {found['peak'] / 1e6:>9.0f} {guess.memory_bytes / 1e6:>9.0f} "
+            f"{found['seconds']:>9.1f} {guess.seconds:>9.1f}",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    if len(sys.argv) > 1:
+        measure(int(sys.argv[1]), int(sys.argv[2]))
+    else:
+        main()

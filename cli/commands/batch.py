@@ -1,0 +1,191 @@
+"""`pliant submit` of several files: a job each, found again when the command is repeated, and a table of how they ended."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pliant.cli.exits import Exit
+from pliant.cli.films import is_film
+from pliant.cli.paths import output_folder
+from pliant.cli.show import COLOURS, err, out, print_json
+
+if TYPE_CHECKING:
+    from pliant.client import Client, RemoteJob
+    from pliant.schemas.job import Job
+
+ENDINGS = frozenset({".npz", ".npy", ".mat", ".h5", ".hdf5", ".csv", ".txt"})
+"""Names that are taken for track files in a folder."""
+
+
+def expanded(given: list[Path], region: Path | None) -> list[Path]:
+    """Return the files that folders and patterns stand for, in the order of their names; a folder of pictures is a film.
+
+    Raises
+    ------
+    BadArgument
+        A folder has no track file, or a pattern finds nothing.
+    """
+    from pliant.client.errors import BadArgument
+
+    found: list[Path] = []
+    for path in given:
+        inside = track_files(path)
+        if inside:
+            found += inside
+        elif path.is_dir() and region is None and not any(path.iterdir()):
+            raise BadArgument(
+                f"{path}: expected track files ({', '.join(sorted(ENDINGS))}), got an empty folder. Name the files."
+            )
+        elif not path.exists() and any(sign in path.name for sign in "*?["):
+            matching = sorted(path.parent.glob(path.name))
+            if not matching:
+                raise BadArgument(f"{path}: expected files that match, got none. Check the pattern and its quotes.")
+            found += matching
+        else:
+            found.append(path)
+    return list(dict.fromkeys(found))
+
+
+def track_files(folder: Path) -> list[Path]:
+    """Return the track files of a folder by name, none if it is no folder or has pictures of a film instead."""
+    if not folder.is_dir():
+        return []
+    return sorted(each for each in folder.iterdir() if each.suffix.lower() in ENDINGS and each.is_file())
+
+
+@dataclass(slots=True)
+class Row:
+    """A file, and what became of it."""
+
+    file: Path
+    job: Job | None = None
+    error: Exception | None = None
+
+
+@dataclass(slots=True, kw_only=True)
+class Batch:
+    """Several files with the same options."""
+
+    files: list[Path]
+    shared: dict[str, Any]
+    """Further parameters of `Client.submit`."""
+    options: dict[str, Any]
+    key: str
+    """Told apart from other batches of the same files by it."""
+    priority: str
+    timeout: float | None
+    output: Path | None
+    wait: bool
+    rows: list[Row] = field(default_factory=list)
+
+    def check(self, *, name: str, job_id: str | None, region: Path | None, force: bool) -> None:
+        """Refuse options that belong to a single job, and output folders that hold something.
+
+        Raises
+        ------
+        BadArgument
+            One was given, or two files have the same name.
+        """
+        from pliant.client.errors import BadArgument
+        from pliant.client.multipart import existing_file
+
+        given = [word for word, value in (("--name", name), ("--id", job_id), ("--region", region)) if value]
+        if given:
+            raise BadArgument(
+                f"{', '.join(given)}: expected one file, got {len(self.files)}. Leave it out, or submit them singly."
+            )
+        for file in self.files:
+            existing_file(file, "tracks")
+        if self.output is None:
+            return
+        names = [file.stem for file in self.files]
+        twice = next((each for each in names if names.count(each) > 1), None)
+        if twice is not None:
+            raise BadArgument(
+                f"--output: several files are named {twice}, and would share a folder. Submit them apart."
+            )
+        for each in names:
+            if not force and (self.output / each / "report.json").exists():
+                continue  # of an earlier run: `Client.download` fetches only what is missing or different
+            output_folder(self.output / each, force=True)
+
+    def run(self, client: Client) -> None:
+        """Submit all, and wait for them if that is wanted. What fails has a row of its own and stops nothing."""
+        from pliant.client.errors import InvalidRequest, PliantError
+
+        submitted: list[tuple[Row, RemoteJob]] = []
+        for file in self.files:
+            row = Row(file)
+            self.rows.append(row)
+            try:
+                film = is_film(file, None)
+                job = client.submit(
+                    None if film else file, film=file if film else None, name=file.stem, options=self.options,
+                    idempotency_key=self._key_of(file), priority=self.priority, timeout=self.timeout,  # type: ignore[arg-type]
+                    webhook_secret=os.environ.get("PLIANT_WEBHOOK_SECRET") if self.shared.get("webhook") else None, **self.shared,
+                )  # fmt: skip
+            except InvalidRequest as error:
+                row.error = error
+                continue
+            row.job = job.record
+            submitted.append((row, job))
+        for row, job in submitted if self.wait else ():
+            try:
+                done = job.wait(load=False, timeout=self.timeout)
+                if self.output is not None:
+                    done.download(self.output / row.file.stem, timeout=self.timeout)
+            except PliantError as error:
+                row.error = error
+            row.job = client.get(job.id).record
+            err().print(f"{row.file}: {row.job.status}", highlight=False, markup=False)
+
+    @property
+    def exit_code(self) -> Exit:
+        """How the command ends: well only if every file went well."""
+        return Exit.FAILED if any(row.error is not None for row in self.rows) else Exit.DONE
+
+    def show(self, *, as_json: bool) -> None:
+        """Print the table."""
+        if as_json:
+            print_json([{"file": str(row.file), **_outcome(row)} for row in self.rows])
+            return
+        from rich.table import Table
+        from rich.text import Text
+
+        table = Table("file", "job", "status", "verdict", "seconds", "")
+        for row in self.rows:
+            job = row.job
+            status = "refused" if job is None else str(job.status)
+            took = (
+                None
+                if job is None or job.started_at is None or job.finished_at is None
+                else job.finished_at - job.started_at
+            )
+            table.add_row(
+                Text(str(row.file)), "" if job is None else job.id, Text(status, COLOURS.get(status, "red")),
+                "" if job is None else job.verdict or "", "" if took is None else f"{took.total_seconds():.1f}",
+                Text("" if row.error is None else str(row.error)),
+            )  # fmt: skip
+        out().print(table)
+
+    def _key_of(self, file: Path) -> str:
+        """Return the idempotency key of a file: of its content, the options and everything that goes with it."""
+        from pliant.client.multipart import sha256
+
+        content = sha256(file) if file.is_file() else str(file.absolute())
+        rest = json.dumps(
+            [self.key, self.options, {name: str(each) for name, each in self.shared.items()}], sort_keys=True
+        )
+        return f"batch/{hashlib.sha256(f'{content} {file.stem} {rest}'.encode()).hexdigest()}"
+
+
+def _outcome(row: Row) -> dict[str, Any]:
+    return {
+        "job": None if row.job is None else row.job.model_dump(mode="json"),
+        "error": None if row.error is None else str(row.error),
+    }

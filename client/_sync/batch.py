@@ -1,0 +1,65 @@
+# Generated from client/_async/batch.py by `make client`. Edit that file instead.
+"""Many inputs, one after the other: submitted a few ahead, returned in their order."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pliant.client._sync.job import RemoteJob, Result
+from pliant.client.errors import PliantError
+from pliant.client.multipart import Source
+
+if TYPE_CHECKING:
+    from pliant.client._sync.client import Client
+
+OnFailure = Callable[[int, PliantError], None]
+"""Called with the number of an input, from 0, and why it has no result."""
+
+
+def mapped(
+    client: Client,
+    inputs: Iterable[Source | Mapping[str, Any]],
+    *,
+    at_once: int,
+    key: str | None,
+    on_failure: OnFailure | None,
+    load: bool,
+    timeout: float | None,
+    submission: Mapping[str, Any],
+) -> Generator[Result, None, None]:
+    """Submit inputs and yield their results: see `Client.map`."""
+    ahead: deque[tuple[int, RemoteJob]] = deque()
+
+    def finished() -> Result | None:
+        number, job = ahead.popleft()
+        try:
+            return job.wait(load=load, timeout=timeout)
+        except PliantError as error:
+            if on_failure is None:
+                raise
+            on_failure(number, error)
+            return None
+
+    for number, each in enumerate(inputs):
+        given = {"name": named(each), **submission}
+        if key is not None:
+            given["idempotency_key"] = f"{key}/{number}"
+        try:
+            ahead.append((number, client.submit(each, **given)))
+        except PliantError as error:
+            if on_failure is None:
+                raise
+            on_failure(number, error)
+        if len(ahead) >= at_once and (result := finished()) is not None:
+            yield result
+    while ahead:
+        if (result := finished()) is not None:
+            yield result
+
+
+def named(source: object) -> str:
+    """Return the label of a job: its file's name without the ending, empty for arrays."""
+    return Path(source).stem if isinstance(source, (str, Path)) else ""

@@ -1,0 +1,165 @@
+"""Estimates of memory, and what is refused or left to another worker because of them."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pliant.schemas.job import Interpretation, Status
+from pliant.schemas.options import Options
+from pliant.worker.errors import InvalidRequest
+from pliant.worker.formats import read_inputs
+from pliant.worker.formats.cost import LIBRARIES, estimated, largest_that_fits
+from pliant.worker.jobs.admission import check_fits
+from pliant.worker.jobs.service import Jobs
+from pliant.worker.jobs.submission import Submission
+from pliant.worker.processes.memory import LIBRARIES as UNUSED
+from pliant.worker.processes.memory import memory_for_a_job
+from pliant.worker.settings import Settings
+from pliant.worker.store.queue import alive_key
+from worker_house import House
+
+MEASURE = """
+import resource, sys, tempfile
+from pathlib import Path
+from pliant.schemas.job import Interpretation
+from pliant.schemas.options import Options
+from pliant.solver import gallery, threads_limited
+from pliant.worker.execution.pipeline import reconstruct
+from pliant.worker.formats import Inputs
+frames, points, prior = int(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
+sequence = gallery.face(frames, points)
+stated = Interpretation(num_frames=frames, num_points=points, num_faces=0, hidden_fraction=0, mesh_source="given",
+                        has_ground_truth=False, has_rotations=False, layout="")
+with threads_limited(1), tempfile.TemporaryDirectory() as folder:
+    options = Options(prior=prior, max_reweightings=2, camera="scaled_orthographic")
+    reconstruct(Inputs(sequence.tracks, sequence.mesh, None, None, stated), options, Path(folder))
+print(sequence.tracks.num_points, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="reads kilobytes")
+@pytest.mark.parametrize(("frames", "points", "prior"), [(8, 500, "gaussian"), (10, 20_000, "smooth")])
+def test_the_estimate_is_within_a_factor_of_two(frames: int, points: int, prior: str) -> None:
+    env = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    command = [sys.executable, "-c", MEASURE, str(frames), str(points), prior]
+    ran = subprocess.run(command, env=env, capture_output=True, text=True, check=True, timeout=250)
+    count, peak = map(int, ran.stdout.split())
+    estimate = estimated(frames, count, Options(prior=prior)).memory_bytes  # type: ignore[arg-type]
+    assert peak / 2 < estimate < 2 * peak, (peak, estimate)
+
+
+def test_what_fits_is_what_the_estimate_says() -> None:
+    for prior in ("gaussian", "smooth", "smooth+low_rank"):
+        options = Options(prior=prior)
+        points, frames = largest_that_fits(2_000_000_000, 50, 1000, options)
+        assert (
+            estimated(50, points, options).memory_bytes
+            <= 2_000_000_000
+            < estimated(50, points + 1, options).memory_bytes
+        )
+        assert (
+            estimated(frames, 1000, options).memory_bytes
+            <= 2_000_000_000
+            < estimated(frames + 1, 1000, options).memory_bytes
+        )
+    assert largest_that_fits(LIBRARIES - 1, 50, 1000, Options()) == (0, 0)
+
+
+def interpretation(frames: int, points: int) -> Interpretation:
+    return Interpretation(
+        num_frames=frames, num_points=points, num_faces=0, hidden_fraction=0.0, mesh_source="none", has_ground_truth=False,
+        has_rotations=False, layout="", estimate=estimated(frames, points, Options()),
+    )  # fmt: skip
+
+
+def test_a_job_that_fits_no_worker_is_refused_with_what_would_fit() -> None:
+    large = interpretation(100, 100_000)
+    with pytest.raises(InvalidRequest) as caught:
+        check_fits(large, Options(), [1_000_000_000, 2_000_000_000])
+    error = caught.value
+    assert (error.code, error.field) == ("needs_more_memory", "tracks")
+    assert "2.0 GB" in error.expected
+    points = int(error.hint.split("max_points=")[1].split()[0])
+    check_fits(interpretation(100, points), Options(), [2_000_000_000])
+    with pytest.raises(InvalidRequest):
+        check_fits(interpretation(100, points + 1), Options(), [2_000_000_000])
+    with pytest.raises(InvalidRequest, match="more memory"):
+        check_fits(interpretation(3, 4), Options(), [50_000_000])
+    check_fits(large, Options(), [])
+    check_fits(large, Options(), [0])
+    check_fits(large.model_copy(update={"estimate": None}), Options(), [1])
+
+
+def test_inputs_come_with_their_estimate(tmp_path: Path) -> None:
+    generator = np.random.default_rng(0)
+    paths = generator.normal(size=(6, 40, 2)).cumsum(axis=0) + 100 * generator.normal(size=(40, 2))
+    np.save(tmp_path / "t.npy", paths)
+    found = read_inputs(tracks=tmp_path / "t.npy", mesh=None, ground_truth=None, rotations=None, options=Options())
+    assert found.interpretation.estimate == estimated(6, 40, Options())
+
+
+def test_the_memory_of_a_job_is_its_limit_and_its_share(tmp_path: Path) -> None:
+    group = tmp_path / "memory.max"
+    group.write_text("max\n")
+    physical = memory_for_a_job(Settings(), group=group)
+    assert physical == os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    group.write_text("3000000000\n")
+    assert memory_for_a_job(Settings(), group=group) == 3_000_000_000
+    assert memory_for_a_job(Settings(workers=3), group=group) == 1_000_000_000
+    assert memory_for_a_job(Settings(memory_limit=2 << 30), group=group) == (2 << 30) - UNUSED
+    assert memory_for_a_job(Settings(), group=tmp_path / "none") == physical
+
+
+@pytest.fixture
+def jobs(settings: Settings) -> Jobs:
+    return Jobs.open(settings)
+
+
+def alive(jobs: Jobs, name: str, memory: str) -> None:
+    from pliant.worker.store.connection import connect
+
+    client = connect(jobs.settings.redis, decode=True)
+    client.sadd(f"rq:workers:{jobs.settings.queue}", f"rq:worker:{name}")
+    client.set(alive_key(jobs.settings.queue, name), f"1{memory}", ex=60)
+    client.close()
+
+
+def test_a_submission_asks_the_workers_that_run(jobs: Jobs, inputs_file: Path) -> None:
+    large, submission = interpretation(100, 100_000), Submission(options=Options())
+    assert jobs.queue.memories() == {}
+    jobs.submit(inputs_file, submission, interpretation=large)
+    alive(jobs, "old", "")  # of a version that states none
+    alive(jobs, "small", " 500000000")
+    assert jobs.queue.memories() == {"small": 500_000_000}
+    with pytest.raises(InvalidRequest, match=r"0\.5 GB"):
+        jobs.submit(inputs_file, submission, interpretation=large)
+    assert jobs.count(list(Status)) == 1
+    alive(jobs, "large", " 64000000000")
+    jobs.submit(inputs_file, submission, interpretation=large)
+
+
+@pytest.mark.slow
+def test_a_worker_leaves_a_job_that_is_too_large_to_a_larger_one(
+    settings: Settings, inputs_files: tuple[Path, Path]
+) -> None:
+    """The small worker is asked first and puts the job back; the large one does it."""
+    small = replace(settings, memory_limit=UNUSED + (1 << 30), threads=1)
+    with House(small, inputs=inputs_files) as house:
+        alive(house.jobs, "large", f" {1 << 60}")
+        big = interpretation(100, 1_000_000)
+        submission = Submission(options=Options(max_reweightings=2))
+        id = house.jobs.submit(house.short_inputs, submission, interpretation=big).id
+        other = house.submit()
+        assert house.final(other).status is Status.SUCCEEDED
+        assert house.jobs.get(id).status is Status.QUEUED
+        assert (
+            house.jobs.queue.waiting() == [house.jobs.records.get(id).attempt_id] or house.jobs.queue.place(id) is None
+        )
+        house.jobs.cancel(id)
