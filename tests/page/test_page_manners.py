@@ -61,7 +61,7 @@ def test_there_are_no_accessibility_findings_and_no_overflow(
         if "#" in address:
             page.locator(".view canvas").wait_for(timeout=DONE)
         if address == "":
-            page.get_by_text("More options").click()
+            page.get_by_text("Files to write", exact=True).click()
         page.evaluate(axe.read_text())
         found = page.evaluate("axe.run().then((found) => found.violations)")
         if address == "docs":  # Swagger UI has a link inside the button of each operation
