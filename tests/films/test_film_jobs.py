@@ -1,4 +1,4 @@
-"""Films as inputs of jobs: the contained process, its limits, and what becomes of the tracks."""
+"""Films as inputs of jobs: the film process, its limits, and the resulting tracks."""
 
 from __future__ import annotations
 

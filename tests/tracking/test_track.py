@@ -1,4 +1,4 @@
-"""Tracks of rendered films against their truth, and what the tracker makes of awkward films."""
+"""Tracks of rendered films compared with their truth, and the tracker on difficult films."""
 
 from __future__ import annotations
 
