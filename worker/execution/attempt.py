@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pliant.schemas.job import Problem, Progress, Status
+from pliant.worker import tracing
 from pliant.worker.errors import Interrupted, StaleAttempt, StoreUnavailable, UnknownJob
 from pliant.worker.execution.failures import problem_of, timed_out
 from pliant.worker.execution.monitor import Patience
@@ -55,7 +56,19 @@ def run(id: str, attempt_id: str, *, settings: Settings, worker: str) -> None:
         logger.info("delivery %s dropped: %s", attempt_id, error)
         return
     attempt = Attempt(jobs=jobs, id=id, attempt_id=attempt_id, deadline=_deadline(settings))
-    directory = working_directory(settings, attempt_id)
+    tracing.configure(settings.tracing, service="pliant-worker")
+    try:
+        with tracing.span("attempt", parent=stored.trace, job=id, attempt=stored.job.attempt, worker=worker):
+            if stored.job.started_at is not None:
+                tracing.past("queued", begin=stored.job.created_at, end=stored.job.started_at)
+            _conclude(attempt, stored, worker=worker, settings=settings)
+    finally:
+        tracing.finish()
+
+
+def _conclude(attempt: Attempt, stored: Stored, *, worker: str, settings: Settings) -> None:
+    """Work on a claimed attempt, with its own output and memory limit, and record the outcome."""
+    directory = working_directory(settings, attempt.attempt_id)
     directory.mkdir(parents=True, exist_ok=True)
     attempt.log(f"Attempt {stored.job.attempt} began on worker {worker}.")
     with _own_output(directory / OUTPUT):
@@ -64,7 +77,9 @@ def run(id: str, attempt_id: str, *, settings: Settings, worker: str) -> None:
                 end = work(attempt, stored, directory)
             attempt.conclude(end)
         except (StaleAttempt, UnknownJob) as error:
-            logger.info("attempt %s ended: %s", attempt_id, error)
+            logger.info("attempt %s ended: %s", attempt.attempt_id, error)
+        finally:
+            attempt.stages.end()
 
 
 @dataclass(slots=True, kw_only=True)
@@ -81,11 +96,14 @@ class Attempt:
     _parent: int = field(default_factory=os.getppid)
     _next_report: float = 0.0
     _stage: str = ""
+    stages: tracing.Stages = field(default_factory=tracing.Stages)
+    """Spans of the trace, where there is one."""
     _next_look: float = 0.0
     _lines: list[str] = field(default_factory=list)
 
     def report(self, progress: Progress) -> None:
         """Write the progress: each new stage, else at most every `PROGRESS_INTERVAL` seconds. An unavailable store is ignored."""
+        self.stages.enter(progress.stage)
         now = time.monotonic()
         if now < self._next_report and progress.stage == self._stage:
             return

@@ -10,6 +10,7 @@ from datetime import datetime
 from pathlib import Path
 
 from pliant.schemas.job import Artifact, Interpretation, Job, JobPage, Status
+from pliant.worker import tracing
 from pliant.worker.errors import (
     Conflict,
     NotAllowedNow,
@@ -386,6 +387,7 @@ class Jobs:
             key=key_digest(submission.idempotency_key, self.owner),
             fingerprint=submission.fingerprint,
             webhook=submission.webhook,
+            trace=tracing.traceparent(),
             max_running=self.max_running,
         )
         kept = acceptance.create(stored, put, max_queued=self.max_queued)
