@@ -73,7 +73,7 @@ def film_rows(facts: FilmFacts) -> list[tuple[str, str]]:
         ("film", facts.container),
         ("size", f"{facts.width}×{facts.height} pixels"),
         ("frames", f"{facts.frames}{of_all}" if facts.frames else "not stated"),
-        ("rate", f"{facts.fps:.4g} frames a second"),
+        ("rate", f"{facts.fps:.4g} frames per second"),
         ("duration", f"{facts.seconds:.1f} s" if facts.seconds else "not stated"),
         ("rotation", f"{facts.rotation}°, applied" if facts.rotation else "none"),
     ]

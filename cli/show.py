@@ -124,7 +124,7 @@ def understood(interpretation: Interpretation) -> list[tuple[str, str]]:
         ("y axis", interpretation.y_axis),
     ]
     if interpretation.image_size is not None:
-        rate = "" if interpretation.fps is None else f", {interpretation.fps:.4g} frames a second"
+        rate = "" if interpretation.fps is None else f", {interpretation.fps:.4g} frames per second"
         rows.append(("film", f"{interpretation.image_size.replace('x', '×')} pixels{rate}"))
     if len(given) > 0:
         rows.append(("also given", ", ".join(given)))

@@ -14,12 +14,10 @@ from pliant.solver.cameras.joint_refinement import LEARNED_FRAMES, informative_f
 from pliant.solver.cameras.lens import given_lens
 from pliant.solver.cameras.perspective import Perspective, orthographic
 from pliant.solver.cameras.planar_ambiguity import is_planar
-from pliant.solver.energy.hyperparameters import MIN_NOISE_STD
 from pliant.solver.energy.objective import residuals
 from pliant.solver.energy.problem import Problem
 from pliant.solver.energy.robust_loss import largest_weight
 from pliant.solver.errors import InvalidInput, InvalidSettings
-from pliant.solver.evaluation.trust import assess
 from pliant.solver.isometry.surface import IsometricVerdict, isometric_surface
 from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.shape_covariance import ShapeCovariance
@@ -39,6 +37,7 @@ from pliant.solver.records import (
     read_only,
 )  # fmt: skip
 from pliant.solver.settings import Settings
+from pliant.solver.shapes.assessment import assessed
 from pliant.solver.shapes.initialization import pseudo_inverse, uniform_solution
 from pliant.solver.shapes.irls import init, no_higher, step, terminate
 from pliant.solver.shapes.isometric_solution import centre_downwards, downwards, isometric_solution
@@ -47,7 +46,6 @@ from pliant.solver.shapes.perspective_shapes import corrected_again, seen_in_per
 from pliant.solver.shapes.setup import build_problem, with_bending
 from pliant.solver.shapes.sparsely_observed import WELL_OBSERVED_SHARE, WellObserved, place_the_rest, well_observed
 from pliant.solver.shapes.state import State
-from pliant.solver.shapes.uncertainty import bounded_by_neighbours, position_std
 from pliant.solver.tracks.completion import seen_again
 from pliant.solver.tracks.frame_order import as_they_came, content_order, differences, in_order, resolved_order
 from pliant.solver.tracks.noise import OUTLIER_SHARE
@@ -188,7 +186,10 @@ def _solved(
     )
     if estimate.perspective is not None:
         solution = seen_in_perspective(solution, tracks, estimate.perspective, normalized.unit, kept)
-    solution = assessed(solution, problem, estimate, covariance, normalized.unit, seed=settings.seed)
+    solution = assessed(
+        solution, problem.confidence, estimate, covariance, normalized.unit,
+        turning=cameras is None and settings.refine_rotations, seed=settings.seed, should_stop=should_stop,
+    )  # fmt: skip
     if verdict is not None:
         solution = replace(solution, choices=_with_verdict(solution.choices, verdict, settings))
     seconds["finish"] = time.perf_counter() - began
@@ -421,43 +422,6 @@ def finish(
     for array in arrays:
         read_only(array)
     return Solution(shapes, camera, residual, np.clip(trust, 0.0, 1.0), trace, outcome, choices, seconds)
-
-
-INFLATION = 1.6
-"""Factor from the posterior standard deviation with known cameras and prior to that with estimated ones. On ten face
-scans and face landmarks, clean and corrupted, errors exceed the posterior's 90 % quantile by 1.3 to 2."""
-
-
-def assessed(
-    solution: Solution,
-    problem: Problem,
-    estimate: CameraEstimate,
-    covariance: ShapeCovariance | None,
-    unit: float,
-    *,
-    seed: int,
-) -> Solution:
-    """Return the solution with the standard deviation of its positions and how far to trust it."""
-    std, modes = None, 0
-    confidence = np.asarray(problem.confidence, dtype=np.float64)
-    if covariance is not None:
-        projections = np.asarray(estimate.scales)[:, None, None] * np.asarray(estimate.rotations)[:, :2]
-        noise = max(covariance.noise_variance**0.5, MIN_NOISE_STD)
-        std = INFLATION * unit * position_std(covariance, projections, confidence, noise_std=noise, seed=seed)
-        std = bounded_by_neighbours(std, solution.shapes, confidence)
-        modes = covariance.modes.shape[1]
-        read_only(std)
-    trust = assess(
-        solution.shapes,
-        solution.camera.rotations,
-        solution.residuals,
-        confidence,
-        scales=solution.camera.scales,
-        shapes_std=std,
-        planar=is_planar(estimate.gram),
-        modes=modes,
-    )
-    return replace(solution, shapes_std=std, trust=trust)
 
 
 def _start(problem: Problem, estimate: CameraEstimate, settings: Settings) -> State:

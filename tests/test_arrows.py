@@ -119,7 +119,7 @@ PACKAGES = sorted({path.parent for path in SOURCES if path.parent != ROOT / "doo
 
 
 @pytest.mark.parametrize("folder", PACKAGES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_no_arrow_between_rooms_runs_back(folder: Path) -> None:
+def test_imports_between_subpackages_have_no_cycles(folder: Path) -> None:
     try:
         tuple(TopologicalSorter(rooms_below(folder)).static_order())
     except CycleError as error:
@@ -132,7 +132,7 @@ ALSO_ROOMS = sorted(
 
 
 @pytest.mark.parametrize("folder", [*PACKAGES, *ALSO_ROOMS], ids=lambda path: str(path.relative_to(ROOT)))
-def test_a_room_holds_few_files(folder: Path) -> None:
+def test_every_folder_has_at_most_16_files(folder: Path) -> None:
     files = [path.name for path in folder.glob("*.py")]
     assert len(files) <= MOST_FILES, f"{len(files)} Python files side by side: {files}"
 

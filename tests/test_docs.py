@@ -108,7 +108,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("block", BLOCKS, ids=lambda block: block.place)
-def test_every_block_says_what_it_is(block: Block) -> None:
+def test_every_code_block_has_a_language(block: Block) -> None:
     assert block.language in RUN | READ | SHOWN, (
         f"{block.place}: name the block's language, one of {RUN | READ | SHOWN}"
     )

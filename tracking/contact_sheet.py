@@ -75,3 +75,12 @@ def _colours(points: NDArray[np.float32]) -> NDArray[np.uint8]:
     radius = np.linalg.norm(offset, axis=1)
     hsv = np.stack([angle * 179, 90 + 165 * radius / max(radius.max(), 1e-6), np.full(len(angle), 255.0)], axis=1)
     return np.asarray(cv2.cvtColor(hsv.astype(np.uint8)[None], cv2.COLOR_HSV2RGB)[0], dtype=np.uint8)
+
+
+def small_jpeg(image: NDArray[np.uint8], *, longest_side: int, quality: int) -> bytes:
+    """Return an RGB picture `(H, W, 3)` as a JPEG whose longest side is at most `longest_side` pixels."""
+    scale = longest_side / max(image.shape[:2])
+    if scale < 1:
+        image = np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    parameters = [cv2.IMWRITE_JPEG_QUALITY, quality]
+    return bytes(cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), parameters)[1].tobytes())

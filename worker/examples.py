@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pliant.solver.gallery import Sequence, corrupt, face, flag, sphere
 from pliant.worker.errors import UnknownExample
+from pliant.worker.films import example as example_film
 
 Write = Callable[[Sequence], bytes]
 
@@ -59,7 +60,7 @@ def example_file(name: str, file: str) -> bytes:
     Parameters
     ----------
     name : str
-        A key of `EXAMPLES`.
+        A key of `EXAMPLES`, or the name of the example film where OpenCV is installed.
     file : str
         A file that the example lists.
 
@@ -68,6 +69,8 @@ def example_file(name: str, file: str) -> bytes:
     UnknownExample
         There is no such example, or it has no such file.
     """
+    if (name, file) == (example_film.NAME, example_film.FILE) and example_film.available():
+        return example_film.film()
     example = EXAMPLES.get(name)
     if example is None or file not in (listed for _, listed in example.files):
         raise UnknownExample(

@@ -13,10 +13,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from benchmarks.raster import draw_mesh
 from PIL import Image
 from pliant.solver import Camera
 from pliant.tracking import open_film
+
+from benchmarks.figures.shading import draw_mesh
 
 SPLIT = 4
 """Parts of a quad's side in drawings, so that the texture is sharper than the mesh."""

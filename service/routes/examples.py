@@ -9,6 +9,7 @@ from fastapi.responses import Response
 from pliant.schemas.job import Record
 from pliant.service.openapi import problems
 from pliant.worker.examples import EXAMPLES, example_file
+from pliant.worker.films import example as example_film
 
 router = APIRouter(prefix="/v1/examples", tags=["about"])
 
@@ -31,6 +32,8 @@ class Example(Record):
     name: str
     title: str
     files: list[ExampleFile]
+    region_polygon: list[tuple[float, float]] | None = None
+    """The object in a film's first frame, for the option of this name."""
 
 
 class Examples(Record):
@@ -58,7 +61,18 @@ def examples(request: Request) -> Examples:
             )
             for one in EXAMPLES.values()
         ]
+        + _films(request)
     )
+
+
+def _films(request: Request) -> list[Example]:
+    """Return the example film, if films are tracked here."""
+    if not example_film.available():
+        return []
+    name, file = example_film.NAME, example_film.FILE
+    url = str(request.app.url_path_for("example", name=name, file=file))
+    files = [ExampleFile(part="film", file=file, url=url)]
+    return [Example(name=name, title=example_film.TITLE, files=files, region_polygon=list(example_film.region()))]
 
 
 @router.get(

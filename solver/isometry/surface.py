@@ -3,8 +3,9 @@
 Maximum depth (`inextensible`) gives a start, refinement on the isometry itself (`refinement`) the depths of some anchors, splines
 (`extension`) those of all points. The isometric inconsistency I, the share of the edges' length that changes from frame
 to frame, is computed without ground truth. As a function of the focal length it has its minimum at the true one wherever perspective is
-strong enough for the method to work, and is large or flat elsewhere. Isometry is therefore accepted only where I is small and
-clearly smaller than at the neighbouring focal lengths. The order of the frames has no effect.
+strong enough for the method to work, and is large or flat elsewhere. Isometry is therefore accepted only where I is small,
+clearly smaller than at the neighbouring focal lengths, and where halves of the frames lead to the same edge lengths
+(`confirmation`). The order of the frames has no effect.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.isometry.anchors import Anchors, choose_anchors, connected, nearest_neighbours, unlike_frames
+from pliant.solver.isometry.confirmation import DISAGREEMENT, disagreement
 from pliant.solver.isometry.extension import Extended, complete_anchors, extend, flatten
 from pliant.solver.isometry.focal_sweep import CLEAR, FocalSearch, Tried, judged, sweep
 from pliant.solver.isometry.inextensible import SurfaceGraph, maximum_depth
@@ -152,9 +154,11 @@ def isometric_surface(
         return IsometricVerdict("No isometric surface was found: the conic program has no solution.", _trace(tried))
     least = min(tried, key=lambda each: each.found.inconsistency)
     clear, why = judged(tried, least)
+    chosen = least if focal is None else tried[0]
+    if clear:
+        clear, why = _confirmed(search, chosen, why)
     if not clear and not required:
         return IsometricVerdict(why, _trace(tried))
-    chosen = least if focal is None else tried[0]
     surface = _everywhere(search, tracks, seen, chosen)
     if surface is None:
         return IsometricVerdict("No isometric surface was found: its points do not hang together.", _trace(tried))
@@ -174,6 +178,15 @@ def _implausible(search: FocalSearch | None, focal: float, required: bool) -> st
     return (
         f"Not an isometric sheet: edge lengths of a part of it change by {changes:.1%}." if changes > HOPELESS else None
     )
+
+
+def _confirmed(search: FocalSearch, chosen: Tried, why: str) -> tuple[bool, str]:
+    """Return whether halves of the frames lead to the same surface, and the sentence."""
+    share = disagreement(search, chosen)
+    if share > DISAGREEMENT:
+        change = "by more than their length" if share > 1 else f"by {share:.0%}"
+        return False, f"Not taken as an isometric sheet: its edge lengths differ {change} between halves of the frames."
+    return True, f"{why} Halves of the frames agree about the lengths to {share:.1%}."
 
 
 def _some_frames(points: Floats, seen: NDArray[np.bool_]) -> NDArray[np.intp]:

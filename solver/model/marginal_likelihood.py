@@ -221,6 +221,8 @@ def energy(scene: Scene, motion: Motion) -> tuple[float, Motion]:
     root0, root1 = _root(motion.mean_root), _root(motion.axis_root)
     noise, walk_variance = np.exp(2 * motion.logs)
     try:
+        if walk_variance == 0:  # underflow
+            raise np.linalg.LinAlgError("no random walk is left")
         model = image_of(scene, motion)
         found = terms(model, scene.factor)
     except np.linalg.LinAlgError:

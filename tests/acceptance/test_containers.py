@@ -45,16 +45,16 @@ def valkey(tmp_path: Path) -> Iterator[Settings]:
 
 
 @pytest.mark.parametrize("name", ["api", "worker"])
-def test_the_services_start_what_exists(name: str) -> None:
+def test_the_services_start_existing_commands(name: str) -> None:
     assert starts(COMPOSE["services"][name]["command"])
 
 
-def test_the_image_alone_starts_the_whole_service() -> None:
+def test_the_image_alone_starts_the_complete_service() -> None:
     (command,) = re.findall(r"^CMD (\[.*\])$", DOCKERFILE, flags=re.MULTILINE)
     assert starts(yaml.safe_load(command))
 
 
-def test_every_variable_that_is_set_is_one_that_is_read() -> None:
+def test_every_variable_that_is_set_is_also_read() -> None:
     used = (
         set(COMPOSE["x-pliant"]["environment"])
         | set(COMPOSE["services"]["api"]["environment"])
@@ -73,7 +73,7 @@ def test_every_setting_and_the_credentials_of_s3_reach_the_containers() -> None:
     assert "\nAWS_" not in EXAMPLE, "an empty AWS_ variable would hide the credentials of the machine"
 
 
-def test_whoever_needs_the_queue_waits_until_it_is_healthy() -> None:
+def test_services_that_need_the_queue_wait_until_it_is_healthy() -> None:
     services = COMPOSE["services"]
     assert "valkey-cli ping" in services["valkey"]["healthcheck"]["test"][-1]
     assert "/readyz?exclude=workers" in services["api"]["healthcheck"]["test"][-1]
@@ -81,7 +81,7 @@ def test_whoever_needs_the_queue_waits_until_it_is_healthy() -> None:
         assert services[name]["depends_on"] == {"valkey": {"condition": "service_healthy"}}
 
 
-def test_the_health_check_of_the_worker_tells_whether_there_is_one(valkey: Settings, tmp_path: Path) -> None:
+def test_the_health_check_of_the_worker_reports_whether_one_runs(valkey: Settings, tmp_path: Path) -> None:
     script = COMPOSE["services"]["worker"]["healthcheck"]["test"]
     assert script[:3] == ["CMD", "python", "-c"]
     env = {**os.environ, **valkey.to_environment(), "PLIANT_QUEUE": "health"}
@@ -122,7 +122,7 @@ def test_with_tls_only_the_proxy_is_reachable() -> None:
 
 
 @pytest.mark.parametrize("unit", sorted((ROOT / "deploy" / "systemd").iterdir()), ids=lambda path: path.name)
-def test_the_units_start_what_exists(unit: Path) -> None:
+def test_the_units_start_existing_commands(unit: Path) -> None:
     parser = configparser.ConfigParser(strict=False, interpolation=None)
     parser.optionxform = str  # type: ignore[assignment, method-assign]
     parser.read(unit)
@@ -132,7 +132,7 @@ def test_the_units_start_what_exists(unit: Path) -> None:
     assert used <= read_variables()
 
 
-def test_nothing_is_open_to_the_world_and_no_secret_has_a_default() -> None:
+def test_no_port_is_public_and_no_secret_has_a_default() -> None:
     text = (ROOT / "docker-compose.yml").read_text()
     assert COMPOSE["services"]["api"]["ports"] == ["127.0.0.1:8000:8000"]
     assert "ports" not in COMPOSE["services"]["valkey"]

@@ -40,7 +40,7 @@ def house(root: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]
 
 
 @pytest.mark.parametrize("name", WANTED)
-def test_nothing_is_lost_doubled_half_written_or_left_over(house: Any, name: str) -> None:
+def test_nothing_is_lost_duplicated_half_written_or_left_over(house: Any, name: str) -> None:
     listed = import_module("benchmarks.installation.faults").FAULTS
     _, commit = listed[name]
     told = commit(house)

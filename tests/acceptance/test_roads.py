@@ -43,7 +43,7 @@ def arrays(path: Path) -> dict[str, np.ndarray]:
         return {name: held[name] for name in held.files}
 
 
-def test_the_demonstration_ends_with_files_that_play_and_an_honest_verdict(tmp_path: Path) -> None:
+def test_the_demonstration_ends_with_playable_files_and_a_verdict(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "pliant.cli", "demo", "--small", "--keep", "--json"]
     process = subprocess.Popen(command, cwd=tmp_path, env=ENVIRONMENT, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
@@ -81,7 +81,7 @@ def document(stream: IO[str]) -> dict[str, Any]:
     return value
 
 
-def test_work_serves_a_queue_until_it_is_told_to_stop(tmp_path: Path) -> None:
+def test_work_serves_a_queue_until_it_is_stopped(tmp_path: Path) -> None:
     valkey = Valkey.claim(tmp_path)
     server = valkey.start()
     command = [sys.executable, "-m", "pliant.cli", "work", "--data", str(tmp_path), "--workers", "1", "--json"]
@@ -150,7 +150,7 @@ def test_solve_and_the_service_give_the_same_bits(service_url: str, tmp_path: Pa
         assert (tmp_path / "here" / name).read_bytes() == (tmp_path / "there" / name).read_bytes(), name
 
 
-def test_what_solve_is_refused_is_what_the_service_refuses(tmp_path: Path) -> None:
+def test_solve_and_the_service_reject_the_same_inputs(tmp_path: Path) -> None:
     np.savez(tmp_path / "tracks.npz", tracks=np.ones((2, 9, 2)))
     ran = pliant("solve", "tracks.npz", "-o", "out", "--json", folder=tmp_path)
     assert ran.returncode == 3
@@ -159,7 +159,7 @@ def test_what_solve_is_refused_is_what_the_service_refuses(tmp_path: Path) -> No
     assert not (tmp_path / "out").exists()
 
 
-def test_where_two_readings_fit_the_choices_are_told_and_one_can_be_taken(tmp_path: Path) -> None:
+def test_ambiguous_inputs_list_choices_that_can_be_selected(tmp_path: Path) -> None:
     np.savez(tmp_path / "noise.npz", W=np.random.default_rng(0).normal(size=(16, 9)))
     ran = pliant("inspect", "noise.npz", folder=tmp_path)
     assert ran.returncode == 3
@@ -168,7 +168,7 @@ def test_where_two_readings_fit_the_choices_are_told_and_one_can_be_taken(tmp_pa
     assert pliant("inspect", "noise.npz", "-O", "rows=stacked", folder=tmp_path).returncode == 0
 
 
-def test_inspect_says_how_a_file_is_understood(tmp_path: Path) -> None:
+def test_inspect_shows_how_a_file_is_interpreted(tmp_path: Path) -> None:
     sequence = face(12, 60)
     tracked = sequence.tracks.points[None].transpose(0, 2, 1, 3)
     np.savez(tmp_path / "tapir.npz", tracks=tracked, visibles=np.ones(tracked.shape[:3], bool))
@@ -180,7 +180,7 @@ def test_inspect_says_how_a_file_is_understood(tmp_path: Path) -> None:
     assert f"12 frames × {sequence.tracks.num_points} points" in ran.stdout
 
 
-def test_up_stops_all_it_started_on_one_signal_and_refuses_a_second_one(tmp_path: Path) -> None:
+def test_up_stops_all_its_processes_on_one_signal(tmp_path: Path) -> None:
     with running(tmp_path / "one") as url:
         port = url.rpartition(":")[2]
         busy = pliant("up", "--port", port, "--data", "other", folder=tmp_path)
@@ -200,7 +200,7 @@ def _read(entry: Path) -> bytes:
         return b""
 
 
-def test_the_doctor_finds_a_healthy_house_and_says_what_is_wrong_with_another(tmp_path: Path) -> None:
+def test_doctor_accepts_a_healthy_installation_and_reports_faults(tmp_path: Path) -> None:
     ran = pliant("doctor", "--port", 1, "--url", "http://127.0.0.1:9", "--json", folder=tmp_path)
     found = {finding["what"]: finding for finding in json.loads(ran.stdout)}
     assert (found["Python"]["verdict"], found["packages"]["verdict"], found["queue"]["verdict"]) == (

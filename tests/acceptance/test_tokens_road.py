@@ -85,7 +85,7 @@ def tracks(tmp_path: Path) -> Path:
     return path
 
 
-def test_without_a_token_a_service_that_asks_for_one_does_not_start(tmp_path: Path) -> None:
+def test_a_service_that_requires_tokens_does_not_start_without_one(tmp_path: Path) -> None:
     ran = pliant("up", "--port", 0, "--auth", "required", "--data", tmp_path / "empty")
     assert ran.returncode == Exit.UNREACHABLE
     assert "pliant token create NAME" in ran.stderr
@@ -103,7 +103,7 @@ def test_the_command_line_works_with_a_token_and_not_without(url: str, first: di
         assert "token" in refused.stderr
 
 
-def test_the_end_of_a_job_arrives_signed_and_the_sdk_proves_it(url: str, first: dict[str, Any], tracks: Path) -> None:
+def test_the_webhook_of_a_job_is_signed_and_the_sdk_verifies_it(url: str, first: dict[str, Any], tracks: Path) -> None:
     got: list[tuple[dict[str, str], bytes]] = []
 
     class Receiver(BaseHTTPRequestHandler):
@@ -135,7 +135,7 @@ def test_the_end_of_a_job_arrives_signed_and_the_sdk_proves_it(url: str, first: 
     assert [each.name for each in job.artifacts]
 
 
-def test_tokens_are_made_and_revoked_while_the_service_runs(url: str, data: Path) -> None:
+def test_tokens_are_created_and_revoked_while_the_service_runs(url: str, data: Path) -> None:
     second = made(data, "second", "--scope", "read", "--expires", "1h")
     listed = pliant("token", "list", "--data", data)
     assert "second" in listed.stdout
@@ -156,7 +156,9 @@ def test_tokens_are_made_and_revoked_while_the_service_runs(url: str, data: Path
         (["  "], "printable characters"),
     ],
 )
-def test_what_cannot_be_a_token_is_refused_in_a_sentence(url: str, data: Path, arguments: list[str], said: str) -> None:
+def test_invalid_token_arguments_are_rejected_with_a_message(
+    url: str, data: Path, arguments: list[str], said: str
+) -> None:
     del url
     ran = pliant("token", "create", *arguments, "--data", data)
     assert ran.returncode == Exit.REFUSED

@@ -103,7 +103,7 @@ def test_aims_are_met_or_missed_by_what_was_measured(bench):
     assert table[-1].endswith("| met |")
 
 
-def test_cells_of_another_commit_are_measured_anew_only_on_request(tmp_path):
+def test_results_of_another_commit_are_remeasured_only_on_request(tmp_path):
     write_case(tmp_path / "data" / "tiny")
     results = tmp_path / "cells.jsonl"
     arguments = ("--data", tmp_path / "data", "--methods", "pseudo_inverse", "--cameras", "true", "--results", results)
@@ -117,7 +117,7 @@ def test_cells_of_another_commit_are_measured_anew_only_on_request(tmp_path):
     assert len(results.read_text().splitlines()) == 2
 
 
-def test_the_plan_names_sequences_methods_and_corruptions_that_there_are(bench):
+def test_the_plan_names_existing_sequences_methods_and_corruptions(bench):
     plan, cells, aims = bench("accuracy.plan"), bench("accuracy.cells"), bench("accuracy.aims")
     for part in plan.PARTS:
         assert set(part.methods) <= set(cells.METHODS)
@@ -163,7 +163,7 @@ def test_all_visible_puts_hidden_points_where_the_camera_would_see_them(bench):
     assert sequences.as_given(sequences.from_gallery(ball, "sphere"), "file").tracks is ball.tracks
 
 
-def test_a_regression_is_noticed_and_noise_is_not(bench):
+def test_a_regression_is_detected_and_noise_is_not(bench):
     gate = bench("accuracy.gate")
     baseline = {"a": 0.1, "b": 0.0, "c": 0.2}
     assert gate.regressions({"a": 0.1055, "b": 0.0009, "c": 0.05}, baseline) == set()
@@ -267,7 +267,7 @@ def test_pictures_are_drawn_of_anything(tmp_path: Path, given: str) -> None:
 @pytest.mark.parametrize(
     ("value", "text"), [(0.03412, ".0341"), (1.254, "1.25"), (-0.5, "-.500"), (0.0, "0"), (float("nan"), "–")]
 )
-def test_numbers_are_written_in_the_field_s_manner(bench, value, text):
+def test_numbers_are_formatted_as_in_the_literature(bench, value, text):
     assert bench("accuracy.tables").number(value) == text
 
 

@@ -30,7 +30,7 @@ def speed(*arguments: str) -> list[str]:
     return ran.stdout.splitlines()
 
 
-def test_every_baseline_stands_beside_the_solver():
+def test_every_baseline_is_timed_beside_the_solver():
     lines = speed("compare", "--frames", "6", "--points", "80", "--cap", "60")
     cells = {
         line.split("|")[1].strip(): [cell.strip() for cell in line.split("|")[2:-1]] for line in lines if "|" in line
@@ -83,7 +83,7 @@ def test_memory_of_one_process_is_its_own(bench):
     assert measured.peak > measured.growth
 
 
-def test_too_little_memory_is_no_number(bench):
+def test_running_out_of_memory_gives_no_number(bench):
     assert bench("speed.apart").apart(hold, 1 << 40, limit=1 << 32) is None
 
 

@@ -29,7 +29,7 @@ def solve(*arguments: object) -> Result:
     return CliRunner().invoke(app, ["solve", *map(str, arguments)], env={"COLUMNS": "200"})
 
 
-def test_a_film_is_solved_and_its_tracks_lie_beside_the_shapes(film: Path, tmp_path: Path) -> None:
+def test_a_film_is_solved_and_its_tracks_are_written_beside_the_shapes(film: Path, tmp_path: Path) -> None:
     ran = solve(film, "--region", film.with_name("mask.png"), "-o", tmp_path, "--json", "--threads", 1, *QUICK)
     assert ran.exit_code == 0, ran.output
     files = json.loads(ran.stdout)["files"]
@@ -45,7 +45,7 @@ def test_a_film_is_solved_and_its_tracks_lie_beside_the_shapes(film: Path, tmp_p
     assert "No region was given" in words
 
 
-def test_wrong_films_and_parts_are_refused_in_a_sentence(film: Path, tmp_path: Path) -> None:
+def test_invalid_films_and_parts_are_rejected_with_a_message(film: Path, tmp_path: Path) -> None:
     ran = solve(film, "--mesh", "3x4", "-o", tmp_path)
     assert ran.exit_code == Exit.REFUSED
     assert "--mesh: expected tracks, got a film" in ran.output
@@ -74,7 +74,7 @@ def test_inspect_describes_a_film(film: Path, tmp_path: Path) -> None:
     for each in (
         "size 72×96 pixels",
         "frames 5 of 10",
-        "rate 15 frames a second",
+        "rate 15 frames per second",
         "rotation 90°, applied",
         "tracking about",
     ):

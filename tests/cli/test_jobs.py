@@ -60,7 +60,7 @@ def submitted(run: Run, tracks: Path, *more: object) -> dict[str, Any]:
     return json.loads(ran.stdout)
 
 
-def test_inspect_may_ask_a_service(run: Run, service: InMemoryService, tracks: Path) -> None:
+def test_inspect_can_use_a_service(run: Run, service: InMemoryService, tracks: Path) -> None:
     ran = run("inspect", tracks, "--mesh", "3x4", "-O", "loss=huber", "--url", "http://pliant.test", "--json")
     assert ran.exit_code == 0, ran.output
     assert json.loads(ran.stdout)["num_points"] == 12
@@ -87,7 +87,7 @@ def test_options_reach_the_service(run: Run, tracks: Path) -> None:
     assert job["id"] == "mine"
 
 
-def test_submit_without_waiting_says_how_to_follow(run: Run, tracks: Path) -> None:
+def test_submit_without_waiting_prints_how_to_follow(run: Run, tracks: Path) -> None:
     ran = run("submit", tracks)
     assert ran.exit_code == 0
     assert "pliant watch" in ran.stderr
@@ -119,7 +119,7 @@ def test_list_shows_the_newest_first_and_filters(run: Run, tracks: Path, service
     assert len(run("list", "--limit", 2).stdout.splitlines()) == 3
 
 
-def test_result_can_fetch_one_file_alone(run: Run, tracks: Path, tmp_path: Path) -> None:
+def test_result_can_fetch_a_single_file(run: Run, tracks: Path, tmp_path: Path) -> None:
     job = submitted(run, tracks)["id"]
     run("watch", job)
     ran = run("result", job, "-o", tmp_path / "some", "--only", "report.json")
@@ -134,9 +134,7 @@ def test_cancel_and_retry(run: Run, tracks: Path) -> None:
     assert "queued" in run("retry", job).stdout
 
 
-def test_options_lists_every_option_with_its_values_and_asks_the_service_if_told(
-    run: Run, service: InMemoryService
-) -> None:
+def test_options_lists_every_option_of_this_installation_or_a_service(run: Run, service: InMemoryService) -> None:
     text = run("options").stdout
     for words in ("temporal_weight", "l1 | l2 | huber", "number ≥ 0 ≤ 1e+06 or null", "boolean"):
         assert words in text
@@ -166,7 +164,7 @@ def test_options_lists_every_option_with_its_values_and_asks_the_service_if_told
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
 @pytest.mark.usefixtures("endless")
-def test_every_fault_has_its_exit_code_and_sentence(
+def test_every_error_has_its_exit_code_and_message(
     run: Run, tracks: Path, arguments: list[str], code: Exit, words: str
 ) -> None:
     job = submitted(run, tracks)["id"]
@@ -176,7 +174,7 @@ def test_every_fault_has_its_exit_code_and_sentence(
     assert ran.stdout == ""
 
 
-def test_a_failed_job_ends_with_1_and_its_sentence(tracks: Path) -> None:
+def test_a_failed_job_ends_with_exit_code_1_and_its_message(tracks: Path) -> None:
     session = Session(transport=InMemoryService(problem=FAULT))
     ran = CliRunner().invoke(app, ["submit", str(tracks), "--wait"], obj=session)
     assert ran.exit_code == Exit.FAILED
@@ -186,7 +184,7 @@ def test_a_failed_job_ends_with_1_and_its_sentence(tracks: Path) -> None:
     assert json.loads(ran.stderr)["exit_code"] == 1
 
 
-def test_waiting_too_long_and_nobody_answering(tracks: Path) -> None:
+def test_timeouts_and_unreachable_services_have_exit_codes(tracks: Path) -> None:
     endless = Session(transport=InMemoryService(steps=math.inf))
     ran = CliRunner().invoke(app, ["submit", str(tracks), "--wait", "--timeout", "0.3"], obj=endless)
     assert ran.exit_code == Exit.TIMEOUT
@@ -204,7 +202,7 @@ def test_the_token_comes_from_the_environment(tracks: Path, monkeypatch: pytest.
     assert CliRunner().invoke(app, ["list"], obj=session).exit_code == 0
 
 
-def test_ctrl_c_ends_with_130(tracks: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ctrl_c_ends_with_exit_code_130(tracks: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 

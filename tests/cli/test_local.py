@@ -40,7 +40,7 @@ def test_a_mesh_is_a_file_if_there_is_one(tmp_path: Path) -> None:
     assert file_or_word(None) is None
 
 
-def test_a_port_that_is_taken_is_refused_and_0_finds_a_free_one() -> None:
+def test_an_occupied_port_is_rejected_and_0_finds_a_free_one() -> None:
     with socket.socket() as holder:
         holder.bind(("127.0.0.1", 0))
         holder.listen()
@@ -62,11 +62,11 @@ def test_a_port_that_is_taken_is_refused_and_0_finds_a_free_one() -> None:
         ("host.example", "http://host.example:80"),
     ],
 )
-def test_the_address_is_one_that_can_be_called_from_here(host: str, url: str) -> None:
+def test_the_address_is_reachable_from_this_machine(host: str, url: str) -> None:
     assert up.address(host, 80) == url
 
 
-def test_the_command_line_comes_before_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command_line_takes_precedence_over_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PLIANT_WORKERS", "3")
     monkeypatch.setenv("PLIANT_DATA", "there")
     assert (up.chosen(None, None).workers, up.chosen(None, None).data) == (3, Path("there"))
@@ -80,7 +80,7 @@ def test_a_service_that_ends_instead_of_starting_is_reported() -> None:
         up.until_ready("http://127.0.0.1:9")(process)
 
 
-def test_a_service_that_never_gets_ready_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_service_that_never_becomes_ready_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(up, "READY_WITHIN", 2)
     process = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
     try:
@@ -91,7 +91,7 @@ def test_a_service_that_never_gets_ready_is_given_up(monkeypatch: pytest.MonkeyP
         process.wait()
 
 
-def test_the_demonstration_is_good_only_if_every_error_that_counts_is_there_and_small() -> None:
+def test_the_demonstration_succeeds_only_if_all_errors_are_small() -> None:
     assert judge(GOOD)
     assert judge({**GOOD, "reprojection_rms": 1e9})
     assert not judge({})
@@ -100,7 +100,7 @@ def test_the_demonstration_is_good_only_if_every_error_that_counts_is_there_and_
         assert not judge({**GOOD, name: float("nan")})
 
 
-def test_the_address_is_read_from_what_up_announces() -> None:
+def test_the_address_is_read_from_the_output_of_up() -> None:
     assert announced(io.StringIO('{\n  "url": "http://x",\n  "data": "d"\n}\n')) == "http://x"
     assert announced(io.StringIO("")) is None
 
@@ -109,7 +109,7 @@ def verdicts(findings: object) -> dict[str, str]:
     return {finding.what: finding.verdict for finding in findings}  # type: ignore[attr-defined]
 
 
-def test_the_doctor_misses_packages(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_doctor_reports_missing_packages(monkeypatch: pytest.MonkeyPatch) -> None:
     def without(*absent: str):
         def find(name: str) -> str:
             if name in absent:
@@ -126,7 +126,7 @@ def test_the_doctor_misses_packages(monkeypatch: pytest.MonkeyPatch) -> None:
     assert verdicts(doctor.check_python()) == {"Python": "bad"}
 
 
-def test_the_doctor_measures_and_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_doctor_measures_speed_and_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in NUMERICAL_THREADS:
         monkeypatch.delenv(name, raising=False)
     (blas,) = doctor.check_blas()
@@ -142,7 +142,7 @@ def test_the_doctor_measures_and_counts(monkeypatch: pytest.MonkeyPatch) -> None
     assert verdicts(doctor.check_cores()) == {"cores": "note"}
 
 
-def test_the_doctor_tries_the_storage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_doctor_checks_the_storage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "LITTLE_SPACE", 1)
     assert verdicts(doctor.check_storage(tmp_path / "not" / "yet")) == {"storage": "good"}
     assert list(tmp_path.iterdir()) == []
@@ -152,7 +152,7 @@ def test_the_doctor_tries_the_storage(tmp_path: Path, monkeypatch: pytest.Monkey
     assert verdicts(doctor.check_storage(tmp_path / "file" / "data")) == {"storage": "bad"}
 
 
-def test_the_doctor_looks_for_the_queue(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_doctor_checks_the_queue(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("PLIANT_REDIS_URL", raising=False)
     assert verdicts(doctor.check_valkey()) == {"queue": "good"}
     port = free_port()
@@ -188,7 +188,7 @@ def test_the_doctor_looks_for_the_queue(tmp_path: Path, monkeypatch: pytest.Monk
     assert verdicts(doctor.check_valkey()) == {"queue": "bad"}
 
 
-def test_the_doctor_looks_into_the_blob_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_doctor_checks_the_blob_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("PLIANT_BLOB_URL", raising=False)
     assert list(doctor.check_blobs()) == []
     monkeypatch.setenv("PLIANT_BLOB_URL", (tmp_path / "blobs").as_uri())
@@ -200,7 +200,7 @@ def test_the_doctor_looks_into_the_blob_store(tmp_path: Path, monkeypatch: pytes
     assert "AWS_" in found.advice
 
 
-def test_the_doctor_checks_the_service() -> None:
+def test_doctor_checks_the_service() -> None:
     session = Session(transport=InMemoryService())
     assert verdicts(doctor.check_service(session, "http://pliant.test")) == {"service": "good"}
     (found,) = doctor.check_service(Session(), "http://127.0.0.1:9")
@@ -208,7 +208,7 @@ def test_the_doctor_checks_the_service() -> None:
     assert "pliant up" in found.advice
 
 
-def test_without_the_server_the_doctor_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_server_doctor_names_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "redis", None)
     findings = {finding.what: finding for finding in doctor.check_packages()}
     assert (findings["packages"].verdict, findings["server"].verdict) == ("good", "note")

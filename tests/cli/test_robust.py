@@ -96,7 +96,7 @@ def test_wrong_paths_and_options(run: Run, tracks: Path, tmp_path: Path, argumen
     assert words(ran) == f"error {filled(sentence)}"
 
 
-def test_a_path_that_the_system_refuses(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_path_that_the_system_rejects(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Permissions do not bind root, so the system's answers are put in their place."""
     folder = tmp_path / "locked"
     folder.mkdir()
@@ -115,7 +115,7 @@ def test_an_unreadable_file(run: Run, tracks: Path, monkeypatch: pytest.MonkeyPa
     assert words(ran) == f"error tracks: the file {tracks} cannot be read. Change its permissions."
 
 
-def test_errors_of_the_system_have_a_sentence_and_defects_have_none(tmp_path: Path) -> None:
+def test_system_errors_have_a_message_and_defects_a_traceback(tmp_path: Path) -> None:
     full = OSError(28, "No space left on device")
     assert (code_of(full), sentence_of(full)) == (Exit.REFUSED, "No space left on device.")
     with pytest.raises(OSError, match="Is a directory") as caught:
@@ -191,7 +191,7 @@ def test_a_line_is_printed_regularly_without_a_terminal(
 
 
 @pytest.mark.parametrize("command", [["up"], ["work"], ["token", "list"], ["demo"], ["fsck"]], ids=" ".join)
-def test_commands_of_the_server_say_what_to_install(
+def test_commands_of_the_server_name_what_to_install(
     command: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -243,7 +243,7 @@ def test_ctrl_c_while_solving(tmp_path: Path) -> None:
     assert "Traceback" not in printed
 
 
-def test_ctrl_c_while_waiting_says_how_to_return(
+def test_ctrl_c_while_waiting_prints_how_to_resume(
     run: Run, tracks: Path, service: InMemoryService, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupt(*_: object, **__: object) -> None:

@@ -32,7 +32,7 @@ def test_a_film_becomes_tracks_and_a_preview(tmp_path: Path) -> None:
     assert "Only 4 frames" in ran.stderr
 
 
-def test_a_playlist_is_refused_in_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_playlist_is_rejected_with_a_message(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "film.mp4").write_text("#EXTM3U\n/etc/passwd\n")
     ran = CliRunner().invoke(app, ["track", str(tmp_path / "film.mp4"), "-o", str(tmp_path / "tracks.npz")])
     assert ran.exit_code == 3, ran.output

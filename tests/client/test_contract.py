@@ -107,7 +107,7 @@ def test_a_result_holds_arrays_report_and_job(client: Client, tmp_path: Path) ->
     assert set(everything) == {artifact.name for artifact in result.job.artifacts}
 
 
-def test_what_the_service_refuses_is_a_typed_error_with_its_sentence(client: Client) -> None:
+def test_rejected_requests_raise_typed_errors_with_the_services_message(client: Client) -> None:
     with pytest.raises(InvalidRequest) as caught:
         client.submit(np.ones((2, 9, 2)), name="too-short")
     assert caught.value.code == "too_few_frames"
@@ -117,7 +117,7 @@ def test_what_the_service_refuses_is_a_typed_error_with_its_sentence(client: Cli
     assert "too-short" not in [job.record.name for job in client.list()]
 
 
-def test_inspecting_says_what_the_job_would_and_makes_none(client: Client) -> None:
+def test_inspecting_returns_the_interpretation_without_creating_a_job(client: Client) -> None:
     points = moving_points()
     points[2, 3] = np.nan
     before = [job.id for job in client.list()]
@@ -132,7 +132,7 @@ def test_inspecting_says_what_the_job_would_and_makes_none(client: Client) -> No
     assert caught.value.code == "too_few_frames"
 
 
-def test_the_same_idempotency_key_makes_one_job(client: Client) -> None:
+def test_the_same_idempotency_key_creates_one_job(client: Client) -> None:
     points, key = moving_points(), secrets.token_hex()
     first = client.submit(points, options=FAST, idempotency_key=key)
     assert client.submit(points, options=FAST, idempotency_key=key).id == first.id
@@ -141,7 +141,7 @@ def test_the_same_idempotency_key_makes_one_job(client: Client) -> None:
         client.submit(points + 1, options=FAST, idempotency_key=key)
 
 
-def test_a_job_may_bring_its_own_id(client: Client) -> None:
+def test_a_job_can_have_an_id_chosen_by_the_client(client: Client) -> None:
     points, mine = moving_points(), f"take-{secrets.token_hex(4)}"
     assert client.submit(points, options=FAST, job_id=mine).id == mine
     assert client.submit(points, options=FAST, job_id=mine).id == mine
@@ -198,7 +198,7 @@ def test_many_jobs_at_once(asked: dict[str, Any]) -> None:
     asyncio.run(use())
 
 
-def test_events_tell_a_job_from_its_queue_to_its_end(client: Client) -> None:
+def test_events_follow_a_job_from_the_queue_to_its_end(client: Client) -> None:
     job = client.submit(moving_points(), options=FAST)
     seen = list(job.events(timeout=60))
     assert [each.status for each in seen][-1] is Status.SUCCEEDED
@@ -207,7 +207,7 @@ def test_events_tell_a_job_from_its_queue_to_its_end(client: Client) -> None:
     assert [order.index(each.status) for each in seen] == sorted(order.index(each.status) for each in seen)
 
 
-def test_a_result_before_its_time_is_refused(client: Client) -> None:
+def test_a_result_of_an_unfinished_job_is_an_error(client: Client) -> None:
     job = client.submit(**long_request())
     with pytest.raises(NotAllowedNow, match="no result yet"):
         client.result(job.id)
@@ -236,7 +236,7 @@ def test_cancelling_ends_the_wait_and_a_retry_is_a_new_job(kind: str, asked: dic
         again.cancel()
 
 
-def test_what_is_large_is_sent_ahead_and_comes_to_the_same(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_inputs_are_uploaded_first_with_the_same_result(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
     points, key = moving_points(6, 4000), secrets.token_hex()
     carried = client.submit(points, options=FAST, idempotency_key=key)
     monkeypatch.setattr("pliant.client.multipart.LARGE", 100_000)

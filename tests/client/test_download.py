@@ -62,7 +62,7 @@ def finished_job(service: InMemoryService) -> tuple[Client, str, bytes]:
     return client, job.id, b"".join(blob.read())
 
 
-def test_an_interrupted_download_goes_on_where_it_broke_off(tmp_path: Path) -> None:
+def test_an_interrupted_download_resumes(tmp_path: Path) -> None:
     service = Tearing(300_000)
     client, job, data = finished_job(service)
     told: list[tuple[int, int]] = []
@@ -76,7 +76,7 @@ def test_an_interrupted_download_goes_on_where_it_broke_off(tmp_path: Path) -> N
     assert [path.name for path in tmp_path.iterdir()] == ["shapes.npz"]
 
 
-def test_a_download_given_up_is_continued_by_the_next_one(tmp_path: Path) -> None:
+def test_an_abandoned_download_is_resumed_by_the_next_call(tmp_path: Path) -> None:
     service = Tearing(200_000)
     client, job, data = finished_job(service)
 
@@ -93,7 +93,7 @@ def test_a_download_given_up_is_continued_by_the_next_one(tmp_path: Path) -> Non
     assert service.fetches()[-1].headers["range"].startswith("bytes=")
 
 
-def test_wrong_bytes_are_fetched_again_once_then_refused(tmp_path: Path) -> None:
+def test_a_wrong_digest_is_retried_once_then_an_error(tmp_path: Path) -> None:
     service = Tearing(10**9)
     client, job, data = finished_job(service)
     service.changed = 1
@@ -105,7 +105,7 @@ def test_wrong_bytes_are_fetched_again_once_then_refused(tmp_path: Path) -> None
     assert list((tmp_path / "other").iterdir()) == []
 
 
-def test_a_file_that_is_already_there_is_not_fetched_again(tmp_path: Path) -> None:
+def test_an_existing_file_is_not_downloaded_again(tmp_path: Path) -> None:
     service = Tearing(10**9)
     client, job, _ = finished_job(service)
     client.download(job, tmp_path)
@@ -117,7 +117,7 @@ def test_a_file_that_is_already_there_is_not_fetched_again(tmp_path: Path) -> No
     assert len(service.fetches()) == before + 1
 
 
-def test_a_part_of_another_file_never_gets_in(tmp_path: Path) -> None:
+def test_parts_of_different_files_are_never_mixed(tmp_path: Path) -> None:
     service = Tearing(10**9)
     client, job, data = finished_job(service)
     artifact = next(a for a in client.get(job).record.artifacts if a.name == "shapes.npz")

@@ -29,7 +29,7 @@ def messages(data: bytes, cuts: list[int]) -> list[Message]:
 
 
 @given(cuts=st.lists(st.integers(0, 10_000)), newline=st.sampled_from(["\n", "\r\n", "\r"]))
-def test_messages_do_not_depend_on_how_the_bytes_are_cut(cuts: list[int], newline: str) -> None:
+def test_messages_do_not_depend_on_chunk_boundaries(cuts: list[int], newline: str) -> None:
     text = 'retry: 2000\n\nid: 7\nevent: job\ndata: {"naïve": 1}\n\n: still here\n\ndata: two\ndata:lines\n\nid: 8\nevent: x\n\n'
     found = messages((text + "end: 1\n").replace("\n", newline).encode(), cuts)
     assert found == [Message("7", "job", '{"naïve": 1}'), Message("7", "message", "two\nlines")]
@@ -61,7 +61,7 @@ class Shaky(InMemoryService):
         return httpx.Response(200, stream=Breaking(cut), headers={"Content-Type": "text/event-stream"})
 
 
-def test_events_end_with_the_final_record_and_never_go_back() -> None:
+def test_events_end_with_the_final_record_and_never_repeat() -> None:
     with Client("http://pliant.test", transport=InMemoryService(steps=5), retries=QUICK) as client:
         job = client.submit(POINTS)
         seen = list(job.events())
@@ -72,7 +72,7 @@ def test_events_end_with_the_final_record_and_never_go_back() -> None:
         assert fractions == sorted(fractions)
 
 
-def test_a_stream_that_breaks_is_taken_up_from_the_last_event() -> None:
+def test_an_interrupted_stream_resumes_after_the_last_event() -> None:
     service = Shaky(steps=4)
     with Client("http://pliant.test", transport=service, retries=QUICK) as client:
         told = []
@@ -84,7 +84,7 @@ def test_a_stream_that_breaks_is_taken_up_from_the_last_event() -> None:
     assert all("last-event-id" in request.headers for request in streams[1:])
 
 
-def test_progress_events_change_the_progress_alone() -> None:
+def test_progress_events_change_only_the_progress() -> None:
     class Late(InMemoryService):
         """Keeps no event but the latest progress; the record has to be asked for."""
 
@@ -113,7 +113,7 @@ def test_progress_events_change_the_progress_alone() -> None:
         ("text/event-stream", "event: job\ndata: {}\n\n", "cannot be read"),
     ],
 )
-def test_what_is_no_stream_of_events_is_named(kind: str, content: str, words: str) -> None:
+def test_a_response_that_is_no_event_stream_is_an_error(kind: str, content: str, words: str) -> None:
     class Odd(InMemoryService):
         def handle_request(self, request: httpx.Request) -> httpx.Response:
             if request.url.path.endswith("/events"):

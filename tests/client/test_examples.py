@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.io
+from PIL import Image
 from pliant.solver.gallery import face
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -28,9 +29,11 @@ def run(service_url: str, tmp_path: Path):
     return run
 
 
-def test_there_are_five_and_each_is_run_here() -> None:
+def test_every_example_script_is_tested() -> None:
     scripts = {path.name for path in EXAMPLES.glob("*.py")}
-    assert scripts == {"from_cotracker.py", "from_mat.py", "batch.py", "many_at_once.py", "evaluate.py"}
+    assert scripts == {
+        "from_cotracker.py", "from_tapnext.py", "from_alltracker.py", "from_mat.py", "batch.py", "many_at_once.py", "evaluate.py",
+    }  # fmt: skip
     assert all(f'run("{script}"' in Path(__file__).read_text() for script in scripts)
 
 
@@ -39,6 +42,51 @@ def test_from_cotracker(run, tmp_path: Path) -> None:
     np.savez(tmp_path / "tracks.npz", pred_tracks=points, pred_visibility=np.ones(points.shape[:3], bool))
     said = run("from_cotracker.py", "tracks.npz", "face.glb")
     assert f"shapes (5, {points.shape[2]}, 3)" in said
+    assert (tmp_path / "face.glb").read_bytes()[:4] == b"glTF"
+
+
+def in_model(points: np.ndarray) -> np.ndarray:
+    """Points of a 640 × 480 picture in the 256 × 256 one that TAPNext and TAPIR see, from its corner."""
+    return ((points + 0.5) * (256 / 640, 256 / 480)).astype(np.float32)
+
+
+@pytest.mark.parametrize("model", ["TAPNext", "TAPIR"])
+def test_from_tapnext(run, tmp_path: Path, model: str) -> None:
+    points = in_model(SEQUENCE.tracks.points)[None]
+    shape = points.shape[:3]
+    if model == "TAPNext":
+        np.savez(
+            tmp_path / "tracks.npz", tracks=points[..., ::-1], visible_logits=np.full((*shape, 1), 4.0, np.float32)
+        )
+    else:
+        turned = points.transpose(0, 2, 1, 3)
+        low = np.full(turned.shape[:3], -4.0, np.float32)
+        np.savez(tmp_path / "tracks.npz", tracks=turned, occlusion=low, expected_dist=low)
+    said = run("from_tapnext.py", "tracks.npz", "640x480", "face.glb")
+    assert f"read as: {model}" in said
+    assert f"shapes (12, {shape[2]}, 3)" in said
+    assert (tmp_path / "face.glb").read_bytes()[:4] == b"glTF"
+
+
+def test_from_alltracker(run, tmp_path: Path) -> None:
+    frames, height, width = 8, 24, 32
+    row, column = np.mgrid[:height, :width].astype(np.float32)
+    centred = np.stack([column - width / 2, row - height / 2])
+    bulge = 6 - (centred**2).sum(axis=0) / 40
+    angle = np.radians(np.linspace(-20, 20, frames)).astype(np.float32)[:, None, None]
+    maps = np.stack(
+        [width / 2 + np.cos(angle) * centred[0] + np.sin(angle) * bulge, np.broadcast_to(row, (frames, height, width))],
+        axis=1,
+    )
+    certain = np.full((frames, 2, height, width), 0.95, np.float32)
+    certain[3, 0, 12, 16] = 0.1
+    np.savez(tmp_path / "tracks.npz", traj_maps_e=maps[None], visconf_maps_e=certain[None])
+    mask = np.zeros((2 * height, 2 * width), np.uint8)
+    mask[10:40, 12:52] = 255
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    said = run("from_alltracker.py", "tracks.npz", "mask.png", "face.glb")
+    assert "points: 300 one pixel in 1" in said
+    assert f"shapes ({frames}, 300, 3)" in said
     assert (tmp_path / "face.glb").read_bytes()[:4] == b"glTF"
 
 
@@ -51,7 +99,7 @@ def test_from_mat(run, tmp_path: Path) -> None:
     assert np.load(tmp_path / "out.npz")["shapes"].shape == (frames, points, 3)
 
 
-def test_batch_goes_on_where_it_stopped(run, tmp_path: Path) -> None:
+def test_batch_resumes_where_it_stopped(run, tmp_path: Path) -> None:
     (tmp_path / "clips").mkdir()
     for name in ("a", "b"):
         np.savez(tmp_path / "clips" / f"{name}.npz", tracks=SEQUENCE.tracks.points)

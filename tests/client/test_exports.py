@@ -13,7 +13,7 @@ from pliant.client import AsyncClient, AsyncRemoteJob, AsyncResult, Client, Remo
 PAIRS = [(Client, AsyncClient), (RemoteJob, AsyncRemoteJob), (Result, AsyncResult)]
 
 
-def test_every_exported_name_is_there_and_every_error_is_exported() -> None:
+def test_every_exported_name_exists_and_every_error_is_exported() -> None:
     assert {name for name in pliant.client.__all__ if not hasattr(pliant.client, name)} == set()
     assert set(pliant.client.__all__) == set(pliant.client._HOME_OF)
     tree = {
@@ -49,7 +49,7 @@ def verbs_of(kind: type) -> dict[str, inspect.Signature]:
 
 
 @pytest.mark.parametrize(("one", "other"), PAIRS, ids=lambda kind: kind.__name__)
-def test_both_clients_have_the_same_verbs_with_the_same_parameters(one: type, other: type) -> None:
+def test_both_clients_have_the_same_methods_and_parameters(one: type, other: type) -> None:
     assert {name: list(signature.parameters.values()) for name, signature in verbs_of(one).items()} == {
         name: list(signature.parameters.values()) for name, signature in verbs_of(other).items()
     }

@@ -16,7 +16,7 @@ def test_options_mirror_the_settings_name_for_name_and_default_for_default() -> 
     assert options == settings
 
 
-def test_every_option_says_what_it_means() -> None:
+def test_every_option_has_a_description() -> None:
     assert all(field.description for field in Options.model_fields.values())
 
 
@@ -32,7 +32,7 @@ def test_a_principal_point_is_two_numbers_with_a_comma_between() -> None:
         Options.model_validate({"principal_point": "320"})
 
 
-def test_an_unknown_output_is_refused_by_the_names_there_are() -> None:
+def test_an_unknown_output_is_rejected_with_the_known_names() -> None:
     with pytest.raises(ValueError, match="'glb', 'ply', 'obj', 'usd', 'abc', 'mdd', 'mat' or 'csv'"):
         Options(outputs="glb,fbx")
     assert Options(outputs="").outputs == ()

@@ -49,7 +49,7 @@ def test_a_terminal_sees_it_and_a_file_does_not() -> None:
         assert ("sending" in screen.getvalue()) == terminal
 
 
-def test_progress_in_words() -> None:
+def test_progress_is_described() -> None:
     now = datetime.now(UTC)
     assert describe(Progress(stage="loading", fraction=0, updated_at=now)) == ""
     full = Progress(
@@ -64,7 +64,7 @@ def test_progress_in_words() -> None:
     assert describe(full) == "reweighting 3 of at most 30, residual 0.25, 7 s left"
 
 
-def test_a_plot_without_matplotlib_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_plot_without_matplotlib_names_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(PliantError, match="pip install matplotlib"):
         draw(np.zeros((4, 9, 3)), np.zeros((0, 3), dtype=np.int32), 2, title="")

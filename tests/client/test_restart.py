@@ -108,7 +108,7 @@ def killing(installation: Installation) -> Iterator[Callable[[str], None]]:
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="finds the service's process through /proc")
 @pytest.mark.parametrize("what", ["everything", "service"])
-def test_kill_9_in_mid_wait_and_mid_download(
+def test_the_client_survives_a_killed_service_while_waiting_and_downloading(
     installation: Installation, killing: Callable[[str], None], tmp_path: Path, what: str
 ) -> None:
     sequence = face(60, 8000)

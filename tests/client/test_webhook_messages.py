@@ -30,7 +30,7 @@ def job() -> Job:
     )
 
 
-def test_what_the_service_signs_is_genuine(job: Job) -> None:
+def test_messages_signed_by_the_service_are_verified(job: Job) -> None:
     body = message(job)
     headers = signed(SECRET, id="msg_one", timestamp=NOW, body=body)
     assert verified(headers, body, secret=SECRET, now=NOW) == job
@@ -42,7 +42,7 @@ def test_what_the_service_signs_is_genuine(job: Job) -> None:
     assert verified(rotated, body, secret=SECRET, now=NOW - 299) == job
 
 
-def test_what_was_changed_is_not(job: Job) -> None:
+def test_altered_messages_are_rejected(job: Job) -> None:
     body = message(job)
     headers = signed(SECRET, id="msg_one", timestamp=NOW, body=body)
     changed = [
@@ -64,19 +64,19 @@ def test_what_was_changed_is_not(job: Job) -> None:
 
 
 @pytest.mark.parametrize("now", [NOW + 301, NOW - 301])
-def test_what_is_old_or_from_the_future_is_not(job: Job, now: int) -> None:
+def test_old_and_future_messages_are_rejected(job: Job, now: int) -> None:
     body = message(job)
     with pytest.raises(InvalidSignature, match="replay"):
         verified(signed(SECRET, id="m", timestamp=NOW, body=body), body, secret=SECRET, now=now)
 
 
 @pytest.mark.parametrize("body", [b"", b"[]", b"{}", b'{"data": 1}', b'{"data": {"id": "x"}}', b"\xff"])
-def test_signed_and_yet_no_job(body: bytes) -> None:
+def test_a_signed_message_without_a_job_is_an_error(body: bytes) -> None:
     with pytest.raises(InvalidSignature, match="contains no job"):
         verified(signed(SECRET, id="m", timestamp=NOW, body=body), body, secret=SECRET, now=NOW)
 
 
-def test_a_secret_is_new_each_time_and_one_the_service_takes() -> None:
+def test_secrets_are_random_and_accepted_by_the_service() -> None:
     assert new_secret() != new_secret()
     assert parse_webhook("https://receiver.example/", new_secret()) is not None
     with pytest.raises(BadArgument, match="webhook_secret"):

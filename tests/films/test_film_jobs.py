@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import errno
+import io
+import itertools
 import json
 import os
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import textwrap
@@ -20,9 +23,10 @@ from PIL import Image
 from pliant.schemas.job import Progress
 from pliant.schemas.options import Options
 from pliant.solver.errors import InvalidInput
+from pliant.tracking import open_film
 from pliant.worker.errors import Interrupted, TimedOut
 from pliant.worker.execution.film import reconstruct_film
-from pliant.worker.films import tracker
+from pliant.worker.films import frame_strip, tracker
 from pliant.worker.films.inputs import read_tracked
 from pliant.worker.films.sources import FilmBounds, FilmSource, is_source, looks_like_film, open_source, save_source
 from pliant.worker.films.tracker import Tracked, check_film, described, film_options, track_film
@@ -71,9 +75,7 @@ def test_a_portrait_film_is_upright(tmp_path: Path) -> None:
     assert (facts.width, facts.height, facts.frames) == (72, 96, 6)
 
 
-def test_what_does_not_fit_the_film_is_refused_with_the_option_at_fault(
-    film: Path, region: Path, tmp_path: Path
-) -> None:
+def test_options_that_do_not_fit_the_film_are_rejected_by_name(film: Path, region: Path, tmp_path: Path) -> None:
     Image.new("L", (10, 10), 255).save(tmp_path / "small.png")
     wrong = refusal(FilmSource(film, tmp_path / "small.png"))
     assert (wrong.code, wrong.field) == ("wrong_region_size", "region")
@@ -90,7 +92,7 @@ def test_what_does_not_fit_the_film_is_refused_with_the_option_at_fault(
     assert refusal(FilmSource(many), bounds=FilmBounds(max_frames=3)).code == "too_many_frames"
 
 
-def test_too_little_memory_or_time_is_a_refusal(film: Path, tmp_path: Path) -> None:
+def test_too_little_memory_or_time_is_an_input_error(film: Path, tmp_path: Path) -> None:
     large = films.zip_of(tmp_path / "large.zip", {"1.png": films.png(np.zeros((2000, 3000, 3), np.uint8))})
     assert refusal(FilmSource(large), bounds=FilmBounds(memory=50 << 20)).code == "too_large"
     late = refusal(FilmSource(film), bounds=FilmBounds(check_seconds=0.01))
@@ -98,7 +100,7 @@ def test_too_little_memory_or_time_is_a_refusal(film: Path, tmp_path: Path) -> N
     assert "longest_side" in late.hint
 
 
-def test_how_the_film_process_died_becomes_a_sentence() -> None:
+def test_every_end_of_the_film_process_has_a_message() -> None:
     def code_of(code: int, answer: bytes = b"") -> str:
         fault = tracker._fault(Ended(code, answer, ""), FilmBounds(), 1.0)
         assert isinstance(fault, InvalidInput)
@@ -133,7 +135,7 @@ def test_a_film_and_its_region_are_stored_byte_for_byte(film: Path, region: Path
         open_source(films.zip_of(tmp_path / "bad.npz", {"film.json": b"[]"}), tmp_path / "b")
 
 
-def test_what_is_a_film_on_a_command_line(film: Path, tmp_path: Path) -> None:
+def test_films_are_recognised_on_the_command_line(film: Path, tmp_path: Path) -> None:
     np.savez(tmp_path / "tracks.npz", tracks=np.zeros(3))
     np.save(tmp_path / "tracks.npy", np.zeros(3))
     (tmp_path / "list.mp4").write_text("#EXTM3U\n")
@@ -173,6 +175,52 @@ def test_a_film_becomes_shapes_tracks_and_a_contact_sheet(film: Path, region: Pa
     assert report["seconds"]["track"] > 0
     with Image.open(tmp_path / "out" / "contact_sheet.jpg") as sheet:
         assert sheet.format == "JPEG"
+    check_followed(told, tmp_path / "out")
+    check_film_frames(tmp_path / "out", count=10)
+
+
+def check_followed(told: list[Progress], folder: Path) -> None:
+    """Points that are reported while tracking runs are those of the finished tracks."""
+    followed = next(each.followed for each in told if each.followed is not None)
+    assert told[-1].followed is None
+    assert (followed.width, followed.height) == SIZE
+    places = np.array(followed.points).reshape(-1, 2)
+    assert 4 <= len(places) <= 150
+    with np.load(folder / "tracks.npz") as file:
+        row = int(np.flatnonzero(file["frame_indices"] == followed.frame)[0])
+        assert followed.seconds == pytest.approx(file["frame_times"][row])
+        apart = np.linalg.norm(places[:, None] - file["tracks"][row][None], axis=2).min(axis=1)
+    assert np.median(apart) <= 0.71  # rounding to whole pixels
+
+
+def check_film_frames(folder: Path, *, count: int) -> None:
+    """film_frames.bin read by the layout that its docstring states: one picture for each tracked frame."""
+    raw = (folder / "film_frames.bin").read_bytes()
+    assert raw[:8] == b"PLIANTFF"
+    version, length = struct.unpack_from("<II", raw, 8)
+    header = json.loads(raw[16 : 16 + length])
+    assert (version, header["width"], header["height"]) == (1, *SIZE)
+    offsets = header["offsets"]
+    assert len(offsets) == count + 1
+    assert offsets[-1] == len(raw)
+    pictures = [np.asarray(Image.open(io.BytesIO(raw[a:b]))) for a, b in itertools.pairwise(offsets)]
+    assert {picture.shape for picture in pictures} == {(SIZE[1], SIZE[0], 3)}
+    # The texture moves to the right, a pixel a frame.
+    moved = np.abs(pictures[5][:, 5:].astype(float) - pictures[0][:, :-5]).mean()
+    assert moved < 0.5 * np.abs(pictures[5].astype(float) - pictures[0]).mean()
+
+
+def test_large_pictures_are_reduced_and_long_films_have_no_film_frames(
+    film: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wide = np.zeros((300, 960, 3), np.uint8)
+    with Image.open(io.BytesIO(frame_strip.small_jpeg(wide))) as picture:
+        assert picture.size == (480, 150)
+    opened = open_film(film)
+    assert not frame_strip.write_frames(opened, np.array([0, 3, 99]), tmp_path / "a")  # the film has no frame 99
+    monkeypatch.setattr(frame_strip, "MOST_BYTES", 1000)
+    assert not frame_strip.write_frames(opened, np.arange(10), tmp_path / "a")
+    assert not (tmp_path / "a").exists()
 
 
 def shapes_count(folder: Path) -> int:
@@ -206,7 +254,7 @@ def tracks_file(path: Path, **more: np.ndarray) -> Path:
     return path
 
 
-def test_tracks_weigh_what_the_tracker_is_sure_of(tmp_path: Path) -> None:
+def test_confidence_of_the_tracker_is_the_weight(tmp_path: Path) -> None:
     seen = np.ones((4, 9), bool)
     seen[1, 3] = False
     tracked = Tracked(container="mp4", warnings=("Only 4 frames.",))
@@ -243,12 +291,12 @@ def test_the_film_process_has_no_network_and_starts_no_programs() -> None:
     socket.socket().close()  # here it still works
 
 
-def test_there_is_no_filter_for_an_unknown_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unknown_architecture_has_no_network_filter(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("platform.machine", lambda: "pdp11")
     assert not forbid_network()
 
 
-def test_progress_is_passed_on_and_nonsense_dropped() -> None:
+def test_progress_is_passed_on_and_invalid_lines_dropped() -> None:
     heard: list[dict[str, object]] = []
     with _Progress(heard.append) as progress:
         assert progress.target is not None

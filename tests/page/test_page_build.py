@@ -36,7 +36,7 @@ def use_commands(builder: ModuleType, monkeypatch: pytest.MonkeyPatch, node: str
     monkeypatch.setattr(builder, "node_commands", lambda: commands)
 
 
-def test_without_node_a_warning_names_the_package_that_brings_it(
+def test_without_node_a_warning_names_the_package_that_provides_it(
     builder: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(builder, "node_commands", lambda: None)

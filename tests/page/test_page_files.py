@@ -26,7 +26,7 @@ def built(tmp_path: Path) -> TestClient:
 
 
 def test_the_page_is_revalidated_and_its_files_are_immutable(built: TestClient) -> None:
-    for address in ("/", "/docs"):
+    for address in ("/", "/docs", "/guide"):
         index = built.get(address)
         assert index.status_code == 200
         assert index.headers["cache-control"] == "no-cache"
@@ -75,7 +75,7 @@ def test_head_returns_the_same_headers_without_a_body(built: TestClient) -> None
     assert head.headers["content-length"] == str(len(SCRIPT))
 
 
-@pytest.mark.parametrize("address", ["/", "/docs"])
+@pytest.mark.parametrize("address", ["/", "/docs", "/guide"])
 def test_without_a_built_page_a_sentence_says_how_to_build_it(tmp_path: Path, address: str) -> None:
     app = FastAPI(docs_url=None)
     mount_page(app, tmp_path / "absent")
@@ -85,7 +85,7 @@ def test_without_a_built_page_a_sentence_says_how_to_build_it(tmp_path: Path, ad
     assert answer.headers["cache-control"] == "no-store"
 
 
-def test_a_page_built_meanwhile_is_served_without_a_restart(tmp_path: Path) -> None:
+def test_a_page_built_later_is_served_without_a_restart(tmp_path: Path) -> None:
     app = FastAPI(docs_url=None)
     mount_page(app, tmp_path)
     client = TestClient(app)

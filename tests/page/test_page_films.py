@@ -177,7 +177,9 @@ def test_a_region_drawn_with_the_mouse_is_sent_with_the_film(
     assert corners.max(0) == pytest.approx([0.8 * WIDTH, 0.8 * HEIGHT], abs=2)
 
 
-def test_a_region_by_keyboard_alone(filming: Page, url: str, films: dict[str, bytes], finished: str) -> None:
+def test_a_region_is_drawn_with_the_keyboard_only(
+    filming: Page, url: str, films: dict[str, bytes], finished: str
+) -> None:
     answer_with(filming, film_record(url, finished))
     drop(filming, {"film.webm": films["film.webm"]})
     filming.get_by_role("button", name="Draw a region").press("Enter")
@@ -228,7 +230,7 @@ def test_a_region_drawn_with_a_finger(filming: Page, films: dict[str, bytes]) ->
     expect(status).to_contain_text("160 × 132 pixels")
 
 
-def test_a_film_that_the_browser_cannot_show_is_sent_whole(
+def test_a_film_that_the_browser_cannot_show_is_sent_without_a_region(
     filming: Page, url: str, films: dict[str, bytes], finished: str
 ) -> None:
     answer_with(filming, film_record(url, finished))
@@ -241,7 +243,7 @@ def test_a_film_that_the_browser_cannot_show_is_sent_whole(
     assert "region_polygon" not in sent_options(filming)
 
 
-def test_a_service_without_films_offers_no_place_for_one(page: Page, url: str) -> None:
+def test_a_service_without_films_offers_no_film_input(page: Page, url: str) -> None:
     def without(route: Route) -> None:
         answer = route.fetch()
         schema = answer.json()
@@ -254,6 +256,74 @@ def test_a_service_without_films_offers_no_place_for_one(page: Page, url: str) -
     page.get_by_label("Preset").wait_for()
     expect(page.get_by_text("Drop tracks and a mesh here")).to_be_visible()
     expect(page.locator("[data-part=film]")).to_be_hidden()
+
+
+def test_the_camera_records_a_film(filming: Page) -> None:
+    filming.get_by_role("button", name="Record with the camera").click()
+    dialog = filming.get_by_role("dialog", name="Record a film")
+    expect(dialog).to_contain_text("At most 20 seconds are recorded.")
+    dialog.get_by_role("button", name="Record").click()
+    expect(dialog).to_contain_text("19 s left")
+    dialog.get_by_role("button", name="Stop").click()
+    expect(dialog).to_have_count(0)
+    expect(filming.locator("[data-part=film]")).to_contain_text("recording.")
+    filming.get_by_role("img", name="First frame of the film").wait_for()
+    expect(filming.get_by_role("button", name="Draw a region")).to_be_visible()
+
+
+def test_a_running_films_picture_points_title_and_clock(
+    filming: Page, url: str, films: dict[str, bytes], finished: str
+) -> None:
+    record = film_record(url, finished)
+    drop(filming, {"film.webm": films["film.webm"]})
+    filming.get_by_role("img", name="First frame of the film").wait_for()
+    answer_with(filming, record)
+    filming.get_by_role("button", name="Reconstruct").click()
+    live = filming.get_by_role("img", name="The film with the points that are tracked")
+
+    def reddest() -> list[int]:
+        """A pixel of the picture's corner: the first frame is red, the others are blue."""
+        corner = "(it) => [...it.getContext('2d').getImageData(4, 4, 1, 1).data]"
+        return list(live.evaluate(corner))
+
+    until(lambda: reddest()[0] > 150 > reddest()[2])  # before any point is known
+    assert filming.title() == "20 % – a film – Pliant"
+    left = filming.locator(".figures div", has_text="Left").locator("dd")
+    first = left.inner_text()
+    until(lambda: left.inner_text() != first)  # no message came: the page counts by itself
+    followed = {"frame": 3, "seconds": 0.6, "width": WIDTH, "height": HEIGHT, "points": [160, 120, 170, 130]}
+    moved = {**record["progress"], "followed": followed, "fraction": 0.3, "updated_at": "2099-01-01T00:00:00Z"}
+    answer_with(filming, {**record, "progress": moved})
+    expect(filming.get_by_text("Frame 3: 2 of the tracked points.")).to_be_visible()
+    until(lambda: reddest()[2] > 150 > reddest()[0])
+    middle = "(it) => [...it.getContext('2d').getImageData(Math.round(it.width * 160.5 / 320), Math.round(it.height / 2), 1, 1).data]"
+    until(lambda: live.evaluate(middle)[0] > live.evaluate(middle)[2] + 60)  # a mark on the white disc
+    assert filming.title() == "30 % – a film – Pliant"
+
+
+NOTE = """() => {
+  window.notes = [];
+  window.Notification = class extends EventTarget {
+    static permission = "default";
+    static requestPermission() { this.permission = "granted"; return Promise.resolve("granted"); }
+    constructor(title, options) { super(); window.notes.push(`${title} | ${options.body}`); }
+  };
+}"""
+
+
+def test_a_notification_at_the_end_for_those_who_asked(filming: Page, url: str, finished: str) -> None:
+    filming.add_init_script(f"({NOTE})()")
+    record = film_record(url, finished)
+    answer_with(filming, record)
+    filming.goto(f"{url}/#job={finished}")
+    filming.reload()
+    filming.get_by_role("button", name="Notify me at the end").click()
+    expect(filming.get_by_role("button", name="You will be notified")).to_be_disabled()
+    assert filming.evaluate("window.notes") == []
+    done = httpx.get(f"{url}/v1/jobs/{finished}").json()
+    answer_with(filming, {**done, "name": "a film", "trust_sentence": "About 2 %."})
+    until(lambda: filming.evaluate("window.notes") == ["Done: a film | About 2 %."])
+    assert filming.title().endswith(" – a film – Pliant")
 
 
 def test_the_result_of_a_film_shows_its_contact_sheet(filming: Page, url: str, finished: str) -> None:

@@ -69,7 +69,7 @@ def test_the_list_follows_a_running_job_that_is_not_shown(
     until(lambda: float(row.get_by_role("progressbar", include_hidden=True).evaluate("(it) => it.value")) > before)
 
 
-def test_an_outage_is_reported_and_its_end_noticed(page: Page, url: str, finished: str) -> None:
+def test_an_outage_and_its_end_are_reported(page: Page, url: str, finished: str) -> None:
     page.route("**/v1/**", lambda route: route.abort())
     page.goto(f"{url}/#job={finished}")
     page.reload()
@@ -79,7 +79,7 @@ def test_an_outage_is_reported_and_its_end_noticed(page: Page, url: str, finishe
     expect(page.get_by_role("alert")).to_have_count(0, timeout=15_000)
 
 
-def test_a_token_is_asked_for_and_then_sent_with_everything(page: Page, url: str, finished: str) -> None:
+def test_a_token_is_requested_once_and_sent_with_every_request(page: Page, url: str, finished: str) -> None:
     def guarded(route: Route) -> None:
         if route.request.headers.get("authorization") == "Bearer a-token":
             route.continue_()

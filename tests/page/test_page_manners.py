@@ -16,7 +16,7 @@ pytestmark = [
 ]
 
 
-def test_the_example_by_keyboard_alone(page: Page) -> None:
+def test_an_example_is_run_with_the_keyboard_only(page: Page) -> None:
     def tab_to(name: str, most: int = 60) -> None:
         for _ in range(most):
             page.keyboard.press("Tab")
@@ -47,7 +47,7 @@ def test_the_example_by_keyboard_alone(page: Page) -> None:
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [1280, 390])
-def test_no_accessibility_finding_and_nothing_wider_than_the_screen(
+def test_there_are_no_accessibility_findings_and_no_overflow(
     page: Page, url: str, finished: str, scheme: str, width: int
 ) -> None:
     axe = Path(__file__).parents[2] / "service" / "web" / "node_modules" / "axe-core" / "axe.min.js"

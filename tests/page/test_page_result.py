@@ -25,7 +25,7 @@ pytestmark = [
 ]
 
 
-def test_every_view_of_a_result_shows_something_else(page: Page, url: str, finished: str) -> None:
+def test_all_views_of_a_result_differ(page: Page, url: str, finished: str) -> None:
     page.goto(f"{url}/#job={finished}")
     canvas = page.locator(".view canvas")
     canvas.wait_for(timeout=DONE)
@@ -62,7 +62,7 @@ def test_every_view_of_a_result_shows_something_else(page: Page, url: str, finis
     until(lambda: different() == 0)
 
 
-def test_the_animation_stops_loops_or_turns_back_at_the_speed_asked_for(page: Page, url: str, finished: str) -> None:
+def test_the_animation_stops_loops_or_reverses_at_the_chosen_speed(page: Page, url: str, finished: str) -> None:
     page.goto(f"{url}/#job={finished}")
     page.locator(".view canvas").wait_for(timeout=DONE)
     slider = page.get_by_role("slider", name="Frame")
@@ -101,7 +101,7 @@ def test_the_animation_stops_loops_or_turns_back_at_the_speed_asked_for(page: Pa
 
 
 @pytest.mark.parametrize("language", ["Python", "Shell", "curl"])
-def test_the_code_shown_makes_the_same_job(
+def test_the_code_shown_submits_the_same_job(
     page: Page, url: str, small: dict[str, bytes], tmp_path: Path, language: str
 ) -> None:
     if language == "curl" and shutil.which("curl") is None:

@@ -20,7 +20,7 @@ pytestmark = [
 ]
 
 
-def test_from_an_upload_to_a_playing_mesh(page: Page, url: str, small: dict[str, bytes]) -> None:
+def test_files_are_submitted_and_the_result_plays(page: Page, url: str, small: dict[str, bytes]) -> None:
     choose(page, small)
     expect(page.locator("[data-part=tracks]")).to_contain_text("tracks 10 × 300 × 2 float64")
     seen = page.get_by_role("region", name="How your files are interpreted")
@@ -70,7 +70,7 @@ def test_from_an_upload_to_a_playing_mesh(page: Page, url: str, small: dict[str,
     assert json.loads(Path(download.value.path()).read_text())["metrics"] == job["metrics"]
 
 
-def test_a_refusal_is_shown_as_the_services_own_sentence(page: Page, url: str) -> None:
+def test_an_error_is_shown_with_the_services_message(page: Page, url: str) -> None:
     said = httpx.post(f"{url}/v1/jobs", files={"tracks": ("tracks.npz", b"hello, I am not tracks")}).json()
     choose(page, {TRACKS: b"hello, I am not tracks"})
     page.get_by_role("button", name="Reconstruct").click()
@@ -83,7 +83,7 @@ def test_a_refusal_is_shown_as_the_services_own_sentence(page: Page, url: str) -
     expect(alert).to_contain_text("too_few_frames")
 
 
-def test_dropped_files_find_their_places_and_say_what_they_are(page: Page, url: str, small: dict[str, bytes]) -> None:
+def test_dropped_files_are_assigned_to_their_parts(page: Page, url: str, small: dict[str, bytes]) -> None:
     jobs = len(httpx.get(f"{url}/v1/jobs?limit=100").json()["jobs"])
     drop(page, small)
     for part, name in (("tracks", TRACKS), ("mesh", "mesh.npz"), ("ground_truth", "truth.npz")):
@@ -102,7 +102,7 @@ def test_dropped_files_find_their_places_and_say_what_they_are(page: Page, url: 
     assert len(httpx.get(f"{url}/v1/jobs?limit=100").json()["jobs"]) == jobs
 
 
-def test_a_reading_can_be_chosen_before_anything_is_made_of_it(page: Page, url: str) -> None:
+def test_an_interpretation_can_be_chosen_before_submitting(page: Page, url: str) -> None:
     jobs = len(httpx.get(f"{url}/v1/jobs?limit=100").json()["jobs"])
     choose(page, {TRACKS: packed(W=np.random.default_rng(0).normal(size=(40, 50)))})
     page.get_by_role("button", name="W (2F, P), rows stacked").click()
@@ -111,7 +111,9 @@ def test_a_reading_can_be_chosen_before_anything_is_made_of_it(page: Page, url: 
     assert len(httpx.get(f"{url}/v1/jobs?limit=100").json()["jobs"]) == jobs
 
 
-def test_sending_again_after_a_lost_answer_makes_no_second_job(page: Page, url: str, small: dict[str, bytes]) -> None:
+def test_resubmitting_after_a_lost_response_creates_no_second_job(
+    page: Page, url: str, small: dict[str, bytes]
+) -> None:
     def lost(route: Route) -> None:
         route.fetch()
         route.abort()
@@ -127,7 +129,7 @@ def test_sending_again_after_a_lost_answer_makes_no_second_job(page: Page, url: 
     assert len([job for job in jobs if job["name"] == "sent twice"]) == 1
 
 
-def test_where_two_readings_fit_a_click_chooses_one(page: Page, url: str) -> None:
+def test_an_ambiguous_input_is_resolved_by_a_click(page: Page, url: str) -> None:
     noise = np.random.default_rng(0).normal(size=(40, 50))
     choose(page, {TRACKS: packed(W=noise)})
     page.get_by_role("button", name="Reconstruct").click()
@@ -139,7 +141,7 @@ def test_where_two_readings_fit_a_click_chooses_one(page: Page, url: str) -> Non
     assert httpx.get(f"{url}/v1/jobs/{id}").json()["options"]["rows"] == "stacked"
 
 
-def test_sending_nothing_says_what_is_missing(page: Page) -> None:
+def test_submitting_nothing_names_the_missing_part(page: Page) -> None:
     page.get_by_role("button", name="Reconstruct").click()
     expect(page.get_by_text("Choose a film or track file first")).to_be_visible()
     expect(page.get_by_label("Tracks", exact=True)).to_be_focused()

@@ -42,7 +42,7 @@ def judge(page: Page, url: str, id: str, **fields: Any) -> None:
 @pytest.mark.parametrize(
     ("verdict", "words"), [("good", "Good"), ("with_care", "Use with care"), ("do_not_use", "Do not use")]
 )
-def test_the_verdict_stands_above_the_viewer_and_in_the_list(
+def test_the_verdict_is_above_the_viewer_and_in_the_list(
     page: Page, url: str, finished: str, verdict: str, words: str
 ) -> None:
     reasons = [] if verdict == "good" else REASONS

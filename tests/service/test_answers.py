@@ -32,7 +32,7 @@ def address(running: Running) -> str:
     return f"/v1/jobs/{job.id}/artifacts/shapes.npz"
 
 
-def test_a_file_comes_whole_with_its_digest(http: httpx.Client, address: str) -> None:
+def test_a_file_is_sent_completely_with_its_digest(http: httpx.Client, address: str) -> None:
     answer = http.get(address)
     digest = hashlib.sha256(CONTENTS)
     assert answer.content == CONTENTS
@@ -60,7 +60,7 @@ def test_an_interrupted_download_is_resumed(http: httpx.Client, address: str) ->
     assert http.get(address + "x").json()["code"] == "unknown_artifact"
 
 
-def test_a_file_that_is_deleted_meanwhile_is_gone(
+def test_a_file_deleted_during_a_download_is_gone(
     running: Running, http: httpx.Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     job = submit(http, name="gone")
@@ -79,7 +79,7 @@ def test_a_file_that_is_deleted_meanwhile_is_gone(
     assert (answer.status_code, answer.json()["code"]) == (404, "unknown_job")
 
 
-def test_an_api_process_without_workers_is_ready_for_its_own_part(http: httpx.Client) -> None:
+def test_an_api_process_without_workers_is_ready_by_itself(http: httpx.Client) -> None:
     whole = http.get("/readyz")
     assert (whole.status_code, whole.json()["code"]) == (503, "not_ready")
     assert "No worker" in whole.json()["detail"]
@@ -88,7 +88,7 @@ def test_an_api_process_without_workers_is_ready_for_its_own_part(http: httpx.Cl
     assert http.get("/readyz", params={"exclude": "nothing"}).status_code == 422
 
 
-def test_events_end_with_the_job_and_go_on_from_the_last_one(running: Running, http: httpx.Client) -> None:
+def test_events_end_with_the_job_and_resume_after_the_last_one(running: Running, http: httpx.Client) -> None:
     job = submit(http, name="followed")
     timer = threading.Timer(0.5, finish, (running, job.id, b"x"))
     timer.start()
@@ -104,7 +104,7 @@ def test_events_end_with_the_job_and_go_on_from_the_last_one(running: Running, h
     assert http.get("/v1/jobs/nobody/events").status_code == 404
 
 
-def test_waiting_ends_when_the_job_does_or_patience_does(running: Running, http: httpx.Client) -> None:
+def test_waiting_ends_with_the_job_or_its_time_limit(running: Running, http: httpx.Client) -> None:
     job = submit(http, name="awaited")
     begun = time.monotonic()
     early = http.get(f"/v1/jobs/{job.id}", headers={"Prefer": "wait=1"})
@@ -129,7 +129,7 @@ def test_every_answer_has_the_security_headers(http: httpx.Client) -> None:
     ("method", "path", "status", "code"),
     [("GET", "/nowhere", 404, "no_such_address"), ("DELETE", "/v1/options", 405, "method_not_allowed")],
 )
-def test_the_frameworks_own_refusals_are_problems(
+def test_errors_of_the_framework_are_problem_documents(
     http: httpx.Client, method: str, path: str, status: int, code: str
 ) -> None:
     answer = http.request(method, path)
@@ -153,14 +153,14 @@ def test_a_page_of_another_site_cannot_write(running: Running, headers: dict[str
     assert running.waiting == before
 
 
-def test_an_origin_that_was_allowed_may(serve: Serve) -> None:
+def test_a_page_of_an_allowed_origin_can_write(serve: Serve) -> None:
     running = serve(cors_origins=("https://good.example",))
     headers = {"Origin": "https://good.example"}
     answer = httpx.post(f"{running.url}/v1/jobs", content=b"x", headers=headers)
     assert (answer.status_code, answer.headers["access-control-allow-origin"]) == (415, "https://good.example")
 
 
-def test_without_its_store_the_service_says_so_and_keeps_nothing(serve: Serve, tmp_path: Path) -> None:
+def test_without_its_store_the_service_returns_503_and_keeps_nothing(serve: Serve, tmp_path: Path) -> None:
     running = serve(redis_url=f"unix://{tmp_path}/nobody.sock")
     assert httpx.get(f"{running.url}/healthz").status_code == 200
     assert httpx.get(f"{running.url}/readyz").json()["code"] == "not_ready"
@@ -176,7 +176,7 @@ def test_every_error_of_the_worker_has_a_status() -> None:
     assert all(any(base in STATUS_OF for base in kind.__mro__) for kind in kinds)
 
 
-def test_while_the_store_hangs_requests_fail_soon_and_the_process_stays_alive(
+def test_while_the_store_hangs_requests_fail_in_time_and_the_process_is_live(
     serve: Serve, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("pliant.worker.store.connection.ANSWER_WITHIN", 2.0)
@@ -202,7 +202,7 @@ def test_while_the_store_hangs_requests_fail_soon_and_the_process_stays_alive(
         assert time.monotonic() - began < 10
 
 
-def test_a_killed_process_folder_is_swept_and_a_living_ones_is_not(tmp_path: Path) -> None:
+def test_folders_of_killed_processes_are_removed_and_others_kept(tmp_path: Path) -> None:
     living = Incoming(tmp_path)
     living.open()
     (tmp_path / "dead").mkdir()

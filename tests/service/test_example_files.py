@@ -6,7 +6,7 @@ import httpx
 import pytest
 
 
-def test_a_listed_example_makes_a_job(http: httpx.Client) -> None:
+def test_every_listed_example_can_be_submitted(http: httpx.Client) -> None:
     listed = http.get("/v1/examples").json()["examples"]
     assert {one["name"] for one in listed} >= {"face", "flag", "sphere"}
     sphere = next(one for one in listed if one["name"] == "sphere")

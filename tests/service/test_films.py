@@ -92,7 +92,7 @@ def test_without_a_region_the_whole_picture_is_tracked_with_a_warning(
     assert any("No region was given" in sentence for sentence in done.warnings)
 
 
-def test_a_film_comes_as_an_upload_too_and_is_the_same_request(http: httpx.Client, film: bytes) -> None:
+def test_a_film_can_be_an_upload_and_is_the_same_request(http: httpx.Client, film: bytes) -> None:
     for id, content in (("the-film", film), ("the-mask", mask())):
         assert http.put(f"/v1/uploads/{id}", content=content).is_success
     key = {"Idempotency-Key": "once"}
@@ -130,7 +130,7 @@ BAD: dict[str, tuple[dict[str, object], str, str]] = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_what_is_no_film_is_refused_in_a_sentence(running: Running, http: httpx.Client, case: str) -> None:
+def test_files_that_are_not_films_are_rejected_with_a_message(running: Running, http: httpx.Client, case: str) -> None:
     given, code, field = BAD[case]
     files = {name: (None, value) if isinstance(value, str) else (name, value) for name, value in given.items()}
     refused(running, http, files, code, field)

@@ -30,7 +30,9 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", GOOD)
-def test_it_is_the_interpretation_of_the_job_and_makes_none(running: Running, http: httpx.Client, case: str) -> None:
+def test_inspection_equals_the_interpretation_of_the_job_and_creates_none(
+    running: Running, http: httpx.Client, case: str
+) -> None:
     before = running.waiting
     answer = http.post("/v1/inspect", files=GOOD[case])
     assert answer.status_code == 200, answer.text
@@ -61,7 +63,7 @@ def test_the_sample_is_the_tracks_upright_and_to_scale(http: httpx.Client) -> No
 
 
 @pytest.mark.parametrize("size", [(3, 2000), (500, 9)])
-def test_the_sample_is_small_whatever_is_sent(http: httpx.Client, size: tuple[int, int]) -> None:
+def test_the_sample_is_small_for_any_input(http: httpx.Client, size: tuple[int, int]) -> None:
     points = np.random.default_rng(3).normal(size=(*size, 2))
     points[0, 0] = 1e9  # one outlier does not make the rest a dot
     sample = http.post("/v1/inspect", files=form(npz(tracks=points), mesh="none")).json()["sample"]
@@ -72,7 +74,7 @@ def test_the_sample_is_small_whatever_is_sent(http: httpx.Client, size: tuple[in
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_an_inspection_refuses_what_a_submission_refuses(running: Running, http: httpx.Client, case: str) -> None:
+def test_inspection_and_submission_reject_the_same_inputs(running: Running, http: httpx.Client, case: str) -> None:
     parts, status, code = BAD[case]
     answer, submitted = (http.post(f"/v1/{path}", files=parts) for path in ("inspect", "jobs"))
     assert (answer.status_code, answer.json()["code"]) == (status, code)

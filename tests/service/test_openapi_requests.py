@@ -69,7 +69,7 @@ def token(guarded: Running) -> str:
 
 @pytest.mark.parametrize("mode", [GenerationMode.POSITIVE, GenerationMode.NEGATIVE], ids=["fits", "does not fit"])
 @pytest.mark.parametrize(("method", "path"), OPERATIONS, ids=lambda part: str(part))
-def test_every_answer_is_one_that_is_declared(
+def test_every_response_is_declared(
     guarded: Running, schema: Any, counts: Counter[str], token: str, method: str, path: str, mode: GenerationMode
 ) -> None:
     operation = schema[path][method]

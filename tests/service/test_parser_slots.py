@@ -9,7 +9,7 @@ import pytest
 from pliant.service.spool import ParserSlots
 
 
-def test_another_owner_is_next_and_all_run() -> None:
+def test_the_owner_with_fewest_slots_is_next_and_all_run() -> None:
     began: list[str] = []
     steps = threading.Semaphore(0)
 
@@ -38,7 +38,7 @@ def test_another_owner_is_next_and_all_run() -> None:
     anyio.run(everything)
 
 
-def test_one_who_leaves_holds_no_slot_and_a_failure_gives_it_back() -> None:
+def test_disconnects_and_failures_release_the_slot() -> None:
     go_on = threading.Event()
 
     async def everything() -> None:

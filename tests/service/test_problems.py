@@ -118,7 +118,7 @@ def test_the_table_holds_exactly_the_codes_that_the_sources_raise() -> None:
 
 
 @pytest.mark.parametrize("code", ProblemCode)
-def test_every_entry_is_whole(code: ProblemCode) -> None:
+def test_every_entry_is_complete(code: ProblemCode) -> None:
     assert code.name == code.value.upper()
     assert code.cause.endswith(".")
     assert code.remedy.endswith(".")
@@ -147,18 +147,18 @@ def test_the_type_of_a_problem_resolves_to_its_explanation(http: httpx.Client) -
     assert {each["code"] for each in http.get("/errors").json()} == {code.value for code in ProblemCode}
 
 
-def test_an_explanation_of_no_code_is_refused(http: httpx.Client) -> None:
+def test_the_explanation_of_an_unknown_code_is_404(http: httpx.Client) -> None:
     answer = http.get("/errors/<b>")
     assert (answer.status_code, answer.json()["code"]) == (422, "invalid_request")
 
 
-def test_a_code_of_a_newer_version_is_still_a_problem() -> None:
+def test_a_code_of_a_newer_version_is_a_valid_problem() -> None:
     made = Problem.of("from_the_future", 418, detail="Something new. Update.")
     assert (made.title, made.type, made.retryable) == ("I'm a Teapot", "/errors/from_the_future", False)
     assert Problem(title="T", status=500, detail="D.", code="out_of_memory").type == "/errors/out_of_memory"
 
 
-def test_a_refusal_has_its_codes_usual_status() -> None:
+def test_an_error_has_the_usual_status_of_its_code() -> None:
     assert Refusal(ProblemCode.BODY_STALLED, detail="D.").status == 408
     assert Refusal(ProblemCode.UNKNOWN_UPLOAD, detail="D.", status=422).status == 422
     assert Refusal(ProblemCode.HTTP_ERROR, detail="D.").status == 500

@@ -28,12 +28,12 @@ TAG = '"abc"'
         ("bytes=" + "9" * 30 + "-", Slice(200, 0, 100)),
     ],
 )
-def test_a_range_header_means_these_bytes(wanted: str, expected: Slice) -> None:
+def test_a_range_header_selects_these_bytes(wanted: str, expected: Slice) -> None:
     assert decide({"range": wanted}, size=100, etag=TAG) == expected
 
 
 @given(first=st.integers(0, 120), last=st.integers(0, 120), size=st.integers(1, 100))
-def test_a_part_is_what_python_slices(first: int, last: int, size: int) -> None:
+def test_a_range_equals_a_python_slice(first: int, last: int, size: int) -> None:
     part = decide({"range": f"bytes={first}-{last}"}, size=size, etag=TAG)
     whole = bytes(i % 251 for i in range(size))
     wanted = whole[first : last + 1]

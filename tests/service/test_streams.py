@@ -71,7 +71,7 @@ def test_a_stream_ends_when_its_token_does(serve: Serve, how: str, monkeypatch: 
 
 
 @pytest.mark.parametrize("verb", ["POST", "PUT"])
-def test_a_submission_may_wait_for_the_end(running: Running, http: httpx.Client, verb: str) -> None:
+def test_a_submission_can_wait_for_the_end(running: Running, http: httpx.Client, verb: str) -> None:
     path = "/v1/jobs" if verb == "POST" else "/v1/jobs/awaited-at-once"
     body = form(tracks(seed=7), name=f"awaited {verb}")
     begun = time.monotonic()
@@ -88,7 +88,7 @@ def test_a_submission_may_wait_for_the_end(running: Running, http: httpx.Client,
 
 
 @pytest.mark.parametrize("wish", ["wait", "wait=", "wait=x", "wait=-9", "return=minimal", "wait=9.5", "wait=٩"])
-def test_a_wish_that_is_none_is_passed_over(http: httpx.Client, wish: str) -> None:
+def test_an_invalid_preference_is_ignored(http: httpx.Client, wish: str) -> None:
     job = submit(http)
     begun = time.monotonic()
     answer = http.get(f"/v1/jobs/{job.id}", headers={b"Prefer": wish.encode()})

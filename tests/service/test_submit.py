@@ -16,9 +16,7 @@ from pliant.worker.formats import Limits, load_inputs
 from serving import Running, Serve, claim, form, heard, npz, submit, tracks, until
 
 
-def test_a_submitted_job_is_stored_queued_and_answered_whole(
-    running: Running, http: httpx.Client, tmp_path: Path
-) -> None:
+def test_a_submitted_job_is_stored_queued_and_returned(running: Running, http: httpx.Client, tmp_path: Path) -> None:
     points = np.random.default_rng(1).normal(size=(6, 12, 2)) * 100
     answer = http.post(
         "/v1/jobs", files=form(npz(tracks=points), mesh="3x4", options={"method": "temporal"}, name=" a\nb ")
@@ -35,7 +33,7 @@ def test_a_submitted_job_is_stored_queued_and_answered_whole(
     assert running.left_on_disk == []
 
 
-def test_texts_may_come_with_a_file_name(http: httpx.Client) -> None:
+def test_text_parts_can_have_a_file_name(http: httpx.Client) -> None:
     parts = form() | {"options": ("options.json", b'{"method": "temporal"}', "application/json")}
     answer = http.post("/v1/jobs", files=parts)
     assert answer.status_code == 202
@@ -65,7 +63,7 @@ BAD: dict[str, tuple[dict[str, Any], int, str, str]] = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_a_refusal_says_both_sides_and_leaves_nothing(running: Running, http: httpx.Client, case: str) -> None:
+def test_an_error_states_expected_and_got_and_nothing_is_kept(running: Running, http: httpx.Client, case: str) -> None:
     parts, status, code, field = BAD[case]
     given = form() | {
         name: value if isinstance(value, tuple) else form(**{name: value})[name]
@@ -92,12 +90,12 @@ def test_a_file_that_cannot_be_written_here_is_refused_before_the_job_is_queued(
     running: Running, http: httpx.Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     wish = form(options={"outputs": ["usd"]})
-    monkeypatch.setattr("pliant.worker.artifacts.usd.available", lambda: False)
+    monkeypatch.setattr("pliant.worker.artifacts.scenes.usd.available", lambda: False)
     before = running.waiting
     problem = Problem.model_validate_json(http.post("/v1/jobs", files=wish).content)
     assert (problem.status, problem.code, problem.field) == (422, "output_unavailable", "options.outputs")
     assert running.waiting == before
-    monkeypatch.setattr("pliant.worker.artifacts.usd.available", lambda: True)
+    monkeypatch.setattr("pliant.worker.artifacts.scenes.usd.available", lambda: True)
     assert http.post("/v1/jobs", files=wish).status_code == 202
 
 
@@ -125,7 +123,7 @@ def test_a_file_that_cannot_be_written_here_is_refused_before_the_job_is_queued(
         ),
     ],
 )
-def test_a_body_that_is_no_form_is_refused(
+def test_a_body_that_is_not_a_form_is_rejected(
     running: Running, http: httpx.Client, content_type: str | None, body: bytes, status: int, code: str
 ) -> None:
     answer = http.post("/v1/jobs", content=body, headers={"content-type": content_type} if content_type else {})
@@ -170,7 +168,7 @@ def _begun(url: str, *, declared: int, sent: bytes) -> socket.socket:
     return connection
 
 
-def test_a_stalled_body_is_given_up(serve: Serve) -> None:
+def test_a_stalled_body_is_rejected(serve: Serve) -> None:
     hasty = serve(stall_seconds=0.5)
     with _begun(hasty.url, declared=100_000, sent=b"x" * 1000) as connection:
         answer = heard(connection, b'"body_stalled"')
@@ -178,7 +176,7 @@ def test_a_stalled_body_is_given_up(serve: Serve) -> None:
     assert hasty.left_on_disk == []
 
 
-def test_a_client_that_goes_away_leaves_nothing(running: Running) -> None:
+def test_nothing_is_kept_of_a_client_that_disconnects(running: Running) -> None:
     connection = _begun(running.url, declared=10_000_000, sent=b"x" * 3_000_000)
     until(lambda: any(path.is_file() and path.stat().st_size > 0 for path in running.left_on_disk))
     connection.close()
@@ -195,7 +193,7 @@ def test_two_idempotency_keys_are_refused(running: Running, http: httpx.Client) 
     assert running.waiting == before
 
 
-def test_a_key_makes_a_repeated_request_the_same_job(running: Running, http: httpx.Client) -> None:
+def test_an_idempotency_key_makes_a_submission_repeatable(running: Running, http: httpx.Client) -> None:
     key = {"Idempotency-Key": "6f1b"}
     first = http.post("/v1/jobs", files=form(name="same"), headers=key)
     # The same parts in another order and with another boundary are the same content.
@@ -207,7 +205,7 @@ def test_a_key_makes_a_repeated_request_the_same_job(running: Running, http: htt
     assert http.post("/v1/jobs", files=form(name="same")).json()["id"] != first.json()["id"]
 
 
-def test_twenty_repeats_at_once_make_one_job(running: Running) -> None:
+def test_twenty_concurrent_repetitions_create_one_job(running: Running) -> None:
     found: list[str] = []
 
     def send() -> None:
@@ -293,7 +291,7 @@ def _chunks(body: bytes, sizes: list[int]) -> Iterator[bytes]:
     yield body[at:]
 
 
-def test_the_way_a_body_is_cut_does_not_matter(http: httpx.Client) -> None:
+def test_chunk_boundaries_of_a_body_do_not_matter(http: httpx.Client) -> None:
     request = httpx.Request("POST", "http://x/v1/jobs", files=form(name="cut"))
     body = request.read()
     answers = [
@@ -308,7 +306,7 @@ def test_the_way_a_body_is_cut_does_not_matter(http: httpx.Client) -> None:
     assert len({answer.json()["id"] for answer in answers}) == 1
 
 
-def test_the_fingerprint_is_of_names_and_contents() -> None:
+def test_the_fingerprint_covers_names_and_contents() -> None:
     from pliant.service.multipart import File, Form
 
     def made(**texts: str) -> str:

@@ -38,7 +38,7 @@ def offset(http: httpx.Client, path: str) -> int:
     return int(answer.headers["upload-offset"]) if answer.status_code == 204 else -1
 
 
-def test_one_plain_put_is_a_whole_upload(http: httpx.Client) -> None:
+def test_one_put_is_a_complete_upload(http: httpx.Client) -> None:
     answer = http.put("/v1/uploads/plain", content=DATA)
     assert answer.status_code == 201
     upload = Upload.model_validate_json(answer.content)
@@ -56,7 +56,7 @@ def test_one_plain_put_is_a_whole_upload(http: httpx.Client) -> None:
 
 
 @pytest.mark.parametrize("verb", ["PATCH", "PUT"])
-def test_parts_one_after_the_other(http: httpx.Client, verb: str) -> None:
+def test_an_upload_in_several_requests(http: httpx.Client, verb: str) -> None:
     path = f"/v1/uploads/parts-{verb}"
     first = http.put(path, content=DATA[:1_000_000], headers={"Upload-Complete": "?0", "Upload-Length": str(len(DATA))})
     assert (first.status_code, first.json()["complete"], first.headers["upload-complete"]) == (201, False, "?0")
@@ -68,7 +68,7 @@ def test_parts_one_after_the_other(http: httpx.Client, verb: str) -> None:
     assert (whole["complete"], whole["sha256"]) == (True, hashlib.sha256(DATA).hexdigest())
 
 
-def test_a_broken_connection_keeps_what_arrived_and_the_rest_follows(running: Running, http: httpx.Client) -> None:
+def test_a_broken_connection_keeps_the_received_bytes(running: Running, http: httpx.Client) -> None:
     path = "/v1/uploads/broken"
     connection = begun(running.url, path, declared=len(DATA), sent=DATA[:2_000_000])
     until(lambda: offset(http, path) >= 1_000_000)
@@ -86,7 +86,7 @@ def test_a_broken_connection_keeps_what_arrived_and_the_rest_follows(running: Ru
     assert rest.json()["sha256"] == hashlib.sha256(DATA).hexdigest()
 
 
-def test_a_client_that_comes_back_need_not_wait_for_its_dead_connection(running: Running, http: httpx.Client) -> None:
+def test_a_reconnecting_client_replaces_its_dead_connection(running: Running, http: httpx.Client) -> None:
     path = "/v1/uploads/half-open"
     with begun(running.url, path, declared=len(DATA), sent=DATA[:2_000_000]) as dead:
         until(lambda: offset(http, path) >= 1_500_000)  # whole batches; the service still waits for more
@@ -108,7 +108,7 @@ def test_repeating_a_put_after_a_lost_answer_is_safe(running: Running, http: htt
     assert http.get("/v1/uploads/again").json()["complete"]
 
 
-def test_ten_at_once_end_in_one_whole(running: Running, http: httpx.Client) -> None:
+def test_ten_concurrent_uploads_of_one_id_give_one_complete_file(running: Running, http: httpx.Client) -> None:
     said = {"Repr-Digest": repr_digest(DATA)}
 
     def send() -> None:
@@ -143,7 +143,7 @@ REFUSED: dict[str, tuple[dict[str, str], bytes, int, str]] = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_a_refusal_says_why(small: Running, case: str) -> None:
+def test_rejected_uploads_state_the_reason(small: Running, case: str) -> None:
     headers, body, status, code = REFUSED[case]
     path = f"{small.url}/v1/uploads/{case.replace(' ', '-')}"
     answer = httpx.put(path, content=body, headers=headers)
@@ -159,7 +159,7 @@ def test_a_body_without_a_length_is_held_to_the_limit_too(small: Running) -> Non
     assert httpx.put(f"{small.url}/v1/uploads/x", content=b"").json()["code"] == "invalid_id"
 
 
-def test_a_stalled_upload_is_given_up_and_kept(serve: Serve) -> None:
+def test_a_stalled_upload_ends_and_its_bytes_are_kept(serve: Serve) -> None:
     hasty = serve(stall_seconds=0.5)
     with begun(hasty.url, "/v1/uploads/stalled", declared=90_000, sent=b"x" * 1000) as connection:
         heard(connection, b'"body_stalled"')
@@ -167,7 +167,7 @@ def test_a_stalled_upload_is_given_up_and_kept(serve: Serve) -> None:
     assert (there["complete"], there["length"]) == (False, 90_000)
 
 
-def test_a_job_names_uploads_instead_of_carrying_parts(running: Running, http: httpx.Client) -> None:
+def test_a_job_can_name_uploads_instead_of_parts(running: Running, http: httpx.Client) -> None:
     sent = tracks(6, 12)
     truth = npz(shapes=np.random.default_rng(1).normal(size=(6, 12, 3)))
     http.put("/v1/uploads/tracks-1", content=sent)
@@ -189,7 +189,7 @@ def test_a_job_names_uploads_instead_of_carrying_parts(running: Running, http: h
     assert running.left_on_disk == []
 
 
-def test_a_job_that_names_no_upload_or_both_is_refused(running: Running, http: httpx.Client) -> None:
+def test_a_missing_upload_or_a_duplicate_part_is_rejected(running: Running, http: httpx.Client) -> None:
     before = running.waiting
     unknown = http.post("/v1/jobs", files={"tracks_upload": (None, "nowhere")})
     assert (unknown.status_code, unknown.json()["code"]) == (422, "unknown_upload")
@@ -220,7 +220,7 @@ def test_too_many_uploads_are_refused(serve: Serve, monkeypatch: pytest.MonkeyPa
     assert answers[-1].json()["code"] == "too_many_uploads"
 
 
-def test_to_another_token_an_upload_is_not_there(serve: Serve) -> None:
+def test_uploads_of_another_token_do_not_exist(serve: Serve) -> None:
     running = serve(auth="required")
     assert httpx.put(f"{running.url}/v1/uploads/mine", content=b"x").status_code == 401
     with running.client() as ada, running.client() as bob:

@@ -38,7 +38,7 @@ def test_a_webhook_is_kept_with_the_job_and_shown_nowhere(running: Running, http
         (PARTS | {"webhook": "file:///etc/passwd"}, "invalid_webhook"),
     ],
 )
-def test_one_that_cannot_be_is_refused_at_once(
+def test_an_invalid_webhook_is_rejected_at_submission(
     running: Running, http: httpx.Client, parts: dict[str, str], code: str
 ) -> None:
     before = running.waiting

@@ -53,14 +53,14 @@ def test_three_frames_of_four_points(cameras: KnownCamera | None, method: str, m
 
 
 @pytest.mark.parametrize(("frames", "points"), [(2, 5), (3, 3)])
-def test_fewer_are_refused(frames: int, points: int) -> None:
+def test_fewer_are_rejected(frames: int, points: int) -> None:
     with pytest.raises(InvalidInput, match="at least"):
         Tracks.from_arrays(np.random.default_rng(0).standard_normal((frames, points, 2)))
 
 
 @BOTH
 @pytest.mark.parametrize("nothing", [np.nan, np.inf, -np.inf])
-def test_what_is_not_a_number_is_hidden_and_nothing_else(cameras: KnownCamera | None, nothing: float) -> None:
+def test_only_values_that_are_not_finite_are_hidden(cameras: KnownCamera | None, nothing: float) -> None:
     gaps = np.random.default_rng(3).random(MADE.tracks.points.shape[:2]) < 0.2
     points = MADE.tracks.points.copy()
     points[gaps, 1] = nothing

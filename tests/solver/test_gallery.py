@@ -100,7 +100,7 @@ def test_facing_is_exact_on_a_box():
     assert not seen[0, back].any()
 
 
-def test_the_camera_turns_as_told_and_scales_have_mean_log_zero():
+def test_the_camera_turns_by_the_given_degrees_and_scales_have_mean_log_zero():
     made = face(30, 50, degrees=40, tilt=0, scale_change=0.2)
     forward = made.rotations[:, 2]
     assert np.degrees(np.arccos(forward[0] @ forward[-1])) == pytest.approx(80)

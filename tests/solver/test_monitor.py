@@ -43,27 +43,27 @@ def stopped_at(tracks: Tracks, settings: Settings, number: int) -> None:
     assert np.isfinite(found.camera.rotations).all()
 
 
-def test_a_stop_at_questions_of_the_smooth_prior_is_reported() -> None:
+def test_a_stop_during_the_smooth_prior_is_reported() -> None:
     tracks, settings = small(), Settings(prior="smooth", refine_rotations=False)
     for number in np.linspace(1, questions(tracks, settings), 6).astype(int):
         stopped_at(tracks, settings, number)
 
 
-def test_a_stop_at_questions_of_the_default_is_reported() -> None:
+def test_a_stop_during_the_default_is_reported() -> None:
     for number in (1, 2, 40, 400):
         stopped_at(small(noisy=True), Settings(), number)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("noisy", [False, True])
-def test_a_stop_at_questions_of_every_stage_is_reported(noisy: bool) -> None:
+def test_a_stop_in_every_stage_is_reported(noisy: bool) -> None:
     tracks, settings = small(noisy=noisy), Settings()
     for number in np.linspace(1, questions(tracks, settings), 40).astype(int):
         stopped_at(tracks, settings, number)
 
 
 @pytest.mark.slow
-def test_a_stop_at_every_question_of_the_smooth_prior_is_reported() -> None:
+def test_a_stop_at_every_unit_of_the_smooth_prior_is_reported() -> None:
     tracks, settings = small(), Settings(prior="smooth")
     for number in range(1, questions(tracks, settings) + 1, 3):
         stopped_at(tracks, settings, number)

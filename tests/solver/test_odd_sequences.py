@@ -17,7 +17,7 @@ MORE_SEEDS = tuple(set(range(24)) - set(SEEDS))
 
 
 @pytest.mark.parametrize("known", [True, False])
-def test_too_little_seen_is_said(known: bool) -> None:
+def test_too_few_observations_are_an_input_error(known: bool) -> None:
     random = np.random.default_rng(0)
     visible = np.zeros((6, 20), dtype=bool)
     visible[[0, 3], :3] = True  # three points in two frames, the others once at most
@@ -29,7 +29,7 @@ def test_too_little_seen_is_said(known: bool) -> None:
 
 
 @pytest.mark.parametrize("seed", [*SEEDS, *(pytest.param(seed, marks=pytest.mark.slow) for seed in MORE_SEEDS)])
-def test_odd_little_sequences_give_finite_shapes_or_a_sentence(seed: int) -> None:
+def test_small_sequences_give_finite_shapes_or_an_input_error(seed: int) -> None:
     random = np.random.default_rng(seed)
     frames, points = int(random.integers(3, 10)), int(random.integers(4, 30))
     flat = random.choice([0.0, 0.01, 1.0])

@@ -72,7 +72,7 @@ def test_the_same_call_gives_the_same_bits() -> None:
     assert np.array_equal(one.shapes, two.shapes)
 
 
-def test_stopping_gives_the_last_shapes_and_says_so() -> None:
+def test_stopping_returns_the_last_shapes_with_outcome_stopped() -> None:
     _, rotations, tracks, mesh = scene()
     asked = iter([False] * 3)
     found = solve(tracks, mesh, cameras=cameras_of(rotations), should_stop=lambda: next(asked, True))

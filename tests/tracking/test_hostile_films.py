@@ -56,7 +56,7 @@ def test_missing_and_empty_files(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["%03d.mp4", "http:film.mp4", "concat:a|b.mp4", "pipe:0"])
-def test_a_name_is_a_name_only(tmp_path: Path, name: str) -> None:
+def test_a_file_name_is_never_interpreted(tmp_path: Path, name: str) -> None:
     films.write_film(tmp_path / "plain.mp4", PICTURES).rename(tmp_path / name)
     assert len(list(open_film(tmp_path / name).frames())) == 12
 
@@ -135,7 +135,7 @@ def test_dimensions_of_the_container_alone_decide_nothing(tmp_path: Path) -> Non
     assert open_film(path).size == (64, 48)
 
 
-def test_a_film_of_rubbish_is_refused(tmp_path: Path) -> None:
+def test_a_film_of_random_bytes_is_rejected(tmp_path: Path) -> None:
     path = films.write_film(tmp_path / "film.mkv", PICTURES)
     path.write_bytes(path.read_bytes()[:64] + bytes(1000))
     assert refused(path) == "undecodable_film"

@@ -100,7 +100,7 @@ def test_small_films_are_enlarged_and_large_ones_reduced() -> None:
     assert tracking_scale((3840, 2160), 960) == 0.25
 
 
-def test_matches_follow_the_motion_and_notice_what_leaves() -> None:
+def test_matches_follow_the_motion_and_detect_lost_points() -> None:
     first, second = grey()
     points = np.array([[30.0, 30.0], [50.5, 40.25], [94.5, 40.0]], np.float32)
     with opencv_serial():
@@ -116,7 +116,7 @@ def test_sampling_is_bilinear() -> None:
     np.testing.assert_allclose(sample(field, points), [[5.25, 3.375], [0, 0], [14, 20], [4, 0]], atol=1e-5)
 
 
-def test_patches_notice_what_hides_a_point() -> None:
+def test_patches_detect_occlusion() -> None:
     first, second = grey()
     seeds, _ = place(first, np.ones_like(first, bool), step=6)
     beside = neighbours(seeds.grid, len(seeds.points))
@@ -195,3 +195,22 @@ def test_rendered_films_are_written_in_known_containers_only(tmp_path: Path) -> 
     with pytest.raises(FilmError) as caught:
         film.write(tmp_path / "missing" / "film.avi")
     assert caught.value.code == "unwritable_film"
+
+
+def test_refinement_finds_the_point_that_the_flow_missed() -> None:
+    wide = cv2.cvtColor(films.textured_pictures(1, (96, 72))[0], cv2.COLOR_RGB2GRAY)
+    turn = cv2.getRotationMatrix2D((48, 36), 6, 1.05)
+    frame = np.asarray(cv2.warpAffine(wide, turn, (96, 72), flags=cv2.INTER_CUBIC), np.uint8)
+    frame = np.clip(0.8 * frame + 20.0, 0, 255).astype(np.uint8)  # the light changes, too
+    seeds, _ = place(wide, np.pad(np.ones((40, 64), bool), 16), step=4)
+    appearance = Appearance.of(wide, seeds.points, neighbours(seeds.grid, len(seeds.points)))
+    true = seeds.points @ turn[:, :2].T.astype(np.float32) + turn[:, 2].astype(np.float32)
+    flowed = true + np.random.default_rng(0).normal(0, 0.3, true.shape).astype(np.float32)
+    visible = np.ones(len(true), bool)
+    refined = appearance.refine(frame, flowed, visible)
+    before, after = (np.median(np.linalg.norm(found - true, axis=1)) for found in (flowed, refined))
+    assert after < 0.4 * before
+    np.testing.assert_array_equal(appearance.refine(frame, flowed, ~visible), flowed)
+    other = cv2.cvtColor(films.textured_pictures(1, (96, 72), seed=5)[0], cv2.COLOR_RGB2GRAY)
+    kept = (appearance.refine(other, flowed, visible) == flowed).all(axis=1)
+    assert kept.mean() > 0.95, "what shows something else is left where it was"

@@ -221,7 +221,7 @@ def test_a_region_without_texture_is_refused(tmp_path: Path) -> None:
     assert (caught.value.code, caught.value.field) == ("no_texture", "region")
 
 
-def test_frames_that_share_nothing_are_refused(tmp_path: Path) -> None:
+def test_unrelated_frames_are_rejected(tmp_path: Path) -> None:
     random = np.random.default_rng(0)
     pictures = [random.integers(0, 256, (96, 128, 3), dtype=np.uint8) for _ in range(16)]
     path = films.write_film(tmp_path / "film.mkv", pictures)
@@ -231,7 +231,7 @@ def test_frames_that_share_nothing_are_refused(tmp_path: Path) -> None:
     assert caught.value.code == "tracks_lost"
 
 
-def test_a_region_that_is_gone_before_the_template_is_refused(tmp_path: Path) -> None:
+def test_a_region_lost_before_the_template_is_rejected(tmp_path: Path) -> None:
     pictures = [picture.copy() for picture in films.textured_pictures(14, (96, 72))]
     for number, picture in enumerate(pictures):
         picture[max(14, 72 - 6 * number) :] = 120  # a blank panel rises and covers the region

@@ -6,14 +6,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image, ImageDraw
 from pliant.schemas.options import Options
 from pliant.worker.errors import UnknownExample
 from pliant.worker.examples import EXAMPLES, example_file
+from pliant.worker.films import example as example_film
 from pliant.worker.formats import read_inputs
 
 
 @pytest.mark.parametrize("name", sorted(EXAMPLES))
-def test_an_example_reads_as_what_it_says(name: str, tmp_path: Path) -> None:
+def test_every_example_is_read_as_described(name: str, tmp_path: Path) -> None:
     parts = {}
     for part, file in EXAMPLES[name].files:
         parts[part] = tmp_path / file
@@ -42,3 +44,21 @@ def test_the_same_bytes_every_time() -> None:
 def test_an_unknown_example_names_those_there_are(name: str, file: str) -> None:
     with pytest.raises(UnknownExample, match=r"There are: face/tracks\.npz, face/mesh\.npz"):
         example_file(name, file)
+
+
+def test_the_example_film_shows_a_face_inside_its_region(tmp_path: Path) -> None:
+    pytest.importorskip("cv2")
+    from pliant.tracking import open_film
+
+    target = tmp_path / "face.webm"
+    target.write_bytes(example_file("film", "face.webm"))
+    frames = [frame.image.astype(float) for frame in open_film(target).frames()]
+    assert len(frames) == 30
+    corners = np.array(example_film.region())
+    assert frames[0].shape[:2] == (360, 480)
+    inside = Image.new("1", (480, 360))
+    ImageDraw.Draw(inside).polygon([(float(x), float(y)) for x, y in corners], fill=1)
+    face_, around = frames[0][np.asarray(inside)], frames[0][~np.asarray(inside)]
+    assert face_.std() > 4 * around.std()  # a pattern before a plain background
+    assert np.abs(frames[29] - frames[0])[np.asarray(inside)].mean() > 10  # it turns
+    assert example_film.film() is example_film.film()

@@ -16,7 +16,7 @@ def tokens(settings: Settings) -> Tokens:
     return Tokens.open(settings)
 
 
-def test_a_token_is_recognised_whole_and_only_so(tokens: Tokens) -> None:
+def test_only_a_complete_token_is_recognised(tokens: Tokens) -> None:
     token, text = tokens.create(" ada  l. ", scopes=[Scope.READ, Scope.READ])
     assert tokens.recognise(text) == token
     assert (token.name, token.scopes, token.owner) == ("ada l.", (Scope.READ,), token.id)
@@ -88,7 +88,7 @@ def test_tokens_may_share_jobs(tokens: Tokens) -> None:
         tokens.create("x", sharing="0" * 12)
 
 
-def test_admin_may_everything_and_the_others_what_they_say(tokens: Tokens) -> None:
+def test_admin_grants_every_scope_and_others_only_their_own(tokens: Tokens) -> None:
     def made(*scopes: Scope) -> Token:
         return tokens.create("x", scopes=scopes)[0]
 
@@ -99,7 +99,7 @@ def test_admin_may_everything_and_the_others_what_they_say(tokens: Tokens) -> No
 
 
 @pytest.mark.parametrize("name", ["", "   ", "n" * 101, "a\x00b"])
-def test_a_name_must_be_one(tokens: Tokens, name: str) -> None:
+def test_token_names_are_validated(tokens: Tokens, name: str) -> None:
     with pytest.raises(InvalidRequest, match="printable characters"):
         tokens.create(name)
 
@@ -122,7 +122,7 @@ def test_durations() -> None:
             parse_duration(wrong)
 
 
-def test_a_store_that_is_away_is_said_so(tmp_path: object) -> None:
+def test_an_unavailable_store_is_an_error(tmp_path: object) -> None:
     tokens = Tokens(connect(f"unix://{tmp_path}/nobody.sock", decode=True, retries=0), prefix="x")
     with pytest.raises(StoreUnavailable):
         tokens.recognise(f"pliant_{'0' * 12}_{secrets.token_urlsafe(32)}")

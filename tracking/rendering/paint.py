@@ -27,9 +27,10 @@ def face_paint(num_points: int) -> Floats:
     cheek = spot(x, y, at=(0.42, -0.08), size=(0.16, 0.13))
     nostril = spot(x, y, at=(0.055, -0.15), size=(0.03, 0.02))
     colours = np.tile(np.array(SKIN), (len(rest), 1))
-    for share, colour in (
+    layers = (
         (0.8 * cheek, CHEEK), (0.85 * mouth, LIPS), (inside, INSIDE), (0.9 * brow, BROW), (almond, WHITE), (iris, IRIS),
         (0.6 * nostril, BROW),
-    ):  # fmt: skip
+    )  # fmt: skip
+    for share, colour in layers:
         colours += share[:, None] * (np.array(colour) - colours)
     return colours

@@ -5,6 +5,7 @@ The demonstration and the tests track these films and compare with `RenderedFilm
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -88,10 +89,10 @@ class RenderedFilm:
         here = np.stack([x, y, np.zeros_like(x)], axis=-1)
         time = index / max(self.num_frames - 1, 1)
         drift = np.array([0.02 * self.size[0] * time, 0.0, 0.0])
-        image = 0.7 * _texture(here.reshape(-1, 3) + drift, self.size[1], self.seed + 1).reshape(height, width, 3) + 20
+        image = 0.7 * texture(here.reshape(-1, 3) + drift, self.size[1], self.seed + 1).reshape(height, width, 3) + 20
         covered = surface.triangle >= 0
         corners = self.rest[self.triangles[surface.triangle[covered]]]
-        image[covered] = _texture(np.einsum("nk,nkc->nc", surface.weights[covered], corners), self.size[1], self.seed)
+        image[covered] = texture(np.einsum("nk,nkc->nc", surface.weights[covered], corners), self.size[1], self.seed)
         if self.paint is not None:
             image[~covered] = DIM * image[~covered]
             colour = np.einsum(
@@ -101,7 +102,7 @@ class RenderedFilm:
         if self.occluder:
             left, right = self._bar(index)
             behind = (x >= left) & (x <= right)
-            image[behind] = _texture(here[behind] - (left, 0, 0), self.size[1], self.seed + 2)
+            image[behind] = texture(here[behind] - (left, 0, 0), self.size[1], self.seed + 2)
         small = image.reshape(self.size[1], fine, self.size[0], fine, 3).mean(axis=(1, 3))
         if self.blur > 0:
             small = cv2.GaussianBlur(small, (0, 0), self.blur)
@@ -139,8 +140,19 @@ class RenderedFilm:
         visible = np.stack([self._sees(tracks[t], shapes[t, :, 2], t) for t in range(self.num_frames)])
         return tracks, visible & np.isfinite(tracks[..., 0]), shapes
 
-    def write(self, path: Path | str, *, fps: float = 30.0) -> Path:
+    def write(
+        self, path: Path | str, *, fps: float = 30.0, frame: Callable[[int], NDArray[np.uint8]] | None = None
+    ) -> Path:
         """Encode the film; `.avi` and `.mkv` are lossless, `.mp4`, `.mov` and `.webm` lossy.
+
+        Parameters
+        ----------
+        path
+            The file to write.
+        fps
+            Frames a second.
+        frame
+            Renders a frame by its index in place of `self.frame`.
 
         Raises
         ------
@@ -168,7 +180,7 @@ class RenderedFilm:
                     hint="Check the folder and its permissions.",
                 )
             for index in range(self.num_frames):
-                writer.write(cv2.cvtColor(self.frame(index), cv2.COLOR_RGB2BGR))
+                writer.write(cv2.cvtColor((frame or self.frame)(index), cv2.COLOR_RGB2BGR))
         finally:
             writer.release()
         return target
@@ -259,7 +271,7 @@ def render_film(
     )
 
 
-def _texture(points: Floats, height: int, seed: int) -> Floats:
+def texture(points: Floats, height: int, seed: int) -> Floats:
     """Evaluate a solid texture: soft-clipped sums of plane waves; `(N, 3)` places in pixels to `(N, 3)` grey levels."""
     random = np.random.default_rng(seed)
     direction = random.standard_normal((WAVES, 3))

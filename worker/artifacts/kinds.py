@@ -10,14 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.schemas.options import Options, Output
 from pliant.solver import InvalidInput
-from pliant.worker.artifacts import alembic, matlab, preview, usd
+from pliant.worker.artifacts import matlab, preview
 from pliant.worker.artifacts.animation import animate
 from pliant.worker.artifacts.colours import linear
 from pliant.worker.artifacts.frames_zip import OnProgress, write_obj_zip, write_ply_zip
 from pliant.worker.artifacts.geometry import Floats, triangles_of, viewer_scale
 from pliant.worker.artifacts.glb import write_glb
-from pliant.worker.artifacts.mdd import write_mdd
 from pliant.worker.artifacts.result import Result
+from pliant.worker.artifacts.scenes import alembic, usd
+from pliant.worker.artifacts.scenes.mdd import write_mdd
 from pliant.worker.artifacts.tables import write_frames_csv, write_points_csv
 from pliant.worker.artifacts.view import view_of
 

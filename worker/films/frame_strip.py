@@ -53,28 +53,19 @@ def write_frames(film: Film, indices: NDArray[np.int64], path: Path) -> bool:
     bool
         False, and no file, where the pictures take more than `MOST_BYTES` or not all frames are found again.
     """
+    from pliant.tracking.contact_sheet import small_jpeg
+
     wanted = {int(index) for index in indices}
     pictures: list[bytes] = []
     for frame in film.frames():
         if frame.index in wanted:
-            pictures.append(small_jpeg(frame.image))
+            pictures.append(small_jpeg(frame.image, longest_side=LONGEST_SIDE, quality=QUALITY))
         if sum(map(len, pictures)) > MOST_BYTES:
             return False
     if len(pictures) != len(wanted):
         return False
     path.write_bytes(packed(pictures, film.size))
     return True
-
-
-def small_jpeg(image: NDArray[np.uint8]) -> bytes:
-    """Return an RGB picture `(H, W, 3)` as a JPEG whose longest side is at most `LONGEST_SIDE`."""
-    import cv2
-
-    scale = LONGEST_SIDE / max(image.shape[:2])
-    if scale < 1:
-        image = np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-    parameters = [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
-    return bytes(cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), parameters)[1].tobytes())
 
 
 def packed(pictures: Iterable[bytes], size: tuple[int, int]) -> bytes:

@@ -119,6 +119,8 @@ export interface Example {
   name: string;
   title: string;
   files: { part: string; file: string }[];
+  /** What to track in a film: corners in its first frame. */
+  region_polygon?: [number, number][] | null;
 }
 export const listExamples = (): Promise<{ examples: Example[] }> => json("v1/examples");
 

@@ -115,18 +115,18 @@ export class Compose {
     this.options.clear();
   }
 
-  /** Take the first example and send it: the shortest way to a moving mesh. */
-  async tryOut(): Promise<void> {
-    const example = this.offered[0];
+  /** Take the first example, or the first film, and send it: the shortest way to a moving mesh. */
+  async tryOut(kind: "tracks" | "film"): Promise<void> {
+    const example = this.offered.find(({ files }) => files.some(({ part }) => part === kind));
     if (example === undefined) return;
     this.element.open = true;
     await this.takeExample(example);
-    if (this.slots.file("tracks")) this.send.form?.requestSubmit();
+    if (this.slots.file(kind)) this.send.form?.requestSubmit();
   }
 
-  /** True where the service makes examples. */
-  get hasExamples(): boolean {
-    return this.offered.length > 0;
+  /** True where the service makes an example of tracks, or of a film. */
+  hasExample(kind: "tracks" | "film"): boolean {
+    return this.offered.some(({ files }) => files.some(({ part }) => part === kind));
   }
 
   private async takeExample(example: Example): Promise<void> {
@@ -139,6 +139,7 @@ export class Compose {
       this.label.value = example.title;
       this.answer.replaceChildren();
       await this.slots.fill(files);
+      if (example.region_polygon) await this.slots.outline(example.region_polygon);
       this.send.focus();
     } catch (error) {
       this.refuse(error);

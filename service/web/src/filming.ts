@@ -28,6 +28,7 @@ export class Filming {
   private film: File | null = null;
   private picture: ImageBitmap | null = null;
   private region: Region | null = null;
+  private shown: Promise<void> = Promise.resolve();
 
   /** `onChange` is called when another region has been chosen. */
   constructor(private readonly onChange: () => void) {}
@@ -38,7 +39,17 @@ export class Filming {
   }
 
   /** Show another film, or none. */
-  async show(film: File | null): Promise<void> {
+  show(film: File | null): void {
+    this.shown = this.begin(film);
+  }
+
+  /** Choose a region as if it had been drawn, once the film is shown. */
+  async take(corners: Point[]): Promise<void> {
+    await this.shown;
+    if (this.film) this.choose({ kind: "lasso", corners });
+  }
+
+  private async begin(film: File | null): Promise<void> {
     this.film = film;
     this.picture?.close();
     this.picture = this.region = null;

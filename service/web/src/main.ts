@@ -77,8 +77,12 @@ function tokenForm(): HTMLElement {
 /** Offer the example while there are no jobs. */
 function offer(): void {
   const place = document.getElementById("try") as HTMLElement;
-  place.hidden = !compose.hasExamples;
-  place.replaceChildren(button("Try it with a synthetic face", () => void compose.tryOut(), { class: "primary large" }));
+  const [tracks, film] = [compose.hasExample("tracks"), compose.hasExample("film")];
+  place.hidden = !tracks && !film;
+  place.replaceChildren(
+    ...(tracks ? [button("Try it with a synthetic face", () => void compose.tryOut("tracks"), { class: "primary large" })] : []),
+    ...(film ? [button("Try it with a film", () => void compose.tryOut("film"), { class: "large" })] : []),
+  );
 }
 
 let loaded = false;

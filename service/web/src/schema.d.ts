@@ -66,6 +66,11 @@ export interface components {
             title: string;
             /** Files */
             files: components["schemas"]["ExampleFile"][];
+            /** Region Polygon */
+            region_polygon: [
+                number,
+                number
+            ][] | null;
         };
         /**
          * ExampleFile

@@ -1,5 +1,6 @@
 // The files of a new job: a film, or tracks with a mesh. Each place is filled by drop or by choice, and shows what it holds.
 
+import { CameraDialog, canRecord } from "./camera";
 import { button, h, uniqueId } from "./dom";
 import { looksLikeFilm } from "./film";
 import { Filming } from "./filming";
@@ -98,6 +99,11 @@ export class Slots {
     this.onChange();
   }
 
+  /** Choose what to track in the film: corners in its pixels. */
+  async outline(corners: Point[]): Promise<void> {
+    await this.filming.take(corners);
+  }
+
   /** Put dropped files where their names and contents say they belong. */
   async take(files: File[]): Promise<void> {
     for (const file of files) {
@@ -132,9 +138,15 @@ export class Slots {
     const pick = h("span", { class: "pick", "aria-hidden": "true" }, "Choose");
     slot.row.append(slot.input, choose, pick, slot.hint, slot.remove, slot.contents);
     if (part === "mesh") slot.row.append(h("span", { class: "grid-size" }, h("label", { for: "grid" }, "or points on a grid"), this.grid));
-    if (part === "film") slot.row.append(this.filming.element);
+    if (part === "film") slot.row.append(this.recording(), this.filming.element);
     slot.row.append(slot.answer);
     return slot.row;
+  }
+
+  private recording(): HTMLElement | string {
+    if (!canRecord()) return "";
+    const film = (recorded: File): void => void this.put("film", recorded);
+    return h("span", { class: "record" }, button("Record with the camera", () => void new CameraDialog(film).open(), { class: "link" }));
   }
 
   private async put(part: Part, file: File | null): Promise<void> {
@@ -152,7 +164,7 @@ export class Slots {
     if (part === "mesh") (this.grid.parentElement as HTMLElement).hidden = file !== null;
     if (part === "film") {
       this.arrange();
-      void this.filming.show(file);
+      this.filming.show(file);
     }
     if (file === null) {
       slot.input.value = "";

@@ -47,14 +47,14 @@ def test_an_array_keeps_its_type_and_gets_its_visibility(tmp_path: Path) -> None
     assert set(arrays(tracks_file(POINTS.tolist(), None, tmp_path))) == {"tracks"}
 
 
-def test_a_mask_is_visibility_turned_round(tmp_path: Path) -> None:
+def test_a_mask_is_inverted_visibility(tmp_path: Path) -> None:
     mask = np.zeros(POINTS.shape, bool)
     mask[1, 2, 0] = True
     held = arrays(tracks_file(np.ma.masked_array(POINTS, mask), None, tmp_path))
     assert np.argwhere(~held["visibility"]).tolist() == [[1, 2]]
 
 
-def test_a_trackers_dictionary_goes_as_it_is(tmp_path: Path) -> None:
+def test_the_dictionary_of_a_tracker_is_sent_unchanged(tmp_path: Path) -> None:
     given = {"pred_tracks": Tensor(POINTS[None]), "pred_visibility": Tensor(np.ones((1, 4, 9), bool))}
     held = arrays(tracks_file(given, None, tmp_path))
     assert {name: array.shape for name, array in held.items()} == {
@@ -101,7 +101,7 @@ def test_truth_and_cameras_are_arrays_dictionaries_or_files(tmp_path: Path) -> N
         (lambda here: checked_options({"loss": "l3", "los": 1}), r"loss: .*'l3'.*los: there is no such option.*loss.*pliant options"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_sent_is_refused_before_anything_is(make: Any, words: str, tmp_path: Path) -> None:
+def test_invalid_inputs_are_rejected_before_anything_is_sent(make: Any, words: str, tmp_path: Path) -> None:
     with pytest.raises(BadArgument, match=words):
         make(tmp_path)
 
@@ -130,7 +130,7 @@ def test_a_body_is_streamed_counted_and_can_be_sent_again(tmp_path: Path) -> Non
         assert bytes(300_000) in body
 
 
-def test_no_temporary_file_stays_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_temporary_file_remains(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     service = InMemoryService()
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     with Client("http://pliant.test", transport=service) as client:
@@ -142,7 +142,7 @@ def test_no_temporary_file_stays_behind(tmp_path: Path, monkeypatch: pytest.Monk
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_result_that_was_not_loaded_says_so(tmp_path: Path) -> None:
+def test_a_result_that_is_not_loaded_is_an_error(tmp_path: Path) -> None:
     with Client("http://pliant.test", transport=InMemoryService()) as client:
         result = client.submit(POINTS).wait(timeout=9, load=False, folder=tmp_path)
         with pytest.raises(NotLoaded, match=r"call load\(\)"):
@@ -152,7 +152,7 @@ def test_a_result_that_was_not_loaded_says_so(tmp_path: Path) -> None:
         assert result.faces.shape == (0, 3)
 
 
-def test_a_plot_shows_the_frames_asked_for(tmp_path: Path) -> None:
+def test_a_plot_shows_the_requested_frames(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     with Client("http://pliant.test", transport=InMemoryService()) as client:
         figure = client.submit(POINTS, name="a face").wait(timeout=9).plot(frames=3)

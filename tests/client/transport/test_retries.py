@@ -99,7 +99,7 @@ def client_of(service: httpx.BaseTransport, clock: Clock, **policy: float) -> Cl
     return Client("http://pliant.test", transport=service, retries=Retry(clock=clock, jitter=lambda: 1.0, **policy))
 
 
-def test_a_lost_answer_to_a_submission_makes_one_job(clock: Clock) -> None:
+def test_a_lost_response_to_a_submission_creates_one_job(clock: Clock) -> None:
     service = Flaky(cut_off, cut_off, after=True)
     client = client_of(service, clock)
     job = client.submit(POINTS)
@@ -120,7 +120,7 @@ def test_a_call_that_may_have_been_carried_out_is_not_repeated(clock: Clock) -> 
     assert clock.pauses == []
 
 
-def test_a_job_run_again_is_one_new_job_though_the_answer_was_lost(clock: Clock) -> None:
+def test_a_retried_job_is_created_once_despite_a_lost_response(clock: Clock) -> None:
     service = Flaky(after=True, steps=math.inf)
     client = client_of(service, clock)
     job = queued(client).cancel()
@@ -130,7 +130,7 @@ def test_a_job_run_again_is_one_new_job_though_the_answer_was_lost(clock: Clock)
     assert [each.record.retry_of for each in client.list()] == [job.id, None, None]
 
 
-def test_a_question_is_asked_again_though_it_is_a_post(clock: Clock) -> None:
+def test_a_post_without_side_effects_is_repeated(clock: Clock) -> None:
     service = Flaky(cut_off, cut_off)
     assert client_of(service, clock).inspect(POINTS).num_points == 9
     assert [request.url.path for request in service.requests] == ["/v1/inspect"] * 3
@@ -161,7 +161,7 @@ def test_pauses_double_up_to_a_bound(clock: Clock) -> None:
     assert clock.pauses == [0.25, 0.5, 1, 2, 4, 8, 10, 10]
 
 
-def test_a_wrong_address_is_told_within_seconds_but_a_restart_is_outwaited(clock: Clock) -> None:
+def test_a_wrong_address_fails_within_seconds_and_a_restart_is_waited_for(clock: Clock) -> None:
     with pytest.raises(Unreachable, match=r"connection refused.*pliant up"):
         client_of(Flaky(*[no_connection] * 99), clock).options()
     assert 1 < clock.now < 6
@@ -177,21 +177,21 @@ def test_a_wrong_address_is_told_within_seconds_but_a_restart_is_outwaited(clock
 
 
 @pytest.mark.parametrize("status", [400, 401, 404, 409, 413, 422, 500, 501])
-def test_a_definite_no_is_not_asked_again(clock: Clock, status: int) -> None:
+def test_a_definite_rejection_is_not_repeated(clock: Clock, status: int) -> None:
     service = Flaky(answer(status))
     with pytest.raises(Exception, match=r"Sentence\."):
         client_of(service, clock).options()
     assert len(service.requests) == 1
 
 
-def test_a_fault_that_calls_itself_retryable_is_retried(clock: Clock) -> None:
+def test_a_retryable_error_is_retried(clock: Clock) -> None:
     service = Flaky(answer(500, retryable=True))
     client_of(service, clock).options()
     assert len(service.requests) == 2
 
 
 @pytest.mark.parametrize(("status", "kind"), [(429, TooManyRequests), (503, ServiceFailed)])
-def test_a_service_that_never_recovers_is_given_up_with_its_own_sentence(clock: Clock, status: int, kind: type) -> None:
+def test_a_service_that_never_recovers_raises_its_own_message(clock: Clock, status: int, kind: type) -> None:
     with pytest.raises(kind, match=r"Sentence\.") as caught:
         client_of(Flaky(*[answer(status)] * 99), clock).options()
     assert caught.value.status == status
@@ -206,7 +206,7 @@ def test_the_overall_timeout_holds_over_all_repetitions(clock: Clock) -> None:
 
 
 @pytest.mark.parametrize("on_progress", [None, lambda _: None], ids=["polling", "events"])
-def test_waiting_ends_with_the_timeout_and_leaves_the_job_alone(on_progress: Callable[[Job], None] | None) -> None:
+def test_waiting_ends_with_the_timeout_and_the_job_continues(on_progress: Callable[[Job], None] | None) -> None:
     service = InMemoryService(steps=math.inf)
     with Client("http://pliant.test", transport=service, retries=Retry(poll_interval=0.01)) as client:
         job = client.submit(POINTS)
@@ -215,7 +215,7 @@ def test_waiting_ends_with_the_timeout_and_leaves_the_job_alone(on_progress: Cal
         assert job.refresh().status == "running"
 
 
-def test_a_deletion_whose_answer_was_lost_is_a_deletion(clock: Clock) -> None:
+def test_a_deletion_with_a_lost_response_succeeds(clock: Clock) -> None:
     service = Flaky()
     client = client_of(service, clock)
     job = client.submit(POINTS)
@@ -225,7 +225,7 @@ def test_a_deletion_whose_answer_was_lost_is_a_deletion(clock: Clock) -> None:
     assert list(client.list()) == []
 
 
-def test_an_answer_from_something_else_is_named(clock: Clock) -> None:
+def test_a_response_of_another_server_is_an_error(clock: Clock) -> None:
     page = lambda request: httpx.Response(404, html="<h1>nginx</h1>")  # noqa: E731
     with pytest.raises(UnexpectedAnswer, match=r"text/html.*nginx"):
         client_of(Flaky(page), clock).options()
@@ -246,7 +246,7 @@ def test_addresses_and_ids_are_checked_before_anything_is_sent(clock: Clock) -> 
     assert service.requests == []
 
 
-def test_a_token_travels_in_the_header_alone(clock: Clock) -> None:
+def test_a_token_is_only_sent_in_the_header(clock: Clock) -> None:
     service = InMemoryService(auth="required")
     with pytest.raises(NotAuthorized, match="token"):
         client_of(service, clock).options()
@@ -270,7 +270,7 @@ def test_retry_after_is_seconds_or_a_date(header: str | None, seconds: float | N
     assert seconds_of(header) == seconds
 
 
-def test_the_fault_of_an_input_is_whole(clock: Clock) -> None:
+def test_an_input_error_has_all_its_fields(clock: Clock) -> None:
     with pytest.raises(InvalidRequest) as caught:
         client_of(InMemoryService(), clock).submit(np.zeros((5, 9)))
     problem = caught.value.problem

@@ -60,9 +60,7 @@ def submit(kind: str, *args: Any, url: str, **kwargs: Any) -> Any:
 
 
 @pytest.mark.parametrize("kind", ["sync", "async"])
-def test_a_broken_upload_goes_on_where_it_broke(
-    kind: str, service_url: str, breaking: Callable[[int, int], list[int]]
-) -> None:
+def test_an_interrupted_upload_resumes(kind: str, service_url: str, breaking: Callable[[int, int], list[int]]) -> None:
     began = breaking(3, 2)
     told: list[int] = []
     job = submit(kind, POINTS, url=service_url, mesh="none", on_upload=lambda done, _: told.append(done))
@@ -76,7 +74,7 @@ def test_a_broken_upload_goes_on_where_it_broke(
         client.cancel(job.id)
 
 
-def test_what_an_earlier_run_has_sent_is_not_sent_again(
+def test_bytes_sent_by_an_earlier_run_are_not_sent_again(
     service_url: str, breaking: Callable[[int, int], list[int]]
 ) -> None:
     began = breaking(10**6, 2)
@@ -93,7 +91,7 @@ def test_what_an_earlier_run_has_sent_is_not_sent_again(
     assert whole[0] > 0, "it goes on where the first run was given up"
 
 
-def test_a_service_without_uploads_gets_everything_at_once() -> None:
+def test_a_service_without_uploads_receives_one_request() -> None:
     class Older(InMemoryService):
         def handle_request(self, request: httpx.Request) -> httpx.Response:
             if "/uploads/" not in request.url.path:
@@ -110,7 +108,7 @@ def test_a_service_without_uploads_gets_everything_at_once() -> None:
     assert [request.method for request in older.requests] == ["GET", "POST"]
 
 
-def test_an_upload_that_is_gone_when_the_job_comes_is_sent_again() -> None:
+def test_an_expired_upload_is_sent_again() -> None:
     class Forgetful(InMemoryService):
         forgets = 1
 
@@ -134,7 +132,7 @@ def test_an_upload_that_is_gone_when_the_job_comes_is_sent_again() -> None:
     assert caught.value.code == "unknown_upload"
 
 
-def test_out_of_step_it_looks_again_and_small_files_go_along(tmp_path: Path) -> None:
+def test_after_an_offset_mismatch_the_offset_is_read_again(tmp_path: Path) -> None:
     class Jumping(InMemoryService):
         """Somebody else has written part of it in the meantime."""
 

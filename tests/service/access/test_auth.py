@@ -134,7 +134,7 @@ def test_a_scope_limits_what_a_token_can_do(guarded: Running, scopes: tuple[Scop
             assert 'error="insufficient_scope"' in answer.headers["www-authenticate"]
 
 
-def test_which_scope_is_needed() -> None:
+def test_every_route_has_its_scope() -> None:
     assert needed("GET", "/metrics") is Scope.ADMIN
     assert needed("POST", "/v1/options") is Scope.SUBMIT
     assert needed("GET", "/v1/optionsextra") is Scope.READ
@@ -156,7 +156,7 @@ def test_a_token_that_may_only_submit_sends_large_files(guarded: Running, monkey
     assert guarded.jobs.records.get(job.id).bytes > 1000
 
 
-def test_to_another_token_a_job_is_not_there_on_any_route(
+def test_jobs_of_another_token_do_not_exist_on_any_route(
     guarded: Running, ada: httpx.Client, bob: httpx.Client
 ) -> None:
     job = submit(ada, name="ada's")
@@ -186,7 +186,7 @@ def test_to_another_token_a_job_is_not_there_on_any_route(
     assert ada.get(f"/v1/jobs/{queued.id}").json()["status"] == "queued"
 
 
-def test_an_id_of_another_token_is_taken_and_its_job_stays_hidden(
+def test_an_id_used_by_another_token_conflicts_without_revealing_its_job(
     guarded: Running, ada: httpx.Client, bob: httpx.Client
 ) -> None:
     body = tracks(seed=3)
@@ -261,7 +261,7 @@ def test_without_the_store_no_token_is_accepted(serve: Serve, tmp_path: Path, ca
     assert "ConnectionError" in caplog.text
 
 
-def test_a_preflight_needs_no_token_and_a_refusal_can_be_read(serve: Serve) -> None:
+def test_a_preflight_needs_no_token_and_errors_are_readable_across_origins(serve: Serve) -> None:
     running = serve(auth="required", cors_origins=("https://good.example",))
     asking = {
         "Origin": "https://good.example",
@@ -287,7 +287,7 @@ def test_tokens_are_off_on_loopback_and_on_elsewhere_by_default(valkey_url: str)
         asks(AUTH="no")
 
 
-def test_a_service_that_nobody_could_use_does_not_start(valkey_url: str, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_service_without_a_valid_token_does_not_start(valkey_url: str, caplog: pytest.LogCaptureFixture) -> None:
     tokens = Tokens(connect(valkey_url, decode=True), prefix="check-door")
     strict, open_door = ServiceSettings(host="0.0.0.0"), ServiceSettings(host="0.0.0.0", auth="off")
     with pytest.raises(InvalidSetting, match=r"pliant token create.*PLIANT_AUTH=off"):
@@ -301,7 +301,7 @@ def test_a_service_that_nobody_could_use_does_not_start(valkey_url: str, caplog:
     process.check_access(strict, Tokens(connect("unix:///nonexistent/x.sock", decode=True, retries=0), prefix="x"))
 
 
-def test_with_tokens_off_one_that_is_sent_changes_nothing(running: Running, http: httpx.Client) -> None:
+def test_with_tokens_off_a_sent_token_is_ignored(running: Running, http: httpx.Client) -> None:
     job = submit(http, name="anybody's")
     assert http.get(f"/v1/jobs/{job.id}", headers={"Authorization": "Bearer nonsense"}).status_code == 200
     assert Jobs.open(Settings(data=Path("x"), redis_url="unix:///x")).owner is None

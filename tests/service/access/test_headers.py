@@ -81,7 +81,7 @@ def test_on_loopback_only_its_own_names_are_answered(running: Running, host: str
         assert answer.json()["code"] == "unknown_host"
 
 
-def test_a_list_of_hosts_is_the_whole_list(serve: Serve) -> None:
+def test_a_list_of_hosts_is_complete(serve: Serve) -> None:
     running = serve(allowed_hosts=("pliant.example",))
     for host, status in (
         ("pliant.example", 200),
@@ -97,7 +97,9 @@ def test_on_another_address_any_name_is_answered_unless_there_is_a_list(serve: S
     assert httpx.get(f"{running.url}/healthz", headers={"Host": "anything.example"}).status_code == 200
 
 
-def test_a_defect_is_answered_with_care_logged_and_counted(serve: Serve, caplog: pytest.LogCaptureFixture) -> None:
+def test_an_internal_error_reveals_nothing_and_is_logged_and_counted(
+    serve: Serve, caplog: pytest.LogCaptureFixture
+) -> None:
     running = serve()
 
     async def broken(request: Request) -> Response:

@@ -26,7 +26,7 @@ class Clock:
         return self.now
 
 
-def test_a_minutes_worth_at_once_then_one_each_time_one_is_paid_off() -> None:
+def test_a_burst_of_one_minute_is_allowed_then_the_steady_rate() -> None:
     clock = Clock()
     rates = Rates(clock=clock)
     assert [rates.take("a", 60) for _ in range(60)] == [0.0] * 60
@@ -42,7 +42,7 @@ def test_a_minutes_worth_at_once_then_one_each_time_one_is_paid_off() -> None:
     assert [rates.take("a", 60) == 0.0 for _ in range(61)] == [True] * 60 + [False], "idleness is not saved up"
 
 
-def test_over_a_long_time_the_rate_is_what_it_says() -> None:
+def test_over_a_long_time_the_rate_is_the_configured_one() -> None:
     clock = Clock()
     rates = Rates(clock=clock)
     passed = 0
@@ -52,7 +52,7 @@ def test_over_a_long_time_the_rate_is_what_it_says() -> None:
     assert 10 * 30 <= passed <= 11 * 30 + 1
 
 
-def test_the_memory_of_clients_is_bounded_and_the_greedy_are_not_forgotten() -> None:
+def test_the_number_of_remembered_clients_is_bounded_and_busy_ones_are_kept() -> None:
     clock = Clock()
     rates = Rates(clock=clock)
     while rates.take("greedy", 10) == 0.0:
@@ -113,7 +113,7 @@ def test_the_sdk_honours_retry_after_and_succeeds(serve: Serve) -> None:
         many()
 
 
-def test_no_more_jobs_wait_than_may(serve: Serve) -> None:
+def test_the_limit_of_queued_jobs_is_enforced(serve: Serve) -> None:
     running = serve(max_queued=2)
     with httpx.Client(base_url=running.url) as http:
         first, key = submit(http), {"Idempotency-Key": "k"}
@@ -154,7 +154,7 @@ def test_a_full_queue_refuses_before_the_body_is_read(serve: Serve) -> None:
         assert connection.recv(4096).startswith(b"HTTP/1.1 429 ")
 
 
-def test_one_tokens_full_queue_is_not_anothers(serve: Serve) -> None:
+def test_the_queue_limit_is_per_token(serve: Serve) -> None:
     running = serve(auth="required", max_queued=1)
     with running.client() as one, running.client() as other, running.client(max_queued=2) as third:
         for client, room in ((one, 1), (other, 1), (third, 2)):
@@ -164,7 +164,7 @@ def test_one_tokens_full_queue_is_not_anothers(serve: Serve) -> None:
             assert client.post("/v1/jobs", files=form()).status_code == 429
 
 
-def test_a_token_may_have_a_smaller_body_than_the_service_allows(serve: Serve) -> None:
+def test_a_token_can_have_a_smaller_body_limit(serve: Serve) -> None:
     running = serve(auth="required")
     with running.client(max_body_bytes=1000) as small, running.client(max_body_bytes=2**60) as large:
         assert small.get("/v1/limits").json()["max_body_bytes"] == 1000
@@ -189,7 +189,7 @@ def test_the_default_rate_applies_where_the_service_is_reachable_from_outside() 
             rate(**{name: "-1"})
 
 
-def test_no_more_of_a_tokens_jobs_are_queued_for_the_workers_than_may_run(serve: Serve) -> None:
+def test_jobs_above_the_running_limit_are_held_back(serve: Serve) -> None:
     running = serve(auth="required")
     with running.client(max_running=1) as one, running.client() as other:
         assert (one.get("/v1/limits").json()["max_running"], other.get("/v1/limits").json()["max_running"]) == (1, 0)

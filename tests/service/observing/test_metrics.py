@@ -97,7 +97,7 @@ def test_without_its_store_the_service_reports_its_requests(serve: Serve, tmp_pa
     assert ("pliant_queue_depth", ()) not in numbers
 
 
-def test_an_odd_method_or_label_breaks_nothing(running: Running) -> None:
+def test_unusual_methods_and_labels_are_counted(running: Running) -> None:
     metrics = Metrics()
     metrics.count("BREW", 'a"b\\c\nd', status=418, seconds=0.1)
     numbers = read(metrics.exposition(running.jobs).decode())

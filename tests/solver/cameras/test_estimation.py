@@ -48,7 +48,7 @@ def test_a_rigid_scene_is_exact() -> None:
     assert set(found.reasons) == {"basis_size", "scales", "rotations"}
 
 
-def test_a_low_rank_scene_needs_its_own_k() -> None:
+def test_a_low_rank_scene_is_exact_with_its_basis_size() -> None:
     random = np.random.default_rng(0)
     camera = turning(60, 70)
     play = 0.3 * np.sin(np.linspace(0, 9, 60))[:, None, None]
@@ -60,7 +60,7 @@ def test_a_low_rank_scene_needs_its_own_k() -> None:
 
 
 @pytest.mark.slow
-def test_scales_are_found_where_the_camera_has_them() -> None:
+def test_scales_of_a_zooming_camera_are_estimated() -> None:
     scales = np.exp(0.1 * np.sin(np.linspace(0, 3, 20)))
     scales /= np.exp(np.log(scales).mean())
     normalized = normalize(Tracks.from_arrays(view(RIGID, CAMERA) * scales[:, None, None]))
@@ -74,7 +74,7 @@ def test_scales_are_found_where_the_camera_has_them() -> None:
 
 
 @pytest.mark.slow
-def test_outliers_and_hidden_points_hardly_matter() -> None:
+def test_outliers_and_hidden_points_barely_change_the_cameras() -> None:
     random = np.random.default_rng(1)
     points = view(RIGID, CAMERA)
     points[random.random(points.shape[:2]) < 0.1] = random.uniform(-2, 2, 2)
@@ -84,7 +84,7 @@ def test_outliers_and_hidden_points_hardly_matter() -> None:
     assert degrees_apart(found.rotations, CAMERA) < 3
 
 
-def test_a_still_camera_is_said() -> None:
+def test_a_still_camera_is_reported() -> None:
     still = np.broadcast_to(np.eye(3), (8, 3, 3))
     found = estimate_cameras(normalize(Tracks.from_arrays(view(RIGID, still))), Settings())
     assert any("hardly turns" in sentence for sentence in found.warnings)
@@ -142,7 +142,7 @@ def test_logarithms_are_those_of_the_exponentials() -> None:
     assert (logarithm(np.eye(3)[None]) == 0).all()
 
 
-def test_steadiness_pays_for_changes_of_speed_alone() -> None:
+def test_the_camera_motion_prior_penalises_changes_of_velocity_only() -> None:
     spin = exponential(np.arange(30)[:, None] * np.array([0.0, 0.05, 0.0]))
     random = np.random.default_rng(0)
     floor, slope = rotation_roughness(spin)
@@ -165,7 +165,7 @@ def test_corrections_are_carried_to_the_frames_between() -> None:
 
 
 @pytest.mark.slow
-def test_a_dancer_does_not_make_the_camera_dance() -> None:
+def test_a_deforming_body_does_not_move_a_static_camera() -> None:
     # limbs that swing as fast as the camera turns: every K gives cameras that jitter with them
     random = np.random.default_rng(2)
     time = np.linspace(0, 1, 40)

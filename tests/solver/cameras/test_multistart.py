@@ -18,7 +18,7 @@ FRAMES = 16
 
 
 @pytest.mark.slow
-def test_rivals_are_cameras_of_their_own_and_not_far_too_deep() -> None:
+def test_hypotheses_are_distinct_cameras_of_plausible_depth() -> None:
     face = gallery.face(24, 200)
     found = estimate_cameras(normalize(face.tracks), Settings())
     assert found.hypotheses
@@ -30,12 +30,12 @@ def test_rivals_are_cameras_of_their_own_and_not_far_too_deep() -> None:
 
 
 @pytest.mark.slow
-def test_a_sheet_has_no_rivals_for_its_sides_are_chosen() -> None:
+def test_a_sheet_has_no_further_hypotheses() -> None:
     assert not estimate_cameras(normalize(gallery.flag(24, 400).tracks), Settings()).hypotheses
 
 
 @pytest.mark.slow
-def test_cameras_far_too_deep_are_no_rivals(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cameras_with_implausible_depth_are_no_hypotheses(monkeypatch: pytest.MonkeyPatch) -> None:
     face = gallery.face(24, 200)
     monkeypatch.setattr("pliant.solver.cameras.estimation.MAX_START_DEPTH_VARIANCE", 0.0)
     assert not estimate_cameras(normalize(face.tracks), Settings()).hypotheses
@@ -43,9 +43,7 @@ def test_cameras_far_too_deep_are_no_rivals(monkeypatch: pytest.MonkeyPatch) -> 
 
 @pytest.mark.parametrize("better", ["own", "rival"])
 @pytest.mark.slow
-def test_it_starts_from_the_cameras_that_lead_to_more_probable_ones(
-    better: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_start_that_leads_to_the_higher_likelihood_is_chosen(better: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         "pliant.solver.model.full_mode_covariance.POINTS_PER_COEFFICIENT", np.inf
     )  # it would mend either start
@@ -68,7 +66,7 @@ def test_it_starts_from_the_cameras_that_lead_to_more_probable_ones(
 
 
 @pytest.mark.parametrize("outliers", [0.0, 0.1])
-def test_where_outliers_were_found_cameras_keep_all_modes_and_shapes_those_confirmed(
+def test_with_outliers_cameras_keep_all_modes_and_shapes_the_validated_ones(
     outliers: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     random, time = np.random.default_rng(2), np.linspace(0, 1, FRAMES)
@@ -95,7 +93,7 @@ def test_where_outliers_were_found_cameras_keep_all_modes_and_shapes_those_confi
     assert (covariance.modes.shape[1] <= 4) == (outliers > 0)
 
 
-def test_a_rival_that_hardly_turns_is_warned_of() -> None:
+def test_a_chosen_hypothesis_with_little_rotation_gives_a_warning() -> None:
     still = np.broadcast_to(np.eye(3), (FRAMES, 3, 3))
     turning = exponential(np.linspace(0, 1, FRAMES)[:, None] * np.array([0.0, 1.0, 0.0]))
     own = CameraEstimate(turning, np.ones(FRAMES), np.zeros((FRAMES, 2)), 1, np.zeros((0, 0)), np.zeros((FRAMES, 0, 2)))

@@ -231,26 +231,26 @@ def test_other_priors_take_a_given_focal_length() -> None:
         ({"principal_point": (-1e5, 0.0), "image_size": PICTURE}, "principal_point"),
     ],
 )
-def test_settings_that_no_camera_has_are_refused(wrong: dict[str, object], name: str) -> None:
+def test_contradictory_camera_settings_are_rejected(wrong: dict[str, object], name: str) -> None:
     with pytest.raises(InvalidSettings) as refused:
         Settings(**wrong)  # type: ignore[arg-type]
     assert refused.value.field == f"options.{name}"
 
 
-def test_a_picture_beside_the_tracks_is_refused() -> None:
+def test_an_image_size_that_excludes_the_tracks_is_rejected() -> None:
     with pytest.raises(InvalidInput, match="most positions within") as refused:
         solve(pinhole(SEEN, FOCAL), settings=Settings(image_size=(64.0, 48.0)))
     assert refused.value.code == "outside_picture"
 
 
-def test_a_principal_point_absurdly_far_away_is_refused() -> None:
+def test_a_distant_principal_point_is_rejected() -> None:
     tracks = pinhole(SEEN, FOCAL)
     with pytest.raises(InvalidInput) as refused:
         given_lens(tracks, normalize(tracks), Settings(principal_point=(1e7, 0.0)))
     assert refused.value.code == "principal_point_far"
 
 
-def test_two_focal_lengths_are_refused() -> None:
+def test_focal_and_field_of_view_together_are_rejected() -> None:
     cameras = KnownCamera.from_arrays(FACE.rotations, focal=FOCAL)
     with pytest.raises(InvalidInput) as refused:
         solve(FACE.tracks, cameras=cameras, settings=Settings(focal=500.0))
@@ -258,7 +258,7 @@ def test_two_focal_lengths_are_refused() -> None:
 
 
 @pytest.mark.parametrize("wrong", [{"focal": 0.0}, {"focal": float("nan")}, {"principal_point": (0.0, float("nan"))}])
-def test_given_cameras_with_an_impossible_lens_are_refused(wrong: dict[str, object]) -> None:
+def test_given_cameras_with_an_invalid_lens_are_rejected(wrong: dict[str, object]) -> None:
     with pytest.raises(InvalidInput):
         KnownCamera.from_arrays(FACE.rotations, **wrong)  # type: ignore[arg-type]
 

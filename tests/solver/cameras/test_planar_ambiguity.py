@@ -45,7 +45,7 @@ def test_a_reversed_plane_looks_the_same() -> None:
     assert (turned[~pose_signs] == rotations[~pose_signs]).all()
 
 
-def test_the_poses_of_a_plane_are_exact_up_to_its_sides() -> None:
+def test_the_poses_of_a_plane_are_exact_up_to_their_signs() -> None:
     camera = swaying(40)
     found, scales = poses(gram_of_view(PLANE, camera))
     np.testing.assert_allclose(scales, 1.0, atol=5e-3)
@@ -56,7 +56,7 @@ def test_the_poses_of_a_plane_are_exact_up_to_its_sides() -> None:
     assert degrees_apart(mixed, camera) > 8
 
 
-def test_the_steadiest_sides_are_those_of_a_steady_camera() -> None:
+def test_the_smoothest_pose_signs_are_those_of_a_smooth_camera() -> None:
     spin = exponential(np.linspace(-0.6, 0.6, 30)[:, None] * np.array([0.1, 1.0, 0.0]))
     wrong = np.random.default_rng(0).random(30) < 0.4
     assert len({*(smoothest_signs(reversed_at(spin, MIRROR, wrong), 2) ^ wrong)}) == 1
@@ -65,7 +65,7 @@ def test_the_steadiest_sides_are_those_of_a_steady_camera() -> None:
     assert angles_between(least[1:], least[:-1]).max() < 1.01 * angles_between(spin[1:], spin[:-1]).max()
 
 
-def test_only_sheets_are_flat() -> None:
+def test_only_sheets_are_detected_as_planar() -> None:
     flat, solid = gallery.flag(12, 150), gallery.face(12, 150)
     assert is_planar(complete(normalize(flat.tracks)).gram)
     assert not is_planar(complete(normalize(solid.tracks)).gram)
@@ -78,7 +78,7 @@ def flag() -> gallery.Sequence:
 
 
 @pytest.mark.slow
-def test_a_flag_is_seen_from_its_sides(flag: gallery.Sequence) -> None:
+def test_the_pose_signs_of_a_flag_are_found(flag: gallery.Sequence) -> None:
     # without the sheet's own search the cameras are 23° off, and the shapes .34
     found = solve(flag.tracks)
     assert degrees_apart(found.camera.rotations, np.asarray(flag.rotations)) < 10
@@ -86,7 +86,7 @@ def test_a_flag_is_seen_from_its_sides(flag: gallery.Sequence) -> None:
     assert "sheet" in found.choices.reasons["rotations"]
 
 
-def test_sides_that_are_right_stay(flag: gallery.Sequence) -> None:
+def test_correct_pose_signs_are_kept(flag: gallery.Sequence) -> None:
     gram, truth = complete(normalize(flag.tracks)).gram, np.asarray(flag.rotations)
     best = fitted(gram, truth, np.ones(24), np.zeros(24, dtype=bool), iterations=400)
     kept, sentence = resolve_pose_signs(gram, best.rotations, should_stop=lambda: True)
@@ -94,7 +94,7 @@ def test_sides_that_are_right_stay(flag: gallery.Sequence) -> None:
 
 
 @pytest.mark.slow
-def test_a_long_film_is_unfolded_on_some_of_its_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pose_signs_of_a_long_sequence_are_found_on_a_subset_of_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pliant.solver.cameras.planar_ambiguity.PLANAR_FRAMES", 20)
     long = gallery.flag(50, 200, degrees=40)
     gram = complete(normalize(long.tracks)).gram
@@ -119,7 +119,7 @@ def test_orthography_as_set_keeps_the_scales(flag: gallery.Sequence) -> None:
 
 
 @pytest.mark.slow
-def test_a_spoiled_sheet_keeps_the_sides_that_were_found_for_it() -> None:
+def test_a_sheet_with_outliers_keeps_its_pose_signs() -> None:
     """What stands in for outliers is enough to turn a sheet over: its cameras are not refined with the shapes."""
     film = gallery.flag(24, 300)
     spoiled = gallery.corrupt(film, outliers=0.05, hidden=0.2, noise=0.01, seed=0).tracks

@@ -16,7 +16,7 @@ def missed(found: np.ndarray, truth: np.ndarray) -> float:
 
 @pytest.mark.parametrize(("frames", "points"), [(24, 400), (60, 300)])
 @pytest.mark.slow
-def test_a_zooming_camera_is_recovered(frames: int, points: int) -> None:
+def test_scales_of_a_zooming_camera_are_recovered(frames: int, points: int) -> None:
     film = gallery.face(frames, points, scale_change=0.1)
     found = solve(film.tracks)
     plain = solve(film.tracks, settings=Settings(camera="orthographic"))
@@ -36,7 +36,7 @@ def test_a_camera_that_does_not_zoom_has_scales_of_one(name: str) -> None:
     assert found.choices.reasons["scales"].startswith("Every scale is 1")
 
 
-def test_scales_wider_apart_than_any_cameras_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_implausibly_large_scale_changes_are_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
     film = gallery.face(24, 100, scale_change=0.1)
     for module in (
         "cameras.scale",

@@ -45,7 +45,7 @@ def test_without_a_mesh_there_is_no_spatial_weight(face: gallery.Sequence) -> No
     assert solved(face, face.tracks, mesh=False, max_reweightings=1).choices.spatial_weight == 0
 
 
-def test_the_low_rank_prior_counts_only_where_it_is_asked_for(face: gallery.Sequence) -> None:
+def test_the_low_rank_prior_is_used_only_on_request(face: gallery.Sequence) -> None:
     smooth = solved(face, face.tracks, prior="smooth", low_rank_weight=1.0, max_reweightings=1).choices
     asked = solved(face, face.tracks, prior="smooth+low_rank", max_reweightings=1).choices
     assert smooth.low_rank_weight == 0
@@ -54,7 +54,7 @@ def test_the_low_rank_prior_counts_only_where_it_is_asked_for(face: gallery.Sequ
     assert not any("no effect" in warning for warning in asked.warnings)
 
 
-def test_a_weight_that_the_default_prior_does_not_have_is_said_to_be_without_effect(face: gallery.Sequence) -> None:
+def test_a_weight_without_effect_gives_a_warning(face: gallery.Sequence) -> None:
     warnings = solved(face, face.tracks, temporal_order=2, low_rank_weight=1.0, max_reweightings=1).choices.warnings
     assert [warning.split()[0] for warning in warnings if "no effect" in warning] == [
         "low_rank_weight",
@@ -71,7 +71,7 @@ def test_the_gaussian_prior_is_solved_in_double_precision_whatever_is_set(face: 
     assert not any("needs float64" in warning for warning in double.choices.warnings)
 
 
-def test_gross_outliers_ruin_least_squares_and_hardly_touch_the_default(face: gallery.Sequence) -> None:
+def test_the_default_is_robust_to_outliers_that_ruin_least_squares(face: gallery.Sequence) -> None:
     spoiled = gallery.corrupt(face, outliers=0.1, seed=3).tracks
     pseudo = error(face, spoiled, method="pseudo_inverse")
     temporal = error(face, spoiled, method="temporal")
@@ -81,7 +81,7 @@ def test_gross_outliers_ruin_least_squares_and_hardly_touch_the_default(face: ga
     assert 0.003 < clean <= robust < 0.03
 
 
-def test_the_low_rank_prior_brings_a_face_nearer_to_the_truth(face: gallery.Sequence) -> None:
+def test_the_low_rank_prior_reduces_the_error_of_a_face(face: gallery.Sequence) -> None:
     spoiled = gallery.corrupt(face, outliers=0.1, seed=3).tracks
     assert error(face, spoiled, prior="smooth+low_rank") < 0.9 * error(face, spoiled, prior="smooth")
 
@@ -95,14 +95,14 @@ def test_noise_is_measured_where_nothing_moves(frames: int) -> None:
     assert roughness_of(normalized).noise_std * normalized.unit == pytest.approx(0.5, rel=0.1)
 
 
-def test_points_never_seen_in_a_row_say_nothing() -> None:
+def test_points_never_visible_in_consecutive_frames_are_ignored() -> None:
     visible = np.zeros((8, 6))
     visible[::3] = 1
     tracks = Tracks.from_arrays(np.random.default_rng(0).standard_normal((8, 6, 2)), visible)
     assert roughness_of(normalize(tracks)) == Roughness(0.0, 0.0)
 
 
-def test_jumps_are_told_from_motion(face: gallery.Sequence) -> None:
+def test_jumps_are_distinguished_from_motion(face: gallery.Sequence) -> None:
     assert roughness_of(normalize(face.tracks)).jumps < 0.01
     spoiled = gallery.corrupt(face, outliers=0.05, seed=3).tracks
     assert 0.1 < roughness_of(normalize(spoiled)).jumps < 0.3

@@ -159,7 +159,7 @@ def test_corrections_in_single_precision_lead_to_the_same_energy(mesh: str, monk
     np.testing.assert_allclose(single.objective, double.objective, rtol=1e-6)
 
 
-def test_single_precision_is_taken_where_it_can_reach_what_is_asked() -> None:
+def test_single_precision_is_used_where_it_reaches_the_tolerance() -> None:
     problem = small_problem(MESHES["triangles"], prior="smooth", temporal_weight=30.0, spatial_weight=0.009)
     given = operator_at(problem, started(problem))
     assert irls.inner_precision(given, 0.1) == np.float32

@@ -10,6 +10,7 @@ import pytest
 from pliant.solver import Camera, InvalidInput, Tracks
 from pliant.solver.evaluation.alignment import MIRROR, align, procrustes
 from pliant.solver.evaluation.metrics import (
+    coverage,
     e3d_frame,
     e3d_frame_scaled,
     e3d_frame_similarity,
@@ -38,7 +39,7 @@ def solution_of(shapes, rotations=None, scales=None, translations=None):
         scales=np.ones(frames) if scales is None else scales,
         translations=np.zeros((frames, 2)) if translations is None else translations,
     )
-    return SimpleNamespace(shapes=shapes, camera=camera)
+    return SimpleNamespace(shapes=shapes, camera=camera, shapes_std=None)
 
 
 @pytest.mark.parametrize("metric", ALL)
@@ -119,6 +120,20 @@ def test_alignment_beats_any_other_rotation_nearby():
             assert np.sum(best * products) > np.sum((nudge @ best) * products)
     assert np.linalg.det(procrustes(-np.eye(3), proper=True)) == pytest.approx(1)
     assert procrustes(-np.eye(3)) == pytest.approx(-np.eye(3))
+
+
+def test_coverage_is_the_share_within_one_point_six_four_five_deviations():
+    rng = np.random.default_rng(3)
+    truth = rng.standard_normal((8, 600, 3))
+    std = rng.uniform(0.01, 0.03, (8, 600))
+    ours = truth.copy()
+    ours[..., 2] += std * rng.standard_normal(std.shape)
+    assert coverage(std, ours, truth) == pytest.approx(0.9, abs=0.015)
+    assert coverage(0.5 * std, ours, truth) == pytest.approx(0.589, abs=0.02)  # P(|n| < .8225)
+    # One scale for the sequence is free, and the deviations take it too.
+    assert coverage(7 * std, 7 * ours @ TURN.T, truth) == pytest.approx(coverage(std, ours, truth), abs=1e-3)
+    with pytest.raises(InvalidInput, match="shapes_std"):
+        coverage(std[:, 1:], ours, truth)
 
 
 def test_rotation_degrees_ignores_world_axes_and_the_mirror_but_not_an_error():

@@ -28,7 +28,7 @@ def judged(**changed: Any) -> Any:
     return assess(shapes, rotations, **{**given, **changed})
 
 
-def test_a_result_without_a_bad_sign_is_good_and_names_its_error() -> None:
+def test_a_result_without_reasons_against_it_is_good() -> None:
     trust = judged()
     assert trust.verdict is Verdict.GOOD
     assert trust.reasons == ()
@@ -52,14 +52,14 @@ def test_a_result_without_a_bad_sign_is_good_and_names_its_error() -> None:
         ({"modes": 7}, Verdict.WITH_CARE, "7 modes of deformation in 12 frames"),
     ],
 )
-def test_every_sign_lowers_the_verdict_by_itself(changed: dict[str, Any], verdict: Verdict, words: str) -> None:
+def test_each_reason_alone_lowers_the_verdict(changed: dict[str, Any], verdict: Verdict, words: str) -> None:
     trust = judged(**changed)
     assert trust.verdict is verdict
     assert len(trust.reasons) == 1
     assert words in trust.reasons[0]
 
 
-def test_the_gravest_reason_comes_first() -> None:
+def test_the_most_severe_reason_comes_first() -> None:
     trust = judged(planar=True, turn=2.0)
     assert trust.verdict is Verdict.DO_NOT_USE
     assert "turned by" in trust.reasons[0]
@@ -73,7 +73,7 @@ def test_without_a_posterior_the_error_is_not_estimated() -> None:
     assert trust.sentence.startswith("The error is not estimated")
 
 
-def test_opposite_views_are_one() -> None:
+def test_opposite_viewing_directions_count_as_one() -> None:
     rotations = Rotation.from_euler("y", [[0], [180]], degrees=True).as_matrix()
     assert turned(rotations) == pytest.approx(0, abs=1e-5)
 
@@ -92,7 +92,7 @@ def test_a_face_is_good_and_its_error_lies_in_the_interval() -> None:
 
 
 @pytest.mark.slow
-def test_noise_and_a_still_body_are_not_to_be_used() -> None:
+def test_noise_and_a_still_camera_give_do_not_use() -> None:
     rng = np.random.default_rng(0)
     noise = solve(Tracks.from_arrays(rng.normal(size=(20, 30, 2))))
     body = gallery.face(20, 100).tracks.points[:1] + 1e-3 * rng.normal(size=(20, 100, 2))

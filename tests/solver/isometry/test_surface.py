@@ -119,20 +119,20 @@ def test_the_order_of_the_frames_has_no_effect() -> None:
 
 
 @pytest.mark.parametrize("focal", [FOCAL, pytest.param(None, marks=pytest.mark.slow)])
-def test_a_sheet_that_stretches_is_not_taken(focal: float | None) -> None:
+def test_a_stretching_sheet_is_not_taken_as_isometric(focal: float | None) -> None:
     verdict = isometric_surface(rolled("cone", stretch=0.2).tracks, focal=focal, image_size=SIZE)
     assert verdict.surface is None
     assert verdict.reason
 
 
-def test_what_is_no_sheet_is_not_even_tried() -> None:
+def test_isometry_is_not_tried_for_other_surfaces() -> None:
     verdict = isometric_surface(gallery.sphere(12, 150).tracks)
     assert verdict.surface is None
     assert verdict.candidates == ()
 
 
 @pytest.mark.slow
-def test_a_shallow_face_without_perspective_is_not_taken() -> None:
+def test_a_shallow_face_without_perspective_is_not_taken_as_isometric() -> None:
     verdict = isometric_surface(gallery.face(6, 60).tracks)
     assert verdict.surface is None
     assert verdict.reason
@@ -147,7 +147,7 @@ def test_outliers_only_end_with_a_warning_and_a_result() -> None:
 
 
 @pytest.mark.parametrize(("frames", "points"), [(3, 8), (3, 4), (4, 5)])
-def test_hardly_anything_is_enough_for_a_verdict(frames: int, points: int) -> None:
+def test_tiny_inputs_give_a_verdict(frames: int, points: int) -> None:
     image = Tracks.from_arrays(rolled(frames=frames, side=3).tracks.points[:, :points])
     verdict = isometric_surface(image, focal=FOCAL, required=True)
     assert verdict.reason
@@ -155,7 +155,7 @@ def test_hardly_anything_is_enough_for_a_verdict(frames: int, points: int) -> No
     assert (verdict.surface is None) or points >= 6
 
 
-def test_stopping_early_takes_no_isometry() -> None:
+def test_a_stopped_solve_does_not_assume_isometry() -> None:
     sheet = rolled(frames=4, side=5)
     assert isometric_surface(sheet.tracks, focal=FOCAL, image_size=SIZE, should_stop=lambda: True).surface is None
 

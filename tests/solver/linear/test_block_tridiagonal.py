@@ -36,7 +36,7 @@ def test_without_neighbours_it_is_the_inverse() -> None:
     np.testing.assert_allclose(product, np.eye(len(product)), atol=1e-7)
 
 
-def test_with_neighbours_it_is_the_inverse_of_what_does_not_couple_them() -> None:
+def test_with_neighbours_it_inverts_the_uncoupled_part() -> None:
     given = operator(triangulated(GRID), temporal_weight=2.0)
     shape = (6, 3, given.weights.shape[2])
     whole = dense(given.apply, shape).reshape(shape * 2)
@@ -94,13 +94,13 @@ def test_inliers_and_outliers_together_cost_few_iterations() -> None:
     ],
 )
 @pytest.mark.parametrize("mesh", [Mesh.from_grid(GRID), triangulated(GRID)], ids=["grid", "triangles"])
-def test_it_is_taken_where_frames_are_coupled_to_the_next_alone(
+def test_it_applies_where_only_neighbouring_frames_are_coupled(
     mesh: Mesh, settings: dict[str, object], expected: bool
 ) -> None:
     assert block_tridiagonal.fits(operator(mesh, **settings)) is expected
 
 
-def test_a_rank_term_couples_all_frames_and_is_not_for_it() -> None:
+def test_it_does_not_apply_with_a_rank_term() -> None:
     given = operator(temporal_weight=30.0)
     term = RankTerm(1.0, np.eye(6)[:, :2], np.array([0.5, 0.4]))
     assert block_tridiagonal.fits(given)

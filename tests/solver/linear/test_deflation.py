@@ -24,7 +24,7 @@ def operator(*, hidden: float) -> Operator:
     return Operator(projections, weights, np.zeros((2, frames)), None, 0.0, None, prior)
 
 
-def test_points_that_are_all_alike_need_none() -> None:
+def test_points_with_equal_weights_need_no_correction() -> None:
     assert build_coarse(operator(hidden=0.0)) is None
 
 
@@ -42,7 +42,7 @@ def test_it_inverts_the_equations_on_its_span() -> None:
     np.testing.assert_allclose(found, shapes, atol=1e-7)
 
 
-def test_the_whole_is_symmetric_and_positive() -> None:
+def test_the_sum_of_all_parts_is_symmetric_and_positive() -> None:
     given = operator(hidden=0.4)
     precondition = build_preconditioner(given)
     one, two = np.random.default_rng(2).standard_normal((2, 18, 3, 90))

@@ -43,7 +43,7 @@ def both(images: np.ndarray) -> tuple[ShapeCovariance, ShapeCovariance, str]:
     return found, learned(gram_of(images), PAIRS), why
 
 
-def test_what_only_these_points_have_is_not_learned() -> None:
+def test_idiosyncrasies_of_the_given_points_are_not_learned() -> None:
     found, whole, why = both(drawn(30, modes=12, drift=0.03))
     other = rows(drawn(1000, modes=12, drift=0.03, seed=1))
     assert held_out_nll(found, PAIRS, other) < held_out_nll(whole, PAIRS, other) - 0.5
@@ -55,25 +55,25 @@ def test_what_only_these_points_have_is_not_learned() -> None:
     [(30, 2, 1e-6), (2 * FRAMES, 12, 0.03), (MIN_JUDGED_POINTS - 1, 12, 0.03)],
     ids=["few modes are all there is", "as many points as image coordinates", "too few to deal out"],
 )
-def test_else_nothing_is_stopped(points: int, modes: int, drift: float) -> None:
+def test_shared_structure_is_learned_to_the_end(points: int, modes: int, drift: float) -> None:
     found, whole, why = both(drawn(points, modes=modes, drift=drift))
     np.testing.assert_array_equal(found.over_frames(), whole.over_frames())
     assert "learned in" not in why
 
 
-def test_a_sample_of_more_points_is_not_judged(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_large_sample_is_not_held_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(early_stopping, "MAX_SAMPLE_POINTS", 30)
     _, _, why = both(drawn(30, modes=12, drift=0.03))
     assert "learned in" not in why
 
 
-def test_fewer_modes_are_said() -> None:
+def test_a_reduced_number_of_modes_is_reported() -> None:
     images = drawn(200, modes=2, drift=1e-6)
     _, why = learn_with_early_stopping(images, gram_of(images), PAIRS, ModelOrder(max_modes=4))
     assert why.endswith("more than 4 modes, learned from some points, do not make the others more probable.")
 
 
-def test_a_stop_ends_the_judging(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_ends_the_scoring(monkeypatch: pytest.MonkeyPatch) -> None:
     images = drawn(30, modes=12, drift=0.03)
     judged: list[float] = []
 

@@ -88,7 +88,7 @@ def test_the_gradient_is_that_of_the_energy(with_scales: bool) -> None:
         assert gradient @ way == pytest.approx((ahead - behind) / (2 * step), rel=1e-5, abs=1e-6)
 
 
-def test_it_is_of_use_for_many_points_few_modes_no_noise_and_films_that_are_not_long() -> None:
+def test_it_is_used_for_many_points_few_modes_little_noise_and_short_sequences() -> None:
     quiet = covariance(noise=1e-8)
     least = POINTS_PER_COEFFICIENT * 3 * 3
     assert is_identifiable(quiet, least)
@@ -100,7 +100,7 @@ def test_it_is_of_use_for_many_points_few_modes_no_noise_and_films_that_are_not_
     assert not is_identifiable(covariance(frames=MAX_BASIS_FRAMES + 1, noise=1e-8), 10_000)
 
 
-def test_modes_with_axes_of_their_own_tell_the_cameras_exactly() -> None:
+def test_modes_along_different_axes_determine_the_cameras() -> None:
     """Noise-free shapes of low rank: the separable covariance leaves cameras where they start, this one finds them."""
     random = np.random.default_rng(2)
     time = np.linspace(0, 1, FRAMES)

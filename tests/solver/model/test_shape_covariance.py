@@ -57,7 +57,7 @@ def test_no_round_makes_the_tracks_less_probable() -> None:
     assert likelihoods[0] - likelihoods[-1] > 0.01
 
 
-def test_what_the_points_were_drawn_from_is_found() -> None:
+def test_the_covariance_of_sampled_points_is_recovered() -> None:
     truth, projections, gram = drawn()
     found = improve(begin(gram, projections), gram, projections, iterations=300, warm=1e-2)
     for mine, known in (
@@ -70,7 +70,7 @@ def test_what_the_points_were_drawn_from_is_found() -> None:
 
 
 @pytest.mark.parametrize("max_modes", [2, 64])
-def test_learned_is_the_more_probable_of_two_ways(max_modes: int) -> None:
+def test_the_more_probable_of_two_runs_is_returned(max_modes: int) -> None:
     _, projections, gram = drawn(300)
     found = learned(gram, projections, max_modes=max_modes)
     cold = improve(
@@ -88,7 +88,7 @@ def test_learned_is_the_more_probable_of_two_ways(max_modes: int) -> None:
     assert found.modes.shape[1] <= max_modes
 
 
-def test_mean_positions_freed_are_one_more_mode_and_nothing_else() -> None:
+def test_freeing_the_mean_position_adds_exactly_one_mode() -> None:
     truth, _, _ = drawn(10)
     free = freed(truth)
     np.testing.assert_array_equal(free.modes[:, :-1], truth.modes)
@@ -118,7 +118,7 @@ def test_precisions_are_the_inverse_of_the_covariance() -> None:
     )
 
 
-def test_between_the_frames_used_modes_run_straight() -> None:
+def test_modes_are_interpolated_linearly_between_the_used_frames() -> None:
     truth, _, _ = drawn(10)
     wide = truth.stretched(np.arange(FRAMES) * 2, 2 * FRAMES - 1)
     np.testing.assert_array_equal(wide.modes[::2], truth.modes)
@@ -126,7 +126,7 @@ def test_between_the_frames_used_modes_run_straight() -> None:
     assert np.trace(random_walk(31)) == pytest.approx(31)
 
 
-def test_the_drift_never_falls_below_its_floor() -> None:
+def test_the_walk_variance_never_falls_below_its_floor() -> None:
     _, projections, gram = drawn(300, noise=0.0)
     assert improve(begin(gram, projections), gram, projections, iterations=40).walk_variance >= WALK_VARIANCE_FLOOR
 
@@ -144,14 +144,14 @@ def error(face: gallery.Sequence, *, known: bool, settings: Settings, spoiled: g
 
 @pytest.mark.parametrize("known", [True, False])
 @pytest.mark.slow
-def test_it_brings_a_face_far_nearer_to_the_truth(face: gallery.Sequence, known: bool) -> None:
+def test_it_reduces_the_error_of_a_face(face: gallery.Sequence, known: bool) -> None:
     smooth = error(face, known=known, settings=Settings(prior="smooth"))
     gaussian = error(face, known=known, settings=Settings())
     assert 1e-4 < gaussian < 0.6 * smooth
 
 
 @pytest.mark.slow
-def test_gross_outliers_are_left_out_and_said(face: gallery.Sequence) -> None:
+def test_gross_outliers_are_rejected_and_reported(face: gallery.Sequence) -> None:
     spoiled = gallery.corrupt(face, outliers=0.1, seed=1)
     assert error(face, known=True, settings=Settings(), spoiled=spoiled) < 0.03
     cameras = KnownCamera.from_arrays(face.rotations, face.scales)
@@ -174,7 +174,7 @@ def test_a_long_film_is_learned_from_some_of_its_frames(monkeypatch: pytest.Monk
     assert some < smooth
 
 
-def test_frames_that_show_little_are_not_learned_from() -> None:
+def test_frames_with_few_visible_points_are_not_learned_from() -> None:
     visible = np.ones((10, 50))
     visible[3] = 0
     visible[4, 4:] = 0

@@ -13,7 +13,7 @@ from waving_sheet import sheet, triangulated
 
 @pytest.mark.parametrize("kind", [np.float64, np.float32])
 @pytest.mark.parametrize("tile", [5, 2048])
-def test_many_rows_together_are_as_each_alone(kind: type, tile: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rows_multiplied_together_equal_single_products(kind: type, tile: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bending, "TILE", tile)
     built = build_laplacian(triangulated(sheet()[1]), "uniform")
     assert built is not None
@@ -35,7 +35,7 @@ def test_rounding_to_the_precision_there_is_changes_nothing() -> None:
 
 
 @pytest.mark.parametrize(("frames", "together"), [(1, 1), (3, 1), (10, 3), (32, 8), (800, 8)])
-def test_a_few_frames_leave_something_for_every_thread(frames: int, together: int) -> None:
+def test_few_frames_leave_work_for_every_thread(frames: int, together: int) -> None:
     assert frames_together(frames) == together
 
 

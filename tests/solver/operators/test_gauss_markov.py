@@ -61,7 +61,7 @@ def test_stencil_and_modes_make_the_product_and_the_value() -> None:
     assert given.quadratic.value(shapes) == pytest.approx(float((product * shapes).sum()), rel=1e-12)
 
 
-def test_the_loosest_directions_are_the_largest_of_the_covariance() -> None:
+def test_directions_of_least_precision_have_the_largest_variance() -> None:
     found = prior().loosest(2)
     for (directions, held), matrix in zip(found, prior().matrices(), strict=True):
         values, vectors = np.linalg.eigh(matrix)
@@ -113,7 +113,7 @@ def test_blocks_of_points_are_the_same_for_all_threads(monkeypatch: pytest.Monke
     assert found[0][2] == found[1][2]
 
 
-def test_without_weight_the_prior_is_left_alone() -> None:
+def test_a_prior_of_weight_zero_is_not_preconditioned() -> None:
     given = operator(a_frame_s(300.0))
     nothing = replace(given, quadratic=prior().scaled(0.0))
     shapes = np.random.default_rng(5).standard_normal((FRAMES, 3, POINTS))

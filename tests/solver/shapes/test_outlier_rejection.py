@@ -17,7 +17,7 @@ WRONG = np.abs(np.asarray(OUTLIER_SHARE.points) - np.asarray(MADE.tracks.points)
 
 @pytest.mark.parametrize("cameras", [CAMERAS, None], ids=["known", "estimated"])
 @pytest.mark.slow
-def test_what_is_left_out_is_what_was_spoiled(cameras: KnownCamera | None) -> None:
+def test_rejected_observations_are_the_corrupted_ones(cameras: KnownCamera | None) -> None:
     found = solve(OUTLIER_SHARE, cameras=cameras)
     left_out = found.weights == 0
     size = np.abs(np.asarray(MADE.tracks.points)).max()
@@ -31,7 +31,7 @@ def test_what_is_left_out_is_what_was_spoiled(cameras: KnownCamera | None) -> No
 
 @pytest.mark.parametrize("cameras", [CAMERAS, None], ids=["known", "estimated"])
 @pytest.mark.slow
-def test_it_is_as_if_somebody_had_hidden_them(cameras: KnownCamera | None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rejection_equals_hiding_the_outliers(cameras: KnownCamera | None, monkeypatch: pytest.MonkeyPatch) -> None:
     found = solve(OUTLIER_SHARE, cameras=cameras)
     hidden = solve(Tracks.from_arrays(OUTLIER_SHARE.points, found.weights > 0), cameras=cameras)
     error, least = (metrics.e3d_frame(each.shapes, MADE.shapes) for each in (found, hidden))
@@ -46,7 +46,7 @@ def test_it_is_as_if_somebody_had_hidden_them(cameras: KnownCamera | None, monke
     assert metrics.e3d_frame(once.shapes, MADE.shapes) > error - 1e-3
 
 
-def test_clean_tracks_and_the_published_prior_keep_everything() -> None:
+def test_clean_tracks_and_the_published_prior_reject_nothing() -> None:
     clean = solve(MADE.tracks, cameras=CAMERAS)
     assert "outliers" not in clean.choices.reasons
     assert (clean.weights > 0).all()
@@ -70,7 +70,7 @@ def test_the_stiff_fit_descends_though_the_learned_paths_hardly_move() -> None:
     assert metrics.e3d_frame(found.shapes, still) < 0.02
 
 
-def test_a_prior_of_no_weight_is_minimised_as_told() -> None:
+def test_a_prior_of_weight_zero_rejects_nothing() -> None:
     found = solve(OUTLIER_SHARE, cameras=CAMERAS, settings=Settings(temporal_weight=0))
     assert np.isfinite(found.shapes).all()
     assert found.choices.temporal_weight == 0
@@ -79,7 +79,7 @@ def test_a_prior_of_no_weight_is_minimised_as_told() -> None:
     assert metrics.e3d_frame(found.shapes, MADE.shapes) > 0.3, "and nothing says how deep it is"
 
 
-def test_stopped_before_the_stiff_fit_it_leaves_nothing_out() -> None:
+def test_a_stop_before_the_stiff_fit_rejects_nothing() -> None:
     found = solve(OUTLIER_SHARE, cameras=CAMERAS, should_stop=lambda: True)
     assert found.outcome is Outcome.STOPPED
     assert (found.weights > 0).all()

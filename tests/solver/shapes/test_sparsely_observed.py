@@ -65,7 +65,7 @@ def test_a_hole_in_the_face_is_closed(cameras: KnownCamera | None) -> None:
     )
 
 
-def test_what_was_seen_of_a_seldom_seen_point_is_met_and_helps() -> None:
+def test_sparsely_observed_points_match_their_observations() -> None:
     """Seen in three frames of 16, the patch passes through what was seen there, and is nearer to the truth than drawn alone."""
     drawn, seldom = (
         solve(seen_but(HOLE), MADE.mesh, cameras=CAMERAS),
@@ -83,7 +83,7 @@ def test_what_was_seen_of_a_seldom_seen_point_is_met_and_helps() -> None:
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_two_noisy_looks_from_one_side_do_not_send_a_point_off_in_depth(seed: int) -> None:
+def test_two_noisy_observations_from_one_side_keep_the_depth_bounded(seed: int) -> None:
     """They hardly tell how deep it is; of points that may be anywhere in the body the error would be three times that of no look."""
     noise = np.random.default_rng(seed).normal(size=MADE.tracks.points.shape) * 0.02 * np.abs(TRUE).max()
     errors = []
@@ -95,7 +95,7 @@ def test_two_noisy_looks_from_one_side_do_not_send_a_point_off_in_depth(seed: in
 
 
 @given(seed=st.integers(0, 2**32 - 1))
-def test_a_mode_that_never_changes_says_what_a_wider_extent_says(seed: int) -> None:
+def test_a_constant_mode_equals_a_larger_mean_position_covariance(seed: int) -> None:
     """Where the cameras are estimated too, learning leaves to the modes what belongs to the mean positions, or the other way round."""
     random = np.random.default_rng(seed)
     frames, share = int(random.integers(3, 12)), random.uniform(0.2, 2)
@@ -115,7 +115,7 @@ def test_a_mode_that_never_changes_says_what_a_wider_extent_says(seed: int) -> N
 
 @pytest.mark.parametrize("seed", [5, 6])
 @pytest.mark.slow
-def test_outliers_of_seldom_seen_points_cost_hardly_more_than_not_seeing_them(seed: int) -> None:
+def test_outliers_of_sparsely_observed_points_cost_little_more_than_hiding_them(seed: int) -> None:
     """Of three observations of a point one or two may be outliers: a fit to all of them would lose the good ones."""
     tracks = seen_but(HOLE, shown=(0, 5, 10))
     random, visible = np.random.default_rng(seed), np.asarray(tracks.visible) > 0
@@ -134,7 +134,7 @@ def test_outliers_of_seldom_seen_points_cost_hardly_more_than_not_seeing_them(se
 
 
 @given(seed=st.integers(0, 2**32 - 1))
-def test_the_worst_of_the_observations_goes_first_and_the_rest_is_judged_without_it(seed: int) -> None:
+def test_the_worst_observation_is_rejected_first(seed: int) -> None:
     """Against leaving out one after the other by hand, from the conditional mean and covariance of a Gaussian."""
     random = np.random.default_rng(seed)
     frames = 6
@@ -164,13 +164,13 @@ def test_the_worst_of_the_observations_goes_first_and_the_rest_is_judged_without
     np.testing.assert_array_equal(kriging.inconsistent(0, confidence, path), gone)
 
 
-def test_a_patch_that_hangs_on_an_edge_does_not_fly_off() -> None:
+def test_a_patch_attached_to_an_edge_stays_bounded() -> None:
     far = np.flatnonzero(TRUE[0, :, 1] < np.quantile(TRUE[0, :, 1], 0.3)).tolist()
     found = solve(seen_but(far), MADE.mesh, cameras=CAMERAS)
     assert np.abs(found.shapes[:, far]).max() < 1.5 * np.abs(TRUE).max()
 
 
-def test_what_hangs_on_nothing_stays_in_the_middle() -> None:
+def test_unconnected_points_stay_at_the_centre() -> None:
     alone = 77
     faces = MADE.mesh.faces[~(MADE.mesh.faces == alone).any(axis=1)]
     found = solve(seen_but([alone]), Mesh.from_faces(faces, 400), cameras=CAMERAS)
@@ -207,11 +207,11 @@ def test_a_grid_keeps_its_cells_and_gets_a_hole() -> None:
     ],
     ids=["all seen", "no mesh", "no faces", "most are seldom seen", "seen just often enough"],
 )
-def test_everything_is_found_together_where(tracks: Tracks, mesh: Mesh | None) -> None:
+def test_all_points_are_fitted_together(tracks: Tracks, mesh: Mesh | None) -> None:
     assert well_observed(normalize(tracks), mesh) is None
 
 
-def test_the_surface_is_closed_where_its_energy_is_least_and_the_rest_stays() -> None:
+def test_closing_the_surface_minimises_its_energy_and_keeps_known_points() -> None:
     random = np.random.default_rng(0)
     energy, shapes = sparse.random_array((60, 20), density=0.3, rng=random), random.normal(size=(3, 3, 20))
     known = np.setdiff1d(np.arange(20), [2, 5, 11])

@@ -67,7 +67,7 @@ def test_errors_of_the_posterior_mean_are_as_large_as_stated() -> None:
     np.testing.assert_allclose(measured, stated, rtol=0.05)
 
 
-def test_points_seen_alike_are_equally_certain_and_hiding_or_noise_makes_them_less_so() -> None:
+def test_equal_visibility_gives_equal_deviation_and_hiding_or_noise_increases_it() -> None:
     given, pairs = covariance(), projections()
     clear = position_std(given, pairs, np.ones((FRAMES, 3)), noise_std=NOISE)
     assert np.ptp(clear, axis=1).max() == 0

@@ -54,7 +54,7 @@ def test_noise_grows_with_the_square_of_the_unit() -> None:
     assert white_noise(9 * gram) == pytest.approx(9 * white_noise(gram))
 
 
-def test_few_points_leave_the_roughness_to_tell_the_noise() -> None:
+def test_few_points_give_the_roughness_as_noise() -> None:
     gram = gram_of(tracks(20, modes=1, sigma=0.05))  # rank 20 of 60: the median eigenvalue is 0 whatever the noise
     assert white_noise(gram) == roughness(gram)
     assert white_noise(gram) ** 0.5 == pytest.approx(0.05, rel=0.2)
@@ -73,7 +73,7 @@ def test_short_sequences_use_lower_differences(frames: int) -> None:
     assert typical_roughness(noise) == pytest.approx(0.1, rel=0.05)
 
 
-def test_the_camera_is_bound_less_where_noise_is_strong() -> None:
+def test_the_camera_prior_is_weaker_with_strong_noise() -> None:
     weights = [scaled_prior_weight(gram_of(tracks(500, modes=2, sigma=sigma))) for sigma in (0.0, 0.03, 0.1)]
     assert weights[0] == pytest.approx(CAMERA_PRIOR_WEIGHT, rel=1e-3)
     assert weights[1] == pytest.approx(CAMERA_PRIOR_WEIGHT / 2, rel=0.1)
@@ -93,24 +93,24 @@ def test_fine_deformation_is_not_learned_as_noise() -> None:
     assert learned(gram_of(tracks(500, modes=6, sigma=0.0)), PAIRS).noise_variance ** 0.5 < 1e-3
 
 
-def test_as_many_modes_are_taken_as_other_points_confirm() -> None:
+def test_the_number_of_modes_is_cross_validated() -> None:
     few = [select_model_order(tracks(40, modes=modes, sigma=SIGMA), PAIRS) for modes in (0, 2)]
     assert [each.max_modes for each in few] == [0, 2]
     assert all(each.noisy_start for each in few)
     assert select_model_order(tracks(40, modes=8, sigma=0.02), PAIRS).max_modes == 8
 
 
-def test_many_points_confirm_at_least_the_modes_there_are() -> None:
+def test_many_points_support_at_least_the_true_modes() -> None:
     assert select_model_order(tracks(400, modes=2, sigma=SIGMA), PAIRS).max_modes >= 2
     assert select_model_order(tracks(400, modes=8, sigma=0.02), PAIRS).max_modes >= 8
 
 
-def test_without_noise_or_with_hardly_a_point_nothing_is_judged() -> None:
+def test_without_noise_or_with_few_points_the_order_is_not_limited() -> None:
     assert select_model_order(tracks(40, modes=2, sigma=0.0), PAIRS) == ModelOrder()
     assert select_model_order(tracks(MIN_JUDGED_POINTS - 1, modes=2, sigma=SIGMA), PAIRS) == ModelOrder()
 
 
-def test_where_outliers_were_found_what_is_left_of_them_is_not_learned_as_modes() -> None:
+def test_remaining_outliers_are_not_learned_as_modes() -> None:
     random, sample = np.random.default_rng(0), tracks(40, modes=2, sigma=0.0).copy()
     wrong = random.random(sample.shape[:2]) < 0.02
     sample[wrong] += random.normal(0, 0.1, (wrong.sum(), 2))
@@ -121,7 +121,7 @@ def test_where_outliers_were_found_what_is_left_of_them_is_not_learned_as_modes(
 @pytest.mark.parametrize("points", [40, 400])
 @pytest.mark.parametrize("known", [True, False])
 @pytest.mark.slow
-def test_the_default_stands_strong_noise_better_than_the_papers_prior(known: bool, points: int) -> None:
+def test_the_default_has_lower_error_with_strong_noise_than_the_papers_prior(known: bool, points: int) -> None:
     face = gallery.face(60, points)
     cameras = KnownCamera.from_arrays(face.rotations, face.scales) if known else None
     noisy = gallery.corrupt(face, noise=0.05, seed=1).tracks
@@ -133,7 +133,7 @@ def test_the_default_stands_strong_noise_better_than_the_papers_prior(known: boo
 
 
 @pytest.mark.slow
-def test_the_report_says_how_many_modes_and_why() -> None:
+def test_the_report_states_the_number_of_modes_and_the_reason() -> None:
     face = gallery.face(30, 60)
     noisy = gallery.corrupt(face, noise=0.03, seed=1).tracks
     assert "do not make the others more probable" in solve(noisy).choices.reasons["modes"]

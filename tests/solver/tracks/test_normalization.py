@@ -28,7 +28,7 @@ def test_scale_and_position_of_the_input_do_not_matter() -> None:
     np.testing.assert_allclose(two.unit, 7.5 * one.unit)
 
 
-def test_hidden_observations_count_for_nothing_and_stay_zero() -> None:
+def test_hidden_observations_have_no_effect_and_stay_zero() -> None:
     points = some_tracks()
     visible = np.random.default_rng(1).random((6, 30)) > 0.3
     visible[2] = False
@@ -40,7 +40,7 @@ def test_hidden_observations_count_for_nothing_and_stay_zero() -> None:
     np.testing.assert_allclose(found.centroid[2], (found.centroid[1] + found.centroid[3]) / 2)
 
 
-def test_one_absurd_observation_does_not_shrink_the_object() -> None:
+def test_one_extreme_outlier_does_not_change_the_unit() -> None:
     points = some_tracks()
     clean = normalize(Tracks.from_arrays(points))
     points[3, 4] = 1e9

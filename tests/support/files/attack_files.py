@@ -253,3 +253,9 @@ FILMS = (
 )  # fmt: skip
 
 ATTACKS = (*ZIPS, *HEADERS, *NUMBERS, *HDF5, *MAT5, *TEXT, *MESHES, *FILMS)
+
+OVER_HTTP = (
+    "zip bomb", "pickle", "HDF5 bomb", "MAT packed bomb", "OBJ of indices", "glTF lying length", "PNG bomb", "film of huge pictures",
+    "huge numbers in options", "nested options",
+)  # fmt: skip
+"""One of each format, and those that a service meets before any reader."""

@@ -42,6 +42,8 @@ class Browsing:
     def __enter__(self) -> Browser:
         self._playwright = sync_playwright().start()
         flags = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--enable-precise-memory-info"]
+        # A made-up camera that shows a moving pattern, and no question whether the page may use it.
+        flags += ["--use-fake-device-for-media-stream", "--use-fake-ui-for-media-stream"]
         if hasattr(os, "geteuid") and os.geteuid() == 0:
             flags.append("--no-sandbox")  # Chromium refuses to run as root with one
         self._browser = self._playwright.chromium.launch(executable_path=executable(), args=flags)

@@ -90,7 +90,7 @@ def test_equal_results_are_equal_files(tmp_path: Path) -> None:
 
 
 def test_without_the_package_it_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pliant.worker.artifacts.alembic.available", lambda: False)
+    monkeypatch.setattr("pliant.worker.artifacts.scenes.alembic.available", lambda: False)
     with pytest.raises(InvalidInput, match=r"pliant\[alembic\]") as refused:
         kinds_for(Options(outputs=("abc",)))
     assert (refused.value.code, refused.value.field) == ("output_unavailable", "options.outputs")

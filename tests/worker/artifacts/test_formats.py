@@ -17,9 +17,10 @@ import trimesh
 from pliant.schemas.options import Options
 from pliant.solver import InvalidInput
 from pliant.solver.evaluation.metrics import evaluate, point_errors
-from pliant.worker.artifacts import build_report, kinds_for, matlab, usd, write_artifacts
+from pliant.worker.artifacts import build_report, kinds_for, matlab, write_artifacts
 from pliant.worker.artifacts.colours import STOPS, Painting, linear, shade
 from pliant.worker.artifacts.geometry import triangles_of, upright, vertex_normals, viewer_scale
+from pliant.worker.artifacts.scenes import usd
 from pliant.worker.execution import pipeline
 from results import make_result
 
@@ -59,7 +60,7 @@ def members(path: Path) -> list[bytes]:
         (("csv", "ply"), {"metrics_frames.csv", "metrics_points.csv", "shapes_ply.zip"}),
     ],
 )
-def test_what_is_asked_for_is_written_and_no_more(tmp_path: Path, outputs: object, names: set[str]) -> None:
+def test_only_requested_files_are_written(tmp_path: Path, outputs: object, names: set[str]) -> None:
     assert set(write(tmp_path, make_result(outputs=outputs))) == ALWAYS | names
 
 
@@ -214,7 +215,7 @@ def test_ply_carries_normals_and_colours_of_its_frame(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("axes", "y_axis", "turned"), [("viewer", "down", True), ("viewer", "up", False), ("tracks", "down", False)]
 )
-def test_meshes_stand_as_the_glb_does_if_wanted(tmp_path: Path, axes: str, y_axis: str, turned: bool) -> None:
+def test_meshes_have_the_axes_of_the_glb_on_request(tmp_path: Path, axes: str, y_axis: str, turned: bool) -> None:
     made = make_result(outputs="ply,obj", axes=axes, y_axis=y_axis)
     files = write(tmp_path, made)
     expected = (made[1].shapes[2] * ([1, -1, -1] if turned else [1, 1, 1])).astype(np.float32)
@@ -227,7 +228,7 @@ def test_meshes_stand_as_the_glb_does_if_wanted(tmp_path: Path, axes: str, y_axi
     assert lines[0].startswith(f"# x right, y {'up' if up else 'down'}, z {'towards' if up else 'away from'}")
 
 
-def test_obj_colours_are_read_by_others(tmp_path: Path) -> None:
+def test_obj_colours_are_read_by_other_programs(tmp_path: Path) -> None:
     made = make_result(outputs="obj", axes="tracks", colours="error", hidden=True)
     inputs, solution, _ = made
     files = write(tmp_path, made)
@@ -286,7 +287,7 @@ def test_equal_results_are_equal_files_in_every_format(tmp_path: Path) -> None:
         assert first[name].read_bytes() == second[name].read_bytes(), name
 
 
-def test_usd_is_refused_where_it_cannot_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_usd_is_rejected_where_it_cannot_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None if name == "pxr" else find(name, *rest))
     with pytest.raises(InvalidInput, match="usd-core") as refused:
@@ -300,9 +301,7 @@ def test_usd_is_refused_where_it_cannot_be_written(tmp_path: Path, monkeypatch: 
     assert kinds_for(Options())
 
 
-def test_what_matlab_could_not_hold_is_refused_before_anything_is_computed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_mat_files_above_2_gib_are_rejected_before_computing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     inputs, _, options = make_result(outputs="mat")
     assert kinds_for(options, size=(99, 900_000))
     with pytest.raises(InvalidInput, match="less than 2 GiB") as refused:

@@ -104,7 +104,7 @@ def test_residuals_lead_from_the_projection_to_the_track(sequence: Sequence, tmp
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
-def test_truth_stands_where_e3d_frame_compares_it(sequence: Sequence, tmp_path: Path, mirrored: bool) -> None:
+def test_truth_is_aligned_as_for_e3d_frame(sequence: Sequence, tmp_path: Path, mirrored: bool) -> None:
     turned = sequence.shapes @ np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0] + 5.0
     if (
         np.linalg.det(
@@ -160,7 +160,7 @@ def test_without_posterior_and_truth_their_columns_are_unknown(sequence: Sequenc
     assert np.isfinite(arrays["frames"][:, 5]).all()
 
 
-def test_truth_of_too_few_points_is_left_out(sequence: Sequence, tmp_path: Path) -> None:
+def test_truth_of_too_few_points_is_omitted(sequence: Sequence, tmp_path: Path) -> None:
     truth = np.full((F, P, 3), np.nan)
     truth[:, :2] = 1.0
     path = tmp_path / preview.NAME
@@ -180,7 +180,7 @@ def test_a_long_sequence_is_thinned_evenly_and_keeps_its_pace(
     np.testing.assert_allclose(world(header, arrays["positions"]), solution.shapes[::2], atol=header["step"])
 
 
-def test_quads_become_triangles_of_the_same_sense() -> None:
+def test_quads_become_triangles_of_the_same_orientation() -> None:
     mesh = Mesh.from_grid(np.arange(6).reshape(2, 3))
     found = preview.triangles(mesh)
     assert found.shape == (4, 3)
@@ -189,7 +189,7 @@ def test_quads_become_triangles_of_the_same_sense() -> None:
     assert len({float(z) for z in normals[:, 2]}) == 1
 
 
-def test_a_perfect_fit_has_a_step_all_the_same(tmp_path: Path) -> None:
+def test_a_perfect_fit_has_a_positive_residual_step(tmp_path: Path) -> None:
     sequence = face(3, 12)
     exact = solution_of(sequence)
     projected = exact.camera.scales[:, None, None] * exact.shapes @ exact.camera.rotations[:, :2].transpose(0, 2, 1)

@@ -63,7 +63,7 @@ def test_glb_embeds_the_picture(tmp_path: Path, frames: int, quantized: bool, no
     np.testing.assert_allclose(read.visual.uv, np.column_stack([texture.uv[:, 0], 1 - texture.uv[:, 1]]), atol=1e-6)
 
 
-def test_a_cloud_of_points_takes_its_colours_from_the_picture(tmp_path: Path) -> None:
+def test_a_point_cloud_has_the_colours_of_the_picture(tmp_path: Path) -> None:
     made = make_result(mesh="none", texture=True, outputs="glb")
     gltf = pygltflib.GLTF2.load_binary(write(tmp_path, made)["shapes.glb"])
     assert gltf.images == []
@@ -192,7 +192,7 @@ def test_the_texture_is_stored_with_the_inputs(tmp_path: Path) -> None:
     assert load_inputs(tmp_path / "without.npz").texture is None
 
 
-def test_colours_are_those_between_the_texels() -> None:
+def test_colours_are_interpolated_between_texels() -> None:
     texture = make_texture(5, 6)
     np.testing.assert_allclose(texture.colours(), expected_colours(texture), atol=0.02)
     some = texture.at_points(np.array([3, 7]))
@@ -213,7 +213,7 @@ def test_colours_are_those_between_the_texels() -> None:
         (PICTURE, UV * np.nan, "out_of_range", "texture.uv"),
     ],
 )
-def test_what_is_no_texture_is_refused(picture: np.ndarray, uv: np.ndarray, code: str, field: str) -> None:
+def test_invalid_textures_are_rejected(picture: np.ndarray, uv: np.ndarray, code: str, field: str) -> None:
     with pytest.raises(InvalidInput) as refused:
         Texture.from_tracked(picture, uv)
     assert (refused.value.code, refused.value.field) == (code, field)

@@ -47,7 +47,7 @@ def played(page: Page, tmp_path: Path):
         ({"glb_quantized": True, "normals": "none"}, 5e-5),
     ],
 )
-def test_every_vertex_is_where_the_npz_has_it(played, wishes: dict[str, object], bound: float) -> None:
+def test_every_vertex_matches_the_npz(played, wishes: dict[str, object], bound: float) -> None:
     shown, shapes = played(9, 5, 6, fps=10, **wishes)
     assert shown.targets == 9
     assert shown.duration == pytest.approx(0.8)
@@ -69,7 +69,7 @@ def test_modes_are_played_within_their_bound(played) -> None:
 
 
 @pytest.mark.parametrize("wishes", [{}, {"glb_quantized": True, "colours": "error"}])
-def test_the_graphics_card_draws_what_the_npz_says(page: Page, played, wishes: dict[str, object]) -> None:
+def test_rendered_vertices_match_the_npz(page: Page, played, wishes: dict[str, object]) -> None:
     """Positions are computed again by the shader; a wrong target, weight or normal would show."""
     shown, shapes = played(9, 20, 24, fps=10, normals="animated", **wishes)
     for frame in (0, 4, 8):

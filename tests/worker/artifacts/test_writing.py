@@ -186,7 +186,7 @@ def test_a_rigid_scene_needs_one_mode() -> None:
     assert animate(np.tile(moving_sheet(1, 4, 5), (201, 1, 1))).extras["targets"] == 1
 
 
-def test_no_fewer_modes_would_do() -> None:
+def test_the_number_of_modes_is_minimal() -> None:
     shapes = moving_sheet(210, 4, 5)
     made = animate(shapes)
     moved = (shapes - shapes.mean(axis=0)).reshape(210, -1)
@@ -341,7 +341,7 @@ def test_the_report_states_the_field_of_view(focal: float | None, std: float | N
         assert report["field_of_view_std"] == pytest.approx((views[0] - views[1]) / 1e-3 * std, rel=1e-4)
 
 
-def test_the_report_says_how_it_came_to_be(tmp_path: Path) -> None:
+def test_the_report_describes_the_computation(tmp_path: Path) -> None:
     report = json.loads(write(tmp_path, make_result())["report.json"].read_text())
     assert report["outcome"] == "converged"
     assert report["sentence"] == "Converged."
@@ -377,7 +377,7 @@ def test_the_report_states_how_far_to_trust_the_result(tmp_path: Path) -> None:
     assert silent["verdict_reasons"] == []
 
 
-def test_a_result_without_deviations_has_no_array_of_them(tmp_path: Path) -> None:
+def test_a_result_without_deviations_has_no_such_array(tmp_path: Path) -> None:
     files = write(tmp_path, make_result(std=False, outputs="glb", colours="expected_error"))
     with np.load(files["shapes.npz"]) as arrays:
         assert "shapes_std" not in arrays
@@ -387,7 +387,7 @@ def test_a_result_without_deviations_has_no_array_of_them(tmp_path: Path) -> Non
     assert "colours" not in report["artifacts"]["shapes.glb"], "nothing is painted where nothing is known"
 
 
-def test_a_failed_write_leaves_the_old_file_and_no_half(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_write_keeps_the_old_file_and_no_partial_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     files = write(tmp_path, make_result())
     before = files["shapes.npz"].read_bytes()
 

@@ -68,13 +68,13 @@ def test_a_cancel_is_noticed_within_a_quarter_of_a_second(jobs: Jobs, attempt: A
     assert jobs.get(attempt.id).status is Status.CANCELLED
 
 
-def test_past_its_time_it_stops_whatever_the_record_says(attempt: Attempt, now: list[float]) -> None:
+def test_it_stops_at_its_time_limit_whatever_the_record(attempt: Attempt, now: list[float]) -> None:
     assert not attempt.should_stop()
     now[0] = 9.0
     assert attempt.should_stop()
 
 
-def test_a_finished_job_waits_for_a_blob_store_that_is_away(
+def test_a_finished_job_waits_for_an_unavailable_blob_store(
     jobs: Jobs, attempt: Attempt, now: list[float], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """An outage of seconds discarded the result of hours."""

@@ -62,7 +62,7 @@ def test_the_queue_gives_the_same_bits_as_a_plain_call(house: House, tmp_path: P
 
 
 @pytest.mark.slow
-def test_progress_tells_numbers(house: House) -> None:
+def test_progress_contains_numbers(house: House) -> None:
     id = house.submit(long=True)
     house.until(lambda: (house.jobs.get(id).progress or SHORT) and house.solving(id).progress.reweighting, "reweights")  # type: ignore[union-attr]
     progress = house.jobs.get(id).progress
@@ -128,7 +128,7 @@ def test_a_crash_leaves_its_stack_in_the_log(house: House) -> None:
     assert "Segmentation fault" in house.jobs.log(id)
 
 
-def test_the_job_of_a_killed_worker_is_done_by_another(house: House) -> None:
+def test_the_job_of_a_killed_worker_is_completed_by_another(house: House) -> None:
     id = house.submit(long=True)
     house.solving(id)
     (job_process,) = house.job_processes()
@@ -161,7 +161,7 @@ def test_an_attempt_that_lost_its_job_writes_nothing(house: House) -> None:
     settled(house)
 
 
-def test_a_worker_that_is_told_to_stop_puts_its_job_back(house: House) -> None:
+def test_a_stopping_worker_requeues_its_job(house: House) -> None:
     id = house.submit(long=True)
     house.solving(id)
     (job_process,) = house.job_processes()
@@ -176,7 +176,7 @@ def test_a_worker_that_is_told_to_stop_puts_its_job_back(house: House) -> None:
 
 
 @pytest.mark.slow
-def test_a_worker_that_is_told_to_stop_lets_a_short_job_end(house: House, tmp_path: Path) -> None:
+def test_a_stopping_worker_lets_a_short_job_finish(house: House, tmp_path: Path) -> None:
     settings = dataclasses.replace(
         house.settings, data=tmp_path, queue=f"calm-{secrets.token_hex(3)}", workers=1, stop_grace=60.0
     )
@@ -189,7 +189,7 @@ def test_a_worker_that_is_told_to_stop_lets_a_short_job_end(house: House, tmp_pa
         assert (job.status, job.attempt) == (Status.SUCCEEDED, 1)
 
 
-def test_a_foreign_delivery_is_refused(house: House, tmp_path: Path) -> None:
+def test_a_delivery_of_another_function_is_rejected(house: House, tmp_path: Path) -> None:
     marks = [tmp_path / name for name in ("function", "callback")]
     raw = connect(house.settings.redis, decode=False)
     queue = RqQueue(house.settings.queue, connection=raw, serializer=JSONSerializer)
@@ -205,7 +205,7 @@ def test_a_foreign_delivery_is_refused(house: House, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_second_delivery_of_an_attempt_is_dropped(house: House) -> None:
+def test_a_duplicate_delivery_is_dropped(house: House) -> None:
     id = house.submit(long=True)
     job = house.solving(id)
     attempt_id = house.jobs.records.get(id).attempt_id
@@ -220,7 +220,7 @@ def test_a_second_delivery_of_an_attempt_is_dropped(house: House) -> None:
 
 
 @pytest.mark.slow
-def test_a_job_that_the_queue_forgot_is_done(house: House) -> None:
+def test_a_job_missing_from_the_queue_is_completed(house: House) -> None:
     first, second = house.submit(long=True), house.submit(long=True)
     house.solving(first)
     house.solving(second)
@@ -256,7 +256,7 @@ def test_lost_inputs_are_an_internal_error_whose_trace_is_in_the_log(house: Hous
 
 
 @pytest.mark.slow
-def test_a_job_that_takes_too_long_says_so(house: House, tmp_path: Path) -> None:
+def test_a_job_beyond_its_time_limit_reports_it(house: House, tmp_path: Path) -> None:
     settings = dataclasses.replace(
         house.settings, data=tmp_path, queue=f"late-{secrets.token_hex(3)}", workers=1, time_limit=1.5, memory_limit=0
     )
@@ -272,7 +272,7 @@ def test_a_job_that_takes_too_long_says_so(house: House, tmp_path: Path) -> None
 
 
 @pytest.mark.slow
-def test_a_job_that_needs_too_much_memory_says_so(house: House, tmp_path: Path) -> None:
+def test_a_job_out_of_memory_reports_it(house: House, tmp_path: Path) -> None:
     make_inputs(tmp_path / "big.npz", frames=200, points=6000)
     settings = dataclasses.replace(
         house.settings, data=tmp_path, queue=f"lean-{secrets.token_hex(3)}", workers=1, memory_limit=640 << 20
@@ -286,7 +286,7 @@ def test_a_job_that_needs_too_much_memory_says_so(house: House, tmp_path: Path) 
         settled(lean)
 
 
-def test_wrong_arguments_and_settings_are_said() -> None:
+def test_invalid_arguments_and_settings_are_reported() -> None:
     def run(*arguments: str, **env: str) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, "-m", "pliant.worker", *arguments]
         return subprocess.run(command, capture_output=True, text=True, check=False, env={**os.environ, **env})

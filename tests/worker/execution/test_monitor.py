@@ -91,7 +91,7 @@ def test_without_a_limit_there_is_none(running: Callable[..., Watch]) -> None:
     assert watch.must_end(stop_by=None) is None
 
 
-def test_a_worker_that_stops_puts_the_job_back_however_often(jobs: Jobs, running: Callable[..., Watch]) -> None:
+def test_a_stopping_worker_requeues_the_job_regardless_of_attempts(jobs: Jobs, running: Callable[..., Watch]) -> None:
     time = [0.0]
     watch = running(time, max_attempts=1)
     assert watch.must_end(stop_by=2.0) is None
@@ -107,7 +107,7 @@ def test_a_worker_that_stops_puts_the_job_back_however_often(jobs: Jobs, running
     assert finalize(watch, status=KILLED, peak=0, patience=Patience(0)) is None
 
 
-def test_a_job_process_that_is_killed_while_its_worker_stops_is_put_back(running: Callable[..., Watch]) -> None:
+def test_a_job_killed_while_its_worker_stops_is_requeued(running: Callable[..., Watch]) -> None:
     for status, expected in ((KILLED, Status.QUEUED), (int(signal.SIGSEGV), Status.FAILED)):
         watch = running([0.0])
         assert watch.must_end(stop_by=100.0) is None
@@ -126,7 +126,9 @@ def test_an_attempt_that_lost_its_job_is_killed_at_once(jobs: Jobs, running: Cal
     assert finalize(watch, status=KILLED, peak=0, patience=Patience(0)) is None
 
 
-def test_a_watch_outlasts_its_store(running: Callable[..., Watch], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_supervision_continues_while_the_store_is_away(
+    running: Callable[..., Watch], monkeypatch: pytest.MonkeyPatch
+) -> None:
     time = [0.0]
     watch = running(time)
 
@@ -141,7 +143,7 @@ def test_a_watch_outlasts_its_store(running: Callable[..., Watch], monkeypatch: 
         finalize(watch, status=KILLED, peak=0, patience=Patience(0))
 
 
-def test_a_silent_death_is_told_from_one_for_want_of_memory(
+def test_a_crash_is_distinguished_from_lack_of_memory(
     jobs: Jobs, running: Callable[..., Watch], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def code(watch: Watch, status: int, peak: int = 0) -> str:
@@ -208,14 +210,14 @@ def test_every_error_becomes_a_sentence(error: BaseException, code: str, status:
         assert (problem.field, problem.expected, problem.got, problem.hint) == ("tracks", "a", "b", "Do c")
 
 
-def test_a_thread_that_does_not_fit_is_want_of_memory_only_under_a_limit() -> None:
+def test_a_thread_that_cannot_start_is_out_of_memory_only_under_a_limit() -> None:
     error = RuntimeError("can't start new thread")
     assert problem_of(error, memory_limit=2**30).code == "out_of_memory"
     assert "1.0 GiB" in problem_of(error, memory_limit=2**30).detail
     assert problem_of(error).code == "internal_error"
 
 
-def test_limits_are_named_in_words() -> None:
+def test_limits_are_stated_in_messages() -> None:
     assert "2.0 GiB" in out_of_memory(2**31).detail
     assert "the machine has" in out_of_memory().detail
     assert "1.5 s" in timed_out(1.5).detail
@@ -255,7 +257,7 @@ def test_progress_never_falls_and_estimates_what_is_left() -> None:
     assert all(before[1] == after[0] for before, after in itertools.pairwise(edges))
 
 
-def test_the_log_is_whole_before_the_record_is_final(
+def test_the_log_is_complete_before_the_record_is_final(
     jobs: Jobs, running: Callable[..., Watch], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     watch = running([0.0])

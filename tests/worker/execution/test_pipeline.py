@@ -93,7 +93,7 @@ def test_every_option_of_the_solver_reaches_it() -> None:
     assert solver_settings(angle, y_up=True) == Settings(field_of_view=60.0, image_size=(640.0, 480.0), y_up=True)
 
 
-def test_what_does_not_fit_is_refused_before_a_file_is_written(inputs: Inputs, tmp_path: Path) -> None:
+def test_contradictory_inputs_are_rejected_before_a_file_is_written(inputs: Inputs, tmp_path: Path) -> None:
     assert inputs.mesh is not None
     no_grid = Mesh.from_faces(inputs.mesh.faces, inputs.mesh.num_points)
     without = Inputs(inputs.tracks, no_grid, None, None, inputs.interpretation)

@@ -20,7 +20,7 @@ from pliant.worker.settings import Settings
 from pliant.worker.store.connection import connect
 
 
-def test_patience_is_one_span_for_all_that_is_asked() -> None:
+def test_all_calls_share_one_time_limit() -> None:
     asked: list[str] = []
 
     def gone() -> None:
@@ -38,7 +38,7 @@ def test_patience_is_one_span_for_all_that_is_asked() -> None:
 
 
 @pytest.mark.parametrize("away", ["it comes back", "it stays away"])
-def test_the_working_files_go_once_the_store_says_whose_they_are(
+def test_scratch_files_are_removed_once_the_store_confirms_their_owner(
     jobs: Jobs,
     settings: Settings,
     inputs_file: Path,

@@ -57,7 +57,7 @@ HEADERS = {
 
 
 @pytest.mark.parametrize("name", HEADERS)
-def test_headers_that_lie_are_refused(name: str) -> None:
+def test_inconsistent_headers_are_rejected(name: str) -> None:
     code, content = HEADERS[name]
     with pytest.raises(InvalidInput) as caught:
         read_npy(io.BytesIO(content), len(content), field="tracks", limits=SMALL)
@@ -81,14 +81,14 @@ ARCHIVES = {
 
 
 @pytest.mark.parametrize("code", ARCHIVES)
-def test_crafted_archives_are_refused(tmp_path: Path, code: str) -> None:
+def test_crafted_archives_are_rejected(tmp_path: Path, code: str) -> None:
     path = archive(tmp_path / "x.npz", ARCHIVES[code])
     with pytest.raises(InvalidInput) as caught:
         read_npz(path, field="tracks", limits=SMALL)
     assert caught.value.code == code
 
 
-def test_too_many_members_and_odd_packing_are_refused(tmp_path: Path) -> None:
+def test_too_many_members_and_unknown_compression_are_rejected(tmp_path: Path) -> None:
     many = archive(tmp_path / "many.npz", [(f"a{index}.npy", GOOD) for index in range(5)])
     packed = archive(tmp_path / "lzma.npz", [("tracks.npy", GOOD)], zipfile.ZIP_LZMA)
     for path, code in ((many, "too_large"), (packed, "unsupported_feature")):
@@ -109,7 +109,7 @@ def test_a_member_whose_checksum_is_wrong_is_refused(tmp_path: Path) -> None:
 
 @settings(max_examples=300, deadline=None)
 @given(st.binary(max_size=300), st.integers(0, len(GOOD)))
-def test_no_bytes_make_the_reader_fail_otherwise(junk: bytes, at: int) -> None:
+def test_arbitrary_bytes_only_raise_input_errors(junk: bytes, at: int) -> None:
     content = GOOD[:at] + junk + GOOD[at + len(junk) :]
     try:
         read_npy(io.BytesIO(content), len(content), field="tracks", limits=SMALL)
@@ -125,7 +125,7 @@ def test_a_directory_that_points_before_the_file_is_refused(tmp_path: Path) -> N
     assert caught.value.code == "damaged_file"
 
 
-def test_a_disk_that_fails_is_not_the_files_fault(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_failure_is_not_an_input_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = archive(tmp_path / "x.npz", [("tracks.npy", GOOD)])
 
     def fails(*_: object, **__: object) -> None:

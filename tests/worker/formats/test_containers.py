@@ -100,7 +100,7 @@ def test_hdf5_that_points_elsewhere_or_declares_too_much_is_refused(tmp_path: Pa
     assert code_of(tmp_path / "huge.mat") == "too_large"
 
 
-def test_a_sandbox_out_of_time_or_memory_costs_nothing_else(tmp_path: Path) -> None:
+def test_a_sandbox_out_of_time_or_memory_affects_nothing_else(tmp_path: Path) -> None:
     (tmp_path / "m.obj").write_text("v 1 2 3\n" * 8_000_000)  # several seconds on any machine, and one is all it gets
     limits = Limits(parse_seconds=1, max_points=10**8)
     with pytest.raises(InvalidInput) as caught:
@@ -138,7 +138,7 @@ def test_gltf_of_text_gives_its_faces_and_whole_numbers_only(tmp_path: Path) -> 
         )
 
 
-def test_hdf5_that_was_hardly_stored_is_refused_before_it_is_decompressed(tmp_path: Path) -> None:
+def test_implausibly_small_hdf5_is_rejected_before_decompression(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "fill.mat", "w", userblock_size=512) as file:
         file.create_dataset("W", (1 << 13, 1 << 13), dtype="f8", chunks=(256, 256), compression="gzip")
     with h5py.File(tmp_path / "chunk.mat", "w", userblock_size=512) as file:

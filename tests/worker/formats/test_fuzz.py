@@ -41,7 +41,7 @@ def fuzzed(parser: str, examples: int, number: int) -> dict[str, int]:
 
 
 @pytest.mark.parametrize("parser", READERS)
-def test_a_bent_file_is_read_or_refused(parser: str) -> None:
+def test_a_corrupted_file_is_read_or_rejected(parser: str) -> None:
     examples = 40 if parser in NATIVE else 80
     answers = fuzzed(parser, examples, number=7)
     assert sum(answers.values()) >= examples
@@ -111,7 +111,7 @@ meshes = st.one_of(
 
 @settings(max_examples=100, deadline=None, suppress_health_check=list(HealthCheck))
 @given(named, tracked, meshes, st.one_of(st.none(), named), st.one_of(st.none(), named), options)
-def test_arrays_of_any_kind_are_interpreted_or_refused(
+def test_arrays_of_any_kind_are_interpreted_or_rejected(
     around: dict[str, np.ndarray],
     tracks: tuple[str, np.ndarray],
     mesh: Any,

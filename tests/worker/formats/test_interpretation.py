@@ -40,7 +40,7 @@ UNIT = POINTS / [8, 4]
 SIGNED = UNIT * 2 - 1
 
 
-def test_fractions_need_the_pictures_size_or_a_word(tmp_path: Path) -> None:
+def test_fractions_need_the_image_size_or_an_option(tmp_path: Path) -> None:
     error = refused("ambiguous_coordinates", {"tracks": UNIT})
     assert offered(error) == [{"coordinates": "unit"}, {"coordinates": "pixels"}]
     assert refused("missing_image_size", {"tracks": UNIT}, coordinates="unit").field == "options.image_size"
@@ -51,7 +51,7 @@ def test_fractions_need_the_pictures_size_or_a_word(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read(tmp_path, {"tracks": UNIT}, coordinates="pixels").tracks.points, UNIT)
 
 
-def test_signed_fractions_are_seen_where_the_size_is_known(tmp_path: Path) -> None:
+def test_signed_fractions_are_detected_with_a_known_size(tmp_path: Path) -> None:
     got = read(tmp_path, {"tracks": SIGNED}, image_size="9x5")
     np.testing.assert_array_equal(got.tracks.points, POINTS)
     assert got.interpretation.coordinates == "signed"
@@ -66,7 +66,7 @@ def test_points_outside_the_picture_do_not_hide_fractions(tmp_path: Path) -> Non
     assert read(tmp_path, {"tracks": some}, image_size="9x5").interpretation.coordinates == "unit"
 
 
-def test_y_before_x_is_seen_where_only_so_all_is_inside(tmp_path: Path) -> None:
+def test_y_before_x_is_detected_by_the_image_size(tmp_path: Path) -> None:
     wide = POINTS * [80, 20]
     got = read(tmp_path, {"tracks": wide[..., ::-1]}, image_size="641x100")
     np.testing.assert_array_equal(got.tracks.points, wide)
@@ -75,7 +75,7 @@ def test_y_before_x_is_seen_where_only_so_all_is_inside(tmp_path: Path) -> None:
     np.testing.assert_array_equal(kept.tracks.points, wide[..., ::-1])
 
 
-def test_a_contradicted_layout_is_asked_about(tmp_path: Path) -> None:
+def test_a_contradicted_layout_is_ambiguous(tmp_path: Path) -> None:
     error = refused("ambiguous_layout", {"tracks": POINTS.swapaxes(0, 1)})
     assert {"layout": "points_frames"} in offered(error)
     got = read(tmp_path, {"tracks": POINTS.swapaxes(0, 1)}, layout="points_frames")
@@ -84,14 +84,14 @@ def test_a_contradicted_layout_is_asked_about(tmp_path: Path) -> None:
     assert "one.W and two.W" in two.got
 
 
-def test_a_long_list_of_pixels_is_no_long_video() -> None:
+def test_a_long_list_of_pixels_is_not_a_long_video() -> None:
     y, x = np.mgrid[:80, :160].astype(float)
     first = np.stack([x, y], axis=-1).reshape(1, -1, 2)
     quick = first + 30.0 * np.arange(4)[:, None, None] ** 1.5  # neighbours in the list are closer than frames
     assert understand({"tracks": quick}, Options()).points.shape == (4, 80 * 160, 2)
 
 
-def test_y_axis_is_as_asked(tmp_path: Path) -> None:
+def test_the_option_y_axis_is_used(tmp_path: Path) -> None:
     assert read(tmp_path, {"tracks": POINTS}).interpretation.y_axis == "down"
     up = read(tmp_path, {"tracks": POINTS}, y_axis="up").interpretation
     assert up.y_axis == "up"
@@ -125,7 +125,7 @@ def test_more_axes_than_are_known_are_refused() -> None:
     refused("wrong_shape", {"tracks": np.zeros((4, 2, 1, 9))})
 
 
-def test_space_needs_a_camera(tmp_path: Path) -> None:
+def test_points_in_space_need_intrinsics(tmp_path: Path) -> None:
     assert refused("missing_array", {"tracks_xyz": WORLD}).field == "tracks.intrinsics"
     for bad in (np.ones(3), np.array([0.0, 1, 2, 3]), np.array([1, 1, np.nan, 1]), np.array(["8", "8", "4", "2"])):
         refused("wrong_shape", {"tracks_xyz": WORLD, "intrinsics": bad})
@@ -140,7 +140,7 @@ def test_space_needs_a_camera(tmp_path: Path) -> None:
     refused("unsupported_feature", {"tracks": np.concatenate([POINTS, third], axis=2)})
 
 
-def test_truth_is_read_the_way_that_explains_the_tracks() -> None:
+def test_truth_is_read_in_the_layout_that_fits_the_tracks() -> None:
     understood = understand({"tracks": POINTS}, Options())
     interleaved = SHAPES.transpose(0, 2, 1).reshape(3 * F, P)
     stacked = np.vstack([*SHAPES.transpose(2, 0, 1)])
@@ -162,13 +162,13 @@ def test_truth_is_read_the_way_that_explains_the_tracks() -> None:
     assert unexplained(SHAPES[:, :3], POINTS[:, :3]) == 0.0  # too few points to say
 
 
-def test_truth_beside_the_tracks_that_does_not_fit_is_passed_over_and_said(tmp_path: Path) -> None:
+def test_invalid_truth_in_the_tracks_file_is_skipped_with_a_note(tmp_path: Path) -> None:
     got = read(tmp_path, {"tracks": POINTS, "shapes": SHAPES[:, 1:]})
     assert got.ground_truth is None
     assert any("cannot be used: expected (8, 45, 3)" in note for note in got.interpretation.notes)
 
 
-def test_rotations_are_read_the_way_that_makes_them_rotations() -> None:
+def test_rotations_are_read_in_the_layout_that_makes_them_orthonormal() -> None:
     turns = np.linalg.qr(np.random.default_rng(0).normal(size=(F, 3, 3)))[0]
     two = turns[:, :2]
     for array in (turns, turns.transpose(1, 2, 0), turns.reshape(3 * F, 3), np.vstack([*turns.transpose(1, 0, 2)])):
@@ -211,7 +211,7 @@ def test_matlab_73_text_and_empty_arrays_are_no_tracks_and_cells_have_a_limit(tm
         read_matlab73(stream, field="tracks", limits=Limits())
 
 
-def test_whole_pictures_give_their_grid(tmp_path: Path) -> None:
+def test_tracks_of_all_pixels_give_their_grid(tmp_path: Path) -> None:
     np.savez(tmp_path / "t.npz", tracks=pixels(POINTS), visibility=pixels(SEEN))
     got = read_inputs(tracks=tmp_path / "t.npz", options=Options())
     assert got.interpretation.mesh_source == "grid"
@@ -219,7 +219,7 @@ def test_whole_pictures_give_their_grid(tmp_path: Path) -> None:
     np.testing.assert_array_equal(got.tracks.visible > 0, SEEN)
 
 
-def test_numbers_beyond_measure_are_refused_where_they_count(tmp_path: Path) -> None:
+def test_extreme_visible_coordinates_are_rejected(tmp_path: Path) -> None:
     far = POINTS.copy()
     far[2, 3] = 1e13
     with pytest.raises(InvalidInput, match="1 points beyond") as caught:

@@ -45,13 +45,13 @@ def test_the_stored_file_and_the_interpretation_are_the_same(all_apart: None, tm
     assert sorted(path.name for path in tmp_path.iterdir()) == ["g.npz", "here.npz", "t.npz", "there.npz"]
 
 
-def test_both_doors_take_the_same() -> None:
+def test_both_readers_accept_the_same() -> None:
     here, apart_too = (dict(inspect.signature(door).parameters) for door in (read_inputs, store_inputs))
     assert apart_too.pop("target").default is inspect.Parameter.empty
     assert here == apart_too
 
 
-def test_refusals_come_back_whole(all_apart: None, tmp_path: Path) -> None:
+def test_errors_are_transferred_completely(all_apart: None, tmp_path: Path) -> None:
     np.savez(tmp_path / "t.npz", tracks=POINTS[:2])
     with pytest.raises(InvalidInput) as caught:
         store_inputs(tracks=tmp_path / "t.npz", options=Options(), target=None)
@@ -63,7 +63,7 @@ def test_refusals_come_back_whole(all_apart: None, tmp_path: Path) -> None:
     assert {"layout": "points_frames"} in [choice["options"] for choice in asked.value.choices]
 
 
-def test_too_little_memory_or_time_is_the_inputs_fault(all_apart: None, tmp_path: Path) -> None:
+def test_exceeding_memory_or_time_is_an_input_error(all_apart: None, tmp_path: Path) -> None:
     np.savez_compressed(tmp_path / "t.npz", tracks=np.zeros((1000, 20_000, 2), dtype=np.float32))
     with pytest.raises(InvalidInput, match="within 419430400 bytes") as caught:
         store_inputs(tracks=tmp_path / "t.npz", options=Options(), limits=Limits(read_memory=400 << 20), target=None)
@@ -73,14 +73,14 @@ def test_too_little_memory_or_time_is_the_inputs_fault(all_apart: None, tmp_path
     assert late.value.code == "too_large"
 
 
-def test_a_fault_of_ours_is_not_the_inputs(all_apart: None, tmp_path: Path) -> None:
+def test_an_internal_error_is_not_an_input_error(all_apart: None, tmp_path: Path) -> None:
     np.savez(tmp_path / "t.npz", tracks=POINTS)
     with pytest.raises(RuntimeError, match="No such file or directory"):
         store_inputs(tracks=tmp_path / "t.npz", options=Options(), target=tmp_path / "nowhere" / "x.npz")
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-def test_what_is_read_apart_is_not_kept_here(tmp_path: Path) -> None:
+def test_isolated_reading_keeps_no_memory_in_the_parent(tmp_path: Path) -> None:
     path = tmp_path / "t.npz"
     np.savez(path, tracks=np.linspace(0, 900, 20 * 220_000 * 2).reshape(220_000, 20, 2).swapaxes(0, 1))
     assert declared_bytes(path, field="tracks") > isolated_reader.LARGE
@@ -96,7 +96,7 @@ def peak_now() -> int:
     return peak_of(os.getpid())
 
 
-def test_what_a_file_announces(tmp_path: Path) -> None:
+def test_declared_sizes_are_computed(tmp_path: Path) -> None:
     np.savez_compressed(tmp_path / "z.npz", tracks=np.zeros((100, 100, 2)))
     np.save(tmp_path / "p.npy", np.zeros((100, 100, 2)))
     scipy.io.savemat(tmp_path / "m.mat", {"W": np.zeros((20, 30))})

@@ -24,7 +24,7 @@ ALSO = {"matlab5": {"scipy.sparse", "scipy.linalg"}}
 
 
 @pytest.mark.parametrize("parser", PARSERS)
-def test_a_sandbox_loads_its_parser_and_no_more(parser: str) -> None:
+def test_a_sandbox_loads_only_its_parser(parser: str) -> None:
     ran = subprocess.run([sys.executable, "-I", "-c", LISTED, parser], capture_output=True, text=True, check=True)
     loaded = set(ran.stdout.split())
     needed = NEEDED.get(parser, set())
@@ -33,7 +33,7 @@ def test_a_sandbox_loads_its_parser_and_no_more(parser: str) -> None:
 
 
 @pytest.mark.parametrize("package", [pliant.solver, pliant.worker.formats])
-def test_names_that_are_looked_up_when_used_are_all_there(package: object) -> None:
+def test_lazily_imported_names_exist(package: object) -> None:
     for name in package.__all__:  # type: ignore[attr-defined]
         assert getattr(package, name).__name__ == name
     with pytest.raises(AttributeError, match="no attribute 'nonsense'"):

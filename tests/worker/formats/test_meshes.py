@@ -64,7 +64,7 @@ def read(tracks: Path, mesh: Path | str | None) -> Inputs:
 
 
 @pytest.mark.parametrize("faces", [FACES, TRIANGLES], ids=["quads", "triangles"])
-def test_faces_come_back_as_they_were_from_every_format(tmp_path: Path, tracks: Path, faces: np.ndarray) -> None:
+def test_faces_are_read_unchanged_from_every_format(tmp_path: Path, tracks: Path, faces: np.ndarray) -> None:
     (tmp_path / "m.obj").write_text(obj(faces))
     np.savez(tmp_path / "m.npz", faces=faces, vertices=np.zeros((P, 3)))
     np.save(tmp_path / "m.npy", faces)
@@ -108,7 +108,7 @@ def test_a_grid_size_or_mask_makes_quads(tmp_path: Path, tracks: Path) -> None:
     np.testing.assert_array_equal(masked.mesh.faces, FACES)
 
 
-def test_no_mesh_when_none_is_asked_for(tracks: Path) -> None:
+def test_no_mesh_is_generated_for_none(tracks: Path) -> None:
     got = read(tracks, "none")
     assert got.mesh is None
     assert got.interpretation.mesh_source == "none"
@@ -143,7 +143,7 @@ def test_bad_obj_lines_are_refused(
     assert code_of(tracks, tmp_path / "m.obj") == code
 
 
-def test_files_that_are_no_meshes_are_refused(tmp_path: Path, tracks: Path) -> None:
+def test_files_that_are_not_meshes_are_rejected(tmp_path: Path, tracks: Path) -> None:
     (tmp_path / "m.obj").write_text("hello\n")
     (tmp_path / "m.bin").write_bytes(bytes(range(256)))
     (tmp_path / "m.ply").write_bytes(b"ply\nformat ascii 1.0\nelement vertex 3\nend_header\n")
@@ -163,7 +163,7 @@ def test_too_many_faces_are_refused(tmp_path: Path, tracks: Path) -> None:
         assert code_of(tracks, file, max_faces=len(FACES) - 1) == "too_large"
 
 
-def test_the_made_mesh_covers_the_sheet_and_faces_the_camera() -> None:
+def test_the_generated_mesh_covers_the_sheet_and_faces_the_camera() -> None:
     for y_axis, sign in (("down", -1), ("up", 1)):
         mesh, notes = triangulate(Tracks.from_arrays(sheet()), y_axis=y_axis)
         assert mesh is not None
@@ -174,7 +174,7 @@ def test_the_made_mesh_covers_the_sheet_and_faces_the_camera() -> None:
         assert "frame 0" in notes[0]
 
 
-def test_the_made_mesh_does_not_bridge_a_gap() -> None:
+def test_the_generated_mesh_does_not_bridge_a_gap() -> None:
     apart = sheet()
     apart[:, P // 2 :, 0] += 500
     mesh, notes = triangulate(Tracks.from_arrays(apart), y_axis="down")
@@ -184,7 +184,7 @@ def test_the_made_mesh_does_not_bridge_a_gap() -> None:
     assert " 0 of" not in notes[0]
 
 
-def test_the_made_mesh_takes_the_frame_that_shows_most() -> None:
+def test_the_generated_mesh_uses_the_frame_with_most_visible_points() -> None:
     visible = np.ones((F, P))
     visible[:2, :10] = 0
     visible[2, 3] = 0

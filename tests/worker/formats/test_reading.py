@@ -105,7 +105,7 @@ def test_hidden_points_never_carry_nan(tmp_path: Path) -> None:
     assert (got.tracks.visible == 0).sum() == 4
 
 
-def test_points_seen_seldom_keep_their_place_and_are_told(tmp_path: Path) -> None:
+def test_sparsely_observed_points_keep_their_index_and_are_reported(tmp_path: Path) -> None:
     tracks = waving()
     tracks[:, 4] = np.nan
     got = read(tmp_path, tracks=tracks)
@@ -183,7 +183,7 @@ def test_visibility_of_another_shape_is_refused(tmp_path: Path) -> None:
     assert error.field == "tracks.visibility"
 
 
-def test_text_posing_as_npz_is_refused(tmp_path: Path) -> None:
+def test_text_with_the_suffix_npz_is_rejected(tmp_path: Path) -> None:
     (tmp_path / "tracks.npz").write_text("these are no tracks\n" * 20)
     refused("unknown_format", lambda: read_inputs(tracks=tmp_path / "tracks.npz", options=Options()))
 

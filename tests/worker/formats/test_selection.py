@@ -125,7 +125,7 @@ def test_a_grid_with_holes_keeps_its_holes(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("how", [{"stride": 6}, {"max_points": P // 6}], ids=str)
-def test_a_mesh_is_thinned_evenly_and_stays_one_sheet(folder: Path, how: dict[str, int]) -> None:
+def test_a_mesh_is_decimated_evenly_and_stays_connected(folder: Path, how: dict[str, int]) -> None:
     got = read(folder, folder / "quads.npz", **how)
     assert got.selection is not None
     kept = got.selection.points
@@ -149,7 +149,7 @@ def test_a_mesh_is_thinned_evenly_and_stays_one_sheet(folder: Path, how: dict[st
     assert np.percentile(lengths, 95) < 2.5 * np.percentile(lengths, 5)
 
 
-def test_parts_of_a_mesh_stay_apart_and_each_keeps_points() -> None:
+def test_components_of_a_mesh_stay_separate_and_each_keeps_points() -> None:
     far = np.concatenate([POINTS, POINTS + np.array([0, 0.5])], axis=1)  # two sheets, one over the other in the picture
     mesh = Mesh.from_faces(np.concatenate([QUADS, QUADS + P]), 2 * P)
     kept, thinned, _ = thin(far, None, mesh, Options(max_points=60))
@@ -177,7 +177,7 @@ def test_a_list_is_thinned_by_number_or_spread_evenly(folder: Path) -> None:
     assert made.mesh.num_points == made.tracks.num_points
 
 
-def test_nothing_is_chosen_where_all_fits(folder: Path) -> None:
+def test_everything_is_kept_within_the_limits(folder: Path) -> None:
     got = read(folder, folder / "quads.npz", max_points=P, frames=":")
     assert got.selection is None
     assert got.tracks.num_points == P
@@ -200,7 +200,7 @@ def test_a_selection_survives_storage_and_reaches_the_result(folder: Path) -> No
         assert result["shapes"].shape == (F - 2, 20, 3)
 
 
-def test_points_seen_too_seldom_are_left_out_and_said(folder: Path) -> None:
+def test_sparsely_observed_points_are_excluded_and_reported(folder: Path) -> None:
     tracks = POINTS.copy()
     tracks[3:, 4] = np.nan
     tracks[1:, [7, 9]] = np.nan
@@ -223,7 +223,7 @@ def test_points_seen_too_seldom_are_left_out_and_said(folder: Path) -> None:
     assert (caught.value.code, caught.value.field) == ("nothing_visible", "options.min_seen")
 
 
-def test_a_mask_picks_points_of_whole_pictures(tmp_path: Path) -> None:
+def test_a_mask_selects_pixels_of_a_picture(tmp_path: Path) -> None:
     np.savez(tmp_path / "tracks.npz", tracks=POINTS.reshape(F, ROWS, COLUMNS, 2))
     mask = np.zeros((ROWS, COLUMNS), dtype=np.uint8)
     mask[2:9, 3:11] = 255

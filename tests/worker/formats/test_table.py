@@ -37,7 +37,7 @@ def solved(inputs: Inputs) -> Solution:
 
 
 @pytest.mark.parametrize("made", FORMATS, ids=str)
-def test_a_format_gives_what_the_canonical_file_gives(made: Written, tmp_path: Path) -> None:
+def test_every_format_equals_the_canonical_file(made: Written, tmp_path: Path) -> None:
     path = tmp_path / f"tracks.{made.suffix}"
     made.write(path)
     canonical = {"tracks": made.points} | ({} if made.visibility is None else {"visibility": made.visibility})

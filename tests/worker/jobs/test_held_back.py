@@ -15,7 +15,7 @@ from pliant.worker.maintenance.reconciler import Reconciler
 from reconciler_world import World
 
 
-def test_no_more_of_an_owners_jobs_run_than_may_and_the_next_begins_when_one_ends(
+def test_the_limit_of_running_jobs_holds_and_the_next_starts_when_one_ends(
     tmp_path: Path, inputs_file: Path, interpretation: Interpretation
 ) -> None:
     world = World(tmp_path, max_running=2)
@@ -58,7 +58,7 @@ def test_no_more_of_an_owners_jobs_run_than_may_and_the_next_begins_when_one_end
     assert "forgotten" not in world.jobs.log(adas[4])
 
 
-def test_a_job_held_back_and_let_go_between_two_looks_is_not_taken_for_forgotten(
+def test_a_job_released_between_two_checks_is_not_considered_lost(
     tmp_path: Path, inputs_file: Path, interpretation: Interpretation
 ) -> None:
     world = World(tmp_path, max_running=1)
@@ -81,7 +81,7 @@ def test_a_job_held_back_and_let_go_between_two_looks_is_not_taken_for_forgotten
     assert world.jobs.queue.held() == set()
 
 
-def test_what_is_held_back_is_known_to_a_keeper_that_has_only_begun(
+def test_a_new_reconciler_knows_the_held_back_jobs(
     tmp_path: Path, inputs_file: Path, interpretation: Interpretation
 ) -> None:
     world = World(tmp_path, max_running=1)
@@ -119,7 +119,7 @@ def test_a_job_on_its_way_to_a_worker_counts_as_running(
     assert world.jobs.get(second).status is Status.QUEUED
 
 
-def test_a_tokens_own_bound_on_running_jobs_goes_before_the_usual_one(
+def test_a_tokens_own_limit_of_running_jobs_takes_precedence(
     tmp_path: Path, inputs_file: Path, interpretation: Interpretation
 ) -> None:
     world = World(tmp_path, max_running=2)

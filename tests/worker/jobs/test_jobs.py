@@ -64,7 +64,7 @@ def test_a_submitted_job_has_record_blob_and_place(jobs: Jobs, submit, inputs_fi
     assert jobs.records.used() == 2 * inputs_file.stat().st_size
 
 
-def test_an_unknown_job_is_said_so(jobs: Jobs) -> None:
+def test_an_unknown_job_is_an_error(jobs: Jobs) -> None:
     for id in ("nobody", "../etc/passwd", "x" * 500):
         with pytest.raises(UnknownJob, match="List your jobs"):
             jobs.get(id)
@@ -92,13 +92,13 @@ def test_pages_hold_every_job_once_newest_first(jobs: Jobs, submit) -> None:  # 
     ("arguments", "code"),
     [({"cursor": "nonsense"}, "invalid_cursor"), ({"limit": 0}, "invalid_limit"), ({"limit": 201}, "invalid_limit")],
 )
-def test_a_page_that_cannot_be_is_refused(jobs: Jobs, arguments: dict[str, object], code: str) -> None:
+def test_invalid_cursors_and_limits_are_rejected(jobs: Jobs, arguments: dict[str, object], code: str) -> None:
     with pytest.raises(InvalidRequest) as caught:
         jobs.page(**arguments)  # type: ignore[arg-type]
     assert caught.value.code == code
 
 
-def test_an_owner_sees_only_his_own(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
+def test_an_owner_sees_only_own_jobs(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
     ann, bob = jobs.of("ann"), jobs.of("bob")
     hers, his = submit(ann), submit(bob)
     assert ann.get(hers.id).id == hers.id
@@ -280,7 +280,7 @@ def test_running_again_is_a_new_job_with_the_same_inputs(jobs: Jobs, submit, inp
         jobs.retry(again.id)
 
 
-def test_events_tell_every_change_once(jobs: Jobs, submit, inputs_file: Path) -> None:  # type: ignore[no-untyped-def]
+def test_events_report_every_change_once(jobs: Jobs, submit, inputs_file: Path) -> None:  # type: ignore[no-untyped-def]
     id = submit().id
     first = jobs.events(id)
     assert [event.name for event in first] == ["job"]
@@ -323,7 +323,7 @@ def test_events_are_capped(jobs: Jobs, submit) -> None:  # type: ignore[no-untyp
     assert Job.model_validate_json(kept[-1].data).status is Status.CANCELLED
 
 
-def test_the_quota_refuses_what_does_not_fit(jobs: Jobs, submit, inputs_file: Path) -> None:  # type: ignore[no-untyped-def]
+def test_the_quota_rejects_jobs_that_do_not_fit(jobs: Jobs, submit, inputs_file: Path) -> None:  # type: ignore[no-untyped-def]
 
     tight = dataclasses.replace(jobs, settings=dataclasses.replace(jobs.settings, disk_quota=4_000_000))
     submit(tight)
@@ -338,9 +338,7 @@ def test_readiness_names_each_part(jobs: Jobs) -> None:
     assert found["workers"] == "ok" or "pliant work" in found["workers"]
 
 
-def test_a_retry_that_meets_a_deletion_says_that_the_job_is_gone(
-    jobs: Jobs, submit, monkeypatch: pytest.MonkeyPatch
-) -> None:  # type: ignore[no-untyped-def]
+def test_a_retry_during_a_deletion_reports_an_unknown_job(jobs: Jobs, submit, monkeypatch: pytest.MonkeyPatch) -> None:  # type: ignore[no-untyped-def]
     id = submit().id
     jobs.cancel(id)
     known = Jobs.known

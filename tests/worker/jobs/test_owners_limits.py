@@ -15,7 +15,7 @@ from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.service import Jobs
 
 
-def test_no_more_of_an_owners_jobs_wait_than_may(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
+def test_the_limit_of_queued_jobs_holds(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
     ada, bob = (dataclasses.replace(jobs.of(owner), max_queued=2) for owner in ("ada", "bob"))
     first, _ = submit(ada), submit(ada, id="second", fingerprint="f")
     before = list(jobs.blobs.list("jobs/"))
@@ -40,7 +40,7 @@ def test_no_more_of_an_owners_jobs_wait_than_may(jobs: Jobs, submit) -> None:  #
         submit(ada)
 
 
-def test_submissions_at_the_same_moment_do_not_slip_past_the_limit(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
+def test_simultaneous_submissions_respect_the_limit(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
     ada = dataclasses.replace(jobs.of("ada"), max_queued=3)
     refused: list[Exception] = []
 
@@ -74,7 +74,7 @@ def test_a_job_over_its_owners_limit_is_noted_as_held_back_until_it_is_cancelled
     assert jobs.queue.held() == set()
 
 
-def test_what_a_token_says_of_running_jobs_is_kept_with_each(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
+def test_the_tokens_limit_of_running_jobs_is_stored_with_each_job(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
     ids = [submit(dataclasses.replace(jobs.of("ada"), max_running=most)).id for most in (None, 0, 3)]
     beats = jobs.records.beats(ids)
     assert [(beats[id].owner, beats[id].max_running) for id in ids] == [("ada", None), ("ada", 0), ("ada", 3)]

@@ -13,7 +13,7 @@ from worker_house import House, settled
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="finds processes in /proc")
-def test_with_two_workers_one_owner_has_one_job_running_and_all_get_done(
+def test_with_two_workers_the_running_limit_holds_and_all_jobs_finish(
     settings: Settings, inputs_files: tuple[Path, Path]
 ) -> None:
     limited = dataclasses.replace(settings, workers=2, max_running=1, threads=1)

@@ -48,7 +48,7 @@ def succeed(jobs: Jobs, stored: Stored, file: Path, *, size: int) -> Stored:
     )  # fmt: skip
 
 
-def test_jobs_in_every_status_that_are_in_order_give_no_finding(
+def test_consistent_jobs_in_every_status_give_no_finding(
     jobs: Jobs, submit: Callable[[], Stored], inputs_file: Path
 ) -> None:
     submit()
@@ -67,7 +67,7 @@ def test_jobs_in_every_status_that_are_in_order_give_no_finding(
     assert findings(jobs, pause=0) == []
 
 
-def test_every_kind_of_misfit_is_found(jobs: Jobs, submit: Callable[[], Stored], inputs_file: Path) -> None:
+def test_every_kind_of_inconsistency_is_found(jobs: Jobs, submit: Callable[[], Stored], inputs_file: Path) -> None:
     def only(sentence: str) -> None:
         (found,) = findings(jobs, pause=0)
         assert sentence in found
@@ -127,7 +127,7 @@ def test_every_kind_of_misfit_is_found(jobs: Jobs, submit: Callable[[], Stored],
     only("has lost its inputs")
 
 
-def test_a_change_caught_half_way_is_no_finding(
+def test_a_change_in_progress_is_no_finding(
     jobs: Jobs, submit: Callable[[], Stored], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stored = submit()
@@ -136,7 +136,7 @@ def test_a_change_caught_half_way_is_no_finding(
     assert findings(jobs) == []
 
 
-def test_a_token_twice_in_the_queue_is_found(
+def test_an_attempt_queued_twice_is_found(
     jobs: Jobs, submit: Callable[[], Stored], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     attempt_id = submit().attempt_id

@@ -35,9 +35,7 @@ def submit(inputs_file: Path, interpretation: Interpretation) -> Callable[[World
     return lambda world: world.jobs.submit(inputs_file, Submission(options=Options()), interpretation=interpretation).id
 
 
-def test_a_job_whose_worker_falls_silent_is_queued_again_then_fails(
-    world: World, submit: Callable[[World], str]
-) -> None:
+def test_a_job_without_heartbeats_is_requeued_then_fails(world: World, submit: Callable[[World], str]) -> None:
     id = submit(world)
     old = world.claim(id)
     working_directory(world.jobs.settings, old).mkdir(parents=True)
@@ -56,7 +54,7 @@ def test_a_job_whose_worker_falls_silent_is_queued_again_then_fails(
     assert (job.error.code, job.error.retryable) == ("worker_lost", True)
 
 
-def test_a_cancelled_job_whose_worker_falls_silent_is_cancelled(world: World, submit: Callable[[World], str]) -> None:
+def test_a_cancelled_job_without_heartbeats_is_cancelled(world: World, submit: Callable[[World], str]) -> None:
     id = submit(world)
     world.claim(id)
     world.jobs.cancel(id)
@@ -64,7 +62,7 @@ def test_a_cancelled_job_whose_worker_falls_silent_is_cancelled(world: World, su
     assert world.jobs.get(id).status is Status.CANCELLED
 
 
-def test_signs_of_life_keep_a_job(world: World, submit: Callable[[World], str]) -> None:
+def test_heartbeats_keep_a_job_running(world: World, submit: Callable[[World], str]) -> None:
     id = submit(world)
     attempt_id = world.claim(id)
     world.pass_seconds(30, meanwhile=lambda: world.jobs.records.beat(id, attempt_id))
@@ -145,7 +143,7 @@ def test_files_of_no_job_are_removed_once_they_are_old(
     assert sweep_at(datetime.now(UTC) + timedelta(hours=7)) == wanted
 
 
-def test_working_files_of_attempts_that_are_over_are_removed(world: World, submit: Callable[[World], str]) -> None:
+def test_scratch_directories_of_ended_attempts_are_removed(world: World, submit: Callable[[World], str]) -> None:
     id = submit(world)
     attempt_id = world.claim(id)
     running, over, just_over = (
@@ -191,7 +189,7 @@ def test_what_an_attempt_had_uploaded_is_removed_when_its_worker_is_lost(
     assert findings(world.jobs, pause=0) == []
 
 
-def test_a_store_that_is_away_is_waited_for(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unavailable_store_is_waited_for(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     calls = []
 
     def tick(self: Reconciler) -> None:
@@ -204,7 +202,7 @@ def test_a_store_that_is_away_is_waited_for(world: World, monkeypatch: pytest.Mo
     assert len(calls) == 3
 
 
-def test_stillness_counts_only_between_two_looks_at_the_same_thing() -> None:
+def test_lost_time_counts_only_between_checks_of_the_same_heartbeat() -> None:
     still = Stillness()
     assert still.look({"a": 1}, 5.0) == {"a": 0.0}
     assert still.look({"a": 1, "b": 1}, 2.0) == {"a": 2.0, "b": 0.0}
@@ -213,7 +211,7 @@ def test_stillness_counts_only_between_two_looks_at_the_same_thing() -> None:
     assert still.look({"a": 2}, 1.0) == {"a": 0.0}
 
 
-def test_last_words_are_the_end_of_what_was_written(tmp_path: Path) -> None:
+def test_the_last_output_is_the_end_of_the_file(tmp_path: Path) -> None:
     settings = Settings(data=tmp_path)
     assert last_words(settings, "t-1") == []
     directory = working_directory(settings, "t-1")
@@ -268,7 +266,7 @@ def test_a_jump_of_the_clock_loses_nothing(
     assert world.jobs.get(busy).attempt == 1
 
 
-def test_what_a_stale_attempt_stores_late_is_removed_soon(
+def test_files_stored_late_by_a_stale_attempt_are_removed(
     world: World, submit: Callable[[World], str], tmp_path: Path
 ) -> None:
     """After Redis was cut off for 200 s the files of stale attempts stayed until the hourly sweep."""
@@ -287,7 +285,7 @@ def test_what_a_stale_attempt_stores_late_is_removed_soon(
     assert findings(world.jobs, pause=0) == []
 
 
-def test_files_of_a_deleted_job_go_once_the_blob_store_is_back(
+def test_files_of_a_deleted_job_are_removed_once_the_blob_store_is_back(
     world: World, submit: Callable[[World], str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     id = submit(world)

@@ -43,7 +43,7 @@ def gone(pid: int) -> bool:
 SLEEP = "import time; time.sleep(600)"
 
 
-def test_what_ends_is_started_again_with_growing_pauses(tmp_path: Path) -> None:
+def test_ended_children_are_restarted_with_growing_pauses(tmp_path: Path) -> None:
     log = tmp_path / "starts"
     code = f"import time; open({str(log)!r}, 'a').write(f'{{time.monotonic()}}\\n')"
     supervisor = Supervisor([python("flappy", code), python("steady", SLEEP)])
@@ -66,7 +66,7 @@ def test_what_ends_is_started_again_with_growing_pauses(tmp_path: Path) -> None:
     assert gone(steady)
 
 
-def test_children_stop_before_what_they_stand_on_and_stubborn_ones_are_killed(tmp_path: Path) -> None:
+def test_children_stop_before_their_dependencies_and_are_killed_after_the_grace_period(tmp_path: Path) -> None:
     log = tmp_path / "ends"
     polite = (
         "import signal, sys, time\n"
@@ -94,7 +94,7 @@ def test_children_stop_before_what_they_stand_on_and_stubborn_ones_are_killed(tm
     assert gone(mule)
 
 
-def test_a_child_that_never_serves_stops_the_rest() -> None:
+def test_a_child_that_never_becomes_ready_stops_the_rest() -> None:
     def fail(process: subprocess.Popen[bytes]) -> None:
         raise ServerFailed("It does not start.", log="")
 
@@ -153,7 +153,7 @@ def test_a_signal_while_starting_stops_what_was_started() -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells a child of its parent's end")
-def test_children_die_with_a_killed_supervisor() -> None:
+def test_children_end_with_a_killed_supervisor() -> None:
     process = subprocess.Popen([sys.executable, "-c", SUPERVISED.format(code=SLEEP)], stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     child = int(process.stdout.readline())
@@ -163,13 +163,13 @@ def test_children_die_with_a_killed_supervisor() -> None:
     until(lambda: gone(child), 5)
 
 
-def test_a_parent_that_is_gone_already_is_noticed() -> None:
+def test_an_already_ended_parent_is_detected() -> None:
     code = f"from pliant.worker.processes.containment import die_with_parent; die_with_parent({os.getpid() + 10**6}); print('alive')"
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False)
     assert (ran.returncode, ran.stdout) == (-signal.SIGKILL, b"")
 
 
-def test_workers_are_told_their_settings_and_threads(tmp_path: Path) -> None:
+def test_workers_receive_their_settings_and_threads(tmp_path: Path) -> None:
     settings = Settings(data=tmp_path, workers=2, threads=3)
     children = worker_children(settings)
     assert [child.name for child in children] == ["worker-1", "worker-2", "reconciler"]
@@ -209,7 +209,7 @@ def test_a_server_that_outlived_its_supervisor_is_taken_over_with_its_data(tmp_p
 def test_a_server_that_does_not_stop_keeps_its_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(valkey_module, "STOPS_WITHIN", 0.3)
     first = Valkey.claim(tmp_path)
-    holder = subprocess.Popen([sys.executable, "-S", "-c", SLEEP], pass_fds=(first.lock,))
+    holder = subprocess.Popen([sys.executable, "-S", "-c", SLEEP], pass_fds=(first.server_lock,))
     first.release()
     with pytest.raises(DataDirectoryInUse, match="a Valkey server that does not stop"):
         Valkey.claim(tmp_path)
@@ -236,7 +236,7 @@ def test_a_damaged_log_is_shown(tmp_path: Path) -> None:
     first.release()
 
 
-def test_a_server_that_never_answers_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_server_that_never_answers_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(valkey_module, "STARTS_WITHIN", 0.2)
     valkey = Valkey.claim(tmp_path)
     mute = subprocess.Popen([sys.executable, "-S", "-c", SLEEP])
@@ -290,7 +290,7 @@ def test_a_data_directory_is_its_owners_alone(tmp_path: Path) -> None:
     assert (shared / "blobs").stat().st_mode & 0o777 == 0o700
 
 
-def test_without_a_binary_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_binary_the_error_names_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     assert find_binary().is_file()
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     monkeypatch.setattr("shutil.which", lambda name: None)
@@ -300,7 +300,7 @@ def test_without_a_binary_it_says_what_to_install(monkeypatch: pytest.MonkeyPatc
     assert find_binary() == Path("/somewhere/redis-server")
 
 
-def test_a_store_that_hangs_is_asked_once() -> None:
+def test_a_call_to_a_hanging_store_is_not_repeated() -> None:
     with socket.create_server(("127.0.0.1", 0)) as deaf:  # the kernel accepts for it
         client = connect(f"redis://127.0.0.1:{deaf.getsockname()[1]}", decode=True, retries=5, answer_within=0.3)
         with pytest.raises(StoreUnavailable, match="TimeoutError"), reachable():
@@ -312,7 +312,7 @@ def test_a_store_that_hangs_is_asked_once() -> None:
             deaf.accept()
 
 
-def test_a_store_that_does_not_answer_is_said_so() -> None:
+def test_an_unavailable_store_is_an_error() -> None:
     with socket.socket() as unused:
         unused.bind(("127.0.0.1", 0))
         port = unused.getsockname()[1]

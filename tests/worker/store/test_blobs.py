@@ -32,7 +32,7 @@ def file(tmp_path: Path) -> Path:
     return path
 
 
-def test_what_is_put_is_got(blobs: Blobs, file: Path, tmp_path: Path) -> None:
+def test_a_stored_file_is_read_back(blobs: Blobs, file: Path, tmp_path: Path) -> None:
     content = file.read_bytes()
     assert blobs.put("jobs/a/t/inputs.npz", file) == len(content)
     blob = blobs.get("jobs/a/t/inputs.npz")
@@ -87,7 +87,7 @@ def test_a_key_cannot_leave_the_store(tmp_path: Path, file: Path) -> None:
     assert not (tmp_path / "outside").exists()
 
 
-def test_a_store_that_does_not_answer_is_said_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_an_unavailable_store_is_an_error(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     (tmp_path / "a-file").write_text("")
     with pytest.raises(StoreUnavailable, match="is unavailable"):
         Blobs.open((tmp_path / "a-file" / "below").as_uri())
@@ -99,7 +99,7 @@ def test_a_store_that_does_not_answer_is_said_so(monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.skipif(not Path("/proc/self/io").exists(), reason="reads /proc")
-def test_a_local_store_writes_no_bytes_again(tmp_path: Path) -> None:
+def test_a_local_store_links_instead_of_copying(tmp_path: Path) -> None:
     """Inputs went from the spool to the store and to the scratch directory as three copies; now they are one file."""
     canonical = tmp_path / "canonical.npz"
     canonical.write_bytes(bytes(8_000_000))
@@ -129,7 +129,7 @@ def test_files_that_cannot_be_linked_are_copied(tmp_path: Path, file: Path, monk
         blobs.fetch("jobs/nothing", tmp_path / "nothing")
 
 
-def test_a_call_that_hangs_costs_its_time_limit_and_too_many_cost_nothing() -> None:
+def test_hanging_calls_end_at_their_time_limit_and_further_ones_fail_at_once() -> None:
     calls, go_on = RemoteCalls(), threading.Event()
     assert calls.run(lambda: 7, seconds=5) == 7
     began = time.monotonic()
@@ -156,7 +156,7 @@ def test_a_call_that_hangs_costs_its_time_limit_and_too_many_cost_nothing() -> N
 
 
 @pytest.mark.slow
-def test_a_store_that_takes_connections_and_says_nothing(monkeypatch: pytest.MonkeyPatch, file: Path) -> None:
+def test_a_store_that_accepts_connections_without_replying(monkeypatch: pytest.MonkeyPatch, file: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as silent:
         for name, value in {
             "AWS_ENDPOINT_URL": f"http://127.0.0.1:{silent.getsockname()[1]}", "AWS_ALLOW_HTTP": "true",

@@ -26,7 +26,7 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="finds processes
 
 
 @pytest.mark.slow
-def test_a_job_lives_through_an_outage_of_the_store(tmp_path: Path, inputs_files: tuple[Path, Path]) -> None:
+def test_a_job_survives_an_outage_of_the_store(tmp_path: Path, inputs_files: tuple[Path, Path]) -> None:
     settings = Settings(data=tmp_path, workers=1, threads=1, lost_after=2.0)
     with House(settings, own_valkey=True, inputs=inputs_files) as house:
         id = house.submit(long=True)
@@ -138,7 +138,7 @@ def test_killing_the_supervisor_kills_all_and_loses_nothing(tmp_path: Path, inpu
         settled(house)
 
 
-def test_a_full_disk_fails_the_job_and_the_next_one_is_done(
+def test_a_full_disk_fails_the_job_and_the_next_one_succeeds(
     small_disk: Path, tmp_path: Path, valkey_data: Path, inputs_files: tuple[Path, Path]
 ) -> None:
     settings = Settings(

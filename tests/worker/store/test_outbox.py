@@ -120,7 +120,7 @@ def until(holds: Callable[[], object], *, seconds: float = 10.0) -> None:
         time.sleep(0.02)
 
 
-def test_the_end_of_a_job_is_told_once_signed_and_whole(
+def test_the_end_of_a_job_is_sent_once_with_signature_and_body(
     door: Jobs, made: Made, receiver: Receiver, webhook_sender: WebhookSender
 ) -> None:
     waiting = made(receiver.url, end=False)
@@ -146,7 +146,7 @@ def test_the_end_of_a_job_is_told_once_signed_and_whole(
     assert len(receiver.got) == 1
 
 
-def test_a_receiver_that_fails_is_asked_again_with_the_same_id(
+def test_a_failed_delivery_is_repeated_with_the_same_id(
     door: Jobs, made: Made, receiver: Receiver, webhook_sender: WebhookSender
 ) -> None:
     receiver.answers = [500, 302]
@@ -162,7 +162,7 @@ def test_a_receiver_that_fails_is_asked_again_with_the_same_id(
     assert "(try 3)" in log
 
 
-def test_after_the_last_try_or_a_410_it_is_given_up(
+def test_after_the_last_attempt_or_a_410_it_is_given_up(
     door: Jobs, made: Made, receiver: Receiver, webhook_sender: WebhookSender
 ) -> None:
     receiver.answers = [500, 500, 500]
@@ -178,7 +178,7 @@ def test_after_the_last_try_or_a_410_it_is_given_up(
     assert (tallies["webhooks:tried"], tallies["webhooks:given_up"]) == (4, 2)
 
 
-def test_nobody_listening_is_a_failure_like_others(door: Jobs, made: Made, webhook_sender: WebhookSender) -> None:
+def test_a_refused_connection_counts_as_a_failed_attempt(door: Jobs, made: Made, webhook_sender: WebhookSender) -> None:
     with socket.socket() as unused:
         unused.bind(("127.0.0.1", 0))
         job = made(f"http://127.0.0.1:{unused.getsockname()[1]}/")
@@ -189,7 +189,7 @@ def test_nobody_listening_is_a_failure_like_others(door: Jobs, made: Made, webho
 @pytest.mark.parametrize(
     "name", ["x" * 64 + ".example", "no-such-name.invalid", "a..b"], ids=["too long", "unknown", "empty label"]
 )
-def test_a_name_that_is_none_is_a_failure_and_harms_nobody(
+def test_an_invalid_host_name_counts_as_a_failed_attempt(
     door: Jobs, made: Made, receiver: Receiver, webhook_sender: WebhookSender, name: str
 ) -> None:
     bad, good = made(f"http://{name}/"), made(receiver.url)
@@ -198,7 +198,7 @@ def test_a_name_that_is_none_is_a_failure_and_harms_nobody(
     until(lambda: "given up" in door.log(bad.id), seconds=30)
 
 
-def test_a_name_that_leads_inside_is_given_up_without_a_connection(
+def test_a_name_of_an_internal_address_is_given_up_without_connecting(
     door: Jobs, made: Made, receiver: Receiver, webhook_sender: WebhookSender
 ) -> None:
     webhook_sender.networks = ""
@@ -235,7 +235,7 @@ def test_the_name_is_looked_up_once_and_the_connection_goes_to_what_was_found(
 
 
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="needs the command openssl to make a certificate")
-def test_the_certificate_must_be_the_names_although_the_connection_goes_to_a_number(
+def test_the_certificate_must_match_the_host_name(
     door: Jobs, made: Made, receiver: Receiver, webhook_sender: WebhookSender, tmp_path: Path
 ) -> None:
     pem = tmp_path / "both.pem"
@@ -269,7 +269,7 @@ def test_a_proxy_of_the_environment_is_not_used(
     until(lambda: "Webhook delivered" in door.log(job.id))
 
 
-def test_a_slow_receiver_holds_up_nobody(
+def test_a_slow_receiver_delays_no_other_messages(
     door: Jobs, made: Made, receiver: Receiver, webhook_sender: WebhookSender
 ) -> None:
     slow = Receiver()
@@ -292,7 +292,7 @@ def test_a_slow_receiver_holds_up_nobody(
         slow.server.server_close()
 
 
-def test_one_owner_does_not_take_all_the_places(door: Jobs, made: Made, webhook_sender: WebhookSender) -> None:
+def test_one_owner_does_not_occupy_all_connections(door: Jobs, made: Made, webhook_sender: WebhookSender) -> None:
     job = made("http://a.example/")
     busy = collections.Counter({f"owner {door.records.get(job.id).owner}": PER_OWNER})
     assert webhook_sender._take(busy) is None
@@ -303,7 +303,7 @@ def test_one_owner_does_not_take_all_the_places(door: Jobs, made: Made, webhook_
     assert taken[:2] == (job.id, 1)
 
 
-def test_what_is_owed_survives_a_sender_that_died_with_it(
+def test_a_message_survives_a_sender_killed_while_sending_it(
     door: Jobs, made: Made, receiver: Receiver, webhook_sender: WebhookSender
 ) -> None:
     job = made(receiver.url)
@@ -315,7 +315,7 @@ def test_what_is_owed_survives_a_sender_that_died_with_it(
     assert len(receiver.got) == 1
 
 
-def test_a_message_that_kills_its_sender_each_time_is_not_tried_for_ever(
+def test_a_message_that_always_kills_its_sender_is_given_up(
     door: Jobs, made: Made, receiver: Receiver, webhook_sender: WebhookSender
 ) -> None:
     job = made(receiver.url)
@@ -326,7 +326,7 @@ def test_a_message_that_kills_its_sender_each_time_is_not_tried_for_ever(
     assert receiver.got == []
 
 
-def test_a_deleted_job_owes_nothing(door: Jobs, made: Made, receiver: Receiver, settings: Settings) -> None:
+def test_a_deleted_job_sends_nothing(door: Jobs, made: Made, receiver: Receiver, settings: Settings) -> None:
     job = made(receiver.url)
     outbox = Outbox(connect(settings.redis, decode=True), prefix=settings.queue)
     door.delete(job.id)
@@ -335,7 +335,7 @@ def test_a_deleted_job_owes_nothing(door: Jobs, made: Made, receiver: Receiver, 
     assert outbox.owed() == 0, "nor does a try that was under way bring it back"
 
 
-def test_a_job_run_again_tells_its_end_too_and_one_without_webhook_does_not(
+def test_a_retried_job_sends_its_webhook_and_one_without_does_not(
     door: Jobs,
     made: Made,
     receiver: Receiver,
@@ -353,6 +353,6 @@ def test_a_job_run_again_tells_its_end_too_and_one_without_webhook_does_not(
     assert {headers["webhook-id"] for _, headers, _ in receiver.got} == {f"msg_{again.id}", f"msg_{again.retry_of}"}
 
 
-def test_the_pauses_grow_and_make_a_day() -> None:
+def test_the_pauses_grow_and_sum_to_a_day() -> None:
     assert list(PAUSES) == sorted(PAUSES)
     assert 20 * 3600 < sum(PAUSES) < 28 * 3600

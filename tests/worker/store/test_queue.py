@@ -11,7 +11,7 @@ from pliant.worker.store.queue import RedisQueue
 from rq.executions import ExecutionRegistry
 
 
-def test_the_queue_notes_what_is_held_back_and_forgets_what_is_not(jobs: Jobs) -> None:
+def test_the_queue_marks_held_back_jobs(jobs: Jobs) -> None:
     queue = jobs.queue
     for attempt_id in ("job-1", "job-2"):
         queue.hold(attempt_id)
@@ -23,7 +23,7 @@ def test_the_queue_notes_what_is_held_back_and_forgets_what_is_not(jobs: Jobs) -
     assert (queue.held(), queue.waiting()) == (set(), ["job-3"])
 
 
-def test_a_delivery_that_a_worker_drops_at_this_moment_can_be_taken_out(settings: Settings) -> None:
+def test_a_delivery_being_dropped_by_a_worker_can_be_removed(settings: Settings) -> None:
     """Between listing what a delivery's workers noted and reading it, the note may be gone."""
     raw = connect(settings.redis, decode=False)
     queue = RedisQueue(raw, name=settings.queue)

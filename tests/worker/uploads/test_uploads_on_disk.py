@@ -42,7 +42,7 @@ def now(**later: float) -> datetime:
 
 @given(data=st.binary(max_size=300), cuts=st.lists(st.integers(0, 300), max_size=5))
 @settings(max_examples=30, deadline=None)
-def test_however_it_is_cut_the_whole_is_the_whole(
+def test_an_upload_in_pieces_equals_the_file(
     tmp_path_factory: pytest.TempPathFactory, data: bytes, cuts: list[int]
 ) -> None:
     folder = tmp_path_factory.mktemp("cut")
@@ -57,7 +57,7 @@ def test_however_it_is_cut_the_whole_is_the_whole(
     assert (folder / "taken").read_bytes() == data
 
 
-def test_a_part_cannot_be_taken_and_a_whole_one_not_be_written(uploads: Uploads, tmp_path: Path) -> None:
+def test_incomplete_uploads_cannot_be_used_and_complete_ones_not_be_written(uploads: Uploads, tmp_path: Path) -> None:
     send(uploads, "one", b"half", finish=False)
     assert (uploads.get("one").complete, uploads.get("one").sha256) == (False, None)
     with pytest.raises(errors.Conflict, match="not complete yet") as caught:
@@ -82,7 +82,7 @@ def test_a_part_cannot_be_taken_and_a_whole_one_not_be_written(uploads: Uploads,
         send(uploads, "one", b"x", offset=4)
 
 
-def test_bytes_in_the_wrong_place_are_refused_and_beginning_anew_is_allowed(uploads: Uploads) -> None:
+def test_a_wrong_offset_is_rejected_and_restarting_is_allowed(uploads: Uploads) -> None:
     send(uploads, "one", b"half", finish=False)
     with pytest.raises(errors.OffsetMismatch, match=r"Continue at 4\.") as caught:
         send(uploads, "one", b"x", offset=3)
@@ -103,7 +103,7 @@ def test_the_length_holds_over_requests(uploads: Uploads) -> None:
     assert uploads.get("one").complete
 
 
-def test_what_is_too_large_is_removed_and_what_exceeds_the_quota_is_kept(uploads: Uploads) -> None:
+def test_too_large_uploads_are_removed_and_those_over_quota_kept(uploads: Uploads) -> None:
     for length in (None, 1001):
         with pytest.raises(errors.UploadTooLarge, match="at most 1000 bytes"):
             send(uploads, "one", b"x" * 1001, length=length)
@@ -116,7 +116,7 @@ def test_what_is_too_large_is_removed_and_what_exceeds_the_quota_is_kept(uploads
     assert uploads.get("one").offset == uploads.size("one") == uploads.used() == 60
 
 
-def test_other_bytes_than_the_sender_meant_are_removed(uploads: Uploads) -> None:
+def test_uploads_with_another_digest_are_removed(uploads: Uploads) -> None:
     with pytest.raises(errors.InvalidRequest) as caught:
         send(uploads, "one", b"half", sha256="0" * 64)
     assert caught.value.code == "digest_mismatch"
@@ -167,7 +167,7 @@ def test_two_processes_do_not_write_to_one_upload(uploads: Uploads) -> None:
     assert uploads.get("one").sha256 == hashlib.sha256(b"abcdef").hexdigest()
 
 
-def test_what_nobody_goes_on_with_expires_and_nothing_younger(uploads: Uploads, tmp_path: Path) -> None:
+def test_only_unused_uploads_expire(uploads: Uploads, tmp_path: Path) -> None:
     send(uploads, "part", b"x", finish=False)
     send(uploads.of("you"), "whole", b"x")
     expires = uploads.get("part").expires_at
@@ -186,7 +186,7 @@ def test_what_nobody_goes_on_with_expires_and_nothing_younger(uploads: Uploads, 
     assert for_ever.expire(now(days=9999)) == []
 
 
-def test_the_audit_sees_what_does_not_belong(uploads: Uploads) -> None:
+def test_fsck_finds_inconsistent_uploads(uploads: Uploads) -> None:
     send(uploads, "part", b"x", finish=False, length=3)
     send(uploads, "whole", b"x")
     assert list(uploads.findings(now())) == []
@@ -202,7 +202,7 @@ def test_the_audit_sees_what_does_not_belong(uploads: Uploads) -> None:
     assert list(uploads.findings(now())) == ["Upload part holds nothing, not one file."]
 
 
-def test_a_full_disk_gets_back_what_the_request_brought(small_disk: Path) -> None:
+def test_on_a_full_disk_the_bytes_of_the_request_are_removed(small_disk: Path) -> None:
     uploads, room = Uploads(directory=small_disk / "uploads", expiry=0), Capacity(max_bytes=2**30)
     with pytest.raises(OSError, match="No space"):
         send(uploads, "announced", b"", length=4_000_000, capacity=room)
@@ -229,7 +229,7 @@ def test_a_file_system_without_links_gets_a_copy(
     assert (tmp_path / "taken").read_bytes() == b"abc"
 
 
-def test_uploads_at_once_do_not_exceed_the_quota_together(uploads: Uploads) -> None:
+def test_concurrent_uploads_respect_the_quota(uploads: Uploads) -> None:
     """Eight chunked uploads of unknown length once put 400 MB on the disk under a quota of 120."""
     tight = Capacity(max_bytes=10**9, quota=120 << 20, used=20 << 20)
     piece, written, refused = b"x" * (1 << 20), 0, 0

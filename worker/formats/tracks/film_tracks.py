@@ -34,7 +34,7 @@ class FilmTracks:
     """Width and height of the film in pixels."""
 
     fps: float
-    """Frames a second."""
+    """Frames per second."""
 
     texture: Texture | None
     """The template frame with the place of every point in it; None where the file has been stripped of it."""

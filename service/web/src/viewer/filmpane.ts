@@ -4,8 +4,8 @@ import { edges } from "./body";
 import type { FilmFrames } from "./filmframes";
 import { type Preview, isHidden } from "./preview";
 
-/** Points drawn at most. */
-const MOST = 3000;
+/** Points drawn at most, over a film and without one: the picture should be seen between them. */
+const MOST = { film: 500, plain: 3000 };
 const TAIL = 6;
 
 interface Frame {
@@ -32,7 +32,7 @@ export class FilmPane {
     private readonly residuals: Int16Array,
     private readonly film: FilmFrames | null,
   ) {
-    this.every = Math.max(1, Math.ceil(preview.points / MOST));
+    this.every = Math.max(1, Math.ceil(preview.points / (film ? MOST.film : MOST.plain)));
     this.frame = film ? { left: -0.5, top: -0.5, width: film.width, height: film.height } : this.around();
     this.canvas.setAttribute("role", "img");
     this.canvas.setAttribute("aria-label", film ? "The film at the same moment, with its tracks" : "The tracks at the same moment");
@@ -85,7 +85,7 @@ export class FilmPane {
       context.lineTo(...to);
     }
     context.strokeStyle = this.colours.wire;
-    context.globalAlpha = 0.65;
+    context.globalAlpha = this.preview.points > 2000 ? 0.4 : 0.65;
     context.lineWidth = density * Math.max(0.35, Math.min(1, 40 / Math.sqrt(preview.points)));
     context.stroke();
     context.globalAlpha = 1;

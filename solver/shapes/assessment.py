@@ -1,0 +1,75 @@
+"""Attach to a solution the standard deviations of its positions and a verdict on how far to trust it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from pliant.solver.cameras.estimation import CameraEstimate
+from pliant.solver.cameras.planar_ambiguity import is_planar
+from pliant.solver.energy.hyperparameters import MIN_NOISE_STD
+from pliant.solver.evaluation.trust import assess
+from pliant.solver.model.shape_covariance import ShapeCovariance
+from pliant.solver.records import Floats, Solution, read_only
+from pliant.solver.shapes.jackknife import learning_std
+from pliant.solver.shapes.uncertainty import bounded_by_neighbours, position_std
+
+INFLATION = 1.6
+"""Factor from the standard deviation that the model knows to that of the errors."""
+
+
+def assessed(
+    solution: Solution,
+    confidence: Floats,
+    estimate: CameraEstimate,
+    covariance: ShapeCovariance | None,
+    unit: float,
+    *,
+    turning: bool,
+    seed: int,
+    should_stop: Callable[[], bool] | None = None,
+) -> Solution:
+    """Return the solution with the standard deviation of its positions and how far to trust it.
+
+    Parameters
+    ----------
+    solution : Solution
+        The tracks' unit.
+    confidence : ndarray, shape (F, P)
+        Of the observations that were used; 0 where hidden or rejected.
+    estimate, covariance
+        What the shapes were solved with; without a covariance there are no standard deviations.
+    unit : float
+        The tracks' unit per normalized unit.
+    turning : bool
+        Whether the cameras were estimated.
+    seed : int
+        Of the sample of patterns of visibility.
+    should_stop : callable, optional
+        Called between units of work; once it returns True, what is left is not computed.
+    """
+    std, modes = None, 0
+    confidence = np.asarray(confidence, dtype=np.float64)
+    if covariance is not None:
+        projections = np.asarray(estimate.scales)[:, None, None] * np.asarray(estimate.rotations)[:, :2]
+        noise = max(covariance.noise_variance**0.5, MIN_NOISE_STD)
+        posterior = unit * position_std(covariance, projections, confidence, noise_std=noise, seed=seed)
+        posterior = bounded_by_neighbours(posterior, solution.shapes, confidence)
+        learning = unit * learning_std(
+            estimate, covariance, solution.shapes / unit, turning=turning, should_stop=should_stop
+        )
+        std = INFLATION * np.hypot(posterior, learning)
+        modes = covariance.modes.shape[1]
+        read_only(std)
+    trust = assess(
+        solution.shapes,
+        solution.camera.rotations,
+        solution.residuals,
+        confidence,
+        scales=solution.camera.scales,
+        shapes_std=std,
+        planar=is_planar(estimate.gram),
+        modes=modes,
+    )
+    return replace(solution, shapes_std=std, trust=trust)

@@ -1,0 +1,238 @@
+"""The viewer of a finished job: points, timeline, colourings, panes, comparison, and the files that it saves."""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+from browsing import differing_pixels, why_not
+from paging import DONE, TRACKS, packed, seek, until
+from playwright.sync_api import Browser, Locator, Page, expect
+from pliant.solver.gallery import corrupt, flag
+
+pytestmark = [
+    pytest.mark.chromium,
+    pytest.mark.skipif(why_not() is not None and not os.environ.get("CI"), reason=str(why_not())),
+]
+
+FRAMES, POINTS = 10, 300
+
+
+@pytest.fixture(scope="module")
+def jobs(url: str) -> tuple[str, str]:
+    """Two finished jobs of the same points: with hidden points and outliers, and clean."""
+    ids = []
+    for name, sequence in (
+        ("spoiled flag", corrupt(flag(FRAMES, POINTS), outliers=0.03, hidden=0.15, seed=5)),
+        ("clean flag", flag(FRAMES, POINTS)),
+    ):
+        tracks = packed(tracks=sequence.tracks.points, visibility=sequence.tracks.visible > 0)
+        files = {"tracks": (TRACKS, tracks), "mesh": ("mesh.npz", packed(faces=sequence.mesh.faces))}
+        answer = httpx.post(f"{url}/v1/jobs", files=files, data={"name": name}, timeout=60)
+        ids.append(str(answer.json()["id"]))
+    for id in ids:
+        while httpx.get(f"{url}/v1/jobs/{id}", headers={"Prefer": "wait=20"}, timeout=60).json()["status"] in (
+            "queued",
+            "running",
+        ):
+            pass
+    return ids[0], ids[1]
+
+
+@pytest.fixture(scope="module")
+def shared(browser: Browser, url: str, jobs: tuple[str, str]) -> Iterator[Page]:
+    """One page for all tests of this module: opening a viewer takes seconds without a graphics card."""
+    context = browser.new_context(viewport={"width": 1280, "height": 800}, reduced_motion="reduce")
+    page = context.new_page()
+    page.goto(f"{url}/#job={jobs[0]}")
+    page.locator(".view canvas").wait_for(timeout=DONE)
+    yield page
+    context.close()
+
+
+@pytest.fixture
+def viewer(shared: Page) -> Page:
+    """The page with the view as it is after opening."""
+    shared.get_by_label("Colour", exact=True).select_option("plain")
+    shared.get_by_role("button", name="Front").click()
+    seek(shared, 3)
+    shared.evaluate("scrollTo(0, 0)")
+    return shared
+
+
+def canvas(page: Page) -> Locator:
+    return page.get_by_role("application", name=re.compile("^3-D view"))
+
+
+def facts(page: Page) -> dict[str, str]:
+    rows = page.locator(".probe dl")
+    return dict(zip(rows.locator("dt").all_inner_texts(), rows.locator("dd").all_inner_texts(), strict=True))
+
+
+def test_picture_and_tools_are_visible_without_scrolling(viewer: Page) -> None:
+    for part in (canvas(viewer), viewer.locator(".tools"), viewer.get_by_role("slider", name="Frame")):
+        box = part.bounding_box()
+        assert box is not None
+        assert box["y"] >= 0
+        assert box["y"] + box["height"] <= 800
+    picture, tools = canvas(viewer).bounding_box(), viewer.locator(".tools").bounding_box()
+    assert picture is not None
+    assert tools is not None
+    assert tools["x"] >= picture["x"] + picture["width"]
+    viewer.set_viewport_size({"width": 390, "height": 844})
+    picture, tools = canvas(viewer).bounding_box(), viewer.locator(".tools").bounding_box()
+    assert picture is not None
+    assert tools is not None
+    assert tools["y"] >= picture["y"] + picture["height"]
+    sizes = viewer.locator("button:visible, select:visible, .chip:visible, input[type=number]:visible").evaluate_all(
+        """(all) => all.map((one) => {
+          const box = one.getBoundingClientRect();
+          return [one.textContent || one.ariaLabel, box.height, box.width];
+        })"""
+    )
+    assert [one for one in sizes if min(one[1:]) < 24] == []
+    viewer.set_viewport_size({"width": 1280, "height": 800})
+
+
+def test_views_show_other_sides_and_fit_brings_the_mesh_back(viewer: Page) -> None:
+    front = canvas(viewer).screenshot()
+
+    def changed() -> float:
+        return differing_pixels(viewer, front, canvas(viewer).screenshot())
+
+    for key in ("2", "3"):
+        canvas(viewer).press(key)
+        until(lambda: changed() > 0.02)
+        canvas(viewer).press("1")
+        until(lambda: changed() == 0)
+    for _ in range(6):
+        canvas(viewer).press("+")
+    until(lambda: changed() > 0.02)
+    viewer.get_by_role("button", name="Fit").click()
+    until(lambda: changed() == 0)
+
+
+def test_a_point_is_chosen_by_click_by_key_and_by_number(viewer: Page, url: str, jobs: tuple[str, str]) -> None:
+    box = canvas(viewer).bounding_box()
+    assert box is not None
+    middle = (box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    number = viewer.get_by_role("spinbutton", name="Point")
+    viewer.mouse.click(*middle)
+    until(lambda: "Now" in facts(viewer))
+    clicked = number.input_value()
+    viewer.get_by_role("button", name="Clear").click()
+    canvas(viewer).press("Enter")
+    expect(number).to_have_value(clicked)
+    raw = httpx.get(f"{url}/v1/jobs/{jobs[0]}/artifacts/shapes.npz").content
+    with np.load(io.BytesIO(raw)) as arrays:
+        shapes, weights, spread = arrays["shapes"], arrays["weights"], arrays["shapes_std"]
+    size = np.sqrt(np.square(shapes - shapes.mean(axis=1, keepdims=True)).sum(axis=2).mean())
+    hidden = int(np.flatnonzero(weights[3] == 0)[0])
+    for point in (int(clicked), hidden):
+        number.fill(str(point))
+        until(lambda point=point: "Now" in facts(viewer))  # type: ignore[misc]
+        shown = facts(viewer)
+        position = [float(each) for each in shown["Position"].split(", ")]
+        np.testing.assert_allclose(position, shapes[3, point], atol=2e-3 * size)
+        assert float(shown["Expected error"].split(" %")[0]) == pytest.approx(100 * spread[3, point] / size, rel=0.06)
+        assert re.match(rf"\d+ of {FRAMES} frames", shown["Seen in"])
+    assert facts(viewer)["Now"].startswith(("hidden", "rejected"))
+    number.fill("")
+
+
+def test_the_timeline_moves_by_key_and_states_each_frames_values(viewer: Page) -> None:
+    slider = viewer.get_by_role("slider", name="Frame")
+    slider.focus()
+    texts = set()
+    for key, frame in (("Home", 1), ("ArrowRight", 2), ("End", FRAMES), ("ArrowLeft", FRAMES - 1)):
+        viewer.keyboard.press(key)
+        expect(viewer.locator(".clock")).to_have_text(f"{frame} / {FRAMES}")
+        texts.add(slider.get_attribute("aria-valuetext"))
+    assert len(texts) == 4
+    found = r"frame \d+ of 10, expected error [\d.]+ % of the size, [\d.]+ % of the points hidden"
+    assert all(re.fullmatch(found, str(text)) for text in texts)
+    chart = viewer.locator(".frames-chart svg").bounding_box()
+    assert chart is not None
+    viewer.mouse.click(chart["x"] + chart["width"] / 3, chart["y"] + 10)
+    expect(viewer.locator(".clock")).to_have_text(f"4 / {FRAMES}")
+
+
+def test_hidden_positions_are_grey_and_the_legend_states_the_unit(viewer: Page) -> None:
+    viewer.get_by_label("Colour", exact=True).select_option("expected")
+    legend = viewer.locator(".legend")
+    expect(legend).to_contain_text("% of the size")
+    expect(legend).to_contain_text("grey: not seen")
+    viewer.get_by_label("Colour", exact=True).select_option("seen")
+    expect(legend).to_contain_text(f"{FRAMES} of {FRAMES} frames")
+    viewer.get_by_label("Colour", exact=True).select_option("residual")
+    top = float(re.findall(r"([\d.e-]+) \(tracks' unit\)", legend.inner_text())[0])
+    assert top < 1  # the outliers are tens of units away and rejected
+
+
+def test_tracks_stand_beside_the_mesh_and_the_mesh_over_them(viewer: Page) -> None:
+    viewer.get_by_role("checkbox", name="Tracks beside").check()
+    tracks = viewer.get_by_role("img", name="The tracks at the same moment")
+    until(lambda: tracks.evaluate("(it) => it.width") > 100)
+    viewer.wait_for_timeout(200)
+    before = tracks.screenshot()
+    seek(viewer, 8)
+    until(lambda: differing_pixels(viewer, before, tracks.screenshot()) > 0.005)
+    seek(viewer, 3)
+    viewer.get_by_role("checkbox", name="Mesh over it").check()
+    until(lambda: differing_pixels(viewer, before, tracks.screenshot()) > 0.02)
+    viewer.get_by_role("checkbox", name="Tracks beside").uncheck()
+    expect(viewer.get_by_role("checkbox", name="Mesh over it")).not_to_be_checked()
+    expect(tracks).to_have_count(0)
+
+
+def test_another_job_is_compared_point_by_point(viewer: Page) -> None:
+    viewer.get_by_label("Compare with").select_option(label="clean flag")
+    other = viewer.get_by_role("img", name="The other job's result, from the same side")
+    other.wait_for()
+    expect(viewer.get_by_text(re.compile(r"Expected error: this job [\d.]+ % of the size, clean flag"))).to_be_visible()
+    expect(viewer.locator(".legend")).to_contain_text("this job minus the other")
+    viewer.wait_for_timeout(300)
+    before = other.screenshot()
+    canvas(viewer).press("2")
+    until(lambda: differing_pixels(viewer, before, other.screenshot()) > 0.02)
+    viewer.get_by_label("Compare with").select_option("")
+    expect(other).to_have_count(0)
+
+
+def test_help_opens_and_closes_by_keyboard(viewer: Page) -> None:
+    canvas(viewer).press("?")
+    help_ = viewer.get_by_role("dialog", name="Keys and gestures")
+    expect(help_).to_contain_text("Camera's view".lower())
+    viewer.keyboard.press("Escape")
+    expect(help_).to_have_count(0)
+
+
+def test_picture_film_and_page_are_saved(viewer: Page, tmp_path: Path) -> None:
+    saved = {}
+    for name in ("Picture", "HTML page", "Camera's film"):
+        with viewer.expect_download() as download:
+            viewer.get_by_role("button", name=name).click()
+        target = tmp_path / download.value.suggested_filename
+        download.value.save_as(target)
+        saved[name] = target
+    assert saved["Picture"].read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+    assert saved["Camera's film"].suffix in (".mp4", ".webm")
+    assert saved["Camera's film"].stat().st_size > 2000
+    context = viewer.context.browser.new_context(reduced_motion="reduce", offline=True)  # type: ignore[union-attr]
+    alone = context.new_page()
+    asked: list[str] = []
+    alone.on("request", lambda request: asked.append(request.url))
+    alone.goto(saved["HTML page"].as_uri())
+    canvas(alone).wait_for()
+    seek(alone, 3)
+    assert [address for address in asked if not address.startswith(("file:", "blob:", "data:"))] == []
+    before = canvas(alone).screenshot()
+    alone.get_by_role("button", name="Side").click()
+    until(lambda: differing_pixels(alone, before, canvas(alone).screenshot()) > 0.02)
+    context.close()

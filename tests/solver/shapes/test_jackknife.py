@@ -1,0 +1,85 @@
+"""How far shapes depend on which points were learned from: what changes it, and what must not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pliant.solver.cameras.estimation import CameraEstimate
+from pliant.solver.cameras.perspective import centred, columns
+from pliant.solver.model.shape_covariance import ShapeCovariance, annealed
+from pliant.solver.shapes.jackknife import FEWEST, PARTS, learning_std, parts
+from scipy.spatial.transform import Rotation
+
+FRAMES = 12
+
+
+def seen(points: int, *, degrees: float = 50.0, seed: int = 0) -> tuple[CameraEstimate, ShapeCovariance, np.ndarray]:
+    """A body of a mean and two modes before a camera that turns, its learned covariance, and its true shapes."""
+    rng = np.random.default_rng(seed)
+    modes = np.stack([np.sin(np.arange(FRAMES) / 2), np.cos(np.arange(FRAMES) / 3)])
+    shapes = rng.normal(size=(points, 3)) + 0.3 * np.einsum("kf,kpi->fpi", modes, rng.normal(size=(2, points, 3)))
+    shapes = centred(shapes)
+    turn = np.linspace(0, degrees, FRAMES)
+    rotations = Rotation.from_euler("yx", np.stack([turn, 0.3 * turn], axis=1), degrees=True).as_matrix()
+    sample = np.einsum("fij,fpj->fpi", rotations[:, :2], shapes) + 1e-3 * rng.normal(size=(FRAMES, points, 2))
+    rows = columns(centred(sample))
+    gram = rows @ rows.T / points
+    covariance = annealed(gram, rotations[:, :2], iterations=40)
+    estimate = CameraEstimate(rotations, np.ones(FRAMES), np.zeros((FRAMES, 2)), 0, gram, sample)
+    return estimate, covariance, shapes
+
+
+def rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.square(values).mean()))
+
+
+def test_few_points_are_less_certain_than_many() -> None:
+    few, many = (rms(learning_std(*seen(points), turning=True)) for points in (14, 200))
+    assert 0 < many < 0.5 * few
+
+
+def test_a_camera_that_hardly_turns_is_less_certain() -> None:
+    narrow, wide = (rms(learning_std(*seen(40, degrees=degrees), turning=True)) for degrees in (3, 60))
+    assert wide < 0.5 * narrow
+
+
+def test_it_does_not_depend_on_the_unit_of_the_scales_nor_on_the_world_axes() -> None:
+    estimate, covariance, shapes = seen(30)
+    plain = learning_std(estimate, covariance, shapes, turning=False)
+    turn = Rotation.from_euler("xyz", (30, -20, 50), degrees=True).as_matrix()
+    turned = replace(
+        covariance,
+        mean_covariance=turn @ covariance.mean_covariance @ turn.T,
+        axis_covariance=turn @ covariance.axis_covariance @ turn.T,
+    )
+    elsewhere = replace(estimate, rotations=estimate.rotations @ turn.T)
+    np.testing.assert_allclose(
+        learning_std(elsewhere, turned, shapes @ turn.T, turning=False), plain, rtol=1e-3, atol=1e-5
+    )
+
+
+def test_more_frames_than_are_evaluated_are_interpolated(monkeypatch: pytest.MonkeyPatch) -> None:
+    estimate, covariance, shapes = seen(30)
+    whole = learning_std(estimate, covariance, shapes, turning=False)
+    monkeypatch.setattr("pliant.solver.shapes.jackknife.MAX_FRAMES", 8)
+    some = learning_std(estimate, covariance, shapes, turning=False)
+    assert some.shape == whole.shape == shapes.shape[:2]
+    assert 0.3 < rms(some) / rms(whole) < 3
+
+
+def test_hardly_any_points_or_a_request_to_stop_give_zero() -> None:
+    estimate, covariance, shapes = seen(20)
+    few = replace(estimate, sample=estimate.sample[:, :FEWEST])
+    assert (learning_std(few, covariance, shapes, turning=True) == 0).all()
+    assert (learning_std(estimate, covariance, shapes, turning=True, should_stop=lambda: True) == 0).all()
+
+
+def test_parts_are_compact_and_hold_every_point() -> None:
+    rng = np.random.default_rng(0)
+    corners = np.array([[x, y] for x in (-5.0, 5.0) for y in (-5.0, 0.0, 5.0)])
+    at = rng.permutation(np.repeat(np.arange(PARTS), 7))
+    part_of = parts(np.tile(corners[at] + 0.1 * rng.normal(size=(len(at), 2)), (3, 1, 1)))
+    assert part_of.shape == at.shape
+    assert len({(int(a), int(b)) for a, b in zip(part_of, at, strict=True)}) == PARTS
