@@ -13,12 +13,12 @@ from contextlib import suppress
 import uvicorn
 from fastapi import FastAPI
 from pliant.service.app import create_app
-from pliant.service.logs import configure_logging
 from pliant.service.settings import ServiceSettings
 from pliant.worker import tracing
 from pliant.worker.environment import variable_of
 from pliant.worker.errors import InvalidSetting, NewerData, StoreUnavailable
 from pliant.worker.jobs.service import Jobs
+from pliant.worker.logs import configure_logging
 from pliant.worker.settings import Settings
 from pliant.worker.store.schema import prepare
 from pliant.worker.tokens import Tokens

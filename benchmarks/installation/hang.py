@@ -113,7 +113,9 @@ def timed(url: str, id: str) -> tuple[dict[str, str], str]:
             spent.append(1000 * (time.monotonic() - began))
     for each in waiting:
         each.join()
-    return answers, f"{statistics.quantiles(spent, n=100)[98]:.0f} ms of {len(spent)}" if len(spent) > 1 else f"{spent[0]:.0f} ms of 1"
+    return answers, f"{statistics.quantiles(spent, n=100)[98]:.0f} ms of {len(spent)}" if len(
+        spent
+    ) > 1 else f"{spent[0]:.0f} ms of 1"
 
 
 def main() -> None:

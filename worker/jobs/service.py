@@ -336,6 +336,8 @@ class Jobs:
                 found[part] = "ok"
             except StoreUnavailable as error:
                 found[part] = str(error)
+        if found["redis"] != "ok":  # asking again would only take as long again
+            return {**found, "workers": found["redis"]}
         try:
             workers = self.queue.workers()
             found["workers"] = "ok" if workers else "No worker is running; start one with `pliant work`."
