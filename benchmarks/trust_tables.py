@@ -115,8 +115,8 @@ def by_sequence(rows: list[Row], calibration: Sequence[str]) -> str:
         star = "*" if is_of(row, calibration) else ""
         reason = row["reasons"][0] if row["reasons"] else ""
         lines.append(
-            f"| {row['sequence']}{star} | {row['kind']} | {VERDICTS[row['verdict']]} | {reason} | {figure(row['expected'])} | {figure(row['true'])} | "
-            f"{percent(row.get('coverage'))} | {ratio(row.get('std_over_error'))} |"
+            f"| {row['sequence']}{star} | {row['kind']} | {VERDICTS[row['verdict']]} | {reason} | "
+            f"{figure(row['expected'])} | {figure(row['true'])} | {percent(row.get('coverage'))} | {ratio(row.get('std_over_error'))} |"
         )
     return "\n".join(lines)
 

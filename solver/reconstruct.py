@@ -187,7 +187,7 @@ def _solved(
     if estimate.perspective is not None:
         solution = seen_in_perspective(solution, tracks, estimate.perspective, normalized.unit, kept)
     solution = assessed(
-        solution, problem.confidence, estimate, covariance, normalized.unit,
+        solution, np.asarray(problem.confidence, dtype=np.float64), estimate, covariance, normalized.unit,
         turning=cameras is None and settings.refine_rotations, seed=settings.seed, should_stop=should_stop,
     )  # fmt: skip
     if verdict is not None:

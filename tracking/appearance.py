@@ -57,7 +57,11 @@ class Appearance:
         image, places = _smooth(template), points[:, None] + PATCH
         patches = _cut(image, places)
         slopes = np.stack(
-            [_cut(cv2.Sobel(image, cv2.CV_32F, *axis, scale=1 / 8), places) for axis in ((1, 0), (0, 1))], -1
+            [
+                _cut(np.asarray(cv2.Sobel(image, cv2.CV_32F, *axis, scale=1 / 8), np.float32), places)
+                for axis in ((1, 0), (0, 1))
+            ],
+            -1,
         )
         return cls(points, neighbours, patches - patches.mean(axis=1, keepdims=True), slopes, noise_variance(template))
 

@@ -83,7 +83,7 @@ def _frame(film: RenderedFilm, index: int, picture: NDArray[np.float32], low: ND
     corners = film.rest[film.triangles[surface.triangle], :2]
     at = (np.einsum("hwk,hwkc->hwc", surface.weights, corners) - low).astype(np.float32)
     shown = cv2.remap(picture, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    image = np.where(covered[..., None], shown, np.float32(BACKGROUND))
+    image = np.where(covered[..., None], shown, np.array(BACKGROUND, dtype=np.float32))
     image = cv2.GaussianBlur(image, (0, 0), 0.6)
     grain = np.random.default_rng((film.seed, index)).standard_normal(image.shape)
     return np.asarray(np.clip(np.round(image + NOISE * grain), 0, 255), dtype=np.uint8)

@@ -56,6 +56,22 @@ export interface components {
             retryable: boolean;
         };
         /**
+         * Estimate
+         * @description What a job is expected to need, from the numbers of its frames and points. Right within a factor of about two.
+         */
+        Estimate: {
+            /**
+             * Memory Bytes
+             * @description Largest memory of the process that works on the job.
+             */
+            memory_bytes: number;
+            /**
+             * Seconds
+             * @description Processor seconds on one core of a usual machine.
+             */
+            seconds: number;
+        };
+        /**
          * Example
          * @description A synthetic sequence with ground truth.
          */
@@ -215,6 +231,8 @@ export interface components {
              * @description Sentences with evidence, exclusions and assumptions.
              */
             notes: string[];
+            /** @description Memory and time the job will need; null for films, whose points are not known before they are tracked. */
+            estimate: components["schemas"]["Estimate"] | null;
             /**
              * Sample
              * @description Some points in some frames, for a picture: x and y in turn, 0 to 1000, y down; -1 twice where hidden.
@@ -313,6 +331,8 @@ export interface components {
              * @description Sentences with evidence, exclusions and assumptions.
              */
             notes: string[];
+            /** @description Memory and time the job will need; null for films, whose points are not known before they are tracked. */
+            estimate: components["schemas"]["Estimate"] | null;
         };
         /**
          * Job
@@ -358,6 +378,13 @@ export interface components {
              * @description The finished job whose result this one writes in further files, without solving again.
              */
             outputs_of: string | null;
+            /**
+             * Priority
+             * @description Order among the waiting jobs of one owner; jobs of others are not passed.
+             * @default normal
+             * @enum {string}
+             */
+            priority: "high" | "normal" | "low";
             /**
              * Place In Queue
              * @description Number of queued jobs ahead; null if not queued.
@@ -793,7 +820,7 @@ export interface components {
          * ProblemCode
          * @enum {string}
          */
-        ProblemCode: "bad_request" | "malformed_form" | "no_such_address" | "method_not_allowed" | "body_stalled" | "precondition_failed" | "body_too_large" | "text_too_large" | "unsupported_media_type" | "range_not_satisfiable" | "unknown_host" | "invalid_request" | "unknown_part" | "repeated_part" | "missing_part" | "conflicting_parts" | "not_a_file" | "not_utf8" | "name_too_long" | "invalid_limit" | "invalid_cursor" | "invalid_event_id" | "http_error" | "internal_error" | "not_ready" | "conflicting_headers" | "unauthorized" | "invalid_token" | "expired_token" | "invalid_share" | "expired_share" | "beyond_share" | "insufficient_scope" | "cross_site_request" | "too_many_requests" | "unknown_job" | "unknown_artifact" | "unknown_example" | "not_allowed_now" | "not_finished" | "id_taken" | "idempotency_conflict" | "invalid_id" | "invalid_idempotency_key" | "too_many_queued" | "unknown_option" | "invalid_option" | "output_unavailable" | "invalid_webhook" | "invalid_webhook_secret" | "webhook_not_public" | "artifact_gone" | "timed_out" | "out_of_memory" | "worker_lost" | "storage_failed" | "interrupted" | "stale_attempt" | "store_unavailable" | "storage_full" | "quota_exceeded" | "worker_error" | "unknown_upload" | "upload_incomplete" | "upload_complete" | "upload_offset_mismatch" | "upload_busy" | "upload_taken_over" | "upload_too_large" | "inconsistent_upload_length" | "invalid_digest" | "digest_mismatch" | "unknown_share" | "too_many_shares" | "too_many_uploads" | "unknown_format" | "empty_file" | "damaged_file" | "pickle_refused" | "object_array" | "unsupported_feature" | "too_large" | "too_slow" | "member_name" | "duplicate_member" | "duplicate_observation" | "missing_array" | "film_unavailable" | "unsupported_film" | "unreadable_film" | "empty_film" | "playlist" | "external_reference" | "truncated_film" | "undecodable_film" | "no_picture" | "broken_picture" | "changing_size" | "too_small" | "too_many_streams" | "too_many_pictures" | "too_many_bytes" | "too_many_pixels" | "too_many_frames" | "too_long" | "wrong_selection" | "no_such_frame" | "unreadable_region" | "wrong_region" | "wrong_region_size" | "wrong_polygon" | "empty_region" | "region_lost" | "no_texture" | "tracks_lost" | "outside_picture" | "principal_point_far" | "unwritable_film" | "stopped" | "ambiguous_layout" | "ambiguous_coordinates" | "missing_image_size" | "wrong_type" | "wrong_shape" | "out_of_range" | "not_finite" | "too_few_frames" | "too_few_points" | "no_frames_left" | "nothing_visible" | "too_little_seen" | "no_extent" | "vertex_count_mismatch" | "mesh_mismatch" | "index_out_of_range" | "degenerate_face" | "not_a_rotation" | "camera_mismatch" | "invalid_setting" | "data_directory_in_use" | "newer_data" | "bad_backup" | "server_failed" | "unknown_token" | "invalid_token_name" | "invalid_token_text" | "invalid_duration" | "no_scope";
+        ProblemCode: "bad_request" | "malformed_form" | "no_such_address" | "method_not_allowed" | "body_stalled" | "precondition_failed" | "body_too_large" | "text_too_large" | "unsupported_media_type" | "range_not_satisfiable" | "unknown_host" | "invalid_request" | "unknown_part" | "repeated_part" | "missing_part" | "conflicting_parts" | "not_a_file" | "not_utf8" | "invalid_priority" | "name_too_long" | "invalid_limit" | "invalid_cursor" | "invalid_event_id" | "http_error" | "internal_error" | "not_ready" | "conflicting_headers" | "unauthorized" | "invalid_token" | "expired_token" | "invalid_share" | "expired_share" | "beyond_share" | "insufficient_scope" | "cross_site_request" | "too_many_requests" | "unknown_job" | "unknown_artifact" | "unknown_example" | "not_allowed_now" | "not_finished" | "id_taken" | "idempotency_conflict" | "invalid_id" | "invalid_idempotency_key" | "too_many_queued" | "unknown_option" | "invalid_option" | "output_unavailable" | "invalid_webhook" | "invalid_webhook_secret" | "webhook_not_public" | "artifact_gone" | "timed_out" | "out_of_memory" | "worker_lost" | "storage_failed" | "interrupted" | "stale_attempt" | "store_unavailable" | "storage_full" | "quota_exceeded" | "worker_error" | "unknown_upload" | "upload_incomplete" | "upload_complete" | "upload_offset_mismatch" | "upload_busy" | "upload_taken_over" | "upload_too_large" | "inconsistent_upload_length" | "invalid_digest" | "digest_mismatch" | "unknown_share" | "too_many_shares" | "too_many_uploads" | "unknown_format" | "empty_file" | "damaged_file" | "pickle_refused" | "object_array" | "unsupported_feature" | "too_large" | "needs_more_memory" | "too_slow" | "member_name" | "duplicate_member" | "duplicate_observation" | "missing_array" | "film_unavailable" | "unsupported_film" | "unreadable_film" | "empty_film" | "playlist" | "external_reference" | "truncated_film" | "undecodable_film" | "no_picture" | "broken_picture" | "changing_size" | "too_small" | "too_many_streams" | "too_many_pictures" | "too_many_bytes" | "too_many_pixels" | "too_many_frames" | "too_long" | "wrong_selection" | "no_such_frame" | "unreadable_region" | "wrong_region" | "wrong_region_size" | "wrong_polygon" | "empty_region" | "region_lost" | "no_texture" | "tracks_lost" | "outside_picture" | "principal_point_far" | "unwritable_film" | "stopped" | "ambiguous_layout" | "ambiguous_coordinates" | "missing_image_size" | "wrong_type" | "wrong_shape" | "out_of_range" | "not_finite" | "too_few_frames" | "too_few_points" | "no_frames_left" | "nothing_visible" | "too_little_seen" | "no_extent" | "vertex_count_mismatch" | "mesh_mismatch" | "index_out_of_range" | "degenerate_face" | "not_a_rotation" | "camera_mismatch" | "invalid_setting" | "data_directory_in_use" | "newer_data" | "bad_backup" | "server_failed" | "unknown_token" | "invalid_token_name" | "invalid_token_text" | "invalid_duration" | "no_scope";
         /**
          * Progress
          * @description Progress of a running job.
