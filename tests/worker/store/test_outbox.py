@@ -159,7 +159,7 @@ def test_a_failed_delivery_is_repeated_with_the_same_id(
     log = door.log(job.id)
     assert "the receiver returned 500 (attempt 1); next attempt in" in log
     assert "the receiver returned 302 (attempt 2)" in log
-    assert "(try 3)" in log
+    assert "(attempt 3)" in log
 
 
 def test_after_the_last_attempt_or_a_410_it_is_given_up(
