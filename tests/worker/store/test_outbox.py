@@ -311,7 +311,7 @@ def test_a_message_survives_a_sender_killed_while_sending_it(
     assert webhook_sender.outbox.take(now=now + 10, until=now + 1500) == (job.id, 1), "and then it was killed"
     assert webhook_sender.outbox.take(now=now + 10, until=now + 1500) is None, "nobody else sends it meanwhile"
     webhook_sender.start()
-    until(lambda: "(try 2)" in door.log(job.id))
+    until(lambda: "(attempt 2)" in door.log(job.id))
     assert len(receiver.got) == 1
 
 
