@@ -105,7 +105,7 @@ def test_a_finished_job_waits_for_an_unavailable_blob_store(
         attempt.store(finished, tmp_path)
 
 
-def test_a_new_stage_is_told_at_once(jobs: Jobs, attempt: Attempt, now: list[float]) -> None:
+def test_a_new_stage_is_reported_at_once(jobs: Jobs, attempt: Attempt, now: list[float]) -> None:
     """A job that waits for its blob store tells nothing more: its record must not stay at the stage before."""
     for stage in ("reweight", "finish", "exporting"):
         now[0] += 0.01

@@ -201,7 +201,7 @@ def test_points_on_a_line_get_no_mesh(tmp_path: Path) -> None:
     line[..., 0] = np.arange(P)
     mesh, notes = triangulate(Tracks.from_arrays(line), y_axis="down")
     assert mesh is None
-    assert "too few points" in notes[0]
+    assert "too few distinct points" in notes[0]
 
 
 def test_vertices_that_are_no_list_are_refused(tmp_path: Path, tracks: Path) -> None:

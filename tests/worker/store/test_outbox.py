@@ -159,7 +159,7 @@ def test_a_failed_delivery_is_repeated_with_the_same_id(
     log = door.log(job.id)
     assert "the receiver returned 500 (attempt 1); next attempt in" in log
     assert "the receiver returned 302 (attempt 2)" in log
-    assert "(try 3)" in log
+    assert "(attempt 3)" in log
 
 
 def test_after_the_last_attempt_or_a_410_it_is_given_up(
@@ -311,7 +311,7 @@ def test_a_message_survives_a_sender_killed_while_sending_it(
     assert webhook_sender.outbox.take(now=now + 10, until=now + 1500) == (job.id, 1), "and then it was killed"
     assert webhook_sender.outbox.take(now=now + 10, until=now + 1500) is None, "nobody else sends it meanwhile"
     webhook_sender.start()
-    until(lambda: "(try 2)" in door.log(job.id))
+    until(lambda: "(attempt 2)" in door.log(job.id))
     assert len(receiver.got) == 1
 
 
