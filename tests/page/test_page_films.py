@@ -1,4 +1,4 @@
-"""A film in the page: recognised, its first frame shown, a region drawn on it and sent, its tracks shown with the result."""
+"""Films in the page: detection, first frame, drawing a region, submission, and tracks beside the result."""
 
 from __future__ import annotations
 

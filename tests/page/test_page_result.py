@@ -1,4 +1,4 @@
-"""A result in the page: every view, the animation, a dense one, and the code that makes the same job."""
+"""A result in the page: every view, the animation, dense results, and the code for the same job."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sending from the page: files chosen or dropped, how they are understood, what is refused."""
+"""Submitting from the page: chosen or dropped files, their interpretation, and errors."""
 
 from __future__ import annotations
 

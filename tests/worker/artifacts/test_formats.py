@@ -1,4 +1,4 @@
-"""The result files that an option asks for, each opened again by a reader that is not ours and compared point for point."""
+"""Optional result files, each read back with another library and compared point by point."""
 
 from __future__ import annotations
 

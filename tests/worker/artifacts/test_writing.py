@@ -1,4 +1,4 @@
-"""Result files, each opened again by a reader that is not ours and compared point for point."""
+"""Result files, each read back with another library and compared point by point."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files of other programs, parsed in the sandbox; an attack is refused by code and costs one process."""
+"""Files of other programs, parsed in the sandbox; an attack is rejected with a code and costs one process."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where two readings of a file fit, nothing is guessed; an option decides, and the evidence is said."""
+"""Ambiguous files are never guessed: options select the interpretation, and notes state the evidence."""
 
 from __future__ import annotations
 
