@@ -48,12 +48,12 @@ def test_a_backup_under_load_is_restored_whole(tmp_path: Path, monkeypatch: pyte
     monkeypatch.syspath_prepend(str(Path(__file__).parents[2]))
     house_of = import_module("benchmarks.installation.house").House
     tracks, stop = face(4, 60).tracks.points, threading.Event()
-    options = {"max_reweightings": 2, "outputs": []}
+    options = {"max_reweightings": 2, "outputs": [], "prior": "smooth", "camera": "scaled_orthographic"}
     with house_of(tmp_path / "before") as house:
 
         def load() -> None:
             with house.client() as client:
-                while not stop.is_set():
+                while not stop.is_set() and len(house.acknowledged) < 12:
                     try:
                         job = client.submit(tracks, mesh="none", options=options)
                         house.acknowledged.append(job.id)
