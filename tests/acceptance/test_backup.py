@@ -46,7 +46,7 @@ def digests(jobs: Jobs, id: str) -> dict[str, str]:
 
 def test_a_backup_under_load_is_restored_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(Path(__file__).parents[2]))
-    house_of = import_module("benchmarks.installation.house").House
+    house_of = import_module("benchmarks.installation.instance").Instance
     tracks, stop = face(4, 60).tracks.points, threading.Event()
     options = {"max_reweightings": 2, "outputs": [], "prior": "smooth", "camera": "scaled_orthographic"}
     with house_of(tmp_path / "before") as house:
