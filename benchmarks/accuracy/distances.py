@@ -1,10 +1,11 @@
 """Error against the distance of the camera: sequences with known cameras seen by a pinhole.
 
-    python -m benchmarks.accuracy.distances --data DIR [--only NAME] [--points N] [--out FILE]
+    python -m benchmarks.accuracy.distances --data DIR [--only NAME] [--points N] [--spoil KINDS] [--out FILE]
 
 The true shapes, seen by their cameras, are scaled to a half-size (largest |coordinate| in the camera frame) of 300 px and projected from
 d half-sizes away into a picture of 1280 × 720 px: u = c + x/(1 + z/φ) with φ = 300·d px and c the centre. All points count as seen; the
-solver gets `image_size`, not φ. Distance `inf` is orthography. Every measurement is appended to FILE as one line of JSON
+solver gets `image_size`, not φ. Distance `inf` is orthography. `--spoil noise,drift,births,outliers,hidden,all` adds the errors of trackers
+(`benchmarks.accuracy.spoiling`), one kind after the other. Every measurement is appended to FILE as one line of JSON
 {method, sequence, metric, value, trial, distance, seconds}, and measured only once.
 """
 
@@ -20,8 +21,8 @@ from typing import Any
 import numpy as np
 from pliant.solver import Settings, Tracks, solve
 from pliant.solver.evaluation.metrics import evaluate
-from pliant.solver.gallery import corrupt_tracks
 
+from benchmarks.accuracy.spoiling import SPOILINGS, spoiled
 from benchmarks.sequences import Case, cases
 
 HALF_SIZE = 300.0
@@ -74,12 +75,10 @@ def mirrored(shapes: np.ndarray, truth: np.ndarray) -> bool:
     return float((sign * values[:, 2]).sum()) < 0
 
 
-def measure(case: Case, distance: str, method: str, *, noise: float = 0.0, trial: int = 0) -> dict[str, float]:
-    """Solve and compare; `noise` is the standard deviation in pixels."""
+def measure(case: Case, distance: str, method: str, *, spoil: str = "clean") -> dict[str, float]:
+    """Solve and compare; `spoil` names one of `SPOILINGS`."""
     tracks, shapes, rotations = seen_from(case, float(distance))
-    if noise > 0:
-        largest = float(np.abs(tracks.points).max())
-        tracks, _ = corrupt_tracks(tracks, noise=noise / largest, seed=trial)
+    tracks = spoiled(tracks, SPOILINGS[spoil])
     began = time.perf_counter()
     solution = solve(tracks, case.mesh, settings=Settings(camera=CAMERAS[method], image_size=PICTURE))  # type: ignore[arg-type]
     seconds = time.perf_counter() - began
@@ -108,10 +107,9 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--points", type=int, help="keep at most so many points")
     parser.add_argument("--distances", default=",".join(DISTANCES), help="half-sizes, comma-separated")
     parser.add_argument("--methods", default=",".join(CAMERAS), help="comma-separated: " + ", ".join(CAMERAS))
-    parser.add_argument("--noise", type=float, default=0.0, help="standard deviation of the tracks' noise, px")
+    parser.add_argument("--spoil", default="clean", help="comma-separated: " + ", ".join(SPOILINGS))
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/distances.jsonl"))
     given = parser.parse_args(arguments)
-    suffix = f" noise {given.noise:g} px" if given.noise else ""
     done = {(row["sequence"], row["distance"], row["method"]) for row in rows(given.out)}
     given.out.parent.mkdir(parents=True, exist_ok=True)
     print(
@@ -120,19 +118,20 @@ def main(arguments: list[str] | None = None) -> None:
     for case in cases(given.data, points=given.points, visibility="all", only=given.only):
         if case.shapes is None or case.cameras is None:
             continue
-        name = f"{case.name} P={case.tracks.num_points}{suffix}"
-        for distance in given.distances.split(","):
-            for method in given.methods.split(","):
-                if (name, distance, method) in done:
-                    continue
-                values = measure(case, distance, method, noise=given.noise)
-                _keep(given.out, name, distance, method, values)
-                print(
-                    f"{name:26} {distance:>4} {method:14} {values['e3d_frame_scaled']:8.4f} {values['e3d_frame_similarity']:8.4f} "
-                    f"{values['rotation_degrees']:8.2f}° {values.get('focal_error', np.nan):7.3f} {values['mirrored']:6.0f} "
-                    f"{values['seconds']:7.1f}",
-                    flush=True,
-                )  # fmt: skip
+        kinds = [(spoil, distance, method) for spoil in given.spoil.split(",") for distance in given.distances.split(",")
+                 for method in given.methods.split(",")]  # fmt: skip
+        for spoil, distance, method in kinds:
+            name = f"{case.name} P={case.tracks.num_points}" + ("" if spoil == "clean" else f" {spoil}")
+            if (name, distance, method) in done:
+                continue
+            values = measure(case, distance, method, spoil=spoil)
+            _keep(given.out, name, distance, method, values)
+            print(
+                f"{name:26} {distance:>4} {method:14} {values['e3d_frame_scaled']:8.4f} {values['e3d_frame_similarity']:8.4f} "
+                f"{values['rotation_degrees']:8.2f}° {values.get('focal_error', np.nan):7.3f} {values['mirrored']:6.0f} "
+                f"{values['seconds']:7.1f}",
+                flush=True,
+            )  # fmt: skip
 
 
 def _keep(path: Path, name: str, distance: str, method: str, values: dict[str, float]) -> None:

@@ -177,19 +177,21 @@ def baselines(records: Records) -> Figure:
 
 
 def distance(records: Records) -> Figure:
-    """Error against the distance of the camera."""
-    chosen = [r for r in records if r["metric"] == "e3d_frame_scaled"]
-    methods = list(dict.fromkeys(r["method"] for r in chosen))
-    figure, grid = plt.subplots(1, len(methods), figsize=(4 * len(methods), 3.2), sharey=True, squeeze=False)
-    for axes, method in zip(grid[0], methods, strict=True):
-        for name in SEQUENCES:
-            points = sorted(
-                (r["distance"], r["value"]) for r in chosen if r["sequence"] == name and r["method"] == method
-            )
+    """Error against the distance of the camera, infinite for orthography; of each sequence with the most points measured."""
+    places = {"3": 0, "5": 1, "10": 2, "inf": 3}
+    chosen = [r for r in records if r["metric"] == "e3d_frame_scaled" and len(r["sequence"].split()) == 2]
+    titles = {"orthographic": "orthographic camera model", "auto": "camera=auto (default), φ not given"}
+    figure, grid = plt.subplots(1, len(titles), figsize=(4 * len(titles), 3.2), sharey=True, squeeze=False)
+    for axes, method in zip(grid[0], titles, strict=True):
+        for name, label in SEQUENCES.items():
+            own = [r for r in chosen if r["sequence"].split()[0] == name and r["method"] == method]
+            most = max((int(r["sequence"].split("=")[1]) for r in own), default=0)
+            points = sorted((places[r["distance"]], r["value"]) for r in own if r["sequence"].endswith(f"={most}"))
             if points:
-                axes.loglog(*np.array(points).T, marker="o", ms=4, label=SEQUENCES[name])
-        axes.set_title(method, fontsize=9)
-        axes.set_xlabel("camera distance / half-size of the object")
+                axes.semilogy(*np.array(points).T, marker="o", ms=4, label=f"{label} ({most} points)")
+        axes.set_xticks(list(places.values()), ["3", "5", "10", "∞"])
+        axes.set_title(titles[method], fontsize=9)
+        axes.set_xlabel("distance of the camera / half-size of the object")
         axes.grid(alpha=0.25, which="both")
     grid[0, 0].set_ylabel("e3d_frame_scaled")
     grid[0, -1].legend(fontsize=7, frameon=False, loc="center left", bbox_to_anchor=(1, 0.5))

@@ -1,4 +1,4 @@
-"""The verdict on a result in the page: above the viewer, in the list, and left out for jobs without one."""
+"""The verdict in the page: above the viewer and in the list, absent for jobs without one."""
 
 from __future__ import annotations
 

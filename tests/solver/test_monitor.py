@@ -1,4 +1,4 @@
-"""Progress never falls and keeps moving; a stop at any question ends the solve as stopped, with finite shapes."""
+"""Progress never decreases; a stop at any unit of work ends the solve as stopped, with finite shapes."""
 
 from __future__ import annotations
 

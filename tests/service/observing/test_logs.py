@@ -1,4 +1,4 @@
-"""The log: one line per request, the reason of every refusal, the request's id, and no secret."""
+"""The log: one line per request, the reason of every error, the request's id, and no secrets."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import logging
 
 import httpx
 import pytest
-from pliant.service.logs import REQUEST_ID, AddRequestId, configure_logging, formatter
 from pliant.worker.errors import WorkerError
+from pliant.worker.logs import REQUEST_ID, AddRequestId, configure_logging, formatter
 from serving import Running, Serve, submit, until
 
 

@@ -1,4 +1,4 @@
-"""The verdict without ground truth: every sign by itself, and on results whose error is known."""
+"""The verdict without ground truth: each criterion alone, and on results with known error."""
 
 from __future__ import annotations
 

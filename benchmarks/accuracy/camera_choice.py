@@ -1,0 +1,79 @@
+"""`camera=auto` beside orthography on sequences as they are recorded: it should cost nothing where there is no perspective.
+
+    python -m benchmarks.accuracy.camera_choice --data DIR [--only NAME] [--points 300] [--out FILE]
+    python -m benchmarks.accuracy.camera_choice --table
+
+Both camera models solve the same tracks one after the other. Every sequence is a line of JSON in FILE: errors, processor seconds, the
+focal length if one was found, and whether the shapes are the same to the bit. Sequences that are there are skipped.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+from pliant.solver import Settings, solve
+from pliant.solver.evaluation.metrics import e3d_frame
+
+from benchmarks.accuracy.distances import rows
+from benchmarks.sequences import Case, cases
+
+RESULTS = Path(__file__).parent.parent / "results" / "camera_choice.jsonl"
+
+WORST_ERROR, WORST_TIME = 1.02, 1.6
+"""Largest ratios of error and time, `auto` over orthography, that the choice may cost."""
+
+
+def measure(case: Case) -> dict[str, Any]:
+    """Return one row: the sequence solved with both camera models."""
+    found: dict[str, Any] = {"sequence": f"{case.name} P={case.tracks.num_points}"}
+    shapes = []
+    for name, camera in (("orthographic", "scaled_orthographic"), ("auto", "auto")):
+        began = time.process_time()
+        solution = solve(case.tracks, case.mesh, settings=Settings(camera=camera))  # type: ignore[arg-type]
+        found[f"seconds_{name}"] = round(time.process_time() - began, 2)
+        found[f"e3d_frame_{name}"] = None if case.shapes is None else e3d_frame(solution.shapes, case.shapes)
+        shapes.append(solution.shapes)
+    return {
+        **found, "camera": solution.choices.camera, "focal": solution.camera.focal, "order": solution.choices.reasons["order"],
+        "same_bits": shapes[0].tobytes() == shapes[1].tobytes(),
+    }  # fmt: skip
+
+
+def table(path: Path) -> str:
+    """Return the rows as a table, with the ratios of error and time."""
+    lines = ["| sequence | e3d_frame, orthography | e3d_frame, auto | time ratio | camera |", "|---|---|---|---|---|"]
+    for row in rows(path):
+        errors = [row["e3d_frame_orthographic"], row["e3d_frame_auto"]]
+        shown = ["not known" if each is None else f"{each:.4f}" for each in errors]
+        ratio = row["seconds_auto"] / row["seconds_orthographic"]
+        same = "; same bits" if row["same_bits"] else ""
+        lines.append(f"| {row['sequence']} | {shown[0]} | {shown[1]}{same} | {ratio:.2f} | {row['camera']} |")
+    return "\n".join(lines)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Measure what is missing, and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, help="directory of recorded sequences; the gallery without it")
+    parser.add_argument("--only", action="append", default=[], help="names that hold this word")
+    parser.add_argument("--points", type=int, default=300, help="keep at most so many points")
+    parser.add_argument("--out", type=Path, default=RESULTS)
+    parser.add_argument("--table", action="store_true", help="only print what was measured")
+    given = parser.parse_args(arguments)
+    done = {row["sequence"] for row in rows(given.out)}
+    for case in () if given.table else cases(given.data, points=given.points, visibility="file", only=given.only):
+        if f"{case.name} P={case.tracks.num_points}" not in done:
+            row = measure(case)
+            given.out.parent.mkdir(parents=True, exist_ok=True)
+            with given.out.open("a") as file:
+                file.write(json.dumps(row) + "\n")
+            print(json.dumps(row), flush=True)
+    print(table(given.out))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,72 @@
+"""New cameras from tracks corrected for perspective: gauge, comparison by evidence, and a film on which the first cameras are off."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pliant.solver import Settings, Tracks, gallery, solve
+from pliant.solver.cameras import depth_rounds
+from pliant.solver.cameras.depth_alternation import aligned, alternated, factorized_again
+from pliant.solver.cameras.learned import Learned
+from pliant.solver.cameras.perspective import MIRROR, Perspective, centred, columns
+from pliant.solver.evaluation.metrics import e3d_frame_scaled
+from pliant.solver.model.model_order import ModelOrder
+from pliant.solver.model.shape_covariance import annealed
+from pliant.solver.model.so3 import angles_between, exponential
+
+PICTURE = (1280.0, 720.0)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_cameras_get_the_world_axes_and_the_sign_of_depth_of_others(mirrored: bool) -> None:
+    random = np.random.default_rng(0)
+    rotations = exponential(random.normal(0, 0.6, (9, 3)))
+    moved = rotations @ exponential(random.normal(size=(1, 3)))[0]
+    moved = MIRROR @ moved @ MIRROR if mirrored else moved
+    used = np.array([0, 2, 5, 8])
+    found = aligned(moved, rotations[used], used)
+    np.testing.assert_allclose(found, rotations, atol=1e-10)
+
+
+@pytest.fixture(scope="module")
+def rigid() -> tuple[np.ndarray, Perspective, np.ndarray]:
+    """Rotations, views in perspective at κ = .25, and the Gram matrix of the exactly corrected tracks of a rigid cloud."""
+    random = np.random.default_rng(1)
+    cloud = random.normal(size=(40, 3))
+    rotations = exponential(np.linspace(0, 1.4, 12)[:, None] * np.array([0.2, 1.0, 0.1]))
+    seen = (cloud - cloud.mean(axis=0)) @ rotations.transpose(0, 2, 1) / 1.5
+    view = Perspective(
+        np.zeros((12, 2)), np.zeros(2), curvature=0.25, sample=seen[..., :2] / (1 + 0.25 * seen[..., 2:])
+    )
+    flat = columns(centred(seen[..., :2]))
+    return rotations, view, flat @ flat.T / 40
+
+
+@pytest.mark.parametrize("degrees", [0.0, 6.0])
+def test_a_factorization_replaces_cameras_that_are_off_and_no_others(
+    rigid: tuple[np.ndarray, Perspective, np.ndarray], degrees: float
+) -> None:
+    rotations, view, gram = rigid
+    off = np.radians(degrees) * np.random.default_rng(2).normal(size=(12, 3))
+    given = exponential(off) @ rotations
+    start = Learned(given, np.ones(12), annealed(gram, given[:, :2], iterations=30), np.inf)
+    used = np.arange(12)
+    found, moved = alternated(view, start, used, model_order=ModelOrder(), turning=True)
+    better = factorized_again(gram, moved, found, used, model_order=ModelOrder())
+    turned = found.rotations if better is None else better
+    assert np.degrees(angles_between(aligned(turned, rotations, used), rotations)).max() < 0.5
+    assert factorized_again(gram, moved, found, used, model_order=ModelOrder(), should_stop=lambda: True) is None
+
+
+@pytest.mark.slow
+def test_a_film_from_nearby_needs_cameras_from_the_corrected_tracks(monkeypatch: pytest.MonkeyPatch) -> None:
+    face = gallery.face(90, 120, degrees=60)
+    seen = (face.shapes - face.shapes.mean(axis=1, keepdims=True)) @ face.rotations.transpose(0, 2, 1)
+    seen = 300 * seen / np.abs(seen).max()
+    tracks = Tracks.from_arrays((np.array(PICTURE) - 1) / 2 + seen[..., :2] / (1 + seen[..., 2:] / 900))
+    errors = []
+    for restarts in (depth_rounds.RESTARTS, 0):
+        monkeypatch.setattr(depth_rounds, "RESTARTS", restarts)
+        errors.append(e3d_frame_scaled(solve(tracks, settings=Settings(image_size=PICTURE)).shapes, seen))
+    assert errors[0] < 0.01
+    assert errors[0] < errors[1]
