@@ -97,7 +97,7 @@ def whitened(columns: Floats, *, ordered: bool = True) -> Floats:
 
 def coloured(columns: Floats, *, ordered: bool = True, transposed: bool = False) -> Floats:
     """Return root⁻ᵀ times columns of shape `(F, k)`, the inverse of `whitened`; `transposed`: root⁻¹ times them."""
-    if not ordered:
+    if not ordered or columns.shape[1] == 0:  # LAPACK writes beyond an array without columns
         return columns
     bands = whitener_bands(len(columns))
     return np.asarray(lapack.dtbtrs(bands, columns, uplo="L", trans="N" if transposed else "T")[0])

@@ -377,7 +377,7 @@ def _linear_round(
     by_columns = -frames * found.by_columns.reshape(columns.shape)
     by_walk = -frames * found.by_walk  # [K B (τT ⊗ I)]_ff
     mean_moments = np.einsum("fic,fid->cd", columns[:, :, 0], by_columns[:, :, 0])
-    own, by_own = (each[:, :, 1:].transpose(2, 0, 1, 3).reshape(count, -1) for each in (columns, by_columns))
+    own, by_own = (each[:, :, 1:].transpose(2, 0, 1, 3).reshape(count, 6 * frames) for each in (columns, by_columns))
     axis_moments = own.reshape(-1, 3).T @ by_own.reshape(-1, 3) + np.einsum("fic,fid->cd", walk, by_walk)
     along, ordered = whitened(covariance.modes, ordered=covariance.ordered), covariance.ordered
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from pliant.solver.model.marginal_likelihood import Motion, Scene, cameras_of, covariances_of, energy, start
+from pliant.solver.model.marginal_likelihood import UNLIKELY, Motion, Scene, cameras_of, covariances_of, energy, start
 from pliant.solver.model.random_walk import random_walk
 from pliant.solver.model.so3 import exponential
 
@@ -29,3 +31,15 @@ def test_the_covariances_reported_are_those_of_the_energy(floor: float) -> None:
     image = seen @ world @ seen.T + noise * np.eye(2 * frames)
     expected = (np.linalg.slogdet(image)[1] + np.trace(np.linalg.solve(image, gram))) / (2 * frames)
     assert energy(scene, motion)[0] == pytest.approx(expected, rel=1e-10)
+
+
+def test_a_random_walk_that_vanishes_to_rounding_is_unlikely_instead_of_a_division_by_zero() -> None:
+    random, frames = np.random.default_rng(1), 6
+    tracks = random.normal(size=(2 * frames, 40))
+    rotations = exponential(random.normal(0, 0.4, (frames, 3)))
+    scene = Scene.of(tracks @ tracks.T / 40, rotations, with_scales=False, prior_weight=0.0, noise_std_floor=1e-3)
+    motion = start(scene, np.ones(frames))
+    assert energy(scene, motion)[0] < UNLIKELY
+    value, gradient = energy(scene, replace(motion, logs=np.array([motion.logs[0], -1000.0])))
+    assert value == UNLIKELY
+    assert (gradient.flat() == 0).all()

@@ -12,6 +12,7 @@ from pliant.solver.cameras.joint_refinement import informative_frames, learn
 from pliant.solver.evaluation import metrics
 from pliant.solver.model.random_walk import random_walk
 from pliant.solver.model.shape_covariance import (
+    MAX_DENSE_FRAMES,
     MAX_ITERATIONS,
     MEAN_MODE_STD,
     WALK_VARIANCE_FLOOR,
@@ -207,3 +208,16 @@ def test_a_stop_leaves_the_rotations_of_the_start(face: gallery.Sequence) -> Non
     moved, covariance = learn(estimate, shown, turning=True)
     assert np.abs(moved.rotations - stopped.rotations).max() > 1e-5
     assert covariance.nll < improve(begin(estimate.gram, projections), estimate.gram, projections, iterations=5).nll
+
+
+def test_a_long_rigid_film_without_modes_is_learned() -> None:
+    frames = MAX_DENSE_FRAMES + 10
+    angles = np.linspace(0, 1, frames)[:, None] * (0.0, 1.0, 0.0)
+    projections = exponential(angles)[:, :2]
+    rng = np.random.default_rng(0)
+    rows = projections.reshape(-1, 3) @ rng.normal(size=(3, 50)) + 1e-4 * rng.normal(size=(2 * frames, 50))
+    gram = rows @ rows.T / 50
+    rigid = replace(begin(gram, projections), modes=np.zeros((frames, 0)), walk_variance=WALK_VARIANCE_FLOOR)
+    found = improve(rigid, gram, projections, iterations=2)
+    assert found.modes.shape == (frames, 0)
+    assert np.isfinite(found.nll)
