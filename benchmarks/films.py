@@ -32,6 +32,8 @@ from pliant.tracking import TrackedFilm, open_film, track_film
 from pliant.tracking.rendering import RenderedFilm, Truth, render_film
 from scipy.interpolate import LinearNDInterpolator
 
+from benchmarks.commit import commit
+
 SCENES: dict[str, tuple[Callable[[int], Sequence], bool]] = {
     "face": (lambda frames: face(frames, 3000, degrees=30), False),
     "flag": (lambda frames: flag(frames, 3000, degrees=30), False),
@@ -188,6 +190,7 @@ def _rows(path: Path) -> Iterator[dict[str, Any]]:
 
 
 def _keep(path: Path, row: dict[str, Any]) -> None:
+    row["commit"] = commit()
     rounded = {name: float(f"{value:.4g}") if isinstance(value, float) else value for name, value in row.items()}
     print(json.dumps(rounded, ensure_ascii=False), flush=True)
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -114,10 +114,11 @@ def by_sequence(rows: list[Row], calibration: Sequence[str]) -> str:
     for row in sorted(rows, key=lambda row: row["sequence"]):
         star = "*" if is_of(row, calibration) else ""
         reason = row["reasons"][0] if row["reasons"] else ""
-        lines.append(
-            f"| {row['sequence']}{star} | {row['kind']} | {VERDICTS[row['verdict']]} | {reason} | "
-            f"{figure(row['expected'])} | {figure(row['true'])} | {percent(row.get('coverage'))} | {ratio(row.get('std_over_error'))} |"
-        )
+        cells = (
+            f"{row['sequence']}{star}", row["kind"], VERDICTS[row["verdict"]], reason, figure(row["expected"]), figure(row["true"]),
+            percent(row.get("coverage")), ratio(row.get("std_over_error")),
+        )  # fmt: skip
+        lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 

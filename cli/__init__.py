@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 from pliant.cli import jobs, tokens
 from pliant.cli.commands.backup import backup, restore
+from pliant.cli.commands.results import rerun, share, view
 from pliant.cli.demo import demo
 from pliant.cli.doctor import doctor, fsck
 from pliant.cli.exits import Guarded
@@ -49,11 +50,12 @@ def _begin(
 
 
 _COMMANDS: dict[str, dict[str, Callable[..., None]]] = {
-    "On this machine": {"solve": solve, "track": track, "inspect": inspect, "demo": demo, "doctor": doctor},
+    "On this machine": {"solve": solve, "track": track, "inspect": inspect, "view": view, "demo": demo, "doctor": doctor},
     "Run a service": {"up": up, "work": work, "fsck": fsck, "backup": backup, "restore": restore},
     "Use a service": {
         "submit": jobs.submit, "status": jobs.status, "watch": jobs.watch, "result": jobs.result, "list": jobs.list_jobs,
-        "log": jobs.log, "cancel": jobs.cancel, "retry": jobs.retry, "delete": jobs.delete, "options": jobs.options,
+        "log": jobs.log, "cancel": jobs.cancel, "retry": jobs.retry, "rerun": rerun, "share": share, "delete": jobs.delete,
+        "options": jobs.options,
     },
 }  # fmt: skip
 for panel, commands in _COMMANDS.items():

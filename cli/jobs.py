@@ -154,6 +154,15 @@ def result(
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the files.")] = Path(),
     force: Force = False,
     only: Annotated[list[str] | None, typer.Option("--only", help="Download only this file; may be repeated.")] = None,
+    make: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--make",
+            help="Have this written of the stored result first: glb, ply, obj, usd, abc, mdd, mat or csv; may be repeated. "
+            "Only these files are downloaded then.",
+        ),
+    ] = None,
+    fps: Annotated[float | None, typer.Option("--fps", help="With --make: frames per second of the animation.")] = None,
     url: Url = HOME,
     timeout: Timeout = None,
     as_json: Json = False,
@@ -162,7 +171,15 @@ def result(
     from pliant.client.progress import progress_bar
 
     with ctx.obj.client(url, as_json=as_json) as client:
-        done = client.result(find_job(client, job).id, load=False, timeout=timeout)
+        found = find_job(client, job).id
+        if make:
+            further = client.make_outputs(found, make, fps=fps, timeout=timeout)
+            ctx.obj.following = found = further.id
+            with progress_bar(line_every=LINE_EVERY) as bar:
+                done = further.wait(on_progress=bar.on_progress, load=False, timeout=timeout)
+            only = only or [each.name for each in done.job.artifacts if each.name != "report.json"]
+        else:
+            done = client.result(found, load=False, timeout=timeout)
         changed = different_files(done.job, output, only)
         output_folder(output, force=force, files=changed)
         with progress_bar(line_every=LINE_EVERY) as bar:

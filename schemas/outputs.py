@@ -17,7 +17,7 @@ class OutputRequest(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     outputs: Annotated[Outputs, Field(min_length=1)] = Field(
-        description="Files to write: glb, ply, obj, usd, mdd, mat, csv; see the option `outputs` of a job."
+        description="Files to write: glb, ply, obj, usd, abc, mdd, mat, csv; see the option `outputs` of a job."
     )
     fps: Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)] | None = Field(
         None, description="Frames per second of the written animation."

@@ -291,6 +291,19 @@ class ProblemCode(StrEnum):
      "Delete some, or wait until they expire.")
 
     # Input files
+    NOT_A_RESULT = ("not_a_result", None, "Not a result",
+     "`pliant view` named a folder without `report.json` and `preview.bin`.",
+     "Name the folder that `pliant solve -o` or `pliant result -o` wrote.")
+    FILM_AS_TRACKS = ("film_as_tracks", 422, "A film sent as tracks",
+     "The part `tracks` is a film or a zip of pictures.",
+     "Send it as the part `film`; `pliant submit FILM` and the page recognise films by themselves.")
+    PICTURE_AS_TRACKS = ("picture_as_tracks", 422, "A picture sent as tracks",
+     "The part `tracks` is a single picture, which shows no motion.",
+     "Send a film, or a zip of its pictures, as the part `film`.")
+    UNREADABLE_TABLE = ("unreadable_table", 422, "Unreadable table",
+     "A line of a table of tracks has other columns than expected, or something that is not a number; `got` shows the line.",
+     "One observation a line with the columns `frame, point, x, y`, or one row a frame with named columns such as `nose_x, nose_y`. "
+     "Decimal commas need semicolons or tabs between the columns.")
     UNKNOWN_FORMAT = ("unknown_format", 422, "Unknown format",
      "The content of the file is of no supported format, or a mesh text is neither a file nor `ROWSxCOLUMNS`.",
      'Convert it, for example `numpy.savez("tracks.npz", tracks=points, visibility=visible)`.')

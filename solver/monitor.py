@@ -1,37 +1,43 @@
-"""Progress and cancellation of one solve: each call of `should_stop` also counts one unit of work."""
+"""Progress and cancellation of one solve: every call of `should_stop` also counts one unit of work."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from pliant.solver.records import Step
+from pliant.solver.stages import Stage
 
 MIN_FRACTION_STEP = 0.002
-"""Minimum increase of the fraction between reports: at most 500 calls of `on_step` besides those of the stages."""
+"""Least increase of the fraction that is reported on its own: at most 500 calls of `on_step` besides those of the
+stages."""
 
-REWEIGHTING_UNITS = 100
-"""Typical number of conjugate gradient iterations per reweighting; 20 to 300 occur."""
+MAX_SILENCE = 1.0
+"""Seconds after which a unit of work is reported however little the fraction has increased."""
 
 EXPECTED_SHARE = 0.9
-"""Share of a stage's span that its expected units fill; further units approach its end."""
+"""Share of a stage that its expected units fill; further units approach its end."""
+
+MAX_FRACTION = 0.99
+"""Largest fraction reported before the end."""
 
 
 class Monitor:
     """Reports steps with a fraction that never decreases, and remembers a request to stop.
 
-    A call counts one unit of work and returns whether to stop; pass the monitor on as `should_stop`. Once it has
-    returned True it always does.
+    A call counts one unit of work and returns whether to stop; pass it on as `should_stop`. Once it returned True it
+    keeps doing so. The fraction is the expected duration of the finished stages over that of the finished and the remaining ones, so
+    that the elapsed time divided by it estimates the whole. Stages that do not run are dropped from the plan.
 
     Parameters
     ----------
     on_step, should_stop : callable, optional
-        The callbacks given to `solve`.
-    camera_share : float
-        Estimated share of the solve spent on the cameras. Fractions of steps of stage `cameras` refer to the whole solve,
-        those of later steps to the remainder.
-    camera_units : int
-        Estimated units of work of the cameras.
+        The user's.
+    plan : sequence of Stage
+        Stages of the solve in their order.
+    clock : callable
+        Monotonic seconds, for `MAX_SILENCE`.
     """
 
     def __init__(
@@ -39,39 +45,79 @@ class Monitor:
         on_step: Callable[[Step], None] | None = None,
         should_stop: Callable[[], bool] | None = None,
         *,
-        camera_share: float = 0.3,
-        camera_units: int = 1000,
+        plan: Sequence[Stage] = (Stage("shapes", 1.0, 1000),),
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.stopped = False
-        """Whether a stop was requested at the last call."""
-        self._on_step, self._should_stop = on_step, should_stop
-        self._share = camera_share
+        """Whether a stop was requested when somebody looked."""
+        self._on_step, self._should_stop, self._clock = on_step, should_stop, clock
         self._last = Step("cameras", 0.0)
-        self._begun, self._span, self._expected, self._units = 0.0, camera_share, camera_units, 0
+        self._reported = clock()
+        self._done, self._current, self._ahead = 0.0, plan[0], list(plan[1:])
+        self._units, self._share = 0, 0.0
 
     def __call__(self) -> bool:
         """Count a unit of work; return whether to stop."""
         if not self.stopped and self._should_stop is not None:
             self.stopped = bool(self._should_stop())
         self._units += 1
-        fraction = self._begun + self._span * _filled(self._units / self._expected)
-        if fraction >= self._last.fraction + MIN_FRACTION_STEP:
+        self._share = max(self._share, _filled(self._units / max(self._current.units, 1)))
+        fraction = self._fraction()
+        if fraction >= self._last.fraction + MIN_FRACTION_STEP or self._clock() - self._reported >= MAX_SILENCE:
             self._emit(replace(self._last, fraction=fraction))
         return self.stopped
 
+    def enter(self, name: str, *, units: int | None = None) -> None:
+        """Begin a stage that is ahead, otherwise nothing changes; stages before it are dropped.
+
+        Parameters
+        ----------
+        name : str
+            Of the stage.
+        units : int, optional
+            Its units of work, where they are known better than planned.
+        """
+        place = next((number for number, stage in enumerate(self._ahead) if stage.name == name), None)
+        if place is None:
+            return
+        self._done += self._current.seconds if self._share > 0 else 0.0
+        self._current, self._ahead = self._ahead[place], self._ahead[place + 1 :]
+        if units is not None:
+            seconds = self._current.seconds * units / max(self._current.units, 1)
+            self._current = replace(self._current, seconds=seconds, units=units)
+        self._units, self._share = 0, 0.0
+
+    def expect(self, stages: Sequence[Stage], *, before: str) -> None:
+        """Add stages to the plan that the data turned out to require."""
+        place = next((number for number, stage in enumerate(self._ahead) if stage.name == before), len(self._ahead))
+        self._ahead[place:place] = stages
+
     def report(self, step: Step) -> None:
-        """Report a step; its fraction never falls below that of the previous step."""
-        share = self._share
-        fraction = step.fraction if step.stage == "cameras" else share + (1 - share) * step.fraction
-        self._emit(replace(step, fraction=max(fraction, self._last.fraction)))
+        """Report a step; the fraction of a step after the cameras is the completed part of the stage `shapes`."""
+        if step.stage == "finish":
+            self._emit(replace(step, fraction=step.fraction if step.fraction == 1 else self._fraction()))
+            return
         if step.stage != "cameras":
-            self._begun, self._expected, self._units = self._last.fraction, REWEIGHTING_UNITS, 0
-            self._span = (1 - self._begun) / (2 + max(step.max_reweightings - step.reweighting, 0))
+            if self._current.name != "shapes":
+                self.enter("shapes")
+            self._share, self._units = max(self._share, step.fraction), 0
+        self._emit(replace(step, fraction=self._fraction()))
+
+    def _fraction(self) -> float:
+        done = self._done + self._share * self._current.seconds
+        left = (1 - self._share) * self._current.seconds + sum(stage.seconds for stage in self._ahead)
+        return max(self._last.fraction, min(done / max(done + left, 1e-9), MAX_FRACTION))
 
     def _emit(self, step: Step) -> None:
-        self._last = step
+        self._last, self._reported = step, self._clock()
         if self._on_step is not None:
             self._on_step(step)
+
+
+def enter(should_stop: Callable[[], bool] | None, name: str, *, units: int | None = None) -> None:
+    """Begin a stage of the solve that `should_stop` monitors; any other callable has no stages."""
+    if isinstance(should_stop, Monitor):
+        should_stop.enter(name, units=units)
 
 
 def _filled(share: float) -> float:

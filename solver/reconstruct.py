@@ -10,7 +10,7 @@ import numpy as np
 from pliant.solver.cameras.camera_choice import with_camera_choice
 from pliant.solver.cameras.depth_rounds import settled
 from pliant.solver.cameras.estimation import CameraEstimate, estimate_cameras, given_cameras
-from pliant.solver.cameras.joint_refinement import LEARNED_FRAMES, informative_frames, learn, learned_frames
+from pliant.solver.cameras.joint_refinement import informative_frames, learn, learned_frames
 from pliant.solver.cameras.lens import given_lens
 from pliant.solver.cameras.perspective import Perspective, orthographic
 from pliant.solver.cameras.planar_ambiguity import is_planar
@@ -21,7 +21,7 @@ from pliant.solver.errors import InvalidInput, InvalidSettings
 from pliant.solver.isometry.surface import IsometricVerdict, isometric_surface
 from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.shape_covariance import ShapeCovariance
-from pliant.solver.monitor import Monitor
+from pliant.solver.monitor import Monitor, enter
 from pliant.solver.records import (
     MIN_POINTS,
     Camera,
@@ -46,18 +46,11 @@ from pliant.solver.shapes.perspective_shapes import corrected_again, seen_in_per
 from pliant.solver.shapes.setup import build_problem, with_bending
 from pliant.solver.shapes.sparsely_observed import WELL_OBSERVED_SHARE, WellObserved, place_the_rest, well_observed
 from pliant.solver.shapes.state import State
+from pliant.solver.stages import learning, planned, settling
 from pliant.solver.tracks.completion import seen_again
 from pliant.solver.tracks.frame_order import as_they_came, content_order, differences, in_order, resolved_order
 from pliant.solver.tracks.noise import OUTLIER_SHARE
 from pliant.solver.tracks.normalization import Normalized, normalize
-
-CAMERA_UNITS, KNOWN_UNITS = 7000, 800
-"""Iterations and rounds for cameras and covariance (6,300 to 11,000 occur), and for the covariance alone; used for
-progress only."""
-
-UNIT_SECONDS, FRAME_SECONDS, POINT_SECONDS = 2e-4, 1.2e-5, 8e-6
-"""Seconds per unit, per unit and frame, and for the shapes per frame and point; from 10 to 357 frames on one core.
-Only their ratios matter, for the cameras' share of the progress."""
 
 DEPTH_ROUNDS, DEPTH_SETTLED = 4, 1e-4
 """Maximum number of corrections of the tracks by the depths of the shapes, and the RMS change of the corrected
@@ -177,7 +170,7 @@ def _solved(
         problem = replace(
             problem, points=np.ascontiguousarray(normalized.points.transpose(0, 2, 1), dtype=problem.points.dtype)
         )
-    outcome = Outcome.STOPPED if monitor.stopped else outcome
+    outcome = Outcome.STOPPED if monitor() else outcome
     choices = with_camera_choice(
         choices, estimate.perspective, settings, unit=normalized.unit, given=cameras is not None
     )
@@ -186,10 +179,13 @@ def _solved(
     )
     if estimate.perspective is not None:
         solution = seen_in_perspective(solution, tracks, estimate.perspective, normalized.unit, kept)
+    enter(should_stop, "trust")
     solution = assessed(
         solution, np.asarray(problem.confidence, dtype=np.float64), estimate, covariance, normalized.unit,
         turning=cameras is None and settings.refine_rotations, seed=settings.seed, should_stop=should_stop,
     )  # fmt: skip
+    if monitor.stopped:
+        solution = replace(solution, outcome=Outcome.STOPPED)
     if verdict is not None:
         solution = replace(solution, choices=_with_verdict(solution.choices, verdict, settings))
     seconds["finish"] = time.perf_counter() - began
@@ -206,16 +202,20 @@ def _isometric(
             "invalid_option", field="options.surface", expected="auto or free where rotations are given", got="'isometric'",
             hint="Leave the rotations out: an isometric surface gives its own cameras.",
         )  # fmt: skip
-    pinhole = (
-        settings.focal_length is not None or settings.image_size is not None
-    )  # without either, I has false minima on cloth seen from afar
-    usual = settings.gaussian and pinhole and cameras is None and settings.camera in {Settings().camera, "perspective"}
-    if settings.surface == "free" or (settings.surface == "auto" and not usual):
+    if not _tries_isometry(cameras, settings):
         return None
     return isometric_surface(
         downwards(tracks) if settings.y_up else tracks, focal=settings.focal_length, principal_point=centre_downwards(settings),
         image_size=settings.image_size, required=settings.surface == "isometric", should_stop=should_stop,
     )  # fmt: skip
+
+
+def _tries_isometry(cameras: KnownCamera | None, settings: Settings) -> bool:
+    if settings.surface != "auto":
+        return settings.surface == "isometric"
+    # Without image size or focal length, I has false minima on cloth seen from afar.
+    pinhole = settings.focal_length is not None or settings.image_size is not None
+    return settings.gaussian and pinhole and cameras is None and settings.camera in {Settings().camera, "perspective"}
 
 
 def _with_verdict(choices: Choices, verdict: IsometricVerdict, settings: Settings) -> Choices:
@@ -253,12 +253,16 @@ def _learned(
 ) -> tuple[CameraEstimate, ShapeCovariance | None]:
     """Return the cameras, and the covariance of the shapes if it is the prior; `before` is the estimate with outliers."""
     rank = 0 if before is None else before.rank
+    enter(should_stop, "multistart")
     if cameras is not None:
         estimate = given_cameras(normalized, cameras, settings, rank=rank)
     else:
         estimate = estimate_cameras(normalized, settings, on_step=on_step, should_stop=should_stop, rank=rank)
     if before is not None:
         estimate = replace(estimate, outliers=max(estimate.outliers, before.outliers))
+    elif isinstance(should_stop, Monitor) and settings.gaussian and estimate.outliers > OUTLIER_SHARE:
+        stages = learning(len(estimate.rotations), gaussian=True, known_cameras=cameras is not None)
+        should_stop.expect(stages, before="shapes")
     estimate = replace(estimate, perspective=lens)
     shown = informative_frames(normalized.visible)
     if not settings.gaussian:
@@ -383,7 +387,10 @@ def _loop(
         after = no_higher(before, computed)
         history[-1] = before.summary()
         history.append(after)
-        report(_step_of("reweight", after, settings, unit))
+        share = settling(
+            [state.objective for state in history], tolerance=settings.tolerance, most=settings.max_reweightings
+        )
+        report(_step_of("reweight", after, settings, unit, fraction=share))
         outcome = terminate(before, computed, tolerance=settings.tolerance, max_reweightings=settings.max_reweightings)
         if outcome is not None:
             return history, outcome
@@ -444,11 +451,10 @@ def _check_fit(tracks: Tracks, mesh: Mesh | None, cameras: KnownCamera | None) -
         )  # fmt: skip
 
 
-def _step_of(stage: str, state: State, settings: Settings, unit: float, *, fraction: float | None = None) -> Step:
-    done = 0.95 * min(1.0, (1 + state.reweighting) / (1 + settings.max_reweightings))
+def _step_of(stage: str, state: State, settings: Settings, unit: float, *, fraction: float = 0.0) -> Step:
     return Step(
         stage,
-        done if fraction is None else fraction,
+        fraction,
         reweighting=state.reweighting,
         max_reweightings=settings.max_reweightings,
         objective=state.objective,
@@ -463,11 +469,9 @@ def _monitored(
     on_step: Callable[[Step], None] | None,
     should_stop: Callable[[], bool] | None,
 ) -> Monitor:
-    """Return the monitor of the solve; the cameras' share of the progress follows from the sizes."""
-    learning = settings.gaussian
-    units = (CAMERA_UNITS if learning else CAMERA_UNITS // 5) if cameras is None else KNOWN_UNITS if learning else 1
-    each = UNIT_SECONDS + FRAME_SECONDS * min(tracks.num_frames, LEARNED_FRAMES)
-    spent, left = units * each, 0.5 + POINT_SECONDS * tracks.num_frames * tracks.num_points
-    return Monitor(
-        on_step, should_stop, camera_share=float(np.clip(spent / (spent + left), 0.02, 0.95)), camera_units=units
-    )
+    """Return the monitor of the solve, with its plan."""
+    plan = planned(
+        tracks.num_frames, tracks.num_points, gaussian=settings.gaussian, known_cameras=cameras is not None,
+        sheet=_tries_isometry(cameras, settings),
+    )  # fmt: skip
+    return Monitor(on_step, should_stop, plan=plan)

@@ -1,4 +1,4 @@
-"""The arrows of the house, read from the imports: who may import whom, and which package is at home where."""
+"""Allowed imports between folders, read from the sources."""
 
 from __future__ import annotations
 

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.tracking.flow import Bools, Floats, Grey
 
-LEAST_CORRELATION = 0.5
-"""Below, a point is hidden: half of the patch's variance is then unexplained, which closed flow cycles do not notice."""
+LEAST_CORRELATION = 0.6
+"""Below, a point is hidden: two thirds of the patch's variance (1 − .6²) are then unexplained, which closed flow cycles do not notice. On a
+rendered face behind a bar, .6 instead of .5 removes 8 % of the wrongly visible observations and .3 % of the right ones."""
 
 LOST_NEIGHBOURS = 2
 """A point with so many hidden neighbours on the grid is hidden too: it lies at the edge of what hides them, where flow mixes the
@@ -58,10 +59,10 @@ class Appearance:
         patches = _cut(image, places)
         slopes = np.stack(
             [
-                _cut(np.asarray(cv2.Sobel(image, cv2.CV_32F, *axis, scale=1 / 8), np.float32), places)
+                _cut(np.asarray(cv2.Sobel(image, cv2.CV_32F, *axis, scale=1 / 8), dtype=np.float32), places)
                 for axis in ((1, 0), (0, 1))
             ],
-            -1,
+            axis=-1,
         )
         return cls(points, neighbours, patches - patches.mean(axis=1, keepdims=True), slopes, noise_variance(template))
 

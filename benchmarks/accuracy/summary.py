@@ -39,8 +39,3 @@ def summarised(cell: dict[str, Any], trials: list[dict[str, Any]]) -> Iterable[d
         record["machine"] = f"{platform.machine()}, {os.cpu_count()} cores"
         record["commit"] = trials[-1]["commit"]
         yield record
-
-
-def read_summary(path: Path) -> list[dict[str, Any]]:
-    """Return the records of a summary."""
-    return [json.loads(line) for line in path.read_text().splitlines()]

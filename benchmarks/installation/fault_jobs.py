@@ -12,34 +12,34 @@ from threading import Thread
 from pliant.client import Status
 from pliant.solver.gallery import face
 
-from benchmarks.installation.fault_list import LARGE, SHORT, Fault, Told, cancelled, fault, said, submitted
-from benchmarks.installation.house import SOON, House, children, running
+from benchmarks.installation.fault_list import LARGE, SHORT, Fault, Outcome, cancelled, fault, status_of, submitted
+from benchmarks.installation.instance import SOON, Instance, children, running
 from benchmarks.installation.long_jobs import LONG
 
 
 @fault("kill -9 the job process in mid solve")
-def job_process(house: House) -> Told:
-    id = submitted(house, options=LONG)
-    house.midst(id, "reweight")
-    house.kill("job process")
+def job_process(instance: Instance) -> Outcome:
+    id = submitted(instance, options=LONG)
+    instance.midst(id, "reweight")
+    instance.kill("job process")
     began = time.monotonic()
-    job = house.final(id)
+    job = instance.final(id)
     assert job.status is Status.FAILED
     assert job.error is not None
     assert (job.error.code, job.error.retryable, job.artifacts) == ("worker_lost", True, [])
-    return Told(said(job), time.monotonic() - began)
+    return Outcome(status_of(job), time.monotonic() - began)
 
 
 @fault("kill -9 the job process while it writes its files")
-def job_process_writing(house: House) -> Told:
-    id = submitted(house, frames=60, points=8000, options=LARGE)
-    attempt_id = house.jobs.records.get(id).attempt_id
-    house.until(lambda: any((house.settings.work / attempt_id).glob("artifacts/*")), "a file is begun")
-    house.kill("job process")
+def job_process_writing(instance: Instance) -> Outcome:
+    id = submitted(instance, frames=60, points=8000, options=LARGE)
+    attempt_id = instance.jobs.records.get(id).attempt_id
+    instance.until(lambda: any((instance.settings.work / attempt_id).glob("artifacts/*")), "a file is begun")
+    instance.kill("job process")
     began = time.monotonic()
-    job = house.final(id)
+    job = instance.final(id)
     assert (job.status, job.artifacts) == (Status.FAILED, [])
-    return Told(f"{said(job)}, no file visible", time.monotonic() - began)
+    return Outcome(f"{status_of(job)}, no file visible", time.monotonic() - began)
 
 
 TRIES = 8
@@ -47,15 +47,15 @@ TRIES = 8
 
 
 @fault("kill -9 the job process while it stores its files")
-def job_process_storing(house: House) -> Told:
+def job_process_storing(instance: Instance) -> Outcome:
     for _ in range(TRIES):
-        id = submitted(house, frames=60, points=8000, options=LARGE)
+        id = submitted(instance, frames=60, points=8000, options=LARGE)
         prefix = f"jobs/{id}/"
-        blobs = house.settings.data / "blobs"
-        attempt = house.settings.work / house.jobs.records.get(id).attempt_id
-        house.until(lambda at=attempt: any(at.glob("artifacts/*")), "a file is begun")
+        blobs = instance.settings.data / "blobs"
+        attempt = instance.settings.work / instance.jobs.records.get(id).attempt_id
+        instance.until(lambda at=attempt: any(at.glob("artifacts/*")), "a file is begun")
         # Storing takes milliseconds: the process is let run by the half of one, until its first file is seen.
-        for process in house.look()["job process"]:
+        for process in instance.look()["job process"]:
             with suppress(ProcessLookupError):
                 while not any(blobs.glob(f"{prefix}*/artifacts/*")):
                     os.kill(process, signal.SIGCONT)
@@ -63,49 +63,49 @@ def job_process_storing(house: House) -> Told:
                     os.kill(process, signal.SIGSTOP)
                 os.kill(process, signal.SIGKILL)
         began = time.monotonic()
-        job = house.final(id)
+        job = instance.final(id)
         if job.status is Status.FAILED:
             assert job.artifacts == []
-            return Told(f"{said(job)}, no file visible", time.monotonic() - began)
+            return Outcome(f"{status_of(job)}, no file visible", time.monotonic() - began)
         assert job.status is Status.SUCCEEDED  # it was done before it was hit
         assert job.artifacts != []
     raise AssertionError(f"none of {TRIES} jobs was hit while it stored its files")
 
 
 @fault("kill -9 a worker in mid solve")
-def worker(house: House) -> Told:
-    id = submitted(house, options=LONG)
-    house.midst(id, "reweight")
-    (pid,) = [pid for pid in house.look()["worker"] if children(pid)]
+def worker(instance: Instance) -> Outcome:
+    id = submitted(instance, options=LONG)
+    instance.midst(id, "reweight")
+    (pid,) = [pid for pid in instance.look()["worker"] if children(pid)]
     os.kill(pid, signal.SIGKILL)
-    seconds = house.until(lambda: house.jobs.get(id).attempt == 2, "another worker has it")
-    cancelled(house, id)
-    return Told("running, attempt 2 (cancelled then)", seconds)
+    seconds = instance.until(lambda: instance.jobs.get(id).attempt == 2, "another worker has it")
+    cancelled(instance, id)
+    return Outcome("running, attempt 2 (cancelled then)", seconds)
 
 
 @fault("kill -9 the reconciler in mid solve")
-def reconciler(house: House) -> Told:
-    id = submitted(house, options={"max_reweightings": 30})
-    house.midst(id, "reweight")
-    old = house.kill("reconciler")
-    seconds = house.until(lambda: house.look()["reconciler"] not in ([], [old]), "another reconciler")
-    job = house.final(id)
+def reconciler(instance: Instance) -> Outcome:
+    id = submitted(instance, options={"max_reweightings": 30})
+    instance.midst(id, "reweight")
+    old = instance.kill("reconciler")
+    seconds = instance.until(lambda: instance.look()["reconciler"] not in ([], [old]), "another reconciler")
+    job = instance.final(id)
     assert (job.status, job.attempt) == (Status.SUCCEEDED, 1)
-    return Told(said(job), seconds)
+    return Outcome(status_of(job), seconds)
 
 
 @fault("kill -9 Valkey in mid solve")
-def valkey(house: House) -> Told:
-    id = submitted(house, options=LONG)
-    house.midst(id, "reweight")
-    house.kill("valkey")
+def valkey(instance: Instance) -> Outcome:
+    id = submitted(instance, options=LONG)
+    instance.midst(id, "reweight")
+    instance.kill("valkey")
     time.sleep(0.1)
-    seconds = house.until(lambda: house.jobs.get(id).status is Status.RUNNING, "it answers again")
-    before = house.jobs.get(id).progress
-    house.until(lambda: house.jobs.get(id).progress != before, "the job goes on telling")
-    assert house.jobs.get(id).attempt == 1
-    cancelled(house, id)
-    return Told("running, attempt 1 (cancelled then)", seconds)
+    seconds = instance.until(lambda: instance.jobs.get(id).status is Status.RUNNING, "it answers again")
+    before = instance.jobs.get(id).progress
+    instance.until(lambda: instance.jobs.get(id).progress != before, "the job goes on telling")
+    assert instance.jobs.get(id).attempt == 1
+    cancelled(instance, id)
+    return Outcome("running, attempt 1 (cancelled then)", seconds)
 
 
 AWAY = [4.0]
@@ -113,113 +113,113 @@ AWAY = [4.0]
 
 
 @fault("Valkey hangs (SIGSTOP) in mid solve")
-def valkey_hangs(house: House) -> Told:
-    id = submitted(house, options=LONG)
-    house.midst(id, "reweight")
-    pid = house.kill("valkey", signal.SIGSTOP)
+def valkey_hangs(instance: Instance) -> Outcome:
+    id = submitted(instance, options=LONG)
+    instance.midst(id, "reweight")
+    pid = instance.kill("valkey", signal.SIGSTOP)
     began = time.monotonic()
     time.sleep(AWAY[0])
     os.kill(pid, signal.SIGCONT)
-    before = house.jobs.get(id).progress
-    house.until(lambda: house.jobs.get(id).progress != before, "the job goes on telling")
-    assert house.jobs.get(id).attempt == 1, "an outage is no reason to begin a job anew"
+    before = instance.jobs.get(id).progress
+    instance.until(lambda: instance.jobs.get(id).progress != before, "the job goes on telling")
+    assert instance.jobs.get(id).attempt == 1, "an outage is no reason to begin a job anew"
     seconds = time.monotonic() - began
-    cancelled(house, id)
-    return Told(f"running, attempt 1, after {AWAY[0]:g} s away (cancelled then)", seconds)
+    cancelled(instance, id)
+    return Outcome(f"running, attempt 1, after {AWAY[0]:g} s away (cancelled then)", seconds)
 
 
 @fault("Valkey is killed again and again, while clients wait and submit")
-def valkey_down(house: House) -> Told:
-    id = submitted(house, options={"max_reweightings": 30})
-    house.midst(id, "reweight")
+def valkey_down(instance: Instance) -> Outcome:
+    id = submitted(instance, options={"max_reweightings": 30})
+    instance.midst(id, "reweight")
     ends: list[Status] = []
 
     def wait() -> None:
-        with house.client() as client:
+        with instance.client() as client:
             ends.append(client.wait(id, load=False, timeout=240).job.status)
 
     waiting = Thread(target=wait)
     waiting.start()
     began = time.monotonic()
     while time.monotonic() < began + AWAY[0]:
-        for pid in house.look()["valkey"]:
+        for pid in instance.look()["valkey"]:
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
         time.sleep(0.05)
-    other = submitted(house, options=SHORT)
-    job = house.final(id)
+    other = submitted(instance, options=SHORT)
+    job = instance.final(id)
     waiting.join(240)
-    assert (job.status, ends, house.final(other).status) == (Status.SUCCEEDED, [job.status], Status.SUCCEEDED)
-    return Told(f"{said(job)}, {AWAY[0]:g} s away; both clients noticed nothing", time.monotonic() - began)
+    assert (job.status, ends, instance.final(other).status) == (Status.SUCCEEDED, [job.status], Status.SUCCEEDED)
+    return Outcome(f"{status_of(job)}, {AWAY[0]:g} s away; both clients noticed nothing", time.monotonic() - began)
 
 
 @fault(
     "worker and job process frozen beyond the lease while the files are written, thawed when another has finished the job"
 )
-def frozen(house: House) -> Told:
-    id = submitted(house, frames=60, points=8000, options=LARGE)
-    stale = house.jobs.records.get(id).attempt_id
-    house.until(lambda: any((house.settings.work / stale).glob("artifacts/*")), "a file is begun")
-    (old,) = [pid for pid in house.look()["worker"] if children(pid)]
+def frozen(instance: Instance) -> Outcome:
+    id = submitted(instance, frames=60, points=8000, options=LARGE)
+    stale = instance.jobs.records.get(id).attempt_id
+    instance.until(lambda: any((instance.settings.work / stale).glob("artifacts/*")), "a file is begun")
+    (old,) = [pid for pid in instance.look()["worker"] if children(pid)]
     pids = [old, *children(old)]
     for pid in pids:
         os.kill(pid, signal.SIGSTOP)
     began = time.monotonic()
-    job = house.final(id)
+    job = instance.final(id)
     seconds = time.monotonic() - began
-    held = house.jobs.records.get(id)
+    held = instance.jobs.records.get(id)
     for pid in reversed(pids):
         os.kill(pid, signal.SIGCONT)
-    house.until(lambda: not any(running(pid) for pid in pids[1:]), "the stale job process ends")
+    instance.until(lambda: not any(running(pid) for pid in pids[1:]), "the stale job process ends")
     time.sleep(0.5)
-    assert house.jobs.records.get(id) == held, "the stale attempt wrote nothing"
+    assert instance.jobs.records.get(id) == held, "the stale attempt wrote nothing"
     assert (job.status, job.attempt) == (Status.SUCCEEDED, 2)
-    return Told(f"{said(job)}; the first one wrote nothing", seconds)
+    return Outcome(f"{status_of(job)}; the first one wrote nothing", seconds)
 
 
 @fault("one attempt delivered to two workers at once")
-def twice(house: House) -> Told:
-    id = submitted(house, options={"max_reweightings": 30})
-    house.midst(id, "reweight")
+def twice(instance: Instance) -> Outcome:
+    id = submitted(instance, options={"max_reweightings": 30})
+    instance.midst(id, "reweight")
     began = time.monotonic()
-    house.jobs.queue.push(id, house.jobs.records.get(id).attempt_id)
-    job = house.final(id)
-    assert (job.status, job.attempt) == (Status.SUCCEEDED, 1), f"{said(job)}\n{house.jobs.log(id)}"
-    return Told(said(job), time.monotonic() - began)
+    instance.jobs.queue.push(id, instance.jobs.records.get(id).attempt_id)
+    job = instance.final(id)
+    assert (job.status, job.attempt) == (Status.SUCCEEDED, 1), f"{status_of(job)}\n{instance.jobs.log(id)}"
+    return Outcome(status_of(job), time.monotonic() - began)
 
 
 def cancel_at(stage: str) -> Fault:
     """Return the fault of cancelling a job in a stage."""
 
-    def cancel(house: House) -> Told:
-        blockers = [submitted(house, options=LONG) for _ in range(2)] if stage == "queued" else []
+    def cancel(instance: Instance) -> Outcome:
+        blockers = [submitted(instance, options=LONG) for _ in range(2)] if stage == "queued" else []
         for blocker in blockers:
-            house.midst(blocker, "reweight")
-        id = _in_stage(house, stage)
-        there = "queued" if stage == "queued" else house.midst(id, stage)
+            instance.midst(blocker, "reweight")
+        id = _in_stage(instance, stage)
+        there = "queued" if stage == "queued" else instance.midst(id, stage)
         began = time.monotonic()
-        job = cancelled(house, id)
+        job = cancelled(instance, id)
         seconds = time.monotonic() - began
-        assert job.status is (Status.SUCCEEDED if there == "succeeded" else Status.CANCELLED), said(job)
+        assert job.status is (Status.SUCCEEDED if there == "succeeded" else Status.CANCELLED), status_of(job)
         assert (job.artifacts == []) is (job.status is Status.CANCELLED)
         for blocker in blockers:
-            cancelled(house, blocker)
-        return Told(said(job) if there == stage else f"{said(job)} (was {there} already)", seconds)
+            cancelled(instance, blocker)
+        return Outcome(status_of(job) if there == stage else f"{status_of(job)} (was {there} already)", seconds)
 
     cancel.__name__ = f"cancel_{stage}"
     return fault(f"cancel in stage `{stage}`")(cancel)
 
 
-def _in_stage(house: House, stage: str) -> str:
+def _in_stage(instance: Instance, stage: str) -> str:
     """Submit a job that is long enough in a stage to be met there."""
     if stage == "cameras":
-        with house.client() as client:
+        with instance.client() as client:
             job = client.submit(face(80, 6000).tracks.points, mesh="none", options=SHORT, timeout=120)
-        house.acknowledged.append(job.id)
+        instance.acknowledged.append(job.id)
         return job.id
     if stage == "reweight":
-        return submitted(house, options=LONG)
-    return submitted(house, frames=80, points=12_000, options=LARGE)
+        return submitted(instance, options=LONG)
+    return submitted(instance, frames=80, points=12_000, options=LARGE)
 
 
 for _stage in ("queued", "loading", "cameras", "reweight", "exporting"):
@@ -227,9 +227,9 @@ for _stage in ("queued", "loading", "cameras", "reweight", "exporting"):
 
 
 @fault("an array larger than the memory that a job may take (RLIMIT_AS)")
-def memory(house: House) -> Told:
+def memory(instance: Instance) -> Outcome:
     """On an installation of its own, with PLIANT_MEMORY_LIMIT."""
-    lean = House(house.folder / "lean", chosen=replace(SOON, memory_limit=700 << 20), workers=1)
+    lean = Instance(instance.folder / "lean", chosen=replace(SOON, memory_limit=700 << 20), workers=1)
     with lean:
         began = time.monotonic()
         id = submitted(lean, frames=200, points=9000, options=SHORT)
@@ -240,4 +240,4 @@ def memory(house: House) -> Told:
         after = submitted(lean, frames=6, points=50, options=SHORT)
         assert lean.final(after).status is Status.SUCCEEDED
         assert lean.misfits() == []
-    return Told(f"{said(job)}; the next job succeeded", seconds)
+    return Outcome(f"{status_of(job)}; the next job succeeded", seconds)

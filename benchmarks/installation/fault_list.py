@@ -1,4 +1,4 @@
-"""The list of faults, and what those who commit them have in common."""
+"""The list of faults, and functions that they share."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pliant.client import Job, NotAllowedNow
 from pliant.solver.gallery import face
 
-from benchmarks.installation.house import House
+from benchmarks.installation.instance import Instance
 from benchmarks.installation.long_jobs import LONG, long_sequence
 
 SHORT = {"max_reweightings": 3}
@@ -17,22 +17,22 @@ LARGE = {"method": "pseudo_inverse"}
 
 
 @dataclass(frozen=True)
-class Told:
-    """What came of a fault."""
+class Outcome:
+    """Outcome of a fault."""
 
-    said: str
-    """By the record, in the end."""
+    record: str
+    """Final state of the job record."""
     seconds: float
-    """From the fault to that."""
+    """Time from the fault to that state."""
 
 
-Fault = Callable[[House], Told]
+Fault = Callable[[Instance], Outcome]
 FAULTS: dict[str, tuple[str, Fault]] = {}
-"""What was done and when, and how it is done, by a short name."""
+"""Description and function of each fault by name."""
 
 
 def fault(when: str) -> Callable[[Fault], Fault]:
-    """List a fault."""
+    """Register a fault with its description."""
 
     def listed(function: Fault) -> Fault:
         FAULTS[function.__name__] = (when, function)
@@ -41,25 +41,25 @@ def fault(when: str) -> Callable[[Fault], Fault]:
     return listed
 
 
-def submitted(house: House, *, frames: int = 40, points: int = 1200, options: dict[str, object]) -> str:
-    """Submit a made-up sequence over HTTP; true cameras, so that the solver is soon at its loop."""
+def submitted(instance: Instance, *, frames: int = 40, points: int = 1200, options: dict[str, object]) -> str:
+    """Submit a synthetic sequence over HTTP, with true cameras so that the main loop starts soon."""
     sequence = long_sequence() if options is LONG else face(frames, points)
-    with house.client() as client:
+    with instance.client() as client:
         job = client.submit(
             sequence.tracks.points, mesh="none", rotations=sequence.rotations, options=options, timeout=120
         )
-    house.acknowledged.append(job.id)
+    instance.acknowledged.append(job.id)
     return job.id
 
 
-def said(job: Job) -> str:
-    """Return a job's end in a few words."""
+def status_of(job: Job) -> str:
+    """Return the final status of a job as text."""
     again = f", attempt {job.attempt}" if job.attempt > 1 else ""
     return job.status.value + (f" ({job.error.code})" if job.error is not None else "") + again
 
 
-def cancelled(house: House, id: str) -> Job:
-    """Cancel a job that has shown what it had to show."""
-    with suppress(NotAllowedNow), house.client() as client:
+def cancelled(instance: Instance, id: str) -> Job:
+    """Cancel a job and return its final record."""
+    with suppress(NotAllowedNow), instance.client() as client:
         client.cancel(id)
-    return house.final(id)
+    return instance.final(id)

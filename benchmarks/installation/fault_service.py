@@ -13,13 +13,13 @@ from pliant.client import Job, Status
 from pliant.client.multipart import Remainder
 from pliant.solver.gallery import face
 
-from benchmarks.installation.fault_list import LARGE, SHORT, Told, cancelled, fault, said, submitted
-from benchmarks.installation.house import House, running
+from benchmarks.installation.fault_list import LARGE, SHORT, Outcome, cancelled, fault, status_of, submitted
+from benchmarks.installation.instance import Instance, running
 from benchmarks.installation.long_jobs import LONG
 
 
 @fault("kill -9 the API in mid upload")
-def api_uploading(house: House) -> Told:
+def api_uploading(instance: Instance) -> Outcome:
     sequence = face(60, 40_000)  # 38 MB, above the SDK's threshold
     began: list[int] = []
     whole, killed = Remainder.pieces, 0.0
@@ -29,119 +29,119 @@ def api_uploading(house: House) -> Told:
         began.append(rest.offset)
         for number, piece in enumerate(whole(rest)):
             if number == 100 and len(began) == 1:
-                house.kill("service")
+                instance.kill("service")
                 killed = time.monotonic()
             yield piece
 
     Remainder.pieces = pieces  # type: ignore[method-assign]
     try:
-        with house.client() as client:
+        with instance.client() as client:
             job = client.submit(sequence.tracks.points, mesh="none", options=LARGE, timeout=240)
     finally:
         Remainder.pieces = whole  # type: ignore[method-assign]
     seconds = time.monotonic() - killed
-    house.acknowledged.append(job.id)
+    instance.acknowledged.append(job.id)
     assert len(began) == 2
     assert began[1] > 10_000_000, "what had arrived was not sent again"
-    cancelled(house, job.id)
-    return Told(f"accepted; went on at byte {began[1]:,}", seconds)
+    cancelled(instance, job.id)
+    return Outcome(f"accepted; went on at byte {began[1]:,}", seconds)
 
 
 @fault("kill -9 the API in mid form (no upload)")
-def api_receiving(house: House) -> Told:
-    host, port = house.url.removeprefix("http://").split(":")
+def api_receiving(instance: Instance) -> Outcome:
+    host, port = instance.url.removeprefix("http://").split(":")
     with socket.create_connection((host, int(port)), timeout=10) as connection:
         head = "POST /v1/jobs HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: multipart/form-data; boundary=b\r\n"
         part = '--b\r\nContent-Disposition: form-data; name="tracks"; filename="t.npz"\r\n\r\n'
         connection.sendall(f"{head}Content-Length: 9000000\r\n\r\n{part}".encode() + bytes(3_000_000))
-        incoming = house.settings.data / "incoming"
-        house.until(
+        incoming = instance.settings.data / "incoming"
+        instance.until(
             lambda: any(path.is_file() and path.stat().st_size for path in incoming.glob("*/*/*")), "it arrives"
         )
-        house.kill("service")
+        instance.kill("service")
         began = time.monotonic()
-    id = submitted(house, options=SHORT)
-    assert house.final(id).status is Status.SUCCEEDED
+    id = submitted(instance, options=SHORT)
+    assert instance.final(id).status is Status.SUCCEEDED
     assert not any(path.is_file() for path in incoming.glob("*/*/*"))
-    return Told("nothing was acknowledged, nothing is kept", time.monotonic() - began)
+    return Outcome("nothing was acknowledged, nothing is kept", time.monotonic() - began)
 
 
 @fault("kill -9 the API in mid wait and mid job")
-def api_waiting(house: House) -> Told:
-    id = submitted(house, options={"max_reweightings": 40})
+def api_waiting(instance: Instance) -> Outcome:
+    id = submitted(instance, options={"max_reweightings": 40})
     killed: list[float] = []
 
     def kill(_: Job) -> None:
         if not killed:
-            house.kill("service")
+            instance.kill("service")
             killed.append(time.monotonic())
 
-    with house.client() as client:
+    with instance.client() as client:
         job = client.wait(id, on_progress=kill, load=False, timeout=240).job
     assert (job.status, job.attempt) == (Status.SUCCEEDED, 1)
-    return Told(f"{said(job)}; the client noticed nothing", time.monotonic() - killed[0])
+    return Outcome(f"{status_of(job)}; the client noticed nothing", time.monotonic() - killed[0])
 
 
 @fault("kill -9 the API in mid download")
-def api_downloading(house: House) -> Told:
-    id = submitted(house, frames=60, points=8000, options=LARGE)
-    house.final(id)
+def api_downloading(instance: Instance) -> Outcome:
+    id = submitted(instance, frames=60, points=8000, options=LARGE)
+    instance.final(id)
     killed: list[float] = []
 
     def kill(done: int, _: int) -> None:
         if not killed and done > 0:
-            house.kill("service")
+            instance.kill("service")
             killed.append(time.monotonic())
 
-    with tempfile.TemporaryDirectory() as folder, house.client() as client:
+    with tempfile.TemporaryDirectory() as folder, instance.client() as client:
         path = client.download(id, folder, names=["shapes.npz"], on_download=kill, timeout=240)["shapes.npz"]
-        about = next(each for each in house.jobs.get(id).artifacts if each.name == "shapes.npz")
+        about = next(each for each in instance.jobs.get(id).artifacts if each.name == "shapes.npz")
         assert hashlib.sha256(path.read_bytes()).hexdigest() == about.sha256
-    return Told("the file is whole and right", time.monotonic() - killed[0])
+    return Outcome("the file is whole and right", time.monotonic() - killed[0])
 
 
 @fault("kill -9 everything in mid solve, and start it again")
-def everything(house: House) -> Told:
-    id = submitted(house, options=LONG)
-    waiting = submitted(house, options=SHORT)
-    house.midst(id, "reweight")
-    old = {pid for pids in house.look().values() for pid in pids}
-    house.kill_all()
+def everything(instance: Instance) -> Outcome:
+    id = submitted(instance, options=LONG)
+    waiting = submitted(instance, options=SHORT)
+    instance.midst(id, "reweight")
+    old = {pid for pids in instance.look().values() for pid in pids}
+    instance.kill_all()
     began = time.monotonic()
-    house.until(lambda: not any(running(pid) for pid in old), "all of it is gone", seconds=30)
-    house.start()
-    house.until(lambda: house.jobs.get(id).attempt >= 2, "it is begun again")
+    instance.until(lambda: not any(running(pid) for pid in old), "all of it is gone", seconds=30)
+    instance.start()
+    instance.until(lambda: instance.jobs.get(id).attempt >= 2, "it is begun again")
     seconds = time.monotonic() - began
-    assert house.final(waiting).status is Status.SUCCEEDED
-    cancelled(house, id)
-    return Told("running, attempt 2 (cancelled then); the waiting one succeeded", seconds)
+    assert instance.final(waiting).status is Status.SUCCEEDED
+    cancelled(instance, id)
+    return Outcome("running, attempt 2 (cancelled then); the waiting one succeeded", seconds)
 
 
 @fault("SIGTERM to everything in mid solve, and start it again")
-def stopped(house: House) -> Told:
-    id = submitted(house, options=LONG)
-    house.midst(id, "reweight")
-    old = {pid for pids in house.look().values() for pid in pids}
+def stopped(instance: Instance) -> Outcome:
+    id = submitted(instance, options=LONG)
+    instance.midst(id, "reweight")
+    old = {pid for pids in instance.look().values() for pid in pids}
     began = time.monotonic()
-    house.stop()
+    instance.stop()
     stopping = time.monotonic() - began
     assert not any(running(pid) for pid in old)
-    house.start()
-    house.until(lambda: house.jobs.get(id).attempt >= 2, "it is begun again")
+    instance.start()
+    instance.until(lambda: instance.jobs.get(id).attempt >= 2, "it is begun again")
     seconds = time.monotonic() - began
-    assert "sign of life" not in house.jobs.log(id), "it was put back, not lost"
-    cancelled(house, id)
-    return Told(f"put back within {stopping:.1f} s; running, attempt 2 (cancelled then)", seconds)
+    assert "sign of life" not in instance.jobs.log(id), "it was put back, not lost"
+    cancelled(instance, id)
+    return Outcome(f"put back within {stopping:.1f} s; running, attempt 2 (cancelled then)", seconds)
 
 
 @fault("a second `pliant up` on the same data directory")
-def second(house: House) -> Told:
-    id = submitted(house, options={"max_reweightings": 30})
+def second(instance: Instance) -> Outcome:
+    id = submitted(instance, options={"max_reweightings": 30})
     began = time.monotonic()
-    command = [sys.executable, "-m", "pliant.cli", "up", "--port", "0", "--data", str(house.settings.data)]
+    command = [sys.executable, "-m", "pliant.cli", "up", "--port", "0", "--data", str(instance.settings.data)]
     ran = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
     seconds = time.monotonic() - began
     assert (ran.returncode, "already used" in ran.stderr) == (6, True), ran.stderr
-    job = house.final(id)
+    job = instance.final(id)
     assert job.status is Status.SUCCEEDED
-    return Told(f"refused with exit code 6; the job {said(job)}", seconds)
+    return Outcome(f"refused with exit code 6; the job {status_of(job)}", seconds)

@@ -1,9 +1,9 @@
-"""Faults: every kind of process killed at every kind of moment, on a real installation; what the record said, and what was lost.
+"""Faults on a real installation: every kind of process is killed at different times; state of the record afterwards, and losses.
 
     python -m benchmarks.installation.faults
 
-Prints a table. After each fault everything stored is compared with what the records say (as `pliant fsck` does), the
-list of jobs with those that were acknowledged, and the process table with what was started. Exits with 1 if anything does not fit.
+Prints a table. After each fault the stored data are compared with the job records (as by `pliant fsck`), the
+list of jobs with the acknowledged ones, and the process table with the started processes. Exits with 1 on any mismatch.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ import tempfile
 from pathlib import Path
 
 from benchmarks.installation import fault_jobs, fault_service
-from benchmarks.installation.fault_list import FAULTS, Told
-from benchmarks.installation.house import House
+from benchmarks.installation.fault_list import FAULTS, Outcome
+from benchmarks.installation.instance import Instance
 
 assert fault_service.__doc__, "imported for what it lists"
 
 
-HEAD = "| what was done | what the record said | seconds | lost, doubled, half-written, left over |"
+HEAD = "| fault | state of the record | seconds | lost, duplicated, half-written, left over |"
 
 
 def main() -> int:
-    """Commit every fault, print the table; return the exit code."""
+    """Inject every fault, print the table; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--away", type=float, default=30.0, help="seconds that Valkey is away")
     parser.add_argument("--only", default="", help="names, commas between them: " + ", ".join(FAULTS))
@@ -34,17 +34,17 @@ def main() -> int:
     wanted = [name for name in given.only.split(",") if name] or list(FAULTS)
     wrong, rows = 0, [HEAD, "|---|---|---|---|"]
     print("\n".join(rows))
-    with tempfile.TemporaryDirectory() as folder, House(Path(folder)) as house:
+    with tempfile.TemporaryDirectory() as folder, Instance(Path(folder)) as instance:
         for name in wanted:
-            when, commit = FAULTS[name]
+            when, inject = FAULTS[name]
             try:
-                told = commit(house)
+                outcome = inject(instance)
             except AssertionError as surprise:
-                told = Told(f"not as expected: {surprise}", 0.0)
+                outcome = Outcome(f"not as expected: {surprise}", 0.0)
                 wrong += 1
-            misfits = house.misfits()
+            misfits = instance.misfits()
             wrong += len(misfits)
-            rows.append(f"| {when} | {told.said} | {told.seconds:.1f} | {' '.join(misfits) or 'nothing'} |")
+            rows.append(f"| {when} | {outcome.record} | {outcome.seconds:.1f} | {' '.join(misfits) or 'nothing'} |")
             print(rows[-1], flush=True)
     if given.into is not None:
         replace_table(given.into, rows)

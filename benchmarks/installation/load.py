@@ -24,7 +24,7 @@ from pliant.client.multipart import LARGE
 from pliant.solver.gallery import face
 from pliant.worker.errors import NotAllowedNow
 
-from benchmarks.installation.house import House, children, resident
+from benchmarks.installation.instance import Instance, children, resident
 
 UNLIMITED = {"PLIANT_REQUESTS_PER_MINUTE": "0", "PLIANT_MAX_QUEUED": "0"}
 MB = 2**20
@@ -54,7 +54,7 @@ def watched(pid: int) -> Iterator[Callable[[], float]]:
         thread.join()
 
 
-def jobs(house: House, *, number: int, clients: int) -> int:
+def jobs(instance: Instance, *, number: int, clients: int) -> int:
     """Let clients submit small jobs and wait for each, while one more reads the status of a job without pause."""
     sequence = face(20, 200)  # with its cameras: what is measured is the way of a job, not the solver
     submits: list[float] = []
@@ -69,32 +69,32 @@ def jobs(house: House, *, number: int, clients: int) -> int:
                 sequence.tracks.points, mesh="none", rotations=sequence.rotations, options={"max_reweightings": 3}
             )
             submits.append(time.monotonic() - began)
-            house.acknowledged.append(job.id)
+            instance.acknowledged.append(job.id)
             ends.append((await job.wait(load=False, timeout=600)).job.status)
 
     async def read(http: httpx.AsyncClient) -> None:
         while len(ends) < number:
-            if house.acknowledged:
+            if instance.acknowledged:
                 began = time.monotonic()
-                answer = await http.get(f"/v1/jobs/{house.acknowledged[-1]}")
+                answer = await http.get(f"/v1/jobs/{instance.acknowledged[-1]}")
                 assert answer.status_code == 200, answer.text
                 reads.append(time.monotonic() - began)
             await asyncio.sleep(0.02)
 
     async def everything() -> None:
-        async with httpx.AsyncClient(base_url=house.url, timeout=60) as http:
-            each = [AsyncClient(house.url) for _ in range(clients)]
+        async with httpx.AsyncClient(base_url=instance.url, timeout=60) as http:
+            each = [AsyncClient(instance.url) for _ in range(clients)]
             await asyncio.gather(read(http), *(work(client) for client in each))
             for client in each:
                 await client.close()
 
-    (service,) = house.look()["service"]
+    (service,) = instance.look()["service"]
     began = time.monotonic()
     with watched(service) as largest:
         asyncio.run(everything())
     seconds = time.monotonic() - began
     lost = number - ends.count(Status.SUCCEEDED)
-    print(f"| {number} jobs of 20 × 200, {clients} clients, {house.workers} workers | |\n|---|---|")
+    print(f"| {number} jobs of 20 × 200, {clients} clients, {instance.workers} workers | |\n|---|---|")
     print(f"| seconds, jobs a second | {seconds:.1f}, {number / seconds:.1f} |")
     print(f"| submissions, ms: median / p99 / largest | {percentiles(submits)} |")
     print(f"| status reads meanwhile ({len(reads)}), ms | {percentiles(reads)} |")
@@ -128,9 +128,9 @@ class Poller:
             self._streams[1].close()
 
 
-def pollers(house: House, *, number: int, seconds: float, every: float) -> int:
+def pollers(instance: Instance, *, number: int, seconds: float, every: float) -> int:
     """Let many clients look at jobs at their own pace, and then all wait for one job at once (`Prefer: wait`)."""
-    ids = house.acknowledged or [_one(house)]
+    ids = instance.acknowledged or [_one(instance)]
     reads: list[float] = []
     lost: list[str] = []
 
@@ -151,12 +151,12 @@ def pollers(house: House, *, number: int, seconds: float, every: float) -> int:
             await asyncio.sleep(every)
 
     async def all_of_them(one: Callable[[Poller, int], Awaitable[None]]) -> None:
-        each = [Poller(house.url) for _ in range(number)]
+        each = [Poller(instance.url) for _ in range(number)]
         await asyncio.gather(*(one(poller, index) for index, poller in enumerate(each)))
         for poller in each:
             poller.close()
 
-    (service,) = house.look()["service"]
+    (service,) = instance.look()["service"]
     with watched(service) as largest:
         until = time.monotonic() + seconds
         asyncio.run(all_of_them(lambda poller, index: poll(poller, index, until)))
@@ -166,19 +166,19 @@ def pollers(house: House, *, number: int, seconds: float, every: float) -> int:
         )
         print(f"| status reads, ms: median / p99 / largest | {percentiles(reads)} |")
         reads.clear()
-        long = _one(house, options={"max_reweightings": 1000, "tolerance": 1e-15}, frames=40, points=1200)
+        long = _one(instance, options={"max_reweightings": 1000, "tolerance": 1e-15}, frames=40, points=1200)
         began = time.monotonic()
         asyncio.run(all_of_them(lambda poller, _: ask(poller, f"/v1/jobs/{long}", wait=15)))
         print(f"| all waiting for one job, `Prefer: wait=15`: all answered after | {time.monotonic() - began:.1f} s |")
         with suppress(NotAllowedNow):
-            house.jobs.cancel(long)
-        house.final(long)
+            instance.jobs.cancel(long)
+        instance.final(long)
     print(f"| API memory at most | {largest():.0f} MB |")
     print(f"| lost | {len(lost)}{' ' + str(sorted(set(lost))) if lost else ''} |\n")
     return len(lost)
 
 
-def upload(house: House, *, size: int) -> int:
+def upload(instance: Instance, *, size: int) -> int:
     """Send a large file with the SDK, and watch the memory of the API while it arrives and while a job is made of it."""
     frames, points = 100, size * MB // (100 * 2 * 8)
     tracks = np.random.default_rng(0).normal(size=(frames, points, 2))
@@ -187,25 +187,27 @@ def upload(house: House, *, size: int) -> int:
         path = Path(folder) / "tracks.npz"
         np.savez(path, tracks=tracks)
         del tracks
-        house.client().limits()
-        (service,) = house.look()["service"]
+        instance.client().limits()
+        (service,) = instance.look()["service"]
         before = resident(service) / MB
         apart: list[float] = []
         moments: dict[str, float] = {}
 
-        with watched(service) as largest, house.client() as client, _children_of(service, apart):
+        with watched(service) as largest, instance.client() as client, _children_of(service, apart):
             began = time.monotonic()
 
-            def told(done: int, _: int) -> None:
+            def report_progress(done: int, _: int) -> None:
                 if done >= path.stat().st_size and "sent" not in moments:
                     moments.update(sent=time.monotonic() - began, memory=largest())
 
-            job = client.submit(path, mesh="none", options={"method": "pseudo_inverse"}, on_upload=told, timeout=600)
+            job = client.submit(
+                path, mesh="none", options={"method": "pseudo_inverse"}, on_upload=report_progress, timeout=600
+            )
             accepted = time.monotonic() - began
-            house.acknowledged.append(job.id)
+            instance.acknowledged.append(job.id)
             client.cancel(job.id)
             peak = largest()
-    house.final(job.id)
+    instance.final(job.id)
     rate = size / moments["sent"]
     print(f"| {size} MB of tracks ({frames} × {points:,}), by the SDK | |\n|---|---|")
     print(f"| sent in, MB a second | {moments['sent']:.1f} s, {rate:.0f} |")
@@ -239,8 +241,8 @@ def _children_of(pid: int, largest: list[float]) -> Iterator[None]:
         thread.join()
 
 
-def _one(house: House, *, options: dict[str, object] | None = None, frames: int = 20, points: int = 200) -> str:
-    with house.client() as client:
+def _one(instance: Instance, *, options: dict[str, object] | None = None, frames: int = 20, points: int = 200) -> str:
+    with instance.client() as client:
         sequence = face(frames, points)
         job = client.submit(
             sequence.tracks.points,
@@ -248,7 +250,7 @@ def _one(house: House, *, options: dict[str, object] | None = None, frames: int 
             rotations=sequence.rotations,
             options=options or {"max_reweightings": 5},
         )
-    house.acknowledged.append(job.id)
+    instance.acknowledged.append(job.id)
     return job.id
 
 
@@ -264,16 +266,16 @@ def main() -> int:
     parser.add_argument("--megabytes", type=int, default=300)
     given = parser.parse_args()
     wrong = 0
-    with tempfile.TemporaryDirectory() as folder, House(Path(folder), of_service=UNLIMITED) as house:
+    with tempfile.TemporaryDirectory() as folder, Instance(Path(folder), of_service=UNLIMITED) as instance:
         for load in given.loads:
             if load == "jobs":
-                wrong += jobs(house, number=given.jobs, clients=given.clients)
+                wrong += jobs(instance, number=given.jobs, clients=given.clients)
             elif load == "pollers":
-                wrong += pollers(house, number=given.pollers, seconds=given.seconds, every=given.every)
+                wrong += pollers(instance, number=given.pollers, seconds=given.seconds, every=given.every)
             else:
-                wrong += upload(house, size=given.megabytes)
-        misfits = house.misfits()
-        print("Audit: " + (" ".join(misfits) or "everything stored is as the records say"))
+                wrong += upload(instance, size=given.megabytes)
+        misfits = instance.misfits()
+        print("fsck: " + (" ".join(misfits) or "the stores are consistent with the job records"))
     return 1 if wrong or misfits else 0
 
 

@@ -40,13 +40,13 @@ def service() -> Iterator[str]:
         command = [sys.executable, "-m", "pliant.cli", "up", "--port", "0", "--json", "--data", data]
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as up:
             assert up.stdout is not None
-            said = ""
-            while not said.endswith("}\n"):
+            output = ""
+            while not output.endswith("}\n"):
                 line = up.stdout.readline()
                 assert line, "pliant up ended at once"
-                said += line
+                output += line
             try:
-                yield json.loads(said)["url"]
+                yield json.loads(output)["url"]
             finally:
                 up.send_signal(signal.SIGINT)
                 up.wait(30)

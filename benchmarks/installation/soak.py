@@ -63,7 +63,7 @@ class Soak:
     """Unfinished jobs: when each was acknowledged."""
     hit: dict[str, list[tuple[str, float]]] = field(default_factory=lambda: defaultdict(list))
     """Unfinished jobs that faults hit: which, and when."""
-    told: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
+    outcomes: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
     seconds: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
     ends: Counter[str] = field(default_factory=Counter)
     wrong: list[str] = field(default_factory=list)
@@ -98,7 +98,7 @@ class Soak:
         hits = self.hit.pop(job.id, [])
         again = ", begun again" if job.attempt > 1 else ""
         for fault, since in hits:
-            self.told[fault][f"{job.status.value}{code}{again}"] += 1
+            self.outcomes[fault][f"{job.status.value}{code}{again}"] += 1
             self.seconds[fault].append(time.monotonic() - since)
         allowed = {ALLOWED[fault] for fault, _ in hits if fault in ALLOWED} | {Status.SUCCEEDED}
         if job.status not in allowed:
@@ -208,9 +208,9 @@ def run(soak: Soak, seconds: float, every: float) -> int:
     print(f"{soak.refused} submissions refused while Valkey was being started again (never acknowledged)\n")
     print("| fault | times | the jobs that ran then | seconds to their end, median / largest |\n|---|---|---|---|")
     for fault in (*FAULTS, OUTAGE):
-        told = ", ".join(f"{count} {what}" for what, count in soak.told[fault].most_common())
+        counts = ", ".join(f"{count} {what}" for what, count in soak.outcomes[fault].most_common())
         times = sorted(soak.seconds[fault]) or [0.0]
-        print(f"| {fault} | {faults[fault]} | {told or 'none'} | {times[len(times) // 2]:.1f} / {times[-1]:.1f} |")
+        print(f"| {fault} | {faults[fault]} | {counts or 'none'} | {times[len(times) // 2]:.1f} / {times[-1]:.1f} |")
     print("\nEnds: " + ", ".join(f"{count} {what}" for what, count in soak.ends.most_common()))
     print("Lost, doubled or left over: " + ("nothing" if not soak.wrong else "\n  ".join(["", *soak.wrong])))
     return 1 if soak.wrong else 0

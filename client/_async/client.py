@@ -363,7 +363,7 @@ class AsyncClient:
         job : str
             The id of a job that has succeeded.
         outputs : iterable of str, or str
-            Any of ``glb``, ``ply``, ``obj``, ``usd``, ``mdd``, ``mat`` and ``csv``; a text is split at commas.
+            Any of ``glb``, ``ply``, ``obj``, ``usd``, ``abc``, ``mdd``, ``mat`` and ``csv``; a text is split at commas.
         fps : float, optional
             Frames per second of the written animation; by default the job's.
         idempotency_key : str, optional

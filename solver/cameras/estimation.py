@@ -262,7 +262,7 @@ def _why(ran: list[Candidate], best: Candidate, settings: Settings) -> str:
 def _warnings(rotations: Floats) -> tuple[str, ...]:
     if angles_between(rotations, rotations[:1]).max() >= MIN_CAMERA_TURN:
         return ()
-    return ("The camera hardly turns about the object: depth cannot be told from the tracks and is a guess.",)
+    return ("The camera hardly turns around the object: the tracks do not determine depth, which is a guess.",)
 
 
 def _silent(_: Step) -> None:

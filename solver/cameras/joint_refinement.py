@@ -26,7 +26,9 @@ from pliant.solver.model.shape_covariance import (
     learned,
 )
 from pliant.solver.model.so3 import angles_between, exponential
+from pliant.solver.monitor import enter
 from pliant.solver.records import Floats, read_only
+from pliant.solver.stages import UNITS_PER_START
 from pliant.solver.tracks.noise import OUTLIER_SHARE
 from pliant.solver.tracks.normalization import Normalized
 from scipy.spatial.transform import Rotation
@@ -95,6 +97,7 @@ def learn(
     used = learned_frames(shown)
     start = np.asarray(estimate.scales)
     unscaled, sample = _of_corrected(estimate, start, used)
+    enter(should_stop, "model_order")
     model_order = select_model_order(
         sample,
         np.asarray(estimate.rotations)[used, :2],
@@ -107,8 +110,10 @@ def learn(
         # Few modes would let the cameras follow the deformation; the order is selected later, for the shapes.
         model_order = replace(model_order, max_modes=MAX_MODES)
     if turning and estimate.hypotheses:
+        enter(should_stop, "starts", units=UNITS_PER_START * (1 + len(estimate.hypotheses)))
         estimate = _best_start(estimate, unscaled, used, model_order, should_stop)
     if estimate.perspective is not None and normalized is not None:
+        enter(should_stop, "perspective")
         estimate = settled(
             estimate, normalized, used, model_order=model_order, turning=turning, should_stop=should_stop
         )
@@ -117,9 +122,11 @@ def learn(
     before = at_first[used]
     start_scales, why = None, None
     if turning and estimates_scales and (start == 1).all():
+        enter(should_stop, "scales")
         start_scales, why = _free_scales(unscaled, before, model_order, should_stop)
     rotations, scales, found = before, np.ones(len(used)), None
     if turning:
+        enter(should_stop, "refinement")
         found = refined(
             unscaled, before, scales if start_scales is None else start_scales, with_scales=start_scales is not None,
             rounds=REFINEMENT_ROUNDS, model_order=model_order, should_stop=should_stop,
@@ -152,6 +159,7 @@ def learn(
             model_order = select_model_order(
                 sample, projections, spoiled=True, ordered=estimate.ordered, seed=seed, should_stop=should_stop
             )
+        enter(should_stop, "covariance")
         covariance, modes = learn_with_early_stopping(
             sample, unscaled, projections, model_order, seed=seed, should_stop=should_stop
         )

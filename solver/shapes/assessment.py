@@ -15,8 +15,10 @@ from pliant.solver.records import Floats, Solution, read_only
 from pliant.solver.shapes.jackknife import learning_std
 from pliant.solver.shapes.uncertainty import bounded_by_neighbours, position_std
 
-INFLATION = 1.6
-"""Factor from the standard deviation that the model knows to that of the errors."""
+INFLATION = 1.4
+"""Factor from the standard deviation that posterior and jackknife give to that of the errors, for what both leave out: wrong models, and
+other optima of the cameras. With it the median coverage of the 90 % intervals is .90 on the sequences for calibration of
+`benchmarks.trust`."""
 
 
 def assessed(

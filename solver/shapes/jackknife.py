@@ -134,11 +134,10 @@ def _shapes_from(sample: Floats, kept: NDArray[np.bool_], start: Learned, turnin
     rows = columns(sample[:, kept])
     gram = rows @ rows.T / rows.shape[1]
     projections = start.rotations[:, :2] * start.scales[:, None, None]
-    found = replace(start, covariance=improve(start.covariance, gram, projections, iterations=LEARNING))
+    covariance = improve(start.covariance, gram, projections, iterations=LEARNING)
+    found = replace(start, covariance=covariance)
     if turning:
-        scene = scene_at(
-            gram, start.rotations, with_scales=bool((start.scales != 1).any()), ordered=start.covariance.ordered
-        )
+        scene = scene_at(gram, start.rotations, with_scales=bool((start.scales != 1).any()), ordered=covariance.ordered)
         moved = fit(scene, motion_of(scene, found), iterations=TURNING, turning=True)
         found = moved_to(scene, found, *moved)
     depths = depth_map(found.rotations, found.scales, found.covariance) @ columns(sample)

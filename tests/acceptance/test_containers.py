@@ -1,4 +1,4 @@
-"""The container files, as far as they can be checked without an engine: what they start exists, what they set is read."""
+"""The container files, as far as they can be checked without an engine: commands exist, variables are read."""
 
 from __future__ import annotations
 

@@ -34,18 +34,18 @@ def root() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def house(root: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    with import_module("benchmarks.installation.house").House(tmp_path_factory.mktemp("house")) as house:
-        yield house
+def instance(root: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    with import_module("benchmarks.installation.instance").Instance(tmp_path_factory.mktemp("instance")) as instance:
+        yield instance
 
 
 @pytest.mark.parametrize("name", WANTED)
-def test_nothing_is_lost_duplicated_half_written_or_left_over(house: Any, name: str) -> None:
+def test_nothing_is_lost_duplicated_half_written_or_left_over(instance: Any, name: str) -> None:
     listed = import_module("benchmarks.installation.faults").FAULTS
-    _, commit = listed[name]
-    told = commit(house)
-    assert told.said
-    assert house.misfits() == []
+    _, inject = listed[name]
+    outcome = inject(instance)
+    assert outcome.record
+    assert instance.misfits() == []
 
 
 def test_every_fault_is_known(root: None) -> None:

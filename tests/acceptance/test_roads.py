@@ -1,4 +1,4 @@
-"""Both roads from tracks to a mesh, as a user walks them: in this process, and through the service. They end in the same place."""
+"""Both ways from tracks to a mesh, in this process and through the service, with identical results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The road with tokens, as those who run a service and those who use it walk it: `pliant token`, `pliant up`, command line, page."""
+"""An installation with tokens: `pliant token`, `pliant up`, command line and page."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The benchmarks run at tiny sizes, resume, thin meshes properly and notice a regression."""
+"""The benchmarks at tiny sizes: they run, resume, decimate meshes correctly and detect regressions."""
 
 from __future__ import annotations
 

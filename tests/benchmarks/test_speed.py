@@ -1,4 +1,4 @@
-"""The speed benchmark at tiny sizes: what it times, what it says when something does not fit, and its arithmetic."""
+"""The speed benchmarks at tiny sizes: timing, limits of memory, and arithmetic."""
 
 from __future__ import annotations
 

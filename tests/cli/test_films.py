@@ -1,4 +1,4 @@
-"""`pliant solve` takes a film, writes its tracks beside the shapes, and refuses what does not belong to a film."""
+"""`pliant solve` accepts films, writes their tracks beside the shapes, and rejects unrelated inputs."""
 
 from __future__ import annotations
 

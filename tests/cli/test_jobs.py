@@ -1,4 +1,4 @@
-"""The commands that talk to a service, against the double: what they print, and how they end."""
+"""The commands that use a service, against the in-memory service: output and exit codes."""
 
 from __future__ import annotations
 

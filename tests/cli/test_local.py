@@ -1,4 +1,4 @@
-"""What the commands that need no service decide: ports, addresses, verdicts, findings."""
+"""Commands without a service: ports, addresses, verdicts, findings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The command line with wrong paths, missing parts and Ctrl-C: exact messages and exit codes, never a traceback."""
+"""The command line with invalid paths, missing parts and Ctrl-C: exact messages and exit codes, no traceback."""
 
 from __future__ import annotations
 

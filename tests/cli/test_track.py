@@ -1,4 +1,4 @@
-"""`pliant track` writes tracks and a preview, and refuses films in a sentence."""
+"""`pliant track` writes tracks and a preview, and rejects unusable films with a message."""
 
 from __future__ import annotations
 

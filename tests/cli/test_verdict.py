@@ -1,4 +1,4 @@
-"""The verdict is what the commands end with; "Converged" never stands alone."""
+"""Commands end with the verdict, never with "Converged" alone."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a client is made with: environment variables, headers, hooks, certificates."""
+"""Construction of clients: environment variables, headers, hooks, certificates."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every Pliant service answers, asked through both clients: of the double in memory, and of the real thing."""
+"""The contract of every Pliant service, through both clients: in memory and over HTTP."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files arrive whole and right, or not at all."""
+"""Downloads are complete and verified, or absent."""
 
 from __future__ import annotations
 

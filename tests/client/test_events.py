@@ -1,4 +1,4 @@
-"""Following a job: messages however the bytes are cut, streams however they break."""
+"""Following a job: parsing at any chunk boundary, and streams that break."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every script in examples/ runs, against a real service, and does what its first line says."""
+"""Every script in examples/ runs against a real service and does what its first line states."""
 
 from __future__ import annotations
 

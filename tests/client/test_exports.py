@@ -1,4 +1,4 @@
-"""The door of the SDK: what it exports, what it costs, and that its two clients are one."""
+"""Exports of the SDK: names, import cost, and equal interfaces of both clients."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The options on the wire and the settings of the solver say the same."""
+"""The options of the wire contract match the settings of the solver."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures: a lit surface where there is a mesh, points where there is none or too large a one."""
+"""Plots: a lit surface with a mesh, points without one or with too large a one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The ready-made bar: shows a terminal what happens, and is silent elsewhere."""
+"""The progress display: visible on terminals, silent elsewhere."""
 
 from __future__ import annotations
 

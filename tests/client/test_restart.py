@@ -1,4 +1,4 @@
-"""The service is killed without warning and started again, and whoever waits or fetches notices nothing."""
+"""The service is killed and restarted; waiting and downloading clients continue."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a result states about its own accuracy, as an SDK user reads it."""
+"""Expected error and verdict as seen by users of the SDK."""
 
 from __future__ import annotations
 

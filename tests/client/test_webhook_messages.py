@@ -1,4 +1,4 @@
-"""Webhooks at the receiver: what the service signs is proved, and nothing else is."""
+"""Webhooks at the receiver: messages of the service are verified, all others rejected."""
 
 from __future__ import annotations
 

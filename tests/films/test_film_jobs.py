@@ -1,4 +1,4 @@
-"""Films as inputs of jobs: the contained process, its limits, and what becomes of the tracks."""
+"""Films as inputs of jobs: the film process, its limits, and the resulting tracks."""
 
 from __future__ import annotations
 
@@ -33,6 +33,7 @@ from pliant.worker.films.tracker import Tracked, check_film, described, film_opt
 from pliant.worker.formats import Inputs
 from pliant.worker.processes.contained import MAX_LINE, Ended, _Progress
 from pliant.worker.processes.no_network import forbid_network
+from pliant.worker.settings import Settings
 
 SIZE = (96, 72)
 
@@ -67,6 +68,17 @@ def test_a_film_is_checked_without_being_tracked(film: Path, region: Path) -> No
     stated = described(facts, options)
     assert stated.mesh_source == "film"
     assert "96×72 pixels" in stated.notes[0]
+
+
+def test_an_installation_sets_the_bounds_of_films(film: Path) -> None:
+    settings = Settings.from_environment(
+        {"PLIANT_FILM_FRAMES": "8", "PLIANT_FILM_PIXELS": "5000", "PLIANT_FILM_SECONDS": "2"}
+    )
+    bounds = FilmBounds.of(settings, max_bytes=10**6)
+    assert (bounds.max_bytes, bounds.max_frames, bounds.max_pixels, bounds.max_seconds) == (10**6, 8, 5000, 2.0)
+    assert bounds.memory == settings.film_memory == FilmBounds().memory
+    assert FilmBounds.of(Settings(memory_limit=1 << 30)).memory == 1 << 30
+    assert refusal(FilmSource(film), bounds=bounds).code == "too_many_pixels"
 
 
 def test_a_portrait_film_is_upright(tmp_path: Path) -> None:
@@ -276,6 +288,7 @@ def test_the_film_process_has_no_network_and_starts_no_programs() -> None:
     script = textwrap.dedent("""
         import socket, subprocess, threading
         from pliant.worker.processes.no_network import forbid_network
+from pliant.worker.settings import Settings
         print(forbid_network())
         for attempt in (socket.socket, lambda: subprocess.run(["/bin/true"])):
             try:

@@ -1,4 +1,4 @@
-"""Building the page: what happens where Node.js, the registry or the sources are not there."""
+"""Building the page, also without Node.js, the registry or the sources."""
 
 from __future__ import annotations
 

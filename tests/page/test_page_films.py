@@ -1,4 +1,4 @@
-"""A film in the page: recognised, its first frame shown, a region drawn on it and sent, its tracks shown with the result."""
+"""Films in the page: detection, first frame, drawing a region, submission, and tracks beside the result."""
 
 from __future__ import annotations
 
@@ -253,7 +253,7 @@ def test_a_service_without_films_offers_no_film_input(page: Page, url: str) -> N
     page.route("**/v1/options", without)
     page.goto(url)
     page.reload()
-    page.get_by_label("Preset").wait_for()
+    page.get_by_text("Files to write", exact=True).wait_for()
     expect(page.get_by_text("Drop tracks and a mesh here")).to_be_visible()
     expect(page.locator("[data-part=film]")).to_be_hidden()
 

@@ -1,4 +1,4 @@
-"""Jobs followed in the page: running, waiting, beside the one that is shown; a service that is away; a token."""
+"""Following jobs in the page: running, queued and other jobs; outages; tokens."""
 
 from __future__ import annotations
 

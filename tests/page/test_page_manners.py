@@ -1,4 +1,4 @@
-"""The page's manners: the keyboard alone, accessibility, and no request to anybody else."""
+"""Keyboard use, accessibility, and no requests to other hosts."""
 
 from __future__ import annotations
 
@@ -55,15 +55,17 @@ def test_there_are_no_accessibility_findings_and_no_overflow(
         pytest.skip("axe-core is not installed; say `make page`")
     page.emulate_media(color_scheme=scheme, reduced_motion="reduce")  # type: ignore[arg-type]
     page.set_viewport_size({"width": width, "height": 844})
-    for address, landmark in (("", "Point tracks in"), (f"#job={finished}", "a finished face")):
+    for address, landmark in (("", "Point tracks in"), (f"#job={finished}", "a finished face"), ("docs", "Pliant 0")):
         page.goto(f"{url}/{address}")
         page.get_by_role("heading", name=landmark).wait_for()
         if "#" in address:
             page.locator(".view canvas").wait_for(timeout=DONE)
         if address == "":
-            page.get_by_text("More options").click()
+            page.get_by_text("Files to write", exact=True).click()
         page.evaluate(axe.read_text())
         found = page.evaluate("axe.run().then((found) => found.violations)")
+        if address == "docs":  # Swagger UI has a link inside the button of each operation
+            found = [one for one in found if one["id"] != "nested-interactive"]
         said = [f"{one['id']} ({one['impact']}): {[node['html'] for node in one['nodes']][:3]}" for one in found]
         assert said == [], address
         assert page.evaluate("document.documentElement.scrollWidth") <= width, address

@@ -1,4 +1,4 @@
-"""A result in the page: every view, the animation, a dense one, and the code that makes the same job."""
+"""A result in the page: every view, the animation, dense results, and the code for the same job."""
 
 from __future__ import annotations
 
@@ -146,9 +146,9 @@ def test_a_dense_result_plays_within_time_and_memory(page: Page, tmp_path: Path)
         page.get_by_label(label, exact=True).set_input_files(tmp_path / f"{part}.npz")
     seen = page.get_by_role("region", name="How your files are interpreted")
     expect(seen).to_contain_text("99 frames of 29,000 points", timeout=30_000)
+    page.get_by_text("For experts").click()
     page.get_by_label("Method").select_option(label="pseudo-inverse")
-    page.get_by_text("More options").click()
-    page.get_by_label("Refine rotations").uncheck()
+    page.get_by_label("Refine cameras").uncheck()
     page.get_by_role("button", name="Reconstruct").click()
     page.locator(".view canvas").wait_for(timeout=DONE)
     seek(page, 0)

@@ -1,4 +1,4 @@
-"""Sending from the page: files chosen or dropped, how they are understood, what is refused."""
+"""Submitting from the page: chosen or dropped files, their interpretation, and errors."""
 
 from __future__ import annotations
 
@@ -30,6 +30,7 @@ def test_files_are_submitted_and_the_result_plays(page: Page, url: str, small: d
     expect(seen.get_by_role("img", name="Sample of the tracks")).to_be_visible()
     painted = "(it) => it.getContext('2d').getImageData(0, 0, it.width, it.height).data.filter((v, i) => i % 4 === 3 && v > 0).length"
     assert seen.get_by_role("img", name="Sample of the tracks").evaluate(painted) > 200 * 9  # a dot each of 200 points
+    page.get_by_text("For experts").click()
     page.get_by_label("Preset").select_option(label="automatic")
     page.get_by_label("name (optional)").fill("my flag")
     page.get_by_role("button", name="Reconstruct").click()
@@ -74,8 +75,13 @@ def test_an_error_is_shown_with_the_services_message(page: Page, url: str) -> No
     said = httpx.post(f"{url}/v1/jobs", files={"tracks": ("tracks.npz", b"hello, I am not tracks")}).json()
     choose(page, {TRACKS: b"hello, I am not tracks"})
     page.get_by_role("button", name="Reconstruct").click()
-    alert = page.get_by_role("alert")
-    expect(alert).to_contain_text(said["detail"])
+    alert = page.locator("[data-part=tracks]").get_by_role("alert")
+    sentence = said["detail"].removeprefix("tracks: ").removesuffix(said["hint"]).strip()
+    expect(alert).to_contain_text(sentence[0].upper() + sentence[1:])
+    expect(alert).to_contain_text(said["hint"])
+    expect(alert.get_by_role("link", name="What files can I send?")).to_have_attribute("href", "guide#tracks")
+    expect(alert.get_by_role("link", name="About this error")).to_have_attribute("href", f"errors/{said['code']}")
+    expect(page.get_by_text("Not sent: see “Tracks” above.")).to_be_visible()
     expect(alert).to_contain_text(said["code"])
     assert "#job" not in page.url
     choose(page, {TRACKS: packed(tracks=np.zeros((2, 50, 2)))})

@@ -1,4 +1,4 @@
-"""The verdict on a result in the page: above the viewer, in the list, and left out for jobs without one."""
+"""The verdict in the page: above the viewer and in the list, absent for jobs without one."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_the_verdict_is_above_the_viewer_and_in_the_list(
     box = page.get_by_role("region", name="Verdict")
     expect(box).to_contain_text(words)
     expect(box).to_contain_text(TRUST)
-    expect(box).to_contain_text("In about nine of ten sequences the true error is between 2.0 % and 5.1 %.")
+    expect(box).to_contain_text("In about three of four sequences the true error is between 2.0 % and 5.1 %.")
     expect(box.locator("svg")).to_be_visible()
     assert box.get_by_role("listitem").all_inner_texts() == reasons
     expect(box).to_contain_text("Solver: Converged.")

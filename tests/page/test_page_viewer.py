@@ -21,6 +21,7 @@ pytestmark = [
     pytest.mark.skipif(why_not() is not None and not os.environ.get("CI"), reason=str(why_not())),
 ]
 
+AXE = Path(__file__).parents[2] / "service" / "web" / "node_modules" / "axe-core" / "axe.min.js"
 FRAMES, POINTS = 10, 300
 
 
@@ -71,8 +72,8 @@ def canvas(page: Page) -> Locator:
 
 
 def facts(page: Page) -> dict[str, str]:
-    rows = page.locator(".probe dl")
-    return dict(zip(rows.locator("dt").all_inner_texts(), rows.locator("dd").all_inner_texts(), strict=True))
+    read = "(it) => [...it.querySelectorAll('dt')].map((term) => [term.innerText, term.nextSibling.innerText])"
+    return dict(page.locator(".probe dl").evaluate(read))
 
 
 def test_picture_and_tools_are_visible_without_scrolling(viewer: Page) -> None:
@@ -101,6 +102,8 @@ def test_picture_and_tools_are_visible_without_scrolling(viewer: Page) -> None:
 
 
 def test_views_show_other_sides_and_fit_brings_the_mesh_back(viewer: Page) -> None:
+    canvas(viewer).press("1")  # the focused canvas is outlined
+    viewer.wait_for_timeout(200)
     front = canvas(viewer).screenshot()
 
     def changed() -> float:
@@ -114,7 +117,7 @@ def test_views_show_other_sides_and_fit_brings_the_mesh_back(viewer: Page) -> No
     for _ in range(6):
         canvas(viewer).press("+")
     until(lambda: changed() > 0.02)
-    viewer.get_by_role("button", name="Fit").click()
+    canvas(viewer).press("0")
     until(lambda: changed() == 0)
 
 
@@ -135,6 +138,8 @@ def test_a_point_is_chosen_by_click_by_key_and_by_number(viewer: Page, url: str,
     size = np.sqrt(np.square(shapes - shapes.mean(axis=1, keepdims=True)).sum(axis=2).mean())
     hidden = int(np.flatnonzero(weights[3] == 0)[0])
     for point in (int(clicked), hidden):
+        number.fill("")
+        expect(viewer.locator(".probe dt")).to_have_count(0)
         number.fill(str(point))
         until(lambda point=point: "Now" in facts(viewer))  # type: ignore[misc]
         shown = facts(viewer)
@@ -236,3 +241,30 @@ def test_picture_film_and_page_are_saved(viewer: Page, tmp_path: Path) -> None:
     alone.get_by_role("button", name="Side").click()
     until(lambda: differing_pixels(alone, before, canvas(alone).screenshot()) > 0.02)
     context.close()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_no_accessibility_finding_with_every_part_open(viewer: Page, scheme: str) -> None:
+    if not AXE.is_file() and not os.environ.get("CI"):
+        pytest.skip("axe-core is not installed; say `make page`")
+    viewer.emulate_media(color_scheme=scheme, reduced_motion="reduce")  # type: ignore[arg-type]
+    viewer.get_by_role("spinbutton", name="Point").fill("7")
+    viewer.get_by_role("checkbox", name="Tracks beside").check()
+    viewer.get_by_label("Compare with").select_option(label="clean flag")
+    viewer.locator(".view.other canvas").wait_for()
+    viewer.evaluate(AXE.read_text())
+    for width in (1280, 390):
+        viewer.set_viewport_size({"width": width, "height": 844})
+        for state in ("compare", "help"):
+            if state == "help":
+                viewer.get_by_role("button", name="Help").click()
+            found = viewer.evaluate("axe.run().then((found) => found.violations)")
+            assert [(one["id"], [node["html"] for node in one["nodes"]][:3]) for one in found] == [], (width, state)
+            assert viewer.evaluate("document.documentElement.scrollWidth") <= width
+            if folder := os.environ.get("PLIANT_SCREENSHOTS"):
+                viewer.screenshot(path=f"{folder}/{state}-{width}-{scheme}.png")
+        viewer.keyboard.press("Escape")
+    viewer.set_viewport_size({"width": 1280, "height": 800})
+    viewer.get_by_label("Compare with").select_option("")
+    viewer.get_by_role("checkbox", name="Tracks beside").uncheck()
+    viewer.get_by_role("spinbutton", name="Point").fill("")

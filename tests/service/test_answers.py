@@ -1,4 +1,4 @@
-"""Files in parts, events, waiting, and what is refused before a body is read."""
+"""Ranges, events, waiting, and requests rejected before their body is read."""
 
 from __future__ import annotations
 

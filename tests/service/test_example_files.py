@@ -1,4 +1,4 @@
-"""The examples that the service offers can be sent back to it as they are."""
+"""The built-in examples can be submitted as they are served."""
 
 from __future__ import annotations
 

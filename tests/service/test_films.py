@@ -1,4 +1,4 @@
-"""Films over HTTP: refused in a sentence or accepted at once, tracked by the worker, stopped in the middle."""
+"""Films over HTTP: rejected with a message or accepted, tracked by the worker, and cancelled."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`POST /v1/inspect` says what a job would say, in the same words, and leaves nothing behind."""
+"""`POST /v1/inspect` returns the interpretation of a job and keeps nothing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What lasts: event streams with nothing to say, streams when the service stops, answers that wait; and what a log says."""
+"""Long-lived responses: idle event streams, shutdown, waiting; and the log."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The least there can be, and the most that can be missing: every answer is finite, and sensible where anything is known."""
+"""Minimal and mostly hidden inputs: every result is finite, and plausible where data exist."""
 
 from __future__ import annotations
 

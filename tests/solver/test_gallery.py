@@ -1,4 +1,4 @@
-"""The gallery's promises: exact tracks, exact sizes, determinism, and the geometry each surface claims."""
+"""The gallery: exact tracks, exact sizes, determinism, and the geometry of each surface."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Progress never falls and keeps moving; a stop at any question ends the solve as stopped, with finite shapes."""
+"""Progress never decreases; a stop at any unit of work ends the solve as stopped, with finite shapes."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from pliant.solver import Outcome, Settings, Step, Tracks, gallery, solve
 from pliant.solver.monitor import Monitor
+from pliant.solver.stages import Stage, settling
 
 
 def small(*, noisy: bool = False) -> Tracks:
@@ -81,13 +82,59 @@ def test_progress_moves_evenly_and_never_falls() -> None:
 
 def test_units_fill_a_stage_and_never_overflow_it() -> None:
     steps: list[Step] = []
-    monitor = Monitor(steps.append, camera_share=0.5, camera_units=10)
+    monitor = Monitor(steps.append, plan=[Stage("scales", 2.0, 10), Stage("shapes", 2.0, 10)])
     for _ in range(1000):
         assert not monitor()
     fractions = [step.fraction for step in steps]
     assert fractions == sorted(fractions)
     assert fractions[9] == pytest.approx(0.45)
     assert fractions[-1] < 0.5
+
+
+def test_stages_that_do_not_run_leave_the_plan_and_others_join_it() -> None:
+    steps: list[Step] = []
+    plan = [Stage("multistart", 2.0, 10), Stage("scales", 100.0, 10), Stage("shapes", 2.0, 10), Stage("trust", 1.0, 10)]
+    monitor = Monitor(steps.append, plan=plan)
+    for _ in range(5):
+        monitor()
+    monitor.report(Step("cameras", 0.0))
+    assert steps[-1].fraction == pytest.approx(0.45 * 2 / 105)
+    monitor.enter("nothing of that name")
+    monitor.enter("shapes")  # scales are left out
+    monitor.report(Step("reweight", 0.5))
+    assert steps[-1].fraction == pytest.approx((2 + 0.5 * 2) / 5)
+    monitor.expect([Stage("scales", 5.0, 10)], before="trust")
+    monitor.enter("scales", units=20)  # twice as long as planned
+    monitor()
+    monitor.report(Step("cameras", 0.0))
+    assert steps[-1].fraction == pytest.approx(3 / 5)  # a plan that grows does not go back
+    monitor.enter("trust")
+    assert monitor() is False
+    assert steps[-1].fraction == pytest.approx((4 + 10 + 0.09) / 15)
+    monitor.report(Step("finish", 1.0))
+    assert steps[-1].fraction == 1.0
+
+
+def test_slow_units_are_reported_however_little_they_add() -> None:
+    steps: list[Step] = []
+    now = [0.0]
+    monitor = Monitor(steps.append, plan=[Stage("shapes", 1.0, 10**6)], clock=lambda: now[0])
+    for _ in range(10):
+        now[0] += 0.6
+        monitor()
+    assert len(steps) == 5
+
+
+def test_settling_follows_the_decrease_of_the_objective() -> None:
+    objectives = list(1 + 0.5 ** np.arange(20))
+    shares = [settling(objectives[: count + 1], tolerance=1e-4, most=100) for count in range(15)]
+    assert shares[0] == 0.0
+    assert (np.diff(shares[2:]) > 0).all()
+    ends = next(n for n in range(1, 20) if (objectives[n - 1] - objectives[n]) / objectives[n - 1] <= 1e-4)
+    assert settling(objectives[: ends + 1], tolerance=1e-4, most=100) == 1.0
+    for count in range(3, ends):
+        assert shares[count] == pytest.approx(count / ends, abs=0.12)
+    assert settling(objectives[:4], tolerance=1e-4, most=3) == 1.0
 
 
 def test_a_stop_is_remembered() -> None:

@@ -1,4 +1,4 @@
-"""Tracks of which hardly anything is seen end in shapes or in a sentence, never in an error of the arithmetic."""
+"""Tracks with very few visible points give shapes or an input error, never an arithmetic error."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The records at the door: what is accepted, what is refused, and that nothing behind the door can be changed."""
+"""Input records: accepted and rejected values, and read-only arrays."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The whole solve: methods, refusals, stopping."""
+"""The complete solve: methods, input errors, stopping."""
 
 from __future__ import annotations
 

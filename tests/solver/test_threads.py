@@ -1,4 +1,4 @@
-"""Threads: how many there are, that a limit is kept, and that the result does not depend on them."""
+"""Threads: their number, limits, and results that do not depend on them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files that are not films, refer elsewhere, or lie about themselves."""
+"""Files that are not films, refer to other files, or have inconsistent headers."""
 
 from __future__ import annotations
 

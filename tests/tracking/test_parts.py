@@ -1,4 +1,4 @@
-"""The tracker's parts: regions, cuts, flow tests, the grid, and the frame store."""
+"""Inputs of users become files for the service; invalid ones are rejected locally."""
 
 from __future__ import annotations
 

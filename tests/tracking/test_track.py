@@ -1,4 +1,4 @@
-"""Tracks of rendered films against their truth, and what the tracker makes of awkward films."""
+"""Tracks of rendered films compared with their truth, and the tracker on difficult films."""
 
 from __future__ import annotations
 
@@ -277,3 +277,15 @@ def test_frames_outside_the_film_are_refused(turning: tuple[Path, RenderedFilm],
     with pytest.raises(FilmError) as caught:
         track_film(turning[0], **{field: frame})  # type: ignore[arg-type]
     assert (caught.value.code, caught.value.field) == ("no_such_frame", field)
+
+
+@pytest.mark.slow
+def test_a_4k_film_is_reduced_for_tracking(tmp_path: Path) -> None:
+    small = films.textured_pictures(5, (192, 108))
+    pictures = [cv2.resize(p, (3840, 2160), interpolation=cv2.INTER_LINEAR) for p in small]
+    path = films.write_film(tmp_path / "film.mp4", pictures)
+    tracked = track_film(path, region=[(800, 500), (3000, 500), (3000, 1700), (800, 1700)])
+    assert tracked.image_size == (3840, 2160)
+    step = np.diff(tracked.tracks, axis=0)[tracked.visibility[1:] & tracked.visibility[:-1]]
+    np.testing.assert_allclose(np.median(step, axis=0), [20, 0], atol=1)
+    assert 1000 < tracked.tracks.shape[1] < 6000

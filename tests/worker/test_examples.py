@@ -1,4 +1,4 @@
-"""The examples that the page offers are what the readers take, and come out the same every time."""
+"""The built-in examples are readable inputs and reproducible."""
 
 from __future__ import annotations
 

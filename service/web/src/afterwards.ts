@@ -10,6 +10,7 @@ import { count, standing } from "./words";
 const KINDS: [string, string][] = [
   ["glb", "glTF, animated"],
   ["usd", "USD"],
+  ["abc", "Alembic"],
   ["mdd", "MDD point cache"],
   ["ply", "PLY, one a frame"],
   ["obj", "OBJ, one a frame"],

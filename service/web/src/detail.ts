@@ -40,7 +40,7 @@ export class Detail {
   private readonly standing = h("p", { class: "standing", role: "status" });
   private readonly meter = h("progress", { max: 1, value: 0, "aria-label": "Progress of this job" });
   private readonly share = h("span", { class: "muted" });
-  private readonly trouble = h("div", {});
+  private readonly trouble = h("div", { class: "trouble" });
   private readonly failure = h("div", {});
   private readonly stage = h("div", { class: "stage", hidden: true });
   private readonly curves = new Curves();
@@ -109,6 +109,7 @@ export class Detail {
       },
       onProgress: (progress: Progress) => this.progress(progress),
       onTrouble: (refusal: Refusal | null) => {
+        this.element.classList.toggle("unknown", refusal !== null && this.job === null);
         if (refusal && this.job === null) say(this.heading, refusal.problem.status === 404 ? "This job does not exist" : "This job cannot be shown");
         this.trouble.replaceChildren(...(refusal ? [refusalBox(refusal.problem)] : []));
       },

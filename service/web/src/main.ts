@@ -9,6 +9,7 @@ import { Hero } from "./hero";
 import { JobList } from "./list";
 import { refusalBox } from "./refusal";
 import type { Job } from "./types";
+import { title } from "./words";
 
 const trouble = document.getElementById("trouble") as HTMLElement;
 const side = document.getElementById("side") as HTMLElement;
@@ -117,20 +118,31 @@ function sharedToken(): string | null {
 /** Show the one result that a share link opens: no form, no list, nothing that changes anything. */
 function showShared(token: string): void {
   setShare(token);
+  showAlone(sharedJob(token), "You see a shared result, read-only.");
+}
+
+/** Show one result without form and list. */
+function showAlone(id: string, note: string): void {
   document.body.classList.add("shared");
   welcome.hidden = true;
-  detail = new Detail(sharedJob(token), { onJob: () => undefined, onDeleted: () => undefined });
-  const home = h("a", { href: location.pathname }, "About Pliant");
-  main.append(h("p", { class: "shared-note" }, "You see a shared result, read-only. ", home), detail.element);
+  detail = new Detail(id, { onJob: (job) => (document.title = `${title(job)} – Pliant`), onDeleted: () => undefined });
+  main.append(h("p", { class: "shared-note" }, note), detail.element);
+}
+
+/** The result that `pliant view` shows. */
+function viewed(): string | null {
+  return new URLSearchParams(location.hash.slice(1)).get("view");
 }
 
 const token = sharedToken();
-if (token === null) {
-  addEventListener("hashchange", () => (sharedToken() === null ? show(named(), true) : location.reload()));
+const local = viewed();
+if (token === null && local === null) {
+  addEventListener("hashchange", () => (sharedToken() === null && viewed() === null ? show(named(), true) : location.reload()));
   show(named(), false);
   await start();
   void watch();
 } else {
   addEventListener("hashchange", () => location.reload());
-  showShared(token);
+  if (token !== null) showShared(token);
+  else if (local !== null) showAlone(local, "A result folder on this computer.");
 }

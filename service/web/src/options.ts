@@ -66,6 +66,7 @@ const LABELS: Record<string, string> = {
   obj: "OBJ",
   usd: "USD",
   mdd: "MDD",
+  abc: "Alembic",
   mat: "MATLAB",
   csv: "tables (csv)",
   viewer: "y up, as in viewers",

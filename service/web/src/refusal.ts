@@ -11,14 +11,16 @@ const OURS = ["unreachable", "unknown", "no_events"];
  * the box stands where the fault is, which need not be named again.
  */
 export function refusalBox(problem: Problem, choose?: ((choice: Record<string, unknown>) => void) | null, inPlace = false): HTMLElement {
-  const detail = inPlace ? unnamed(problem) : problem.detail;
+  const whole = inPlace ? unnamed(problem) : problem.detail;
+  const hintInside = Boolean(problem.hint && whole.endsWith(problem.hint));
+  const detail = hintInside ? whole.slice(0, -(problem.hint as string).length).trim() : whole;
   const facts: [string, string | null | undefined][] = [
     ["Where", problem.field],
     ["Expected", problem.expected],
     ["Got", problem.got],
   ];
-  const shown = facts.filter(([, value]) => value && !detail.includes(value));
-  const hint = problem.hint && !problem.detail.includes(problem.hint) ? h("p", {}, problem.hint) : null;
+  const shown = inPlace ? [] : facts.filter(([, value]) => value && !detail.includes(value));
+  const hint = problem.hint && (hintInside || !whole.includes(problem.hint)) ? h("p", {}, ...withCode(problem.hint)) : null;
   const list = h("dl", { class: "facts" }, ...shown.flatMap(([term, value]) => [h("dt", {}, term), h("dd", {}, value as string)]));
   const choices = choose ? (problem.choices ?? []).map((choice) => choiceButton(choice, choose)) : [];
   return h(
@@ -30,6 +32,11 @@ export function refusalBox(problem: Problem, choose?: ((choice: Record<string, u
     choices.length > 0 && h("div", { class: "row", role: "group", "aria-label": "Possible interpretations" }, ...choices),
     h("p", { class: "row small" }, ...helpLinks(problem), h("span", { class: "code" }, problem.code)),
   );
+}
+
+/** Text between backticks as code. */
+function withCode(text: string): (Node | string)[] {
+  return text.split("`").map((part, index) => (index % 2 === 1 ? h("code", {}, part) : part));
 }
 
 /** The sentence without the name of the field, which is the service's word for the place where it is shown. */

@@ -150,7 +150,10 @@ export class Slots {
   }
 
   private async put(part: Part, file: File | null): Promise<void> {
-    await this.show(part, file);
+    if (part === "tracks" && file !== null && this.hasFilms && looksLikeFilm(file, await peek(file))) {
+      await this.show("tracks", null);
+      await this.show("film", file);
+    } else await this.show(part, file);
     this.onChange();
   }
 

@@ -1,4 +1,4 @@
-"""When a call is repeated: never without need, never twice in effect, never for ever."""
+"""Retries: only when needed, never with double effect, never endless."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files of any size pass through without being held in memory, both ways, in both clients."""
+"""Files of any size are streamed in both directions and in both clients, without being held in memory."""
 
 from __future__ import annotations
 

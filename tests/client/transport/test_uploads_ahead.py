@@ -1,4 +1,4 @@
-"""Large inputs are sent ahead of their job, in raw bytes, and gone on with where the connection broke."""
+"""Large inputs are uploaded before their job, and interrupted uploads resume."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The log: one line per request, the reason of every refusal, the request's id, and no secret."""
+"""The log: one line per request, the reason of every error, the request's id, and no secrets."""
 
 from __future__ import annotations
 

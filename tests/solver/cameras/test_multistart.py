@@ -1,4 +1,4 @@
-"""Cameras of several factorizations: which of them the refinement with the shapes may start from, and that it takes the better start."""
+"""Multistart: several factorizations as hypotheses, and the choice of the best start."""
 
 from __future__ import annotations
 

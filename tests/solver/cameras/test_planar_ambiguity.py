@@ -1,4 +1,4 @@
-"""Cameras of a thin sheet: the two sides of a plane, and which one it shows."""
+"""Planar (Necker) ambiguity: both poses of a plane, and the choice of pose signs for thin sheets."""
 
 from __future__ import annotations
 

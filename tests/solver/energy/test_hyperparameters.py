@@ -1,4 +1,4 @@
-"""Which weights are chosen, and that what is chosen withstands outliers without flattening what is clean."""
+"""Automatic weights: robust to outliers without flattening clean shapes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every metric against numbers that follow from its formula by hand."""
+"""The metrics, parsed by the Prometheus client library."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Isometric surfaces: rolled sheets known in closed form, what the method must not depend on, and what it must refuse."""
+"""Isometric surfaces: rolled sheets in closed form, invariances, and inputs that must be rejected."""
 
 from __future__ import annotations
 

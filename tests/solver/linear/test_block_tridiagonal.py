@@ -1,4 +1,4 @@
-"""The preconditioner that solves every point's path over frames exactly."""
+"""The block-tridiagonal preconditioner: exact over frames for each point."""
 
 from __future__ import annotations
 

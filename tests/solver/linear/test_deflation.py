@@ -1,4 +1,4 @@
-"""The coarse correction: exact on its span, symmetric, and worth its cost where points are hidden."""
+"""The coarse correction: exact on its span, symmetric, and effective for hidden points."""
 
 from __future__ import annotations
 

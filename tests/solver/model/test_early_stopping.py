@@ -1,4 +1,4 @@
-"""Learning the covariance stops where points that were not learned from become less probable, and only there."""
+"""Early stopping: learning ends when held-out points become less probable, and only then."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A basis of shapes whose coefficients covary in full: its energy, where it is of use, and that it brings cameras nearer."""
+"""Full covariance of mode coefficients: its energy, when it is used, and the gain for the cameras."""
 
 from __future__ import annotations
 

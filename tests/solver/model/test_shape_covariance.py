@@ -1,4 +1,4 @@
-"""The Gaussian shape prior: its mathematics, what it gains, and what it must not do."""
+"""The Gaussian shape prior: EM, its accuracy, and its limits."""
 
 from __future__ import annotations
 

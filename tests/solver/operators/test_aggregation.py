@@ -1,4 +1,4 @@
-"""Coarser surfaces, and the preconditioner that adds their corrections."""
+"""Coarser levels by aggregation, and the additive multilevel preconditioner."""
 
 from __future__ import annotations
 

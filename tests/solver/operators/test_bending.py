@@ -1,4 +1,4 @@
-"""Products along the surface for many frames at once: the same as one by one."""
+"""Products over points for several frames at once equal single products."""
 
 from __future__ import annotations
 

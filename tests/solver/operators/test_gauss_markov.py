@@ -1,4 +1,4 @@
-"""The Gaussian prior over frames, kept as a chain and modes: what it stands for, and what inverts it."""
+"""The Gaussian prior over frames as a tridiagonal matrix and modes: its inverse and its preconditioner."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Gross outliers are left out of the Gaussian fit: the right ones, said in the reasons, and nothing where there are none."""
+"""Rejection of gross outliers: the corrupted observations are rejected and reported, clean ones are kept."""
 
 from __future__ import annotations
 

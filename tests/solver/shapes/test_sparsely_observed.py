@@ -1,4 +1,4 @@
-"""Points that are seldom or never seen: the surface is closed over them, and what was seen of them is met."""
+"""Sparsely observed and hidden points: the surface is closed over them, and their observations are matched."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Noise and modes, told from the tracks alone: what each estimate finds, and what the default gains from it."""
+"""Noise and number of modes estimated from the tracks, and their effect on the default."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Units: position and size leave, and come back."""
+"""Normalization: position and unit are removed and restored."""
 
 from __future__ import annotations
 

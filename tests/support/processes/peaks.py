@@ -1,4 +1,4 @@
-"""Greatest resident memory of a process since one last asked, and of its children while one watches. Linux."""
+"""Peak resident memory of a process between two readings, and of its children. Linux."""
 
 from __future__ import annotations
 

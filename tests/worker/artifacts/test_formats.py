@@ -1,4 +1,4 @@
-"""The result files that an option asks for, each opened again by a reader that is not ours and compared point for point."""
+"""Optional result files, each read back with another library and compared point by point."""
 
 from __future__ import annotations
 
@@ -229,7 +229,7 @@ def test_meshes_have_the_axes_of_the_glb_on_request(tmp_path: Path, axes: str, y
 
 
 def test_obj_colours_are_read_by_other_programs(tmp_path: Path) -> None:
-    made = make_result(outputs="obj", axes="tracks", colours="error", hidden=True)
+    made = make_result(outputs="obj", axes="tracks", normals="static", colours="error", hidden=True)
     inputs, solution, _ = made
     files = write(tmp_path, made)
     read = trimesh.load(

@@ -1,4 +1,4 @@
-"""preview.bin read back by the layout its docstring states, independently of the writer."""
+"""preview.bin read back by the layout in its docstring, independently of the writer."""
 
 from __future__ import annotations
 

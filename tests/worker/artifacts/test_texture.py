@@ -1,4 +1,4 @@
-"""The film's picture on the surface and the point cache, each read back by a reader that is not ours."""
+"""Textures and point caches, each read back with another library."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The glTF files as three.js plays them in a browser, against the arrays of the NPZ."""
+"""The glTF files as played by three.js in a browser, compared with the arrays of the NPZ."""
 
 from __future__ import annotations
 

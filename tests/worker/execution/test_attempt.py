@@ -1,4 +1,4 @@
-"""One try at a job, seen from inside, on a clock of our own: how often it tells, how often it asks."""
+"""An attempt as seen by the job process, on a simulated clock: intervals of progress and status."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Real processes, really killed. After each fault: what the record says, that nothing acknowledged was lost, no leftovers."""
+"""Real processes killed at different times: the record, acknowledged jobs, and leftovers afterwards."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Watching an attempt, on a clock of our own; what is written for a job process that ended without a last word."""
+"""Supervision of an attempt on a simulated clock, and the outcome of a job process that recorded none."""
 
 from __future__ import annotations
 

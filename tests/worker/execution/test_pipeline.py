@@ -1,4 +1,4 @@
-"""The whole job as a plain call."""
+"""The complete job as a plain call."""
 
 from __future__ import annotations
 

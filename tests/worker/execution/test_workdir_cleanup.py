@@ -1,4 +1,4 @@
-"""What a worker does for an attempt whose job process has ended, with a store that comes back after a while."""
+"""Cleanup after a job process has ended, with a store that is unavailable for a while."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Crafted NumPy files: each is refused by its code before its content is inflated."""
+"""Crafted NumPy files: each is rejected with its code before its content is inflated."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files of other programs, parsed in the sandbox; an attack is refused by code and costs one process."""
+"""Files of other programs, parsed in the sandbox; an attack is rejected with a code and costs one process."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from pliant.worker.artifacts.glb import write_glb
 from pliant.worker.formats import Inputs, Limits, read_inputs
 from pliant.worker.formats.reading.csv import read_csv
 from pliant.worker.formats.reading.gltf import read_gltf
-from pliant.worker.formats.reading.hdf5 import read_matlab73
+from pliant.worker.formats.reading.pose_hdf5 import read_hdf5 as read_matlab73
 from pliant.worker.formats.reading.sandbox import parse_in_sandbox
 from results import moving_sheet
 

@@ -1,4 +1,4 @@
-"""Where two readings of a file fit, nothing is guessed; an option decides, and the evidence is said."""
+"""Ambiguous files are never guessed: options select the interpretation, and notes state the evidence."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pliant.schemas.options import Options
 from pliant.solver import InvalidInput, Tracks
 from pliant.worker.formats import AmbiguousInput, Inputs, Limits, read_inputs
 from pliant.worker.formats.ground_truth import as_rotations, as_shapes, unexplained
-from pliant.worker.formats.reading.hdf5 import read_matlab73
+from pliant.worker.formats.reading.pose_hdf5 import read_hdf5 as read_matlab73
 from pliant.worker.formats.tracks.interpretation import understand
 from track_files import COLUMNS, MATRIX, POINTS, ROWS, SEEN, SHAPES, WORLD, F, P, pixels
 

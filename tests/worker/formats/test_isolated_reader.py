@@ -1,4 +1,4 @@
-"""Large inputs are read by a process of their own: the same interpretation, the same stored bits, the same refusals, nothing kept."""
+"""The isolated reader: the same interpretation, stored bits and errors as in-process reading, without memory growth."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reading inputs: what comes out is what went in, and what cannot be read is refused by its code."""
+"""Reading inputs: values are preserved, and invalid files are rejected with their code."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Fewer frames and points: what stays is the input's own, in its order, and everything that goes with it follows."""
+"""Selection of frames and points: input order is kept, and all related arrays are selected alike."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every documented track format, built as its program builds it, gives what the canonical file gives: bit for bit, solved too."""
+"""Every documented track format gives the same bits as the canonical file, before and after the solve."""
 
 from __future__ import annotations
 

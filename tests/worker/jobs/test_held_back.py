@@ -1,4 +1,4 @@
-"""Jobs beyond what their owner may have running: held back, known as such, begun when a place is free."""
+"""Jobs above their owner's limit of running jobs: held back, and started when capacity is free."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The door to the jobs: one suite, run on Redis with a directory of blobs and on the doubles in memory."""
+"""The operations on jobs: one suite, on Redis with a directory of blobs and on in-memory stores."""
 
 from __future__ import annotations
 

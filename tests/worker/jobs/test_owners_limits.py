@@ -1,4 +1,4 @@
-"""How many jobs of an owner may wait and run: what is refused, what is held back. On Redis and on the doubles in memory."""
+"""Limits of queued and running jobs per owner, on Redis and on in-memory stores."""
 
 from __future__ import annotations
 

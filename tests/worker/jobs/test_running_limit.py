@@ -1,4 +1,4 @@
-"""The bound on running jobs, with two real workers and a real reconciler."""
+"""The limit of running jobs, with two real workers and a real reconciler."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The audit finds each kind of misfit, and none where all is well."""
+"""fsck finds each kind of inconsistency, and nothing in consistent stores."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The reconciler, on a clock of our own: what counts as lost, what as forgotten, what expires, and what never does."""
+"""The reconciler on a simulated clock: lost jobs, jobs missing from the queue, expiry, stray files."""
 
 from __future__ import annotations
 

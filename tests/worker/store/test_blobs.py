@@ -1,4 +1,4 @@
-"""One suite on a directory, on memory and on an S3 server; and a store that hangs."""
+"""The blob store: one suite on a directory, in memory and on an S3 server; and a store that hangs."""
 
 from __future__ import annotations
 

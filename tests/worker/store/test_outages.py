@@ -1,4 +1,4 @@
-"""The store goes away, the supervisor is killed, the disk is full: what was acknowledged is done all the same."""
+"""Outages of the store, killed supervisors and full disks: every acknowledged job is completed."""
 
 from __future__ import annotations
 

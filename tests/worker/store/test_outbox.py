@@ -1,4 +1,4 @@
-"""The outbox and its webhook sender, with real receivers on 127.0.0.1 and a real store: what is owed, sent, repeated, given up."""
+"""Outbox and webhook sender with real receivers and a real store: delivery, retries, giving up."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The queue: what it notes, and what it does when a worker takes what somebody else takes out."""
+"""The queue: held-back jobs, and removal of deliveries that a worker is taking."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Uploads on the disk: what is whole, what may be written, what expires; with real locks and real files."""
+"""Uploads on disk: completion, permissions, limits and expiry, with real locks and files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Webhooks up to the wire: what is accepted, what is signed, where it may go."""
+"""Webhooks before sending: validation, signature, and allowed addresses."""
 
 from __future__ import annotations
 

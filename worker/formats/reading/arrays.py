@@ -37,6 +37,8 @@ UNREADABLE_ZIP = (
 )  # fmt: skip
 """Exceptions of Python's zip reader for invalid files."""
 
+PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
+
 END_OF_DIRECTORY = b"PK\x05\x06"
 ZIP64_LOCATOR = b"PK\x06\x07"
 
@@ -154,6 +156,8 @@ def checked_members(
         raise too_large(field, expected=f"at most {limits.max_members} members", got=f"{len(infos)}")
     if any(info.filename.endswith("data.pkl") for info in infos):
         raise pickle_refusal(field)
+    if field == "tracks" and infos and all(info.filename.lower().endswith(PICTURES) or info.is_dir() for info in infos):
+        raise film_as_tracks("a zip of pictures")
     members: dict[str, zipfile.ZipInfo] = {}
     for info in infos:
         if MEMBER.fullmatch(info.filename) is None or ".." in info.filename:
@@ -177,6 +181,14 @@ def checked_members(
     if declared > limits.max_bytes:
         raise too_large(field, expected=f"at most {limits.max_bytes} bytes inflated", got=f"{declared} bytes")
     return members
+
+
+def film_as_tracks(got: str) -> InvalidInput:
+    """Return the refusal of a film that was sent as tracks."""
+    return InvalidInput(
+            "film_as_tracks", field="tracks", expected="point tracks", got=got,
+        hint="Send it as the film instead (on the page: under Film; REST: -F film=@film.mp4): its points are tracked for you.",
+    )  # fmt: skip
 
 
 def pickle_refusal(field: str) -> InvalidInput:

@@ -1,28 +1,41 @@
-"""Tracks as a table of text: one observation a line, columns frame, point, x, y and optionally visible."""
+"""Tracks as a table of text: one observation a line, columns frame, point, x, y and optionally visible; or one row a frame."""
 
 from __future__ import annotations
 
 import io
+from collections.abc import Iterator
 from typing import IO
 
 import numpy as np
 from pliant.solver import InvalidInput
 from pliant.worker.formats.errors import damaged, too_large
+from pliant.worker.formats.reading.pose_tables import (
+    LONGEST_ROW,
+    SEPARATORS,
+    columns_of,
+    deeplabcut_columns,
+    not_a_table,
+    number,
+    read_rows,
+    separator_of,
+    split,
+)
 from pliant.worker.formats.records import Arrays, Limits
 
 COLUMNS = ("frame", "point", "x", "y")
 SEEN = ("visible", "visibility")
-MAX_LINE = 4096
+WIDE = 8
+"""A table without names of this many columns is taken for one row a frame, which nothing says how to read."""
 
 
 def looks_like_csv(head: bytes) -> bool:
-    """Whether the first line names the columns, or holds at least four numbers."""
-    names = _cells(head.split(b"\n", 1)[0].decode("utf-8-sig", "replace"))
-    return set(COLUMNS) <= set(names) or _numbers(names[:4]) == 4
+    """Whether the first line has cells: at least three, so that what is wrong with the table can be shown."""
+    line = head.split(b"\n", 1)[0].decode("utf-8-sig", "replace")
+    return len(split(line, separator_of(line))) >= 3
 
 
 def read_csv(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
-    """Read observations in any order; those that are missing are hidden.
+    """Read one observation a line in any order, those that are missing hidden; or one row a frame, see `pose_tables`.
 
     Frames and points are numbered as in the file, in rising order: the smallest number is the first frame, gaps in
     frames are frames without observations, points are the numbers that occur.
@@ -30,14 +43,33 @@ def read_csv(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
     Returns
     -------
     dict
-        `tracks (F, P, 2)` with NaN where there is no observation, and `visibility (F, P)` if the file has it.
+        `tracks (F, P, 2)` with NaN where there is no observation, and `visibility (F, P)` if the file has it; the tracks of other
+        writers under their own names.
 
     Raises
     ------
     InvalidInput
-        Codes damaged_file, duplicate_observation, too_large.
+        Codes damaged_file, duplicate_observation, too_large, unreadable_table.
     """
-    columns, rows = _columns(stream, field=field, limits=limits)
+    text = io.TextIOWrapper(stream, encoding="utf-8-sig", errors="replace", newline="")
+    try:
+        found = _read(iter(lambda: text.readline(LONGEST_ROW), ""), field=field, limits=limits)
+    finally:
+        text.detach()
+    return found if isinstance(found, dict) else _observations(*found, field=field, limits=limits)
+
+
+def _read(lines: Iterator[str], *, field: str, limits: Limits) -> Arrays | tuple[list[str], list[list[float]]]:
+    """Read the lines: whole tracks where a row is a frame, else the names of the columns and the numbers below them."""
+    first, before = next(lines, ""), 1
+    while first and not first.strip(SEPARATORS + " \r\n"):
+        first, before = next(lines, ""), before + 1
+    wide = _wide(first, lines, field=field, limits=limits, before=before)
+    return _columns(first, lines, field=field, limits=limits) if wide is None else wide
+
+
+def _observations(columns: list[str], rows: list[list[float]], *, field: str, limits: Limits) -> Arrays:
+    """Put observations into their places."""
     table = np.array(rows, dtype=np.float64).reshape(-1, len(columns))
     index = {name: column for column, name in enumerate(columns)}
     numbers = table[:, [index["frame"], index["point"]]]
@@ -74,46 +106,50 @@ def read_csv(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
     return found
 
 
-def _columns(stream: IO[bytes], *, field: str, limits: Limits) -> tuple[list[str], list[list[float]]]:
-    lines = io.TextIOWrapper(stream, encoding="utf-8-sig", newline="")
-    columns: list[str] | None = None
+def _wide(first: str, lines: Iterator[str], *, field: str, limits: Limits, before: int) -> Arrays | None:
+    """Read a table with one row a frame; None for one with one observation a line."""
+    separator = separator_of(first)
+    heads = [split(first, separator)]
+    if heads[0][0] == "scorer":
+        while heads[-1][0] != "coords" and len(heads) < 4:
+            heads.append(split(next(lines, ""), separator))
+        columns = deeplabcut_columns(heads)
+        if columns is None:
+            raise not_a_table(field, before, first)
+    else:
+        columns = None if set(COLUMNS) <= set(heads[0]) else columns_of(heads[0])
+    if columns is None:
+        return None
+    return read_rows(
+        lines, columns, separator, field=field, limits=limits, before=before + len(heads) - 1, width=len(heads[0])
+    )
+
+
+def _columns(first: str, lines: Iterator[str], *, field: str, limits: Limits) -> tuple[list[str], list[list[float]]]:
+    """Return the names of the columns and the numbers below them; without names the usual ones are taken."""
+    separator = separator_of(first)
+    cells = split(first, separator)
+    named = set(COLUMNS) <= set(cells)
+    columns = cells if named else [*COLUMNS, "visible", *map(str, range(len(cells)))][: len(cells)]
+    if len(cells) < len(COLUMNS) or (not named and len(cells) >= WIDE):
+        raise not_a_table(field, 1, first)
     rows: list[list[float]] = []
+    for count, line in enumerate([] if named else [first], 1):
+        rows.append(_row(line, separator, len(columns), field=field, count=count))
+    for count, line in enumerate(lines, 2):
+        if not any(split(line, separator)):
+            continue
+        rows.append(_row(line, separator, len(columns), field=field, count=count))
+        if len(rows) > limits.max_bytes // 64:
+            raise too_large(field, expected=f"at most {limits.max_bytes // 64} observations", got="more")
+    return columns, rows
+
+
+def _row(line: str, separator: str, width: int, *, field: str, count: int) -> list[float]:
+    cells = split(line, separator)
+    if len(cells) != width:
+        raise not_a_table(field, count, line)
     try:
-        while line := lines.readline(MAX_LINE):
-            cells = _cells(line)
-            if not any(cells):
-                continue
-            if columns is None:
-                named = set(COLUMNS) <= set(cells)
-                columns = cells if named else [*COLUMNS, "visible", *map(str, range(len(cells)))][: len(cells)]
-                if named:
-                    continue
-                if len(cells) < len(COLUMNS):
-                    raise damaged(field, f"{len(cells)} columns where frame, point, x and y are expected")
-            if len(cells) != len(columns):
-                raise damaged(field, f"a line of {len(cells)} cells where {len(columns)} are expected")
-            rows.append([_number(cell) for cell in cells])
-            if len(rows) > limits.max_bytes // 64:
-                raise too_large(field, expected=f"at most {limits.max_bytes // 64} observations", got="more")
-    except ValueError as error:
-        raise damaged(field, f"line {len(rows) + 2} is not numbers") from error
-    finally:
-        lines.detach()
-    return columns or list(COLUMNS), rows
-
-
-def _number(cell: str) -> float:
-    words = {"": np.nan, "true": 1.0, "false": 0.0}
-    return float(words[cell]) if cell in words else float(cell)
-
-
-def _numbers(cells: list[str]) -> int:
-    try:
-        return len([float(cell) for cell in cells])
+        return [number(cell, separator) for cell in cells]
     except ValueError:
-        return 0
-
-
-def _cells(line: str) -> list[str]:
-    separator = max(",;\t", key=line.count)
-    return [cell.strip().strip('"').lower() for cell in line.strip().split(separator)]
+        raise not_a_table(field, count, line) from None

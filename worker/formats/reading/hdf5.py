@@ -7,12 +7,10 @@ turned back. Cells, and the fields of struct arrays, are references to data sets
 
 from __future__ import annotations
 
-from typing import IO
-
 import h5py
 import numpy as np
 from pliant.solver import InvalidInput
-from pliant.worker.formats.errors import damaged, too_large
+from pliant.worker.formats.errors import too_large
 from pliant.worker.formats.records import Arrays, Limits
 
 UNREADABLE = (OSError, ValueError, KeyError, RuntimeError, TypeError, AttributeError, OverflowError, IndexError)
@@ -32,20 +30,16 @@ MAX_DEPTH = 4
 MAX_CELLS = 20_000
 
 
-def read_matlab73(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
+def read_arrays(file: h5py.File, *, field: str, limits: Limits) -> Arrays:
     """Read every numeric data set; members of structs (groups) under dotted names.
 
     Raises
     ------
     InvalidInput
-        Codes damaged_file, missing_array, too_large, unsupported_feature.
+        Codes missing_array, too_large, unsupported_feature.
     """
     found: Arrays = {}
-    try:
-        with h5py.File(stream, "r") as file:
-            _collect(file, "", found, field=field, limits=limits, depth=0)
-    except UNREADABLE as error:
-        raise damaged(field, f"an HDF5 file that cannot be read ({str(error)[:120]})") from error
+    _collect(file, "", found, field=field, limits=limits, depth=0)
     if not found:
         raise InvalidInput(
             "missing_array", field=field, expected="a numeric matrix such as W", got="no plain array",
@@ -66,7 +60,7 @@ def _collect(group: h5py.Group, prefix: str, found: Arrays, *, field: str, limit
         if isinstance(item, h5py.Group):
             _collect(item, f"{prefix}{name}.", found, field=field, limits=limits, depth=depth + 1)
         elif isinstance(item, h5py.Dataset) and _is_numeric(item):
-            found[f"{prefix}{name}"] = _values(item, f"{prefix}{name}", _bytes(found), field, limits)
+            found[f"{prefix}{name}"] = read_values(item, f"{prefix}{name}", _bytes(found), field, limits)
         elif isinstance(item, h5py.Dataset) and h5py.check_ref_dtype(item.dtype) is h5py.Reference and item.size:
             stacked = _cells(item, f"{prefix}{name}", _bytes(found), field, limits)
             if stacked is not None:
@@ -93,7 +87,9 @@ def _cells(item: h5py.Dataset, name: str, so_far: int, field: str, limits: Limit
         target = item.file[reference] if reference else None
         if not isinstance(target, h5py.Dataset) or not _is_numeric(target):
             return None
-        parts.append(_values(target, name, so_far + sum(part.nbytes for part in parts[:1]) * len(parts), field, limits))
+        parts.append(
+            read_values(target, name, so_far + sum(part.nbytes for part in parts[:1]) * len(parts), field, limits)
+        )
         if parts[-1].shape != parts[0].shape:
             return None
     return parts[0] if len(parts) == 1 else np.stack(parts)
@@ -104,12 +100,29 @@ def _check_within(item: h5py.Dataset, name: str, field: str) -> None:
         raise _elsewhere(field, f"{name} lies in another file")
 
 
-def _values(item: h5py.Dataset, name: str, so_far: int, field: str, limits: Limits) -> np.ndarray:
+def check_before_reading(item: h5py.Dataset, name: str, so_far: int, field: str, limits: Limits) -> None:
+    """Refuse a data set that lies elsewhere, or that claims more than it can hold, before a value is read.
+
+    Parameters
+    ----------
+    so_far : int
+        Bytes of the data sets that were read already.
+
+    Raises
+    ------
+    InvalidInput
+        Codes too_large, unsupported_feature.
+    """
     _check_within(item, name, field)
     declared = int(np.prod(item.shape, dtype=np.float64)) * item.dtype.itemsize
     if so_far + declared > limits.max_bytes:
         raise too_large(field, expected=f"at most {limits.max_bytes} bytes", got=f"{name} declares {declared}")
     _check_stored(item, name, declared, field, limits)
+
+
+def read_values(item: h5py.Dataset, name: str, so_far: int, field: str, limits: Limits) -> np.ndarray:
+    """Read a data set with its axes reversed, as MATLAB means them. Raises as `check_before_reading`."""
+    check_before_reading(item, name, so_far, field, limits)
     values = np.asarray(item[()])
     return np.ascontiguousarray(values.T.astype(values.dtype.newbyteorder("="), copy=False))
 

@@ -9,7 +9,7 @@ from typing import IO
 
 from pliant.solver import InvalidInput
 from pliant.worker.formats.errors import too_large
-from pliant.worker.formats.reading.arrays import pickle_refusal
+from pliant.worker.formats.reading.arrays import film_as_tracks, pickle_refusal
 from pliant.worker.formats.reading.csv import looks_like_csv
 from pliant.worker.formats.records import Arrays, Limits
 
@@ -35,7 +35,7 @@ class Parser:
 
 PARSERS = {
     "matlab5": Parser("matlab", "read_matlab5"),
-    "matlab73": Parser("hdf5", "read_matlab73"),
+    "matlab73": Parser("pose_hdf5", "read_hdf5"),
     "csv": Parser("csv", "read_csv"),
     "obj": Parser("meshes", "read_obj"),
     "ply": Parser("meshes", "read_ply"),
@@ -44,6 +44,7 @@ PARSERS = {
     "png": Parser("mask", "read_png"),
 }
 MATLAB_5, HDF5 = b"MATLAB 5.0", b"\x89HDF\r\n\x1a\n"
+PICTURES = {b"\x89PNG\r\n": "png", b"\xff\xd8\xff": "jpeg", b"BM": "bmp", b"II*\0": "tiff", b"MM\0*": "tiff"}
 PICKLE = tuple(bytes([0x80, version]) for version in range(2, 6))
 
 
@@ -57,6 +58,8 @@ def recognise(head: bytes, field: str) -> str:
     """
     if head.startswith(PICKLE):
         raise pickle_refusal(field)
+    if field == "tracks":
+        _refuse_pictures(head)
     starts = {MATLAB_5: "matlab5", b"ply\n": "ply", b"ply\r": "ply", b"glTF": "glb", b"\x89PNG\r\n": "png"}
     for start, name in starts.items():
         if head.startswith(start):
@@ -82,11 +85,35 @@ def parse(parser: Callable[..., Arrays], stream: IO[bytes], *, field: str, limit
 def unknown_format(field: str, head: bytes) -> InvalidInput:
     """Return the error for a file of an unknown format."""
     mesh = "npz, npy, OBJ, PLY, glTF, GLB or a PNG mask"
-    kinds = mesh if field == "mesh" else "npz, npy, MATLAB .mat or CSV with the columns frame, point, x, y"
+    kinds = mesh if field == "mesh" else "npz, npy, MATLAB .mat, CSV, or DeepLabCut, SLEAP and MediaPipe exports"
     return InvalidInput(
-        "unknown_format", field=field, expected=f"{kinds}, recognised by content", got=f"a file that starts with {head[:16]!r}",
+            "unknown_format", field=field, expected=f"{kinds}, recognised by content", got=f"a file that starts with {head[:16]!r}",
         hint="Convert it, e.g. numpy.savez('tracks.npz', tracks=points, visibility=visible).",
     )  # fmt: skip
+
+
+def _refuse_pictures(head: bytes) -> None:
+    """Refuse films and pictures that were sent as tracks, with the way to send them."""
+    kind = film_kind(head)
+    if kind is not None:
+        raise film_as_tracks(f"a film ({kind})")
+    kind = next((name for start, name in PICTURES.items() if head.startswith(start)), None)
+    if kind is not None:
+        raise InvalidInput(
+            "picture_as_tracks", field="tracks", expected="point tracks over several frames", got=f"a single picture ({kind})",
+            hint="Depth comes from motion: send a film, or a zip of all its pictures, as the film.",
+        )  # fmt: skip
+
+
+def film_kind(head: bytes) -> str | None:
+    """Return what kind of film begins like this, None for anything else."""
+    if head[4:8] in (b"ftyp", b"moov", b"mdat", b"wide"):
+        return "mp4 or mov"
+    if head.startswith(b"\x1aE\xdf\xa3"):
+        return "webm or mkv"
+    if head.startswith(b"RIFF") and head[8:12] == b"AVI ":
+        return "avi"
+    return "gif" if head.startswith(b"GIF8") else None
 
 
 def _is_text(head: bytes) -> bool:

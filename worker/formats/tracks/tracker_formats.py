@@ -5,7 +5,8 @@ BootsTAPIR and LocoTrack `tracks (B, N, T, 2)` with `occlusion` and `expected_di
 `visible_logits` (its model returns y before x, its demonstrations turn that round); TAP-Vid `points (N, T, 2)` with `occluded`;
 AllTracker `trajs_e` and `visconfs_e`, or whole pictures `(B, T, 2, H, W)`; PIPs++ `trajs_e`; DOT `(B, T, H, W, 3)` or `(B, T, N, 3)`
 with visibility as the third number; TAPVid-3D `tracks_xyz` in metres before the camera; MATLAB data sets of non-rigid structure from
-motion `W`, `S`, `Rs`. Pliant's own tracker is known by `frame_indices`.
+motion `W`, `S`, `Rs`. Pliant's own tracker is known by `frame_indices`. DeepLabCut, SLEAP and MediaPipe: the names that
+`reading.pose_tables` and `reading.pose_hdf5` give their arrays.
 """
 
 from __future__ import annotations
@@ -63,6 +64,12 @@ DIALECTS = (
     ),
     Dialect(name="TAP-Vid", tracks=("points", "target_points"), needs=("occluded",), order="points_frames"),
     Dialect(name="DOT", tracks=("tracks",), third="visibility"),
+    Dialect(name="DeepLabCut", tracks=("deeplabcut",)),
+    Dialect(
+        name="SLEAP", tracks=("sleap",), note="The nodes of all instances count as points of one object.",
+    ),
+    Dialect(name="MediaPipe", tracks=("mediapipe",)),
+    Dialect(name="one row a frame", tracks=("one_row_a_frame",)),
     Dialect(name="canonical", tracks=("tracks", "points")),
     Dialect(name="matrix", tracks=("W", "w", "W_obs", "data", "measurements")),
     Dialect(name="unnamed", tracks=("array", "arr_0")),
@@ -75,7 +82,7 @@ HIDING = ("occlusion", "occlusions", "occluded", "MD")
 
 VISIBILITY = (
     "visibility", "visible", "visibles", "pred_visibility", "vis", "mask", "vis_e", "visconfs_e", "visconf_maps_e", "visible_logits",
-    *HIDING, "expected_dist",
+    *HIDING, "expected_dist", "likelihood",
 )  # fmt: skip
 INTRINSICS = ("intrinsics", "fx_fy_cx_cy")
 TRUE_SHAPES = ("shapes", "S", "S_gt", "Shat_gt", "S_GT", "P3_gt", "GT", "gt")

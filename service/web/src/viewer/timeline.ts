@@ -37,14 +37,16 @@ export class Timeline {
   }
 
   /** Draw the errors of another job over those of this one. */
-  compare(other: Preview | null): void {
+  compare(other: Preview | null, title = ""): void {
     this.draw(this.top);
+    this.element.querySelector(".key-other")?.remove();
     if (other === null) return;
     const name = this.name === "3-D error" ? "error" : "expected";
     const values = Array.from({ length: Math.min(other.frames, this.preview.frames) }, (_, frame) => other.facts(frame)[name]);
     if (values.every((value) => value === null)) return;
     const top = Math.max(this.top, ...values.map((value) => value ?? 0));
     this.draw(top);
+    this.element.prepend(h("span", { class: "hint key-other" }, `${this.name} of ${title}`));
     this.needle.before(svg("polyline", { class: "other-error", points: this.line(values, top) }));
   }
 

@@ -165,7 +165,7 @@ export class Viewer {
       group("View", h("div", { class: "row" }, ...views)),
       group(
         "Show",
-        choice("Colour", colours, (value) => void this.colour(value as Colouring)),
+        h("div", { class: "colouring" }, choice("Colour", colours, (value) => void this.colour(value as Colouring))),
         h(
           "div",
           { class: "row" },
@@ -312,7 +312,10 @@ export class Viewer {
   }
 
   private async colour(colouring: Colouring): Promise<void> {
-    await this.guarded(async () => this.paint(await valuesFor(colouring, this.preview, this.leaving.signal)));
+    const { preview, companion } = this;
+    const { signal } = this.leaving;
+    const values = colouring === "difference" && companion ? errorDifference(preview, companion.preview, signal) : valuesFor(colouring, preview, signal);
+    await this.guarded(async () => this.paint(await values));
   }
 
   private paint(values: Values | null): void {
@@ -396,17 +399,33 @@ export class Viewer {
       this.companion = null;
       this.timeline.compare(null);
       say(this.compared, "");
-      if (other === null) return this.paint(null);
+      if (this.offerDifference(false)) this.paint(null);
+      if (other === null) return;
       const companion = await Companion.open(other, this.leaving.signal);
       this.companion = companion;
       companion.element.append(h("span", { class: "view-name" }, other.title));
       this.panes.append(companion.element);
-      this.timeline.compare(companion.preview);
+      this.timeline.compare(companion.preview, other.title);
       const values = await errorDifference(this.preview, companion.preview, this.leaving.signal);
-      if (values) this.paint(values);
+      if (values) {
+        this.offerDifference(true);
+        this.paint(values);
+      }
       say(this.compared, this.difference(other, companion.preview, values !== null));
       this.repaint();
     });
+  }
+
+  /** Add the difference of errors to the colours, chosen, or remove it; returns true if it was the one shown. */
+  private offerDifference(on: boolean): boolean {
+    const select = this.holder.querySelector<HTMLSelectElement>(".colouring select");
+    if (select === null) return false;
+    const shown = select.value === "difference";
+    select.querySelector("option[value=difference]")?.remove();
+    if (on) select.append(h("option", { value: "difference", selected: true }, "error difference"));
+    if (on) select.value = "difference";
+    else if (shown) select.value = "plain";
+    return shown;
   }
 
   private difference(other: Other, theirs: Preview, sharesPoints: boolean): string {

@@ -1,4 +1,4 @@
-"""A whole installation, `pliant up` in processes of its own, that can be looked into and have its processes killed."""
+"""An installation, `pliant up` in separate processes, whose stores can be read and whose processes can be killed."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from pliant.worker.processes.containment import die_with_parent
 from pliant.worker.settings import Settings
 
 SOON = Settings(lost_after=2, stop_grace=1, cancel_grace=3, threads=1, max_attempts=1000)
-"""Settings under which faults are noticed within seconds."""
+"""Settings with which faults are detected within seconds."""
 
 PATIENT = Retry(first_contact=60, shortest_pause=0.05, longest_pause=0.5)
 
@@ -30,7 +30,7 @@ ROLES = {"service": b"pliant.service", "worker": b"pliant.worker\0work", "reconc
 
 
 @dataclass
-class House:
+class Instance:
     """`pliant up` on one data directory; in `with`. It is started again at the same port after `kill_all` or `stop`."""
 
     folder: Path
@@ -41,12 +41,12 @@ class House:
     port: int = 0
     url: str = ""
     acknowledged: list[str] = field(default_factory=list)
-    """Every job that was accepted."""
+    """Ids of all accepted jobs."""
     seen: set[int] = field(default_factory=set)
-    """Every process that was started, as far as anybody looked."""
+    """Ids of all processes that were observed."""
     _process: subprocess.Popen[str] | None = None
 
-    def __enter__(self) -> House:
+    def __enter__(self) -> Instance:
         self.start()
         return self
 

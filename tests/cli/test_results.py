@@ -1,0 +1,152 @@
+"""Commands on finished results: further files, share links, other options, and the viewer on local files."""
+
+from __future__ import annotations
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from fastapi.testclient import TestClient
+from pliant.cli import app
+from pliant.cli.exits import Exit
+from pliant.cli.session import Session
+from pliant.service.routes.local_result import create_viewer, read_result
+from pliant.service.testing import InMemoryService
+from pliant.worker.artifacts import build_report, write_artifacts
+from pliant.worker.errors import InvalidRequest
+from results import make_result
+from typer.testing import CliRunner, Result
+
+Run = Callable[..., Result]
+
+
+@pytest.fixture
+def service() -> InMemoryService:
+    return InMemoryService()
+
+
+@pytest.fixture
+def run(service: InMemoryService, monkeypatch: pytest.MonkeyPatch) -> Run:
+    for name in ("PLIANT_URL", "PLIANT_TOKEN"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("COLUMNS", "200")
+    return lambda *arguments: CliRunner().invoke(app, [str(each) for each in arguments], obj=Session(transport=service))
+
+
+@pytest.fixture
+def job(run: Run, tmp_path: Path) -> str:
+    np.savez(tmp_path / "tracks.npz", tracks=np.random.default_rng(0).normal(size=(5, 12, 2)))
+    ran = run("submit", tmp_path / "tracks.npz", "--wait", "--json", "-n", "take", "-O", "stride=2")
+    assert ran.exit_code == 0, ran.output
+    return str(json.loads(ran.stdout)["id"])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A result as `pliant solve` leaves it, with a file beside it that is nobody's business."""
+    held = tmp_path_factory.mktemp("face")
+    inputs, solution, options = make_result(outputs="glb")
+    report = build_report(inputs, solution, options, metrics={"e3d_frame": 0.5, "rotation_degrees": float("inf")})
+    write_artifacts(inputs, solution, options, report, held)
+    (held / "private.txt").write_text("private")
+    return held
+
+
+def test_further_files_are_made_and_downloaded(run: Run, job: str, tmp_path: Path) -> None:
+    ran = run("result", job, "--make", "mdd", "--make", "csv", "--fps", "50", "-o", tmp_path / "more")
+    assert ran.exit_code == 0, ran.output
+    assert {path.name for path in (tmp_path / "more").iterdir()} == {
+        "shapes.mdd",
+        "metrics_frames.csv",
+        "metrics_points.csv",
+    }
+    assert run("result", job, "--make", "fbx", "-o", tmp_path / "no").exit_code == Exit.REFUSED
+
+
+def test_the_inputs_run_again_with_other_options(run: Run, job: str) -> None:
+    ran = run("rerun", job, "-O", "loss=l2", "--json")
+    assert ran.exit_code == 0, ran.output
+    again = json.loads(ran.stdout)
+    assert (again["name"], again["options"]["loss"], again["options"]["stride"]) == ("take", "l2", 2)
+    assert "pliant watch" in run("rerun", "@last").stderr
+    assert run("rerun", job, "-O", "stride=3").exit_code == Exit.REFUSED
+
+
+def test_a_link_is_made_listed_and_revoked(run: Run, job: str, service: InMemoryService) -> None:
+    made = run("share", job, "--days", "2")
+    assert made.exit_code == 0, made.output
+    address = made.stdout.strip()
+    assert address.startswith("http://127.0.0.1:8000/#share=share.")
+    token = address.partition("#share=")[2]
+    with httpx.Client(
+        transport=service, base_url="http://pliant.test", headers={"Authorization": f"Bearer {token}"}
+    ) as guest:
+        assert guest.get(f"/v1/jobs/{job}").status_code == 200
+        (listed,) = json.loads(run("share", job, "--list", "--json").stdout)
+        assert listed["id"] in run("share", job, "--list").stdout
+        assert token not in run("share", job, "--list", "--json").stdout
+        assert run("share", job, "--revoke", listed["id"]).exit_code == 0
+        assert guest.get(f"/v1/jobs/{job}").status_code == 401
+    assert run("share", job, "--revoke", listed["id"]).exit_code == Exit.NOT_FOUND
+    assert json.loads(run("share", job, "--json").stdout)["url"].startswith("http://127.0.0.1:8000/#share=")
+    assert run("share", job, "--days", "0").exit_code == Exit.REFUSED
+
+
+def test_the_viewer_serves_one_result_under_its_token_alone(folder: Path) -> None:
+    client = TestClient(create_viewer(folder, "secret"), base_url="http://127.0.0.1:1")
+    record = client.get("/secret/v1/jobs/local").json()
+    assert (record["status"], record["name"], record["metrics"]) == ("succeeded", folder.name, {"e3d_frame": 0.5})
+    assert {each["name"] for each in record["artifacts"]} == {"shapes.npz", "shapes.glb", "preview.bin", "report.json"}
+    part = client.get("/secret/v1/jobs/local/artifacts/preview.bin", headers={"Range": "bytes=0-7"})
+    assert (part.status_code, part.content) == (206, b"PLIANTPV")
+    missing = (
+        "/v1/jobs/local", "/guess/v1/jobs/local", "/secret/v1/jobs/other", "/secret/v1/jobs/local/artifacts/private.txt",
+        "/secret/v1/jobs/local/artifacts/..%2Fprivate.txt", "/secret/v1/jobs/other/artifacts/report.json", "/secret/v1/jobs",
+    )  # fmt: skip
+    assert {path: client.get(path).status_code for path in missing} == dict.fromkeys(missing, 404)
+    assert client.get("/secret/v1/jobs/local", headers={"Host": "evil.example"}).status_code == 400
+    assert client.post("/secret/v1/jobs/local").status_code == 405
+
+
+def test_what_is_no_result_is_refused(run: Run, folder: Path, tmp_path: Path) -> None:
+    with socket.socket() as busy:
+        busy.bind(("127.0.0.1", 0))
+        busy.listen()
+        port = busy.getsockname()[1]
+        for arguments, words in (
+            ((tmp_path / "none",), "does not exist"), ((tmp_path,), "a folder without report.json and preview.bin"),
+            ((folder, "--port", port), f"cannot listen on {port}"),
+        ):  # fmt: skip
+            ran = run("view", "--no-browser", *arguments)
+            assert ran.exit_code == Exit.REFUSED, ran.output
+            assert words in ran.stderr
+    for text in ("{", "[]", '{"options": 1}'):
+        (tmp_path / "report.json").write_text(text)
+        (tmp_path / "preview.bin").write_bytes(b"")
+        with pytest.raises(InvalidRequest, match="that Pliant did not write"):
+            read_result(tmp_path)
+
+
+@pytest.mark.slow
+def test_view_runs_until_ctrl_c(folder: Path) -> None:
+    command = [sys.executable, "-m", "pliant.cli", "view", str(folder / "shapes.npz"), "--no-browser", "--json"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as viewing:
+        assert viewing.stdout is not None
+        text = ""
+        while not text.endswith("}\n"):
+            text += viewing.stdout.readline()
+        url: Any = json.loads(text)["url"]
+        address = url.partition("#")[0]
+        answers = httpx.Client(transport=httpx.HTTPTransport(retries=5))
+        assert answers.get(f"{address}v1/jobs/local").json()["id"] == "local"
+        answers.close()
+        viewing.send_signal(signal.SIGINT)
+        assert viewing.wait(20) == Exit.INTERRUPTED

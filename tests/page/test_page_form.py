@@ -1,0 +1,138 @@
+"""The form in use: where its button is, options by intent, refusals in place; and what a finished job leads to."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from pathlib import Path
+
+import httpx
+import pytest
+from browsing import why_not
+from paging import TRACKS, choose
+from playwright.sync_api import Page, expect
+
+pytestmark = [
+    pytest.mark.chromium,
+    pytest.mark.skipif(why_not() is not None and not os.environ.get("CI"), reason=str(why_not())),
+]
+AXE = Path(__file__).parents[2] / "service" / "web" / "node_modules" / "axe-core" / "axe.min.js"
+SOON = 60_000
+
+
+def axe_findings(page: Page) -> list[str]:
+    """What axe-core finds; its script is put into an isolated world, where the page's policy does not hold."""
+    session = page.context.new_cdp_session(page)
+    world = session.send(
+        "Page.createIsolatedWorld", {"frameId": session.send("Page.getFrameTree")["frameTree"]["frame"]["id"]}
+    )
+    where = world["executionContextId"]
+    session.send("Runtime.evaluate", {"expression": AXE.read_text(encoding="utf-8"), "contextId": where})
+    ran = session.send(
+        "Runtime.evaluate",
+        {"expression": "axe.run().then((found) => JSON.stringify(found.violations.map((one) => one.id + ': ' + one.nodes[0].html)))",
+         "contextId": where, "awaitPromise": True, "returnByValue": True},
+    )  # fmt: skip
+    session.detach()
+    return list(json.loads(ran["result"]["value"]))
+
+
+def small_targets(page: Page) -> list[str]:
+    """Controls that are seen and smaller than 24 px in a direction; links within a sentence are exempt."""
+    script = """() => [...document.querySelectorAll('button, select, input, summary, a')].filter((it) => {
+      const box = it.getBoundingClientRect();
+      if (box.width === 0 || it.closest('p, td, li, dd, .visually-hidden') || getComputedStyle(it).opacity === '0') return false;
+      const labelled = it.labels?.[0]?.getBoundingClientRect();
+      return Math.min(Math.max(box.height, labelled?.height ?? 0), Math.max(box.width, labelled?.width ?? 0)) < 24;
+    }).map((it) => it.outerHTML.slice(0, 120))"""
+    return list(page.evaluate(script))
+
+
+def test_button_folds_and_refusals_in_place(page: Page) -> None:
+    page.set_viewport_size({"width": 1280, "height": 720})
+    send = page.get_by_role("button", name="Reconstruct")
+    expect(send).to_be_in_viewport()
+    table = {"name": "walk 7.csv", "mimeType": "text/csv", "buffer": b"time;name;where\n1;nose;3,5\n"}
+    page.get_by_label("Tracks", exact=True).set_input_files(table)  # type: ignore[arg-type]
+    alert = page.locator("[data-part=tracks]").get_by_role("alert")
+    expect(alert).to_contain_text("got line 1: 'time;name;where'.")
+    expect(alert).to_contain_text("Write it as in frame,point,x,y and then 0,0,312.5,200.1")
+    expect(page.get_by_label("Name (optional)")).to_have_value("walk 7")
+    expect(send).to_be_in_viewport()
+    page.get_by_text("Files to write", exact=True).click()
+    page.get_by_label("Frame rate").fill("30")
+    page.get_by_label("Frame rate").press("Tab")
+    expect(page.get_by_text("(1 changed)")).to_be_visible()
+    assert axe_findings(page) == []
+    page.set_viewport_size({"width": 390, "height": 844})
+    assert small_targets(page) == []
+
+
+def test_a_film_chosen_for_tracks_goes_to_its_own_place(page: Page) -> None:
+    page.locator("[data-part=film]").wait_for()
+    film = {"name": "clip.mp4", "mimeType": "video/mp4", "buffer": b"\0\0\0\x18ftypmp42" + bytes(64)}
+    page.get_by_label("Tracks", exact=True).set_input_files(film)  # type: ignore[arg-type]
+    expect(page.locator("[data-part=film]")).to_contain_text("clip.mp4")
+    expect(page.locator("[data-part=tracks]")).to_be_hidden()
+    expect(page.locator("[data-part=film]").get_by_role("alert")).to_be_visible(timeout=SOON)
+
+
+def test_after_a_job_more_files_a_link_and_other_options(page: Page, url: str, finished: str) -> None:
+    page.goto(f"{url}/#job={finished}")
+    page.reload()
+    page.get_by_role("button", name="More files").click()
+    page.get_by_role("button", name="Make the files").click()
+    expect(page.get_by_text("Choose at least one file.")).to_be_visible()
+    page.get_by_label("MDD point cache").check()
+    page.get_by_label("Frames per second").fill("50")
+    page.get_by_role("button", name="Make the files").click()
+    with page.expect_download(timeout=SOON) as download:
+        page.get_by_role("link", name="Save shapes.mdd").click(timeout=SOON)
+    assert Path(download.value.path()).read_bytes()[:8] == b"\0\0\0\x0a\0\0\x01\x2c"
+    assert axe_findings(page) == []
+
+    page.get_by_role("button", name="Share", exact=True).click()
+    page.get_by_role("button", name="Create a link").click()
+    link = page.get_by_label("Link to this result").input_value()
+    assert link.startswith(f"{url}/#share=share.{finished}.")
+    guest = page.context.new_page()
+    guest.goto(link)
+    expect(guest.get_by_text("You see a shared result, read-only.")).to_be_visible()
+    expect(guest.get_by_role("heading", name="a finished face")).to_be_visible()
+    expect(guest.get_by_role("button", name="Delete")).to_be_hidden()
+    expect(guest.get_by_role("button", name="Reconstruct")).to_be_hidden()
+    expect(guest.locator(".view canvas").first).to_be_visible(timeout=SOON)
+    assert axe_findings(guest) == []
+    page.get_by_role("button", name="Revoke").first.click()
+    expect(page.get_by_role("button", name="Revoke")).to_have_count(0)
+    guest.reload()
+    expect(guest.get_by_role("alert")).to_contain_text("This share link is not valid")
+    guest.close()
+
+    page.get_by_role("button", name="Run again with other options").click()
+    expect(page.get_by_text("The inputs of “a finished face” are used again.")).to_be_visible()
+    page.get_by_text("For experts").click()
+    page.get_by_label("Method").select_option(label="temporal")
+    page.get_by_label("Name (optional)").fill("again")
+    page.get_by_role("button", name="Reconstruct").click()
+    expect(page.get_by_role("heading", name="again")).to_be_focused()
+    id = re.search(r"job=(\w+)", page.url)
+    assert id is not None
+    job = httpx.get(f"{url}/v1/jobs/{id[1]}").json()
+    assert (job["options"]["method"], job["interpretation"]["num_points"]) == ("temporal", 300)
+
+
+def test_a_deleted_job_and_a_wrong_option(page: Page, url: str, small: dict[str, bytes]) -> None:
+    choose(page, {TRACKS: small[TRACKS]})
+    page.get_by_text("Camera", exact=True).click()
+    page.get_by_label("Picture size").fill("wide")
+    page.get_by_role("button", name="Reconstruct").click()
+    place = page.locator(".option").filter(has=page.get_by_label("Picture size"))
+    expect(place.get_by_role("alert")).to_contain_text("invalid_option")
+    expect(page.get_by_text("Not sent: see “Picture size” above.")).to_be_visible()
+    page.goto(f"{url}/#job=0123456789abcdef")
+    expect(page.get_by_role("heading", name="This job does not exist")).to_be_visible()
+    expect(page.get_by_role("alert")).to_contain_text("There is no job '0123456789abcdef'.")
+    expect(page.get_by_text("Use from code")).to_be_hidden()
+    assert axe_findings(page) == []

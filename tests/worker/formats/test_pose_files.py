@@ -1,0 +1,227 @@
+"""Spreadsheets, DeepLabCut, SLEAP and MediaPipe: what is read, and the exact words of what is not."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from pliant.schemas.options import Options
+from pliant.worker.formats import InvalidInput, Limits, read_inputs
+from pliant.worker.formats.reading import containers
+from pliant.worker.formats.reading.parsers import PARSERS
+from pliant.worker.formats.records import Arrays
+
+F, P = 5, 6
+NAMES = ("nose", "left_ear", "right ear", "chin", "brow", "tip")
+POINTS = np.round(np.random.default_rng(2).uniform(20, 500, (1, P, 2)) + np.arange(F)[:, None, None] * [1.5, 0.25], 2)
+SURE = np.where(np.arange(F * P).reshape(F, P) == 8, 0.1, 0.9)
+EXAMPLE = "Write it as in `frame,point,x,y` and then `0,0,312.5,200.1`, or one row a frame: `frame,nose_x,nose_y,chin_x,chin_y`."
+
+
+@pytest.fixture(autouse=True)
+def _here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Parse without the time that a child process takes to start; tests/worker/formats/test_containers.py starts one."""
+
+    def parse_here(parser: str, path: Path, *, field: str, limits: Limits) -> Arrays:
+        with path.open("rb") as stream:
+            return PARSERS[parser](stream, field=field, limits=limits)
+
+    monkeypatch.setattr(containers, "parse_in_sandbox", parse_here)
+
+
+def rows_of(*, separator: str = ",", decimal: str = ".", frame: bool = True, confidence: bool = True) -> list[str]:
+    lines = []
+    for index in range(F):
+        cells = [str(index)] if frame else []
+        for point in range(P):
+            values = [*POINTS[index, point], *([SURE[index, point]] if confidence else [])]
+            cells += [f"{value:g}".replace(".", decimal) for value in values]
+        lines.append(separator.join(cells))
+    return lines
+
+
+def one_row_a_frame(separator: str, decimal: str) -> str:
+    head = separator.join(["Frame", *(f"{name}_{axis}" for name in NAMES for axis in ("x", "y", "likelihood"))])
+    return "\n".join([head, *rows_of(separator=separator, decimal=decimal)])
+
+
+def deeplabcut(individuals: bool) -> str:
+    def row(head: str, cells: list[str]) -> str:
+        return ",".join([head, *(each for cell in cells for each in [cell] * (1 if head == "coords" else 3))])
+
+    heads = [row("scorer", ["DLC_resnet50"] * P)]
+    if individuals:
+        heads.append(row("individuals", ["mouse1"] * 3 + ["mouse2"] * 3))
+    parts = [*NAMES[:3], *NAMES[:3]] if individuals else list(NAMES)
+    heads += [row("bodyparts", parts), "coords," + ",".join(["x", "y", "likelihood"] * P)]
+    return "\n".join([*heads, *rows_of()])
+
+
+def long_with_decimal_commas() -> str:
+    lines = ["frame;point;x;y"]
+    for (frame, point), _ in np.ndenumerate(SURE):
+        x, y = (f"{value:g}".replace(".", ",") for value in POINTS[frame, point])
+        lines.append(f"{frame};{point};{x};{y}")
+    return "\n".join(lines)
+
+
+TABLES = {
+    "decimal commas": (long_with_decimal_commas(), "canonical", False),
+    "one row a frame": (one_row_a_frame(",", "."), "one row a frame", True),
+    "one row a frame, decimal commas": (one_row_a_frame(";", ","), "one row a frame", True),
+    "one row a frame, tabs": (one_row_a_frame("\t", ","), "one row a frame", True),
+    "numbered": ("x0,y0,x1,y1,x2,y2,x3,y3,x4,y4,x5,y5\n" + "\n".join(rows_of(frame=False, confidence=False)), "one row a frame", False),
+    "DeepLabCut": (deeplabcut(individuals=False), "DeepLabCut", True),
+    "DeepLabCut, two animals": (deeplabcut(individuals=True), "DeepLabCut", True),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", TABLES)
+def test_a_table_is_read(case: str, tmp_path: Path) -> None:
+    text, form, hides = TABLES[case]
+    path = tmp_path / "tracks.csv"
+    path.write_text(f"\ufeff{text}\r\n".replace("\n", "\r\n"), encoding="utf-8")
+    read = read_inputs(tracks=path, mesh="none", options=Options())
+    assert read.interpretation.format == form
+    expected = np.where(SURE > 0.5, 0.9, 0.0) if hides else np.ones((F, P))
+    np.testing.assert_allclose(read.tracks.visible, expected)
+    seen = expected > 0
+    np.testing.assert_allclose(read.tracks.points[seen], POINTS[seen])
+
+
+def test_mediapipe_landmarks_are_fractions_of_the_picture(tmp_path: Path) -> None:
+    places = np.random.default_rng(0).uniform(0.2, 0.8, (1, 33, 4)) + np.arange(F)[:, None, None] * 0.01
+    head = ",".join(f"{axis}{index}" for index in range(33) for axis in ("x", "y", "z", "v"))
+    text = "\n".join([head, *(",".join(f"{value:.6f}" for value in frame.ravel()) for frame in places)])
+    (tmp_path / "pose.csv").write_text(text)
+    with pytest.raises(InvalidInput) as caught:
+        read_inputs(tracks=tmp_path / "pose.csv", mesh="none", options=Options())
+    assert caught.value.code == "ambiguous_coordinates"
+    read = read_inputs(tracks=tmp_path / "pose.csv", mesh="none", options=Options(image_size="641x481"))
+    assert (read.interpretation.format, read.interpretation.coordinates) == ("MediaPipe", "unit")
+    seen = read.tracks.visible > 0
+    np.testing.assert_allclose(read.tracks.points[seen], (places[..., :2] * [640, 480])[seen], atol=1e-2)
+
+
+@pytest.mark.parametrize("kind", ["table", "fixed"])
+def test_deeplabcut_hdf5(kind: str, tmp_path: Path) -> None:
+    values = np.concatenate([POINTS, SURE[..., None]], axis=2).reshape(F, 3 * P)
+    with h5py.File(tmp_path / "dlc.h5", "w") as file:
+        group = file.create_group("df_with_missing")
+        if kind == "fixed":
+            group["block0_values"] = values
+        else:
+            rows = np.zeros(F, dtype=[("index", "<i8"), ("values_block_0", "<f8", (3 * P,))])
+            rows["index"], rows["values_block_0"] = np.arange(F), values
+            group.create_dataset("table", data=rows, chunks=(F,))
+    read = read_inputs(tracks=tmp_path / "dlc.h5", mesh="none", options=Options())
+    assert read.interpretation.format == "DeepLabCut"
+    np.testing.assert_allclose(read.tracks.points[SURE > 0.5], POINTS[SURE > 0.5])
+    assert (read.tracks.visible[SURE < 0.5] == 0).all()
+
+
+def test_sleap_analysis(tmp_path: Path) -> None:
+    given = np.stack([POINTS[:, :3], POINTS[:, 3:]], axis=1)  # frames, instances, nodes, 2
+    given[2, 1] = np.nan
+    with h5py.File(tmp_path / "sleap.h5", "w") as file:
+        file["tracks"] = given.transpose(1, 3, 2, 0)
+        file["track_occupancy"] = np.ones((F, 2))
+        file["node_names"] = np.array([b"a", b"b", b"c"])
+    read = read_inputs(tracks=tmp_path / "sleap.h5", mesh="none", options=Options())
+    assert read.interpretation.format == "SLEAP"
+    assert (read.tracks.visible[2, 3:] == 0).all()
+    np.testing.assert_allclose(read.tracks.points[:, :3], POINTS[:, :3])
+    np.testing.assert_allclose(read.tracks.points[3], POINTS[3])
+
+
+FILM = "Send it as the film instead (on the page: under Film; REST: -F film=@film.mp4): its points are tracked for you."
+
+
+def pictures() -> bytes:
+    held = io.BytesIO()
+    with zipfile.ZipFile(held, "w") as archive:
+        archive.writestr("0001.png", b"\x89PNG\r\n\x1a\n")
+        archive.writestr("0002.png", b"\x89PNG\r\n\x1a\n")
+    return held.getvalue()
+
+
+TABLE = "tracks: expected a table with the columns frame, point, x and y, or with one row a frame, got line"
+REFUSED: dict[str, tuple[bytes, str, str]] = {
+    "an mp4": (b"\0\0\0\x18ftypmp42" + bytes(600), "film_as_tracks", f"tracks: expected point tracks, got a film (mp4 or mov). {FILM}"),
+    "a webm": (b"\x1aE\xdf\xa3" + bytes(600), "film_as_tracks", f"tracks: expected point tracks, got a film (webm or mkv). {FILM}"),
+    "an avi": (b"RIFF\0\0\0\0AVI LIST" + bytes(600), "film_as_tracks", f"tracks: expected point tracks, got a film (avi). {FILM}"),
+    "a gif": (b"GIF89a" + bytes(600), "film_as_tracks", f"tracks: expected point tracks, got a film (gif). {FILM}"),
+    "a zip of pictures": (pictures(), "film_as_tracks", f"tracks: expected point tracks, got a zip of pictures. {FILM}"),
+    "a picture": (
+        b"\x89PNG\r\n\x1a\n" + bytes(600), "picture_as_tracks",
+        "tracks: expected point tracks over several frames, got a single picture (png). "
+        "Depth comes from motion: send a film, or a zip of all its pictures, as the film.",
+    ),
+    "words in a table": (b"frame,point,x,y\n0,0,1,2\n0,1,left,2\n", "unreadable_table", f"{TABLE} 3: '0,1,left,2'. {EXAMPLE}"),
+    "other columns": (b"time,name,where,how\n1,2,3,4\n", "unreadable_table", f"{TABLE} 1: 'time,name,where,how'. {EXAMPLE}"),
+    "decimal commas between commas": (b"frame,point,x,y\n0,0,1,5,2,5\n", "unreadable_table", f"{TABLE} 2: '0,0,1,5,2,5'. {EXAMPLE}"),
+    "one row a frame without names": (
+        b"0,1,2,3,4,5,6,7,8\n1,2,3,4,5,6,7,8,9\n", "unreadable_table", f"{TABLE} 1: '0,1,2,3,4,5,6,7,8'. {EXAMPLE}",
+    ),
+    "a short row": (b"x0,y0,x1,y1\n1,2,3,4\n1,2,3\n", "unreadable_table", f"{TABLE} 3: '1,2,3'. {EXAMPLE}"),
+    "half of DeepLabCut's head": (b"scorer,a,a,a\nbodyparts,b,b,b\n0,1,2,3\n", "unreadable_table", f"{TABLE} 1: 'scorer,a,a,a'. {EXAMPLE}"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_a_refusal_says_what_was_seen_and_what_to_do(case: str, tmp_path: Path) -> None:
+    content, code, sentence = REFUSED[case]
+    (tmp_path / "tracks").write_bytes(content)
+    with pytest.raises(InvalidInput) as caught:
+        read_inputs(tracks=tmp_path / "tracks", mesh=None, options=Options())
+    assert caught.value.code == code
+    assert str(caught.value) == sentence
+
+
+def test_a_table_that_is_not_deeplabcuts_is_refused(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "dlc.h5", "w") as file:
+        file.create_group("df")["block0_values"] = np.full((F, 7), 3.0)
+    with pytest.raises(InvalidInput, match="expected a DeepLabCut table: x, y and likelihood"):
+        read_inputs(tracks=tmp_path / "dlc.h5", mesh=None, options=Options())
+
+
+@pytest.mark.parametrize("kind", ["virtual", "external", "link", "claimed", "claimed table"])
+def test_attacks_through_pose_files_are_refused(kind: str, tmp_path: Path) -> None:
+    secret = tmp_path / "secret"
+    secret.write_bytes(np.arange(1000.0).tobytes())
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["tracks"] = np.ones((1, 2, 6, F))
+    with h5py.File(tmp_path / "bad.h5", "w") as file:
+        file["node_names"] = np.array([b"a"])
+        if kind == "virtual":
+            layout = h5py.VirtualLayout((1, 2, 6, F), "<f8")
+            layout[:] = h5py.VirtualSource(str(tmp_path / "other.h5"), "tracks", (1, 2, 6, F))
+            file.create_virtual_dataset("tracks", layout)
+        elif kind == "external":
+            file.create_dataset("tracks", (1, 2, 6, F), "<f8", external=[(str(secret), 0, h5py.h5f.UNLIMITED)])
+        elif kind == "link":
+            file["tracks"] = h5py.ExternalLink(str(tmp_path / "other.h5"), "/tracks")
+        elif kind == "claimed":
+            file.create_dataset("tracks", (1, 2, 1 << 20, 1 << 12), "<f8", chunks=(1, 2, 1 << 10, 1))
+        else:
+            group = file.create_group("df_with_missing")
+            group.create_dataset(
+                "table", (1 << 24,), [("index", "<i8"), ("values_block_0", "<f8", (30,))], chunks=(64,)
+            )
+    with pytest.raises(InvalidInput) as caught:
+        read_inputs(tracks=tmp_path / "bad.h5", mesh=None, options=Options())
+    assert caught.value.code in ("unsupported_feature", "too_large")
+
+
+def test_tables_beyond_the_limits_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "wide.csv"
+    path.write_text("x0,y0,x1,y1\n" + "1,2,3,4\n" * 200)
+    with pytest.raises(InvalidInput, match="as a table"), path.open("rb") as stream:
+        PARSERS["csv"](stream, field="tracks", limits=Limits(max_bytes=4096))
+    path.write_text("x0,y0,x1,y1\n" + "1" * ((1 << 20) + 5))
+    with pytest.raises(InvalidInput, match="rows of at most 1048576 characters"), path.open("rb") as stream:
+        PARSERS["csv"](stream, field="tracks", limits=Limits())

@@ -1,0 +1,166 @@
+"""Tables with one row a frame: DeepLabCut's csv, MediaPipe landmarks, and spreadsheets with named columns.
+
+Columns are named by point and coordinate: `nose_x`, `nose y`, `x0`, `y_3`; a confidence may stand beside them. DeepLabCut writes the
+names in three or four rows: scorer, individuals (with several animals), bodyparts, coords.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from pliant.solver import InvalidInput
+from pliant.worker.formats.errors import too_large
+from pliant.worker.formats.records import Arrays, Limits
+
+SEPARATORS = "\t;,"
+"""By precedence: where tabs or semicolons separate the columns, commas may be decimal."""
+
+LONGEST_ROW = 1 << 20
+"""Characters of a row; a row has two numbers for each point."""
+
+LANDMARKS = frozenset((21, 33, 468, 478, 543))
+"""Points of MediaPipe's hands, pose, face (without and with irises) and holistic models."""
+
+EXAMPLE = "Write it as in `frame,point,x,y` and then `0,0,312.5,200.1`, or one row a frame: `frame,nose_x,nose_y,chin_x,chin_y`."
+
+_CONFIDENCE = ("v", "vis", "visible", "visibility", "likelihood", "confidence", "conf", "score", "c", "p", "presence")
+_AXIS = "|".join(sorted(("x", "y", "z", *_CONFIDENCE), key=len, reverse=True))
+_NAMED = re.compile(rf"(?P<point>.*[^ _.:-])[ _.:-]+(?P<axis>{_AXIS})")
+_NUMBERED = re.compile(rf"(?P<axis>{_AXIS})[ _.:-]?(?P<point>\d+)")
+_DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
+
+
+@dataclass(frozen=True, slots=True)
+class Columns:
+    """Which columns hold what, by point."""
+
+    x: list[int]
+    y: list[int]
+    confidence: list[int | None]
+    writer: str
+    """The name under which the track array is handed on."""
+
+
+def separator_of(line: str) -> str:
+    """Return the character between the columns of a line."""
+    return next((sign for sign in SEPARATORS if sign in line), ",")
+
+
+def split(line: str, separator: str) -> list[str]:
+    """Return the cells of a line, in lower case and without quotes."""
+    return [cell.strip().strip('"').strip().lower() for cell in line.rstrip("\r\n").split(separator)]
+
+
+def number(cell: str, separator: str) -> float:
+    """Return the number in a cell, NaN where it is empty.
+
+    Raises
+    ------
+    ValueError
+        It holds something else.
+    """
+    words = {"": np.nan, "nan": np.nan, "na": np.nan, "true": 1.0, "false": 0.0}
+    if cell in words:
+        return words[cell]
+    if separator != "," and _DECIMAL_COMMA.fullmatch(cell):
+        cell = cell.replace(",", ".")
+    return float(cell)
+
+
+def not_a_table(field: str, count: int, line: str) -> InvalidInput:
+    """Return the refusal of a line, with the line."""
+    return InvalidInput(
+            "unreadable_table", field=field, expected="a table with the columns frame, point, x and y, or with one row a frame",
+        got=f"line {count}: {line.strip()[:80]!r}", hint=EXAMPLE,
+    )  # fmt: skip
+
+
+def columns_of(names: list[str]) -> Columns | None:
+    """Return what the columns hold whose names are given; None unless at least two points have x and y."""
+    found: dict[str, dict[str, int]] = {}
+    for index, name in enumerate(names):
+        fits = _NUMBERED.fullmatch(name) or _NAMED.fullmatch(name)
+        if fits is not None:
+            axis = "confidence" if fits["axis"] in _CONFIDENCE else fits["axis"]
+            found.setdefault(fits["point"], {}).setdefault(axis, index)
+    points = [held for held in found.values() if "x" in held and "y" in held]
+    if len(points) < 2:
+        return None
+    landmarks = len(points) in LANDMARKS and all("z" in held for held in points)
+    confidence = [held.get("confidence") for held in points]
+    return Columns(
+        [held["x"] for held in points],
+        [held["y"] for held in points],
+        confidence,
+        "mediapipe" if landmarks else "one_row_a_frame",
+    )
+
+
+def deeplabcut_columns(rows: list[list[str]]) -> Columns | None:
+    """Return what the columns of DeepLabCut's header rows hold; None unless they are such rows."""
+    heads = {row[0]: row for row in rows}
+    if not {"bodyparts", "coords"} <= set(heads) or len({len(row) for row in rows}) != 1:
+        return None
+    places: dict[tuple[str, ...], dict[str, int]] = {}
+    for index in range(1, len(heads["coords"])):
+        point = tuple(heads[name][index] for name in ("individuals", "bodyparts") if name in heads)
+        places.setdefault(point, {}).setdefault(heads["coords"][index], index)
+    points = [held for held in places.values() if "x" in held and "y" in held]
+    return Columns(
+        [held["x"] for held in points],
+        [held["y"] for held in points],
+        [held.get("likelihood") for held in points],
+        "deeplabcut",
+    )
+
+
+def read_rows(
+    lines: Iterator[str], columns: Columns, separator: str, *, field: str, limits: Limits, before: int, width: int
+) -> Arrays:
+    """Read the rows below the names.
+
+    Parameters
+    ----------
+    lines : iterator of str
+        The lines that follow.
+    before : int
+        Lines that were read already.
+    width : int
+        Cells of a line.
+
+    Returns
+    -------
+    dict
+        The tracks `(F, P, 2)` under the writer's name, NaN where a cell is empty, and `likelihood (F, P)` if there are confidences.
+
+    Raises
+    ------
+    InvalidInput
+        Codes too_large, unreadable_table.
+    """
+    rows: list[list[float]] = []
+    seen = [each for each in columns.confidence if each is not None]
+    wanted = [*columns.x, *columns.y, *seen]
+    for count, line in enumerate(lines, before + 1):
+        if not line.strip():
+            continue
+        if len(line) >= LONGEST_ROW:
+            raise too_large(field, expected=f"rows of at most {LONGEST_ROW} characters", got="longer ones")
+        cells = split(line, separator)
+        try:
+            if len(cells) != width:
+                raise ValueError(f"{len(cells)} cells")
+            rows.append([number(cells[index], separator) for index in wanted])
+        except ValueError:
+            raise not_a_table(field, count, line) from None
+        if len(rows) * len(wanted) * 8 > limits.max_bytes:
+            raise too_large(field, expected=f"at most {limits.max_bytes} bytes as a table", got="more")
+    points = len(columns.x)
+    table = np.array(rows, dtype=np.float64).reshape(len(rows), len(wanted))
+    found: Arrays = {columns.writer: np.stack([table[:, :points], table[:, points : 2 * points]], axis=2)}
+    if len(seen) == points:
+        found["likelihood"] = table[:, 2 * points :]
+    return found
