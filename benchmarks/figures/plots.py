@@ -183,12 +183,14 @@ def distance(records: Records) -> Figure:
     titles = {"orthographic": "orthographic camera model", "auto": "camera=auto (default), φ not given"}
     figure, grid = plt.subplots(1, len(titles), figsize=(4 * len(titles), 3.2), sharey=True, squeeze=False)
     for axes, method in zip(grid[0], titles, strict=True):
-        for name, label in SEQUENCES.items():
+        for number, (name, label) in enumerate(SEQUENCES.items()):
             own = [r for r in chosen if r["sequence"].split()[0] == name and r["method"] == method]
             most = max((int(r["sequence"].split("=")[1]) for r in own), default=0)
             points = sorted((places[r["distance"]], r["value"]) for r in own if r["sequence"].endswith(f"={most}"))
             if points:
-                axes.semilogy(*np.array(points).T, marker="o", ms=4, label=f"{label} ({most} points)")
+                axes.semilogy(
+                    *np.array(points).T, marker="o", ms=4, color=f"C{number % 10}", label=f"{label} ({most} points)"
+                )
         axes.set_xticks(list(places.values()), ["3", "5", "10", "∞"])
         axes.set_title(titles[method], fontsize=9)
         axes.set_xlabel("distance of the camera / half-size of the object")
