@@ -12,6 +12,7 @@ import typer
 from pliant.cli import jobs, tokens
 from pliant.cli.commands.backup import backup, restore
 from pliant.cli.commands.results import rerun, share, view
+from pliant.cli.commands.top import top
 from pliant.cli.demo import demo
 from pliant.cli.doctor import doctor, fsck
 from pliant.cli.exits import Guarded
@@ -51,7 +52,7 @@ def _begin(
 
 _COMMANDS: dict[str, dict[str, Callable[..., None]]] = {
     "On this machine": {"solve": solve, "track": track, "inspect": inspect, "view": view, "demo": demo, "doctor": doctor},
-    "Run a service": {"up": up, "work": work, "fsck": fsck, "backup": backup, "restore": restore},
+    "Run a service": {"up": up, "work": work, "fsck": fsck, "backup": backup, "restore": restore, "top": top},
     "Use a service": {
         "submit": jobs.submit, "status": jobs.status, "watch": jobs.watch, "result": jobs.result, "list": jobs.list_jobs,
         "log": jobs.log, "cancel": jobs.cancel, "retry": jobs.retry, "rerun": rerun, "share": share, "delete": jobs.delete,

@@ -13,11 +13,12 @@ from contextlib import suppress
 import uvicorn
 from fastapi import FastAPI
 from pliant.service.app import create_app
-from pliant.service.logs import configure_logging
 from pliant.service.settings import ServiceSettings
+from pliant.worker import tracing
 from pliant.worker.environment import variable_of
 from pliant.worker.errors import InvalidSetting, NewerData, StoreUnavailable
 from pliant.worker.jobs.service import Jobs
+from pliant.worker.logs import configure_logging
 from pliant.worker.settings import Settings
 from pliant.worker.store.schema import prepare
 from pliant.worker.tokens import Tokens
@@ -103,6 +104,7 @@ def main(arguments: Sequence[str] = ()) -> int:
         of_worker = Settings.from_environment()
         tokens = Tokens.open(of_worker)
         check_access(settings, tokens)
+        tracing.configure(of_worker.tracing, service="pliant-api")
         with suppress(StoreUnavailable):  # requests are answered 503 until the store is back
             prepare(of_worker)
     except (InvalidSetting, NewerData) as error:
@@ -126,6 +128,7 @@ def main(arguments: Sequence[str] = ()) -> int:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: setattr(server, "should_exit", True))
     server.run()
+    tracing.finish()
     return 0 if server.started else 1
 
 

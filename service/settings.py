@@ -6,6 +6,7 @@ import ipaddress
 from typing import Annotated, Literal
 
 from pliant.worker.environment import read
+from pliant.worker.logs import LogFormat, LogLevel
 from pydantic import BeforeValidator, Field
 from pydantic.dataclasses import dataclass
 
@@ -15,8 +16,6 @@ USUAL_RATE = 1200
 """Requests in a minute: twenty a second, with a minute's worth at once."""
 
 Auth = Literal["auto", "required", "off"]
-LogLevel = Literal["debug", "info", "warning", "error"]
-LogFormat = Literal["console", "json"]
 
 
 def _split(given: object) -> object:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import importlib
-import logging
 import os
 import secrets
 import signal
@@ -12,9 +11,11 @@ import sys
 from contextlib import suppress
 from types import FrameType
 
+from pliant.worker.environment import read
 from pliant.worker.errors import StoreUnavailable, WorkerError
 from pliant.worker.execution.rq_worker import PliantWorker
 from pliant.worker.jobs.service import Jobs
+from pliant.worker.logs import LogSettings, configure_logging
 from pliant.worker.maintenance.fsck import findings
 from pliant.worker.maintenance.reconciler import Reconciler
 from pliant.worker.paths import make_data_directory
@@ -85,15 +86,14 @@ def fsck(settings: Settings) -> int:
 
 def main(arguments: list[str]) -> int:
     """Run one process; return its exit code."""
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(processName)s %(name)s %(levelname)s %(message)s")
-    logging.getLogger("rq.worker").setLevel(logging.WARNING)
     tasks = {"work": work, "reconcile": reconcile, "fsck": fsck}
     task = tasks.get(arguments[0] if arguments else "work")
     if task is None or len(arguments) > 1:
         sys.stderr.write(f"{USAGE}\n")
         return 2
     try:
-        settings = Settings.from_environment()
+        logs, settings = read(LogSettings), Settings.from_environment()
+        configure_logging(logs.log_level, logs.log_format)
         with suppress(StoreUnavailable):  # each task deals with a store that is away
             prepare(settings)
         return task(settings)

@@ -95,6 +95,9 @@ class Stored(BaseModel):
     shares: tuple[StoredShare, ...] = ()
     """Links that read the job's results without a token of its owner."""
 
+    trace: str | None = None
+    """W3C `traceparent` of the request that made the job, which its attempts continue; None: it was not traced."""
+
     version: int = 0
     """Number of changes, for the compare-and-set."""
 

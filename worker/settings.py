@@ -7,7 +7,7 @@ import math
 import os
 from dataclasses import fields
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 from urllib.parse import quote
 
 from pliant.worker.environment import read, variable_of
@@ -115,6 +115,9 @@ class Settings:
 
     upload_expiry: Seconds = 86400.0
     """Time for which an upload is kept after its last byte or its last use by a job; 0: indefinitely."""
+
+    tracing: Literal["off", "otlp", "console"] = "off"
+    """OpenTelemetry traces of requests and jobs; `otlp` sends them to `OTEL_EXPORTER_OTLP_ENDPOINT`. Needs the extra `otel`."""
 
     @classmethod
     def from_environment(cls) -> Settings:

@@ -11,7 +11,7 @@ import secrets
 import time
 from collections.abc import Callable
 
-from pliant.service.logs import REQUEST_ID
+from pliant.worker.logs import REQUEST_ID
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pliant.schemas.job import Problem, Progress, Status
+from pliant.worker import tracing
 from pliant.worker.errors import Interrupted, StaleAttempt, StoreUnavailable, UnknownJob
 from pliant.worker.execution.failures import problem_of, timed_out
 from pliant.worker.execution.monitor import Patience
@@ -55,16 +56,34 @@ def run(id: str, attempt_id: str, *, settings: Settings, worker: str) -> None:
         logger.info("delivery %s dropped: %s", attempt_id, error)
         return
     attempt = Attempt(jobs=jobs, id=id, attempt_id=attempt_id, deadline=_deadline(settings))
-    directory = working_directory(settings, attempt_id)
+    about = {"job": id, "attempt": stored.job.attempt, "worker": worker}
+    logger.info("job %s: attempt %d began", id, stored.job.attempt, extra=about)
+    tracing.configure(settings.tracing, service="pliant-worker")
+    try:
+        with tracing.span("attempt", parent=stored.trace, job=id, attempt=stored.job.attempt, worker=worker):
+            if stored.job.started_at is not None:
+                tracing.past("queued", begin=stored.job.created_at, end=stored.job.started_at)
+            status = _conclude(attempt, stored, worker=worker, settings=settings)
+        logger.info("job %s: attempt %d ended: %s", id, stored.job.attempt, status, extra={**about, "outcome": status})
+    finally:
+        tracing.finish()
+
+
+def _conclude(attempt: Attempt, stored: Stored, *, worker: str, settings: Settings) -> str:
+    """Work on a claimed attempt, with its own output and memory limit, and record the outcome; return it in a word."""
+    directory = working_directory(settings, attempt.attempt_id)
     directory.mkdir(parents=True, exist_ok=True)
     attempt.log(f"Attempt {stored.job.attempt} began on worker {worker}.")
     with _own_output(directory / OUTPUT):
         try:
             with _limited_memory(settings.memory_limit):
                 end = work(attempt, stored, directory)
-            attempt.conclude(end)
+            return attempt.conclude(end)
         except (StaleAttempt, UnknownJob) as error:
-            logger.info("attempt %s ended: %s", attempt_id, error)
+            logger.info("attempt %s ended: %s", attempt.attempt_id, error)
+            return "stale"
+        finally:
+            attempt.stages.end()
 
 
 @dataclass(slots=True, kw_only=True)
@@ -81,11 +100,14 @@ class Attempt:
     _parent: int = field(default_factory=os.getppid)
     _next_report: float = 0.0
     _stage: str = ""
+    stages: tracing.Stages = field(default_factory=tracing.Stages)
+    """Spans of the trace, where there is one."""
     _next_look: float = 0.0
     _lines: list[str] = field(default_factory=list)
 
     def report(self, progress: Progress) -> None:
         """Write the progress: each new stage, else at most every `PROGRESS_INTERVAL` seconds. An unavailable store is ignored."""
+        self.stages.enter(progress.stage)
         now = time.monotonic()
         if now < self._next_report and progress.stage == self._stage:
             return
@@ -115,7 +137,7 @@ class Attempt:
         moment = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
         self._lines += [f"{moment} {line}" for line in text.splitlines()]
 
-    def conclude(self, end: Finished | Problem | None) -> None:
+    def conclude(self, end: Finished | Problem | None) -> str:
         """Write the final record: the result, the failure, or None for a stop on request.
 
         Raises
@@ -146,6 +168,7 @@ class Attempt:
         kept = Patience(PATIENCE).retry(lambda: self.jobs.records.update(self.id, change))
         if kept.prefix is None:
             self.jobs.blobs.delete(self.prefix)
+        return kept.job.status.value
 
     def store(self, finished: Finished, results: Path) -> None:
         """Store the result files, retrying while the blob store is unavailable.

@@ -10,6 +10,7 @@ from datetime import datetime
 from pathlib import Path
 
 from pliant.schemas.job import Artifact, Interpretation, Job, JobPage, Status
+from pliant.worker import tracing
 from pliant.worker.errors import (
     Conflict,
     NotAllowedNow,
@@ -335,6 +336,8 @@ class Jobs:
                 found[part] = "ok"
             except StoreUnavailable as error:
                 found[part] = str(error)
+        if found["redis"] != "ok":  # asking again would only take as long again
+            return {**found, "workers": found["redis"]}
         try:
             workers = self.queue.workers()
             found["workers"] = "ok" if workers else "No worker is running; start one with `pliant work`."
@@ -386,6 +389,7 @@ class Jobs:
             key=key_digest(submission.idempotency_key, self.owner),
             fingerprint=submission.fingerprint,
             webhook=submission.webhook,
+            trace=tracing.traceparent(),
             max_running=self.max_running,
         )
         kept = acceptance.create(stored, put, max_queued=self.max_queued)

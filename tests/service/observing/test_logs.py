@@ -8,8 +8,8 @@ import logging
 
 import httpx
 import pytest
-from pliant.service.logs import REQUEST_ID, AddRequestId, configure_logging, formatter
 from pliant.worker.errors import WorkerError
+from pliant.worker.logs import REQUEST_ID, AddRequestId, configure_logging, formatter
 from serving import Running, Serve, submit, until
 
 

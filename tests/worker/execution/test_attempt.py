@@ -109,7 +109,7 @@ def test_a_new_stage_is_told_at_once(jobs: Jobs, attempt: Attempt, now: list[flo
     """A job that waits for its blob store tells nothing more: its record must not stay at the stage before."""
     for stage in ("reweight", "finish", "exporting"):
         now[0] += 0.01
-        attempt.tell(Progress(stage=stage, fraction=0.5, updated_at=datetime.now(UTC)))
+        attempt.report(Progress(stage=stage, fraction=0.5, updated_at=datetime.now(UTC)))
         progress = jobs.get(attempt.id).progress
         assert progress is not None
         assert progress.stage == stage

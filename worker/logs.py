@@ -4,15 +4,32 @@ from __future__ import annotations
 
 import logging
 from contextvars import ContextVar
+from typing import Literal
 
-from pliant.service.settings import LogFormat, LogLevel
+from pydantic.dataclasses import dataclass
 from pythonjsonlogger.json import JsonFormatter
+
+LogLevel = Literal["debug", "info", "warning", "error"]
+LogFormat = Literal["console", "json"]
 
 REQUEST_ID: ContextVar[str] = ContextVar("pliant_request_id", default="-")
 """The request that the current task or thread works for."""
 
-_NOISY = {"uvicorn": logging.WARNING, "uvicorn.error": logging.WARNING, "httpx": logging.WARNING}
+_NOISY = {
+    "rq.worker": logging.WARNING,
+    "uvicorn": logging.WARNING,
+    "uvicorn.error": logging.WARNING,
+    "httpx": logging.WARNING,
+}
 """Loggers of libraries, and the least level that is of use: `pliant up` reports start and stop itself."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LogSettings:
+    """How a worker or a reconciler logs; the API has the same variables among its own."""
+
+    log_level: LogLevel = "info"
+    log_format: LogFormat = "console"
 
 
 class AddRequestId(logging.Filter):

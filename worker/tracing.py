@@ -1,0 +1,150 @@
+"""OpenTelemetry traces of a job, from its request through the queue into the stages of the solver. Off by default.
+
+The request's span context is stored in the job's record as a W3C `traceparent`, so the attempt in another process, later and perhaps
+on another host, continues the same trace. Where tracing is off nothing of OpenTelemetry is imported.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import datetime
+from typing import Any
+
+from pliant.worker.errors import InvalidSetting
+
+logger = logging.getLogger(__name__)
+
+_provider: Any = None
+"""The process's source of spans; None: tracing is off."""
+
+
+def configure(kind: str, *, service: str) -> None:
+    """Turn tracing on for this process. Call it after a fork: exporters have threads.
+
+    Parameters
+    ----------
+    kind : str
+        `off`; `otlp`, which sends to `OTEL_EXPORTER_OTLP_ENDPOINT` and reads the other `OTEL_…` variables; or `console`.
+    service : str
+        Name of the process in traces.
+
+    Raises
+    ------
+    InvalidSetting
+        The extra `otel` is not installed.
+    """
+    if kind == "off":
+        use(None)
+        return
+    try:
+        from opentelemetry.sdk.resources import SERVICE_NAME, Resource
+        from opentelemetry.sdk.trace import TracerProvider
+        from opentelemetry.sdk.trace.export import BatchSpanProcessor
+
+        provider = TracerProvider(resource=Resource.create({SERVICE_NAME: service}))
+        provider.add_span_processor(BatchSpanProcessor(_exporter(kind)))
+    except ImportError as error:
+        expected = "off, or the extra otel: pip install 'pliant[otel]'"
+        raise InvalidSetting("PLIANT_TRACING", expected=expected, got=kind) from error
+    use(provider)
+
+
+def use(provider: Any) -> None:
+    """Take spans from this `TracerProvider`; None turns tracing off."""
+    global _provider
+    _provider = provider
+
+
+def finish() -> None:
+    """Send what is left, before the process ends."""
+    if _provider is not None:
+        _provider.shutdown()
+        use(None)
+
+
+@contextmanager
+def span(name: str, *, parent: str | None = None, **attributes: str | int | float) -> Iterator[Any]:
+    """Time a block as a span of the current trace.
+
+    Parameters
+    ----------
+    parent : str, optional
+        A `traceparent` to continue; None: the current span of this thread or task, if there is one.
+    attributes
+        Written with `pliant.` in front.
+
+    Yields
+    ------
+    Span or None
+        None where tracing is off.
+    """
+    if _provider is None:
+        yield None
+        return
+    named = {f"pliant.{key}": value for key, value in attributes.items()}
+    tracer = _provider.get_tracer("pliant")
+    with tracer.start_as_current_span(name, context=_context(parent), attributes=named) as current:
+        yield current
+
+
+def past(name: str, *, begin: datetime, end: datetime, **attributes: str | int | float) -> None:
+    """Add a span for something that is over, such as the wait in the queue."""
+    if _provider is not None:
+        named = {f"pliant.{key}": value for key, value in attributes.items()}
+        tracer = _provider.get_tracer("pliant")
+        tracer.start_span(name, start_time=_nanoseconds(begin), attributes=named).end(end_time=_nanoseconds(end))
+
+
+def traceparent() -> str | None:
+    """Return the current span as a W3C `traceparent`, None where there is none."""
+    if _provider is None:
+        return None
+    from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
+
+    carrier: dict[str, str] = {}
+    TraceContextTextMapPropagator().inject(carrier)
+    return carrier.get("traceparent")
+
+
+class Stages:
+    """A span for each stage of a job, one after the other."""
+
+    def __init__(self) -> None:
+        self._name: str | None = None
+        self._span: Any = None
+
+    def enter(self, name: str) -> None:
+        """Begin a stage, and end the one before; nothing happens if it is the same."""
+        if _provider is not None and name != self._name:
+            self.end()
+            self._name, self._span = name, _provider.get_tracer("pliant").start_span(name)
+
+    def end(self) -> None:
+        """End the stage."""
+        if self._span is not None:
+            self._span.end()
+            self._name = self._span = None
+
+
+def _exporter(kind: str) -> Any:
+    if kind == "console":
+        from opentelemetry.sdk.trace.export import ConsoleSpanExporter
+
+        return ConsoleSpanExporter()
+    from opentelemetry.exporter.otlp.proto.http.trace_exporter import OTLPSpanExporter
+
+    return OTLPSpanExporter()
+
+
+def _context(parent: str | None) -> Any:
+    if parent is None:
+        return None
+    from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
+
+    return TraceContextTextMapPropagator().extract({"traceparent": parent})
+
+
+def _nanoseconds(moment: datetime) -> int:
+    return int(moment.timestamp() * 1e9)
