@@ -121,7 +121,8 @@ export class Viewer {
       h("div", { class: "row pace" }, choice("Speed", speeds, (value) => (this.player.speed = Number(value))), choice("At the end", endings, (value) => (this.player.ending = value as Ending))),
     );
     const full = document.fullscreenEnabled ? button("Full screen", () => void this.fullScreen()) : "";
-    this.view.append(h("div", { class: "corner" }, full, button("Help", () => openHelp(this.holder))));
+    // Before the canvas, so that Shift+Tab leads from the player to the picture itself.
+    this.view.prepend(h("div", { class: "corner" }, full, button("Help", () => openHelp(this.holder))));
     const thinned = preview.header.frame_stride > 1 ? `Every ${ordinal(preview.header.frame_stride)} frame is shown; the files contain all frames.` : "";
     const notes = [h("p", { class: "hint", hidden: !thinned }, thinned), this.trouble];
     const main = h("div", { class: "stage-main" }, this.panes, this.legend, this.compared, time, ...notes);
