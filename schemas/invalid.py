@@ -27,7 +27,7 @@ class Invalid(Exception):
     """
 
     def __init__(self, code: str, *, field: str, expected: str, got: str, hint: str) -> None:
-        super().__init__(f"{field}: expected {expected}, got {got}. {hint}")
+        Exception.__init__(self, f"{field}: expected {expected}, got {got}. {hint}")  # a sibling class may ask for more
         self.code = code
         self.field = field
         self.expected = expected

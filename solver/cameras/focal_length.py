@@ -112,7 +112,11 @@ def search(
         for _ in range(UPDATES):
             depth = depth_map(rotations[used], scales[used], trial.covariance)
             depths = depths_of(depth, some, curvature, start=trial.depths)
-            covariance = _learn(some, depths, curvature, projections, model_order)
+            try:
+                covariance = _learn(some, depths, curvature, projections, model_order)
+            except np.linalg.LinAlgError:  # depths beyond any measure, to which no covariance can be learned
+                trial = replace(trial, curvature=curvature, nll=UNLIKELY)
+                break
             trial = _Trial(curvature, covariance.nll + density(depths, curvature), depths, covariance)
         trials[curvature] = trial
 

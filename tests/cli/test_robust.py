@@ -58,7 +58,9 @@ def words(ran: Result) -> str:
 
 
 NO_FILE = "expected a file, an array or a dictionary of arrays, got no file at"
-A_FOLDER = "tracks: expected a file, got the folder FOLDER. Give the path of a file in it."
+NO_TRACKS = (
+    "FOLDER: expected track files (.csv, .h5, .hdf5, .mat, .npy, .npz, .txt), got an empty folder. Name the files."
+)
 NO_PICTURES = (
     "film: expected pictures (.png, .jpg, .jpeg, .webp, .bmp), got none in folder. "
     "Export the film's frames as PNG or JPEG, numbered in order."
@@ -72,8 +74,8 @@ LISTED = "`pliant options` lists every option."
     [
         ("solve nofile.npz -o OUT", f"tracks: {NO_FILE} nofile.npz."),
         ("solve FOLDER -o OUT", NO_PICTURES),
-        ("submit FOLDER", A_FOLDER.replace("tracks:", "film:")),
-        ("inspect FOLDER", A_FOLDER),
+        ("submit FOLDER", NO_TRACKS),
+        ("inspect FOLDER", NO_PICTURES),
         ("inspect TRACKS -g none.npz", f"ground_truth: {NO_FILE} none.npz."),
         ("solve TRACKS -o TRACKS", A_FILE),
         ("submit TRACKS -o TRACKS", A_FILE),

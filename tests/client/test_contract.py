@@ -125,7 +125,7 @@ def test_inspecting_returns_the_interpretation_without_creating_a_job(client: Cl
     assert [job.id for job in client.list()] == before
     assert (said.num_frames, said.num_points, said.has_rotations) == (6, 16, True)
     assert said.hidden_fraction == pytest.approx(1 / (6 * 16))
-    job = client.submit(points, options=FAST, mesh="none", rotations=np.tile(np.eye(3), (6, 1, 1)))
+    job = client.submit(points, mesh="none", rotations=np.tile(np.eye(3), (6, 1, 1)))
     assert job.record.interpretation == said
     with pytest.raises(InvalidRequest) as caught:
         client.inspect(np.ones((2, 9, 2)))

@@ -64,7 +64,7 @@ def test_from_tapnext(run, tmp_path: Path, model: str) -> None:
         np.savez(tmp_path / "tracks.npz", tracks=turned, occlusion=low, expected_dist=low)
     said = run("from_tapnext.py", "tracks.npz", "640x480", "face.glb")
     assert f"read as: {model}" in said
-    assert f"shapes (12, {shape[2]}, 3)" in said
+    assert f"shapes ({shape[1]}, {shape[2]}, 3)" in said
     assert (tmp_path / "face.glb").read_bytes()[:4] == b"glTF"
 
 

@@ -37,7 +37,16 @@ def test_the_bar_takes_every_callback_of_the_sdk() -> None:
         result = client.submit(POINTS, on_upload=bar.on_upload).wait(on_progress=bar.on_progress)
         result.download(result.folder / "more", on_download=bar.on_download)
     stages = [stage for stage, _ in bars.shown]
-    assert list(dict.fromkeys(stages)) == ["sending", "queued", "running", "loading", "succeeded", "fetching"]
+    assert list(dict.fromkeys(stages)) == [
+        "sending",
+        "queued",
+        "running",
+        "loading",
+        "reweight",
+        "exporting",
+        "succeeded",
+        "fetching",
+    ]
     assert all(0 <= fraction <= 1 for _, fraction in bars.shown)
 
 

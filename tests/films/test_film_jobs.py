@@ -24,6 +24,7 @@ from pliant.schemas.job import Progress
 from pliant.schemas.options import Options
 from pliant.solver.errors import InvalidInput
 from pliant.tracking import open_film
+from pliant.tracking.contact_sheet import small_jpeg
 from pliant.worker.errors import Interrupted, TimedOut
 from pliant.worker.execution.film import reconstruct_film
 from pliant.worker.films import frame_strip, tracker
@@ -224,7 +225,7 @@ def test_large_pictures_are_reduced_and_long_films_have_no_film_frames(
     film: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     wide = np.zeros((300, 960, 3), np.uint8)
-    with Image.open(io.BytesIO(frame_strip.small_jpeg(wide))) as picture:
+    with Image.open(io.BytesIO(small_jpeg(wide, longest_side=480, quality=80))) as picture:
         assert picture.size == (480, 150)
     opened = open_film(film)
     assert not frame_strip.write_frames(opened, np.array([0, 3, 99]), tmp_path / "a")  # the film has no frame 99
@@ -286,7 +287,6 @@ def test_the_film_process_has_no_network_and_starts_no_programs() -> None:
     script = textwrap.dedent("""
         import socket, subprocess, threading
         from pliant.worker.processes.no_network import forbid_network
-from pliant.worker.settings import Settings
         print(forbid_network())
         for attempt in (socket.socket, lambda: subprocess.run(["/bin/true"])):
             try:

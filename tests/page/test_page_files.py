@@ -16,7 +16,7 @@ SCRIPT = "export const answer = 42;\n"
 @pytest.fixture
 def built(tmp_path: Path) -> TestClient:
     html = "<!doctype html><title>Pliant</title>"
-    for name, text in (("index.html", html), ("docs.html", html), ("main-ABC.js", SCRIPT)):
+    for name, text in (("index.html", html), ("docs.html", html), ("guide.html", html), ("main-ABC.js", SCRIPT)):
         (tmp_path / name).write_text(text)
         (tmp_path / f"{name}.gz").write_bytes(gzip.compress(text.encode()))
     (tmp_path / "notes.txt").write_text("not a part of the page")

@@ -12,6 +12,7 @@ import httpx
 import numpy as np
 import pytest
 from pliant.schemas.job import Job, Problem, Status
+from pliant.service.settings import MB
 from pliant.worker.formats import Limits, load_inputs
 from serving import Running, Serve, claim, form, heard, npz, submit, tracks, until
 
@@ -145,7 +146,7 @@ def test_a_body_beyond_the_limit_is_refused_however_it_is_sent(small: Running) -
         answer = httpx.post(request.url, content=iter([content]) if chunked else content, headers=headers)
         assert answer.status_code == 413
         assert answer.json()["code"] == "body_too_large"
-        assert answer.json()["expected"] == "at most 200000 bytes"
+        assert answer.json()["expected"] == f"at most {int(0.2 * MB)} bytes"
         assert answer.headers["connection"] == "close"
     assert small.left_on_disk == []
     assert small.waiting == 0

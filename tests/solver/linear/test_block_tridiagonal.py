@@ -60,7 +60,7 @@ def test_blocks_of_points_and_threads_change_nothing(monkeypatch: pytest.MonkeyP
     given = operator(temporal_weight=0.7)
     r = np.random.default_rng(1).standard_normal((6, 3, given.weights.shape[2]))
     whole = block_tridiagonal.build(given)(r)
-    monkeypatch.setattr(block_tridiagonal, "BLOCK", 10)
+    monkeypatch.setattr(block_tridiagonal, "POINTS_PER_BLOCK", 10)
     with threads_limited(2):
         np.testing.assert_array_equal(block_tridiagonal.build(given)(r), whole)
 

@@ -84,7 +84,7 @@ def test_every_option_of_the_solver_reaches_it() -> None:
         "temporal_weight": 0.5, "spatial_weight": 0.25, "robust_scale": 0.125, "temporal_order": 2, "loss": "huber",
         "laplacian": "uniform", "prior": "smooth+low_rank", "low_rank_weight": 3.0, "max_reweightings": 7, "tolerance": 0.5,
         "precision": "float32", "seed": 9, "focal": 900.0, "field_of_view": None, "principal_point": "319.5,-2",
-        "image_size": "640x480",
+        "image_size": "640x480", "order": "film",
     }  # fmt: skip
     assert set(chosen) == set(SOLVER_FIELDS)
     expected = {**chosen, "principal_point": (319.5, -2.0), "image_size": (640.0, 480.0)}

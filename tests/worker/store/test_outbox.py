@@ -183,7 +183,7 @@ def test_a_refused_connection_counts_as_a_failed_attempt(door: Jobs, made: Made,
         unused.bind(("127.0.0.1", 0))
         job = made(f"http://127.0.0.1:{unused.getsockname()[1]}/")
         webhook_sender.start()
-        until(lambda: "ConnectError, at try 3, the last" in door.log(job.id))
+        until(lambda: "ConnectError (attempt 3, the last one)." in door.log(job.id))
 
 
 @pytest.mark.parametrize(
