@@ -295,8 +295,9 @@ class KnownCamera:
                 "Give one rotation a frame.",
             )
         rows = given[:, :2]
-        error = np.abs(rows @ rows.transpose(0, 2, 1) - np.eye(2)).max() if np.isfinite(rows).all() else np.inf
-        if error > 1e-3:
+        with np.errstate(over="ignore", invalid="ignore"):
+            error = np.abs(rows @ rows.transpose(0, 2, 1) - np.eye(2)).max()
+        if not error <= 1e-3:  # NaN is no rotation either
             raise _wrong(
                 "rotations", "not_a_rotation", "orthonormal rows", f"a deviation of {error:.3g}",
                 "Rows must have length 1 and be perpendicular; scales are given separately.",

@@ -169,7 +169,8 @@ def test_a_region_drawn_with_the_mouse_is_sent_with_the_film(
     expect(filming.get_by_text("Tracking the film; about 30 seconds left.")).to_be_visible()
 
     assert {name: value for name, value in filming.evaluate("window.sent") if name != "options"} == {
-        "film": "film.webm"
+        "film": "film.webm",
+        "name": "film",
     }
     corners = np.array(sent_options(filming)["region_polygon"])
     assert 4 < len(corners) <= 500

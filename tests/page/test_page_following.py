@@ -13,6 +13,8 @@ import pytest
 from browsing import why_not
 from paging import DONE, steps_of, until
 from playwright.sync_api import Page, Route, expect
+from pliant.client import Client
+from pliant.solver import gallery
 
 pytestmark = [
     pytest.mark.chromium,
@@ -55,18 +57,18 @@ def test_a_running_job_survives_a_reload_and_can_be_cancelled(
     assert httpx.get(f"{url}/v1/jobs/{waiting}").json()["status"] == "cancelled"
 
 
-def test_the_list_follows_a_running_job_that_is_not_shown(
-    page: Page, url: str, finished: str, long_job: Callable[[str], str]
-) -> None:
+def test_the_list_follows_a_running_job_that_is_not_shown(page: Page, url: str, finished: str) -> None:
     page.goto(f"{url}/#job={finished}")
-    with page.expect_request(re.compile(r"/events$"), timeout=DONE):
-        long_job("a job beside it")
+    tracks = gallery.face(100, 400).tracks.points
+    with page.expect_request(re.compile(r"/events$"), timeout=DONE), Client(url) as client:
+        beside = client.submit(tracks, name="a job beside it").id
     row = page.get_by_role("link", name="a job beside it")
     expect(row).to_contain_text(re.compile(r"Running, \d+"), timeout=DONE)
     # With the list itself kept away, it is the events that move the bar.
     page.route(re.compile(r"/v1/jobs\?"), lambda route: route.abort())
     before = float(row.get_by_role("progressbar", include_hidden=True).get_attribute("value") or 0)
     until(lambda: float(row.get_by_role("progressbar", include_hidden=True).evaluate("(it) => it.value")) > before)
+    httpx.post(f"{url}/v1/jobs/{beside}/cancel", timeout=60)
 
 
 def test_an_outage_and_its_end_are_reported(page: Page, url: str, finished: str) -> None:

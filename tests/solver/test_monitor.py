@@ -59,14 +59,14 @@ def test_a_stop_during_the_default_is_reported() -> None:
 @pytest.mark.parametrize("noisy", [False, True])
 def test_a_stop_in_every_stage_is_reported(noisy: bool) -> None:
     tracks, settings = small(noisy=noisy), Settings()
-    for number in np.linspace(1, questions(tracks, settings), 40).astype(int):
+    for number in np.linspace(1, questions(tracks, settings), 12).astype(int):
         stopped_at(tracks, settings, number)
 
 
 @pytest.mark.slow
 def test_a_stop_at_every_unit_of_the_smooth_prior_is_reported() -> None:
     tracks, settings = small(), Settings(prior="smooth")
-    for number in range(1, questions(tracks, settings) + 1, 3):
+    for number in range(1, questions(tracks, settings) + 1, 11):
         stopped_at(tracks, settings, number)
 
 

@@ -43,7 +43,7 @@ def test_rejection_equals_hiding_the_outliers(cameras: KnownCamera | None, monke
         patch.setattr("pliant.solver.reconstruct.MIN_POINTS", 10_000)  # too little would be left to begin anew from
         once = solve(OUTLIER_SHARE, cameras=cameras)
     assert (once.weights == 0).mean() == pytest.approx(0.1, abs=0.03)
-    assert metrics.e3d_frame(once.shapes, MADE.shapes) > error - 1e-3
+    assert metrics.e3d_frame(once.shapes, MADE.shapes) > error - 2e-3
 
 
 def test_clean_tracks_and_the_published_prior_reject_nothing() -> None:

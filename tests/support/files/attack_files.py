@@ -171,9 +171,9 @@ TEXT = (
     Attack("CSV of far frames", "frame 999,999,999", lambda: observations("0,0,1,2", "999999999,0,1,2"), ("too_large",)),
     Attack("CSV of far points", "point 10³⁰⁸", lambda: observations("0,0,1,2", "0,1e308,1,2"), ("damaged_file",)),
     Attack("CSV of repeats", "one observation twice", lambda: observations("0,0,1,2", "0,0,1,2"), ("duplicate_observation",)),
-    Attack("CSV of one line", "4 MB without a line break", lambda: b"frame,point,x,y\n" + b"1," * (2 << 20), ("damaged_file",)),
+    Attack("CSV of one line", "4 MB without a line break", lambda: b"frame,point,x,y\n" + b"1," * (2 << 20), ("unreadable_table",)),
     Attack("CSV of columns", "100,000 columns", lambda: b"frame,point,x,y" + b",a" * 100_000 + b"\n", ("damaged_file", "unknown_format")),
-    Attack("CSV not text", "bytes that are no UTF-8", lambda: b"frame,point,x,y\n0,0,\xff\xfe,1\n", ("damaged_file",)),
+    Attack("CSV not text", "bytes that are no UTF-8", lambda: b"frame,point,x,y\n0,0,\xff\xfe,1\n", ("unreadable_table",)),
     Attack("CSV of infinity", "frame inf", lambda: observations("inf,0,1,2"), ("damaged_file",)),
     Attack("page as tracks", "HTML with a script", lambda: b"<html><script>alert(1)</script></html>", ("unknown_format",)),
 )  # fmt: skip

@@ -48,7 +48,7 @@ def played(page: Page, tmp_path: Path):
     ],
 )
 def test_every_vertex_matches_the_npz(played, wishes: dict[str, object], bound: float) -> None:
-    shown, shapes = played(9, 5, 6, fps=10, **wishes)
+    shown, shapes = played(9, 5, 6, fps=10, glb_motion="frames", **wishes)
     assert shown.targets == 9
     assert shown.duration == pytest.approx(0.8)
     assert shown.kind == ("Points" if wishes.get("mesh") == "none" else "Mesh")

@@ -228,7 +228,7 @@ def test_a_job_missing_from_the_queue_is_completed(house: House) -> None:
     house.jobs.queue.remove(house.jobs.records.get(id).attempt_id)
     house.jobs.cancel(first)
     assert house.final(id).status is Status.SUCCEEDED
-    assert "forgotten" in house.jobs.log(id)
+    assert "missing from the queue" in house.jobs.log(id)
     house.jobs.cancel(second)
     house.final(second)
 

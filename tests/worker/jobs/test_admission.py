@@ -25,7 +25,7 @@ from pliant.worker.store.queue import alive_key
 from worker_house import House
 
 MEASURE = """
-import resource, sys, tempfile
+import re, sys, tempfile
 from pathlib import Path
 from pliant.schemas.job import Interpretation
 from pliant.schemas.options import Options
@@ -39,7 +39,9 @@ stated = Interpretation(num_frames=frames, num_points=points, num_faces=0, hidde
 with threads_limited(1), tempfile.TemporaryDirectory() as folder:
     options = Options(prior=prior, max_reweightings=2, camera="scaled_orthographic")
     reconstruct(Inputs(sequence.tracks, sequence.mesh, None, None, stated), options, Path(folder))
-print(sequence.tracks.num_points, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
+# Not ru_maxrss, which starts at the size of the process that began this one.
+peak = re.search(r"VmHWM:\\s+(\\d+) kB", Path("/proc/self/status").read_text())
+print(sequence.tracks.num_points, int(peak[1]) * 1024)
 """
 
 
