@@ -196,7 +196,7 @@ def distance(records: Records) -> Figure:
         axes.set_xlabel("distance of the camera / half-size of the object")
         axes.grid(alpha=0.25, which="both")
     grid[0, 0].set_ylabel("e3d_frame_scaled")
-    if chosen:
+    if grid[0, -1].get_legend_handles_labels()[0]:
         grid[0, -1].legend(fontsize=7, frameon=False, loc="center left", bbox_to_anchor=(1, 0.5))
     return figure
 
