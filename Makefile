@@ -10,12 +10,13 @@ GENERATOR := $(VENV)/generator
 PAGE := service/web/dist/index.html
 PAGE_SOURCES := $(wildcard service/web/*.json service/web/*.mjs service/web/src/* service/web/src/*/*)
 
-.PHONY: help demo test test-slow matrix coverage page client docs types check format clean
+.PHONY: help demo test test-slow test-long matrix coverage page client docs types check format clean
 
 help:
 	@echo "make demo    reconstruct a moving face end to end: service, queue, worker, glTF"
 	@echo "make test    run the tests: four minutes on two cores, nothing but Python needed"
 	@echo "make test-slow  run what is slow or needs Chromium, Node.js, an S3 server or root"
+	@echo "make test-long  run what takes most of a minute or more each"
 	@echo "make matrix  make test with every Python from 3.11 to 3.14 on this machine"
 	@echo "make coverage   make test, with the share of lines that it runs"
 	@echo "make page    bundle the web page"
@@ -66,7 +67,11 @@ test: $(STAMP)
 	$(PYTEST) -m "not ($(NEEDY))" $(TESTS)
 
 test-slow: $(STAMP) $(PAGE)
-	$(PYTEST) -m "$(NEEDY)" $(TESTS)
+	$(PYTEST) -m "($(NEEDY)) and not long" $(TESTS)
+
+# What takes most of a minute or more each.
+test-long: $(STAMP) $(PAGE)
+	$(PYTEST) -m long $(TESTS)
 
 # Every interpreter of 3.11 to 3.14 on this machine, each in an environment of its own.
 matrix:

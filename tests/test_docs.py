@@ -36,6 +36,9 @@ SLOW = {
 }  # fmt: skip
 """Pages whose code solves several jobs, tracks a film or starts an embedded Valkey, left to `make test-slow`."""
 
+LONG = {"docs/how-to/camera.md", "docs/reference/cli.md", "docs/tutorials/blender.md"}
+"""Of these, pages whose shell blocks take most of a minute, left to `make test-long`."""
+
 ADDRESS = "http://127.0.0.1:8000"
 SIZE = re.compile(r"\bface\(\d+, \d+\)")
 """Gallery sequences in the pages; they are run with a smaller one."""
@@ -85,7 +88,13 @@ def pages(language: str) -> list[ParameterSet]:
     ran = [
         path for path in DOCUMENTS if any(b.document == path and b.language == language and not b.note for b in BLOCKS)
     ]
-    return [pytest.param(path, id=named[path], marks=[pytest.mark.slow] if named[path] in SLOW else []) for path in ran]
+
+    def marks(name: str) -> list[pytest.MarkDecorator]:
+        if name not in SLOW:
+            return []
+        return [pytest.mark.slow, pytest.mark.long] if language == "bash" and name in LONG else [pytest.mark.slow]
+
+    return [pytest.param(path, id=named[path], marks=marks(named[path])) for path in ran]
 
 
 def test_the_slow_pages_exist() -> None:

@@ -134,6 +134,7 @@ def test_the_code_shown_submits_the_same_job(
         assert (tmp_path / "result" / "shapes.npz").is_file()
 
 
+@pytest.mark.long
 def test_a_dense_result_plays_within_time_and_memory(page: Page, tmp_path: Path) -> None:
     """99 frames of 29,000 points on the whole road, with known cameras and the method that takes seconds."""
     sequence = face(99, 29_000)

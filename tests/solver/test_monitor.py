@@ -64,6 +64,7 @@ def test_a_stop_in_every_stage_is_reported(noisy: bool) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_stop_at_every_unit_of_the_smooth_prior_is_reported() -> None:
     tracks, settings = small(), Settings(prior="smooth")
     for number in range(1, questions(tracks, settings) + 1, 11):

@@ -59,6 +59,7 @@ def test_a_factorization_replaces_cameras_that_are_off_and_no_others(
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_film_from_nearby_needs_cameras_from_the_corrected_tracks(monkeypatch: pytest.MonkeyPatch) -> None:
     face = gallery.face(90, 120, degrees=60)
     seen = (face.shapes - face.shapes.mean(axis=1, keepdims=True)) @ face.rotations.transpose(0, 2, 1)

@@ -165,6 +165,7 @@ def test_gross_outliers_are_rejected_and_reported(face: gallery.Sequence) -> Non
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_long_film_is_learned_from_some_of_its_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     long = gallery.face(40, 150)
     whole = metrics.e3d_frame(solve(long.tracks).shapes, long.shapes)

@@ -31,6 +31,7 @@ def test_rejected_observations_are_the_corrupted_ones(cameras: KnownCamera | Non
 
 @pytest.mark.parametrize("cameras", [CAMERAS, None], ids=["known", "estimated"])
 @pytest.mark.slow
+@pytest.mark.long
 def test_rejection_equals_hiding_the_outliers(cameras: KnownCamera | None, monkeypatch: pytest.MonkeyPatch) -> None:
     found = solve(OUTLIER_SHARE, cameras=cameras)
     hidden = solve(Tracks.from_arrays(OUTLIER_SHARE.points, found.weights > 0), cameras=cameras)
@@ -56,6 +57,7 @@ def test_clean_tracks_and_the_published_prior_reject_nothing() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_the_stiff_fit_descends_though_the_learned_paths_hardly_move() -> None:
     """A nearly rigid body: the prior's precision spans ten magnitudes, and 300 times that in the stiff fit."""
     rigid = gallery.face(40, 200, degrees=60)
