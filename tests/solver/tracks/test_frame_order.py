@@ -1,4 +1,4 @@
-"""Photographs in no order: how they are told from a film, that nothing compares neighbours, and that no order changes the result."""
+"""Photographs in no order: detection, no terms between neighbouring frames, and equal results in every order."""
 
 from __future__ import annotations
 

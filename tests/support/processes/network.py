@@ -1,4 +1,4 @@
-"""Hosts in network namespaces, joined by a switch, whose cables can be pulled: packets are dropped then, nobody is told."""
+"""Hosts in network namespaces, joined by a switch. A cut cable drops packets without an error to either side."""
 
 from __future__ import annotations
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
@@ -12,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.worker.artifacts.geometry import viewer_scale
 from pliant.worker.artifacts.result import Result
+from pliant.worker.artifacts.scenes.by_path import path_beside
 
 
 def available() -> bool:
@@ -22,17 +22,11 @@ def available() -> bool:
 def write_alembic(result: Result, file: IO[bytes], on_progress: Callable[[float], None]) -> None:
     """Write `/shape/mesh` (`/shape/points` without faces) with a time sample a frame; y up, right-handed, as in the glTF file.
 
-    The library wants a path, so it writes beside the file, into one that goes. The archive has no date, so equal results are
+    The library requires a path, so a temporary file beside the target is used. The archive has no date: equal results give
     equal files.
     """
-    path = Path(f"{file.name}.abc")
-    path.unlink(missing_ok=True)
-    try:
+    with path_beside(file, ".abc") as path:
         _build(path, result, on_progress)
-        with path.open("rb") as made:
-            shutil.copyfileobj(made, file)
-    finally:
-        path.unlink(missing_ok=True)
 
 
 def _build(path: Path, result: Result, on_progress: Callable[[float], None]) -> None:

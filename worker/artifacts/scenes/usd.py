@@ -14,6 +14,7 @@ import numpy as np
 from pliant.worker.artifacts.colours import linear
 from pliant.worker.artifacts.geometry import triangles_of, vertex_normals, viewer_scale
 from pliant.worker.artifacts.result import Result
+from pliant.worker.artifacts.scenes.by_path import path_beside
 from pliant.worker.formats import Texture
 
 PICTURE = "texture.jpg"
@@ -33,14 +34,8 @@ def write_usd(result: Result, file: IO[bytes], on_progress: Callable[[float], No
 
     The library requires a path with its own suffix, so a temporary file beside the target is used.
     """
-    path = Path(f"{file.name}.usdc")
-    path.unlink(missing_ok=True)
-    try:
+    with path_beside(file, ".usdc") as path:
         _build(path, result, on_progress)
-        with path.open("rb") as made:
-            shutil.copyfileobj(made, file)
-    finally:
-        path.unlink(missing_ok=True)
 
 
 def write_usdz(result: Result, file: IO[bytes], on_progress: Callable[[float], None]) -> None:
