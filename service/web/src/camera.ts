@@ -4,6 +4,8 @@ import { button, h, say, uniqueId } from "./dom";
 
 /** A recording ends by itself after this long, seconds: enough for a slow turn, and tracked within a minute or two. */
 const LONGEST = 20;
+/** The recorder hands over what it has this often, milliseconds. */
+const PIECE = 250;
 const FORMATS: [type: string, name: string][] = [
   ["video/mp4;codecs=avc1.640028", "recording.mp4"],
   ["video/webm;codecs=vp8", "recording.webm"],
@@ -20,7 +22,7 @@ export class CameraDialog {
   private readonly video = h("video", { playsinline: true, "aria-label": "The camera's picture" });
   private readonly words = h("p", { role: "status" });
   private readonly start = button("Record", () => this.record(), { class: "primary", disabled: true });
-  private readonly stop = button("Stop", () => this.recorder?.stop(), { class: "primary", hidden: true });
+  private readonly stop = button("Stop", () => this.recorder?.stop(), { class: "primary", hidden: true, disabled: true });
   private readonly dialog: HTMLDialogElement;
   private stream: MediaStream | null = null;
   private recorder: MediaRecorder | null = null;
@@ -68,17 +70,24 @@ export class CameraDialog {
     const [type, name] = format;
     const recorder = new MediaRecorder(this.stream, { mimeType: type, videoBitsPerSecond: 8_000_000 });
     const parts: Blob[] = [];
-    recorder.addEventListener("dataavailable", (event) => parts.push(event.data));
+    recorder.addEventListener("dataavailable", ({ data }) => {
+      if (data.size === 0) return;
+      parts.push(data);
+      // A slow encoder needs a while for its first frame; a recording without one is no film.
+      if (!this.stop.disabled) return;
+      this.stop.disabled = false;
+      this.stop.focus();
+    });
     recorder.addEventListener("stop", () => {
       if (this.closed) return;
+      if (parts.length === 0) return say(this.words, "The camera sent no picture. Cancel, check the camera and record again.");
       this.dialog.close();
       this.onFilm(new File(parts, name, { type: type.split(";")[0] as string }));
     });
-    recorder.start();
+    recorder.start(PIECE);
     this.recorder = recorder;
     this.start.hidden = true;
     this.stop.hidden = false;
-    this.stop.focus();
     this.count(LONGEST);
   }
 
