@@ -133,6 +133,7 @@ def test_the_tests_include_the_server() -> None:
     assert "pliant[server]" in extras["check"]
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_clean_installations(archives: tuple[Path, Path], tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ pytestmark = [
 ]
 
 
+@pytest.mark.long
 def test_the_load_loses_nothing_and_prints_its_tables() -> None:
     tiny = ["--jobs", "4", "--clients", "2", "--pollers", "20", "--seconds", "2", "--every", "1", "--megabytes", "70"]
     ran = subprocess.run(

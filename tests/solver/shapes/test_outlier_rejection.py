@@ -15,7 +15,9 @@ OUTLIER_SHARE = gallery.corrupt(MADE, outliers=0.1, seed=4).tracks
 WRONG = np.abs(np.asarray(OUTLIER_SHARE.points) - np.asarray(MADE.tracks.points)).max(axis=2) > 0
 
 
-@pytest.mark.parametrize("cameras", [CAMERAS, None], ids=["known", "estimated"])
+@pytest.mark.parametrize(
+    "cameras", [pytest.param(CAMERAS, id="known"), pytest.param(None, id="estimated", marks=pytest.mark.long)]
+)
 @pytest.mark.slow
 def test_rejected_observations_are_the_corrupted_ones(cameras: KnownCamera | None) -> None:
     found = solve(OUTLIER_SHARE, cameras=cameras)
