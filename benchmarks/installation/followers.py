@@ -15,7 +15,8 @@ from multiprocessing.synchronize import Event
 from pliant.worker.errors import NotAllowedNow
 
 from benchmarks.installation.instance import Instance
-from benchmarks.installation.load import one_job, percentiles, watched
+from benchmarks.installation.load import percentiles, watched
+from benchmarks.installation.long_jobs import LONG, long_sequence
 
 PAUSE = 0.02
 """Seconds between two status reads."""
@@ -62,7 +63,10 @@ async def follow(host: str, port: int, path: str, connected: asyncio.Semaphore) 
 
 def followers(instance: Instance, *, number: int, seconds: float) -> int:
     """Let many clients follow one job, print a table, and return the number of streams that were lost."""
-    long = one_job(instance, options={"max_reweightings": 1000, "tolerance": 1e-15}, frames=40, points=1200)
+    sequence = long_sequence()
+    with instance.client() as client:
+        long = client.submit(sequence.tracks.points, mesh="none", rotations=sequence.rotations, options=LONG).id
+    instance.acknowledged.append(long)
     instance.until(lambda: instance.jobs.get(long).progress is not None, "it is solved")
     host, _, port = instance.url.removeprefix("http://").partition(":")
     path = f"/v1/jobs/{long}"
