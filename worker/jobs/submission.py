@@ -13,7 +13,7 @@ from pliant.worker.records import Records, Stored, Webhook
 from pliant.worker.settings import Settings
 from pliant.worker.store.blobs import Blobs
 from pliant.worker.store.queue import Queue
-from pliant.worker.uploads.service import Uploads
+from pliant.worker.uploads.shared import open_uploads
 
 RANKS: dict[Priority, int] = {"high": 0, "normal": 1, "low": 2}
 """Smaller comes first."""
@@ -119,7 +119,7 @@ class Acceptance:
         return kept
 
     def _uploaded(self) -> int:
-        return Uploads.open(self.settings).used()
+        return open_uploads(self.settings, self.blobs).used()
 
     def _over_running_limit(self, stored: Stored) -> bool:
         """Whether the new job is held back until fewer jobs of its owner run; the reconciler queues it then.

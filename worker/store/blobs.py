@@ -139,6 +139,15 @@ class Blobs:
             )
         return size
 
+    def write(self, key: str, data: bytes) -> None:
+        """Store bytes atomically."""
+        self._call(lambda: obstore.put(self._store, key, data), seconds=ANSWER_WITHIN + len(data) / SLOWEST)
+
+    @property
+    def remote(self) -> bool:
+        """True for an object store that other hosts can reach, too."""
+        return self._calls is not None
+
     def link(self, key: str, *, seconds: float) -> str | None:
         """Return a URL from which anybody can read a file for some seconds, None if the store is not S3. Raises as `Blob.link`."""
         store = self._store
