@@ -143,6 +143,11 @@ def choose_points(visible: Floats, random: np.random.Generator) -> NDArray[np.in
     return np.sort(np.concatenate([half, rest]))
 
 
+def ranks(points: Floats) -> NDArray[np.intp]:
+    """Return each point's rank by its mean coordinate, shape `(P,)`: what is drawn by rank does not depend on the order of points."""
+    return np.argsort(np.argsort(points.sum(axis=(0, 2)), kind="stable"), kind="stable")
+
+
 def fit_basis(
     points: Floats, weight: Floats, random: np.random.Generator, given: int = 0
 ) -> tuple[Floats, Floats, float]:
@@ -151,7 +156,7 @@ def fit_basis(
     Without a given rank, the one with the lowest held-out error is selected; a larger one must be better by 2 %.
     """
     frames, count = weight.shape
-    held = (random.random(weight.shape) < HELD_OUT_SHARE) & (weight > 0)
+    held = (random.random(weight.shape)[:, ranks(points)] < HELD_OUT_SHARE) & (weight > 0)
     kept = np.where(held, 0.0, weight)
     start = _interpolated(points, weight)
     hidden = bool((weight == 0).any())

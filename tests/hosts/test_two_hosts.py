@@ -91,7 +91,7 @@ def test_a_cut_cable_loses_nothing_and_the_stale_attempt_writes_nothing(hosts: H
     times = moved(hosts, id, began)
     assert hosts.job_process(host) == [stale], "it computes on, and does not know yet"
     hosts.network.plug(host)
-    hosts.until(lambda: not Path(f"/proc/{stale}").exists(), "the stale attempt is ended once it can be told")
+    hosts.until(lambda: not Path(f"/proc/{stale}").exists(), "the stale attempt ends once its host is reachable")
     assert hosts.get(id)["attempt"] == 2
     hosts.cancelled(id)
     assert hosts.blobs(id) == ["inputs.npz"]

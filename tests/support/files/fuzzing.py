@@ -179,8 +179,8 @@ def in_a_fork(act: Callable[[], str]) -> str:
             traceback.print_exc()
             os._exit(1)
     os.close(into)
-    with os.fdopen(out, "rb") as said:
-        text = said.read().decode()
+    with os.fdopen(out, "rb") as stream:
+        text = stream.read().decode()
     code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
     assert code <= 0, "not a refusal; the exception is printed above"
     return text if code == 0 else CRASHED

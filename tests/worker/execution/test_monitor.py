@@ -227,25 +227,25 @@ def test_limits_are_stated_in_messages() -> None:
 
 
 def test_progress_never_falls_and_estimates_what_is_left() -> None:
-    told = []
+    reports = []
     time = [100.0]
-    reporter = Reporter(told.append, clock=lambda: time[0])
+    reporter = Reporter(reports.append, clock=lambda: time[0])
     reporter.part("loading", 1.0)
     reporter.part("solving", 0.5, stage="cameras", max_reweightings=30)
     time[0] = 110.0
     reporter.part("solving", 0.25, stage="reweight", reweighting=3, objective=2.0)
     reporter.part("exporting", 0.5, residual=0.125)
     reporter.part("exporting", 7.0)
-    fractions = [each.fraction for each in told]
+    fractions = [each.fraction for each in reports]
     assert fractions == sorted(fractions)
     assert fractions[-1] == 1.0
-    assert told[0].seconds_left is None, "nothing to base it on"
+    assert reports[0].seconds_left is None, "nothing to base it on"
     middle = fractions[2]
     assert middle == pytest.approx(0.02 + 0.83 / 2)
-    assert told[2].seconds_left == pytest.approx(10 * (1 - middle) / middle, abs=0.05)
-    assert told[-1].seconds_left == 0
-    assert [each.stage for each in told] == ["loading", "cameras", "reweight", "exporting", "exporting"]
-    assert (told[-1].reweighting, told[-1].max_reweightings, told[-1].objective, told[-1].residual) == (
+    assert reports[2].seconds_left == pytest.approx(10 * (1 - middle) / middle, abs=0.05)
+    assert reports[-1].seconds_left == 0
+    assert [each.stage for each in reports] == ["loading", "cameras", "reweight", "exporting", "exporting"]
+    assert (reports[-1].reweighting, reports[-1].max_reweightings, reports[-1].objective, reports[-1].residual) == (
         3,
         30,
         2.0,
