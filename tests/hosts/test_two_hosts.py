@@ -145,6 +145,25 @@ def test_one_key_at_two_api_processes_makes_one_job(hosts: Hosts) -> None:
     row("one request at two API processes at once")
 
 
+def test_an_upload_begun_at_a_killed_api_process_continues_at_the_other(hosts: Hosts) -> None:
+    data = hosts.tracks()
+    half = {"Upload-Complete": "?0", "Upload-Length": str(len(data))}
+    begun = httpx.put(f"{hosts.urls[0]}/v1/uploads/across", content=data[:5000], headers=half, timeout=20)
+    assert begun.status_code == 201, begun.text
+    hosts.signal("api", signal.SIGKILL)
+    other = f"{hosts.urls[1]}/v1/uploads/across"
+    arrived = int(httpx.head(other, timeout=20).headers["Upload-Offset"])
+    assert arrived == 5000
+    rest = httpx.patch(other, content=data[arrived:], headers={"Upload-Offset": str(arrived)}, timeout=20)
+    assert rest.json()["complete"], rest.text
+    hosts.restart("api")
+    hosts.until(lambda: hosts.answers(f"{hosts.urls[0]}/healthz"), "the first one is back")
+    id = hosts.submit(upload="across")
+    assert httpx.delete(other, timeout=20).status_code == 204
+    hosts.cancelled(id)
+    row("an upload's API process is killed, and it continues at the other")
+
+
 @contextmanager
 def s3_away(hosts: Hosts, how: str) -> Iterator[None]:
     """Let S3 drop packets, or refuse connections, while the block runs."""
