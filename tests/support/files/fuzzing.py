@@ -97,8 +97,8 @@ def honest(parser: str) -> list[bytes]:
         "png": [png(4, 5, data=__import__("zlib").compress(bytes(25)))],
     }[parser]
     starts = {
-        "npy": (b"\x93NUMPY",), "npz": (b"PK",), "matlab5": (b"MATLAB",), "matlab73": (b"\x89HDF",), "csv": (b"frame",), "json": (b"[",), "obj": (b"v ",),
-        "ply": (b"ply",), "glb": (b"glTF",), "gltf": (b"{",), "png": (b"\x89PNG",),
+        "npy": (b"\x93NUMPY",), "npz": (b"PK",), "matlab5": (b"MATLAB",), "matlab73": (b"\x89HDF",), "csv": (b"frame",),
+        "json": (b"[",), "obj": (b"v ",), "ply": (b"ply",), "glb": (b"glTF",), "gltf": (b"{",), "png": (b"\x89PNG",),
     }[parser]  # fmt: skip
     slow = ("bomb", "small bomb", "many", "million", "5,000", "count")
     attacks = [
