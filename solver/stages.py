@@ -15,9 +15,12 @@ import numpy as np
 UNIT_SECONDS, FRAME_SECONDS = 1e-4, 1.9e-5
 """Seconds per unit of work, and per unit and frame, on one core: .19 ms at 10 frames, .41 at 30, .73 at 48, 1.4 at 74."""
 
-POINT_SECONDS, SETUP_SECONDS = 2.5e-5, 0.1
-"""Seconds per frame and point of the shapes, and of their setup. The former was .3e-5 on a rigid face, 1e-4 on a flag and 1.6e-4 on a
-sphere, because it depends on the conditioning; `Pace` therefore measures it."""
+POINT_SECONDS = {True: 1.2e-5, False: 6e-6}
+"""Seconds per frame and point of the shapes with and without a learned prior. With one they depend on the conditioning: .3e-5 on a
+rigid face, 2.4e-5 on ten frames of a face, 1e-4 on a flag, 1.6e-4 on a sphere; `Pace` therefore measures them."""
+
+SETUP_SECONDS = 0.1
+"""Of the shapes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +86,7 @@ def planned(
     hidden : bool
         Whether any point is hidden in any frame.
     """
-    shapes = Stage("shapes", SETUP_SECONDS + POINT_SECONDS * frames * points, 100)
+    shapes = Stage("shapes", SETUP_SECONDS + POINT_SECONDS[gaussian] * frames * points, 100)
     last = [stage_of("trust", frames)] if gaussian else []
     first = [Stage("surface", 0.5 + 0.5 * min(frames, 24), 280)] if sheet else []
     filled = COMPLETION_SECONDS * frames * min(points, MOST_COMPLETED) if hidden else 0.0

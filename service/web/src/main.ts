@@ -53,12 +53,17 @@ function named(): string | null {
   return new URLSearchParams(location.hash.slice(1)).get("job") || null;
 }
 
+const GATE = "This service needs a token. Paste the one that you were given for this service. It is kept until you close this tab.";
+
 /** Show a failure that concerns the whole page at its top, with a form for a token if one is missing. */
 function report(error: unknown): void {
   if (!(error instanceof Refusal)) throw error;
-  const parts: Node[] = [refusalBox(error.problem)];
-  if (error.problem.status === 401) parts.push(tokenForm());
-  if (trouble.childElementCount === 0 || error.problem.status !== 401) trouble.replaceChildren(...parts);
+  const { problem } = error;
+  // Without a token the service's sentence is about a header, which concerns programs.
+  const words = problem.code === "unauthorized" ? { ...problem, detail: GATE } : problem;
+  const parts: Node[] = [refusalBox(words)];
+  if (problem.status === 401) parts.push(tokenForm());
+  if (trouble.childElementCount === 0 || problem.status !== 401) trouble.replaceChildren(...parts);
 }
 
 function tokenForm(): HTMLElement {
