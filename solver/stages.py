@@ -135,7 +135,7 @@ def settling(objectives: Sequence[float], *, tolerance: float, most: int) -> flo
     if last <= tolerance:
         return 1.0
     ratio = last / float(decreases[-2]) if taken > 1 and decreases[-2] > 0 else USUAL_RATIO
-    ratio = float(np.clip(ratio, 0.1, 0.9))
+    ratio = float(np.clip(ratio, 0.25, 0.9))  # the decrease slows down later
     left = np.log(tolerance / last) / np.log(ratio)
     return float(taken / (taken + min(left, max(most - taken, 0))))
 
@@ -180,11 +180,10 @@ class Pace:
         spent = now - self.began
         if stage.name == "shapes":
             pace = self.measured / self.planned
-            rest = (
-                spent * (1 - settled) / settled
-                if settled > 0
-                else max(pace * stage.seconds - spent, FIRST_REWEIGHTING * spent)
-            )
+            if settled > 0:  # the first reweighting takes longest, so those that are left take less each than it did
+                rest = min(spent * (1 - settled) / settled, FIRST_REWEIGHTING * spent)
+            else:
+                rest = max(pace * stage.seconds - spent, FIRST_REWEIGHTING * spent)
             return rest + pace * ahead
         pace = (
             (self.measured + spent) / (self.planned + share * stage.seconds)

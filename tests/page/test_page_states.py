@@ -80,7 +80,7 @@ def test_while_a_job_runs(page: Page, url: str, long_job: Callable[[str], str], 
     expect(page.get_by_text("Next in the queue.")).to_be_visible()
     check("queued")
     page.get_by_role("button", name="Cancel").click()
-    expect(page.get_by_text("cancelled this job before it was done")).to_be_visible()
+    expect(page.get_by_text("This job was cancelled before it was done")).to_be_visible()
     check("cancelled")
 
 
@@ -94,6 +94,8 @@ def test_a_finished_job(page: Page, url: str, finished: str, check: Callable[[st
     page.goto(f"{url}/{link.removeprefix('/')}")
     page.get_by_text("You see a shared result, read-only.").wait_for()
     page.locator(".view canvas").wait_for(timeout=DONE)
+    expect(page.get_by_label("Compare with")).to_have_count(0)
+    expect(page.get_by_text("Use a token for anything else")).to_have_count(0)
     check("shared")
 
 

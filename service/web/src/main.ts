@@ -1,7 +1,7 @@
 // The page: a form, a list, and the job that the address names (#job=…), so that a reload comes back to it.
 
 import { AGAIN, sharedJob } from "./afterwards";
-import { Refusal, setShare, setToken } from "./api";
+import { Refusal, hasToken, setShare, setToken } from "./api";
 import { Compose } from "./compose";
 import { Detail } from "./detail";
 import { button, h } from "./dom";
@@ -69,7 +69,7 @@ function report(error: unknown): void {
 function tokenForm(): HTMLElement {
   const input = h("input", { type: "password", id: "token", autocomplete: "off", required: true });
   const form = h("form", { class: "row" }, h("label", { for: "token" }, "Token"), input, h("button", { type: "submit" }, "Use"));
-  form.append(button("Remove", () => setToken(""), { class: "quiet" }));
+  if (hasToken()) form.append(button("Forget the token that was refused", () => setToken(""), { class: "quiet" }));
   form.addEventListener("submit", (event) => {
     event.preventDefault();
     setToken(input.value.trim());

@@ -108,6 +108,6 @@ export function standing(job: Job): string {
     case "failed":
       return job.error?.detail ?? "The job failed; its log has the details.";
     case "cancelled":
-      return "You or someone else cancelled this job before it was done, so there are no results. “Try again” runs it once more from the same files.";
+      return "This job was cancelled before it was done, so it has no results. “Try again” runs it from the same files.";
   }
 }
