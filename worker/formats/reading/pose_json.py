@@ -115,10 +115,11 @@ def _values(landmark: Any) -> tuple[float, float, float] | None:
         landmark.get("y"),
         next((landmark[name] for name in CONFIDENCE if name in landmark), 1.0),
     ]
-    if not all(isinstance(value, int | float) and not isinstance(value, bool) for value in numbers):
+    given = [value for value in numbers if isinstance(value, int | float) and not isinstance(value, bool)]
+    if len(given) < len(numbers):
         return None
     try:
-        x, y, sure = (float(value) for value in numbers)
+        x, y, sure = (float(value) for value in given)
     except OverflowError:
         return None
     return x, y, sure
