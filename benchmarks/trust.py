@@ -9,7 +9,7 @@ file has them (`given`, `given all`). White noise is added as a sequence without
 without `image_size`. Every solve is one line of JSON and is done only once, so that the command can be interrupted and repeated.
 
 The error is `e3d_frame`, for photographs, whose truth is in millimetres, `e3d_frame_scaled`. `quantiles` are those of |error| over
-standard deviation at 5, 10, … 95 %, so that the coverage of any interval follows from the file. Sequences are split by name
+standard deviation at 1, 2, … 99 %, so that the coverage of any interval follows from the file. Sequences are split by name
 (`CALIBRATION`): constants of `solver.evaluation.trust` and `solver.shapes.assessment` are chosen on these alone.
 """
 
@@ -48,7 +48,7 @@ SPOILED: dict[str, dict[str, float]] = {
 KINDS = (*SPOILED, "given", "given all", "shuffled", "still")
 """What is done to a sequence."""
 
-QUANTILES = np.linspace(0.05, 0.95, 19)
+QUANTILES = np.linspace(0.01, 0.99, 99)
 
 IMAGE_SIZES = {"kinect_paper_dense23": (640.0, 480.0)}
 """Of photographs whose `about.json` does not state it."""

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pliant.solver.evaluation.metrics import NINETY
 
 BEGIN, END = "<!-- trust tables -->", "<!-- end of trust tables -->"
 """Lines of the page between which the tables stand."""
@@ -84,25 +85,73 @@ def missed(rows: list[Row]) -> str:
     return f"Solves with a true error above .15 that are *good*, or below .03 that are *do not use*: {names}."
 
 
+def within(row: Row, width: float = NINETY) -> float | None:
+    """Return the share of a solve's positions whose error is at most `width` standard deviations, from its quantiles.
+
+    Quantiles are those at k/(n + 1), k = 1 … n; None without them.
+    """
+    quantiles = row.get("quantiles")
+    if quantiles is None:
+        return None
+    levels = np.arange(1, len(quantiles) + 1) / (len(quantiles) + 1)
+    return float(np.interp(width, [0.0, *quantiles], [0.0, *levels], right=(1 + levels[-1]) / 2))
+
+
+def pooled(rows: list[Row], width: float = NINETY) -> float:
+    """Return the mean share within `width` standard deviations: over the solves of a sequence, then over sequences.
+
+    Solves of a sequence with and without `image_size` count as one sequence.
+    """
+    by_name: dict[str, list[float]] = {}
+    for row in rows:
+        share = within(row, width)
+        if share is not None:
+            by_name.setdefault(row["sequence"].split(" with ")[0], []).append(share)
+    return float(np.mean([np.mean(shares) for shares in by_name.values()]))
+
+
+def calibrated(rows: list[Row], share: float = 0.9) -> float:
+    """Return the half-width, in standard deviations, within which `share` of the positions lie, pooled over sequences."""
+    low, high = 0.0, 1e3
+    for _ in range(60):
+        middle = (low + high) / 2
+        low, high = (middle, high) if pooled(rows, middle) < share else (low, middle)
+    return high
+
+
 def covered(chosen: list[Row], held: list[Row]) -> str:
     """Return how many positions and sequences the intervals hold."""
     lines = [
-        "| | solves | positions within the 90 % interval | solves with 85 to 95 % | true error within `interval` |",
-        "|---|---|---|---|---|",
+        "| | solves | positions within the 90 % interval, sequences weighted equally | solves with 85 to 95 % | above | below | "
+        "true error within `interval` |",
+        "|---|---|---|---|---|---|---|",
     ]
-    for name, rows in (("chosen on", chosen), ("held out", held)):
-        known = [row for row in rows if row.get("coverage") is not None]
-        if not known:
+    for name, rows in (("chosen on", chosen), ("held out", held), ("all", [*chosen, *held])):
+        values = np.array([share for row in rows if (share := within(row)) is not None])
+        if not len(values):
             continue
-        values = np.array([row["coverage"] for row in known])
-        weights = [row["frames"] * row["points"] for row in known]
-        inside = [row["interval"][0] <= row["true"] <= row["interval"][1] for row in known if row["interval"]]
-        share = f"{sum(inside)} of {len(inside)}"
+        inside = [
+            row["interval"][0] <= row["true"] <= row["interval"][1]
+            for row in rows
+            if row["interval"] and row["true"] is not None
+        ]
+        right = int(((values >= AIM[0]) & (values <= AIM[1])).sum())
         lines.append(
-            f"| {name} | {len(known)} | {np.average(values, weights=weights):.0%} of all, {values.mean():.0%} of a solve's on average | "
-            f"{int(((values >= AIM[0]) & (values <= AIM[1])).sum())} | {share} |"
+            f"| {name} | {len(values)} | {pooled(rows):.0%} | {right} | {int((values > AIM[1]).sum())} | "
+            f"{int((values < AIM[0]).sum())} | {sum(inside)} of {len(inside)} |"
         )
+    lines += ["", f"The interval is ± {NINETY:g} standard deviations; {exceptions([*chosen, *held])}"]
     return "\n".join(lines)
+
+
+def exceptions(rows: list[Row]) -> str:
+    """Return a sentence that names the solves whose intervals hold less than `AIM` promises, the worst first."""
+    shares = [(share, row) for row in rows if (share := within(row)) is not None]
+    low = sorted(((share, row) for share, row in shares if share < AIM[0]), key=lambda each: each[0])
+    if not low:
+        return "no solve has fewer than 85 % of its positions within it."
+    names = ", ".join(f"{row['sequence']} {row['kind']} {share:.0%}" for share, row in low)
+    return f"solves with fewer than 85 % of their positions within it: {names}."
 
 
 def by_sequence(rows: list[Row], calibration: Sequence[str]) -> str:
@@ -116,7 +165,7 @@ def by_sequence(rows: list[Row], calibration: Sequence[str]) -> str:
         reason = row["reasons"][0] if row["reasons"] else ""
         cells = (
             f"{row['sequence']}{star}", row["kind"], VERDICTS[row["verdict"]], reason, figure(row["expected"]), figure(row["true"]),
-            percent(row.get("coverage")), ratio(row.get("std_over_error")),
+            percent(within(row)), ratio(row.get("std_over_error")),
         )  # fmt: skip
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)

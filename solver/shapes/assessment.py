@@ -13,7 +13,7 @@ from pliant.solver.evaluation.trust import assess
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.records import Floats, Solution, read_only
 from pliant.solver.shapes.jackknife import learning_std
-from pliant.solver.shapes.uncertainty import bounded_by_neighbours, position_std
+from pliant.solver.shapes.uncertainty import Pinhole, bounded_by_neighbours, position_std
 
 INFLATION = 1.4
 """Factor from the standard deviation that posterior and jackknife give to that of the errors, for what both leave out: wrong models, and
@@ -56,7 +56,10 @@ def assessed(
     if covariance is not None:
         projections = np.asarray(estimate.scales)[:, None, None] * np.asarray(estimate.rotations)[:, :2]
         noise = max(covariance.noise_variance**0.5, MIN_NOISE_STD)
-        posterior = unit * position_std(covariance, projections, confidence, noise_std=noise, seed=seed)
+        pinhole = Pinhole.of(solution.camera, solution.shapes, unit)
+        posterior = unit * position_std(
+            covariance, projections, confidence, noise_std=noise, pinhole=pinhole, seed=seed
+        )
         posterior = bounded_by_neighbours(posterior, solution.shapes, confidence)
         learning = unit * learning_std(
             estimate, covariance, solution.shapes / unit, turning=turning, should_stop=should_stop

@@ -6,18 +6,25 @@ With cameras Π, noise variance σ²/w for an observation of confidence w, and t
     Σ − Σ Πᵀ (Π Σ Πᵀ + σ² W⁻¹)⁻¹ Π Σ,
 
 restricted to the observations that the point has (Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006,
-equation 2.24). It depends on a point through its pattern of visibility alone. Patterns of a sample of points are evaluated exactly;
-from them follows by how much a hidden position is less certain than a visible one, as a function of the frames to the nearest
-observation, and with that the rest is predicted. Cameras are taken as known, so the numbers are lower bounds where few frames or
-little motion leave the cameras uncertain.
+equation 2.24). Under orthography it depends on a point through its pattern of visibility alone. Under perspective with κ = 1/φ the
+image v = w / (1 + κz), relative to the principal point, has the derivative
+
+    ∂v/∂x = (s_f R_f[:2] − κ v ⊗ s_f R_f[2]) / (1 + κz),
+
+which replaces Π and differs from point to point; it is evaluated at one representative of each compact part of the object. Patterns of
+visibility of a sample of points are evaluated exactly; from them follows by how much a hidden position is less certain than a visible
+one, as a function of the frames to the nearest observation, and with that the rest is predicted. Cameras are taken as known, so the
+numbers are lower bounds where few frames or little motion leave the cameras uncertain.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.model.shape_covariance import ShapeCovariance
-from pliant.solver.records import Floats
+from pliant.solver.records import Camera, Floats
 from scipy import linalg
 from scipy.spatial import cKDTree
 
@@ -35,12 +42,57 @@ GAPS = (0, 1, 2, 4, 8, 16, 32, np.inf)
 """Bounds of the classes of positions, in frames to the nearest frame in which the point is visible."""
 
 
+REPRESENTATIVES = 24
+"""Points at which the derivative of a perspective image is evaluated. On a face 3 half-sizes away, the median standard deviation differs by
+3 % from that with a derivative for every point, by 5 % with 8 representatives, and by 23 % with that of orthography."""
+
+NEAREST = 0.2
+"""Least 1 + κz, as in `cameras.perspective`."""
+
 WELL_OBSERVED_SHARE = 0.25
 """Minimum share of the frames in which a well-observed point is visible, as in `shapes.sparsely_observed`."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Pinhole:
+    """What perspective adds to the derivative of the image."""
+
+    views: Floats
+    """v, images relative to the principal point, shape `(F, P, 2)`, the unit of the covariance."""
+
+    depth_rows: Floats
+    """∂z/∂x = ± s_f R_f[2], shape `(F, 3)`."""
+
+    depths: Floats
+    """z, shape `(F, P)`, the unit of the covariance."""
+
+    curvature: float
+    """κ = 1/φ, its inverse; positive."""
+
+    @classmethod
+    def of(cls, camera: Camera, shapes: Floats, unit: float) -> Pinhole | None:
+        """Return it for shapes `(F, P, 3)` in the tracks' unit, one normalized unit being `unit`; None for orthographic cameras."""
+        if camera.focal is None:
+            return None
+        away = (-1.0 if camera.y_up else 1.0) * camera.scales[:, None] * camera.rotations[:, 2]
+        views = (camera.project(shapes) - camera.principal_point) / unit
+        return cls(views, away, camera.depths(shapes) / unit, unit / camera.focal)
+
+    def derivatives(self, projections: Floats, point: int) -> Floats:
+        """Return ∂v/∂x of a point in every frame, shape `(F, 2, 3)`."""
+        bent = projections - self.curvature * self.views[:, point, :, None] * self.depth_rows[:, None]
+        nearer = np.maximum(1 + self.curvature * self.depths[:, point], NEAREST)
+        return np.asarray(bent / nearer[:, None, None])
+
+
 def position_std(
-    covariance: ShapeCovariance, projections: Floats, confidence: Floats, *, noise_std: float, seed: int = 0
+    covariance: ShapeCovariance,
+    projections: Floats,
+    confidence: Floats,
+    *,
+    noise_std: float,
+    pinhole: Pinhole | None = None,
+    seed: int = 0,
 ) -> Floats:
     """Return the posterior standard deviation of every position: the root of the mean squared distance to the truth.
 
@@ -54,6 +106,8 @@ def position_std(
         Weights of the observations in [0, 1]; 0 means hidden or rejected.
     noise_std : float
         Standard deviation of an image coordinate, the unit of the covariance.
+    pinhole : Pinhole, optional
+        Perspective; None for orthographic cameras.
     seed : int
         Of the sample of patterns.
 
@@ -64,20 +118,46 @@ def position_std(
     """
     frames = len(projections)
     used = np.unique(np.linspace(0, frames - 1, min(frames, MAX_FRAMES)).round().astype(int))
-    prior, crossed, image = _moments(covariance, projections, used)
-    noise = noise_std**2
-    weights = confidence[used]
-    everything = _variance(prior, crossed, image, np.ones(len(used)), noise)
+    noise, weights = noise_std**2, confidence[used]
+    nearest, chosen = _representatives(pinhole, used, confidence.shape[1])
+    moments = [_moments(covariance, _rows(projections, pinhole, point), used) for point in chosen]
+    complete = np.stack([_variance(*each, np.ones(len(used)), noise) for each in moments], axis=1)
+    everything = complete[:, nearest]
     if (confidence == 1).all():
-        found = np.repeat(everything[:, None], confidence.shape[1], axis=1)
+        found = everything
     else:
         sample = _sample(weights, seed)
-        exact = np.stack([_variance(prior, crossed, image, weights[:, point], noise) for point in sample], axis=1)
-        found = _predicted(everything, weights, sample, exact)
+        exact = [_variance(*moments[int(nearest[point])], weights[:, point], noise) for point in sample]
+        found = _predicted(everything, weights, sample, np.stack(exact, axis=1))
     if len(used) < frames:
         at = np.arange(frames)
         found = np.stack([np.interp(at, used, column) for column in found.T], axis=1)
     return np.asarray(np.sqrt(np.maximum(found, 0.0)))
+
+
+def _rows(projections: Floats, pinhole: Pinhole | None, point: int) -> Floats:
+    return projections if pinhole is None else pinhole.derivatives(projections, point)
+
+
+def _representatives(
+    pinhole: Pinhole | None, used: NDArray[np.intp], count: int
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return for every point the number of the representative whose derivative it takes, and the representatives' indices.
+
+    Under orthography all points have the same derivative. Representatives are chosen far apart (Gonzalez 1985), by their images.
+    """
+    if pinhole is None:
+        return np.zeros(count, dtype=np.intp), np.zeros(1, dtype=np.intp)
+    paths = pinhole.views[used].transpose(1, 0, 2).reshape(count, -1)
+    distance = np.square(paths - paths.mean(axis=0)).sum(axis=1)
+    chosen, nearest = [int(distance.argmin())], np.zeros(count, dtype=np.intp)
+    distance = np.square(paths - paths[chosen[0]]).sum(axis=1)
+    while len(chosen) < min(REPRESENTATIVES, count):
+        chosen.append(int(distance.argmax()))
+        to_new = np.square(paths - paths[chosen[-1]]).sum(axis=1)
+        nearest = np.where(to_new < distance, len(chosen) - 1, nearest)
+        distance = np.minimum(distance, to_new)
+    return nearest, np.array(chosen)
 
 
 def bounded_by_neighbours(std: Floats, shapes: Floats, visible: Floats) -> Floats:
@@ -140,13 +220,13 @@ def _sample(weights: Floats, seed: int) -> NDArray[np.intp]:
 def _predicted(everything: Floats, weights: Floats, sample: NDArray[np.intp], exact: Floats) -> Floats:
     """Return variances `(F, P)`: those evaluated, and for the others the mean ratio to `everything` in their class."""
     kind = np.digitize(_gaps(weights), GAPS[1:])
-    ratio = exact / np.maximum(everything[:, None], np.finfo(float).tiny)
+    ratio = exact / np.maximum(everything[:, sample], np.finfo(float).tiny)
     sampled = kind[:, sample]
     factors = np.ones(len(GAPS))
     for each in range(len(GAPS)):
         chosen = ratio[sampled == each]
         factors[each] = chosen.mean() if chosen.size else (factors[each - 1] if each else 1.0)
-    found = everything[:, None] * np.maximum.accumulate(factors)[kind]
+    found = everything * np.maximum.accumulate(factors)[kind]
     found[:, sample] = exact
     return np.asarray(found)
 

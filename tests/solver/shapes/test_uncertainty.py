@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from pliant.solver.gallery import face
 from pliant.solver.model.shape_covariance import ShapeCovariance
+from pliant.solver.records import Camera
 from pliant.solver.shapes import uncertainty
-from pliant.solver.shapes.uncertainty import bounded_by_neighbours, position_std
+from pliant.solver.shapes.uncertainty import Pinhole, bounded_by_neighbours, position_std
 from scipy.spatial.transform import Rotation
 
 FRAMES = 9
@@ -52,6 +54,54 @@ def test_it_is_the_inverse_of_the_posterior_precision() -> None:
         posterior = np.linalg.inv(np.linalg.inv(prior) + matrix.T @ (weights[:, None] * matrix))
         expected = np.sqrt(np.diag(posterior).reshape(FRAMES, 3).sum(axis=1))
         np.testing.assert_allclose(found[:, point], expected, rtol=1e-5)
+
+
+def seen_by_a_pinhole(*, y_up: bool, frames: int = FRAMES, points: int = 5) -> tuple[Camera, np.ndarray]:
+    """A camera that turns by 80°, and shapes 3 half-sizes away from it."""
+    turns = np.concatenate([projections(frames), np.zeros((frames, 1, 3))], axis=1)
+    turns[:, 2] = np.cross(turns[:, 0], turns[:, 1])
+    random = np.random.default_rng(6)
+    camera = Camera(
+        turns, random.uniform(0.9, 1.1, frames), random.normal(300, 5, (frames, 2)), 480.0, 1.0, np.array([310.0, 290.0]), y_up
+    )  # fmt: skip
+    return camera, 80.0 * random.normal(size=(frames, points, 3)).clip(-2, 2)
+
+
+@pytest.mark.parametrize("y_up", [False, True])
+def test_under_perspective_it_is_that_of_the_derivative_of_the_projection(y_up: bool) -> None:
+    camera, shapes = seen_by_a_pinhole(y_up=y_up)
+    unit, given = 80.0, covariance()
+    pairs = camera.scales[:, None, None] * camera.rotations[:, :2]
+    confidence = np.random.default_rng(1).choice([0.0, 0.5, 1.0], size=(FRAMES, 5))
+    found = position_std(given, pairs, confidence, noise_std=NOISE, pinhole=Pinhole.of(camera, shapes, unit))
+    ahead, back = (
+        [camera.project(shapes + sign * 1e-4 * np.eye(3)[axis]) for axis in range(3)] for sign in (1, -1)
+    )  # fmt: skip
+    slopes = np.stack([(a - b) / 2e-4 for a, b in zip(ahead, back, strict=True)], axis=-1)
+    for point in range(5):
+        matrix = projection_matrix(slopes[:, point])
+        weights = np.repeat(confidence[:, point], 2) / NOISE**2
+        posterior = np.linalg.inv(np.linalg.inv(dense(given)) + matrix.T @ (weights[:, None] * matrix))
+        expected = np.sqrt(np.diag(posterior).reshape(FRAMES, 3).sum(axis=1))
+        np.testing.assert_allclose(found[:, point], expected, rtol=1e-4)
+    flat = position_std(given, pairs, confidence, noise_std=NOISE)
+    assert np.abs(np.log(found / flat)).max() > 0.05, "perspective changes what the images determine"
+
+
+def test_a_few_representatives_stand_for_the_derivatives_of_all_points(monkeypatch: pytest.MonkeyPatch) -> None:
+    sequence = face(12, 150)
+    unit = float(np.abs(sequence.shapes).max()) / 2
+    camera, _ = seen_by_a_pinhole(y_up=False, frames=12)
+    shapes = 80.0 * sequence.shapes / unit
+    pairs = camera.scales[:, None, None] * camera.rotations[:, :2]
+    given, seen = covariance(5, 12), np.ones(shapes.shape[:2])
+    pinhole = Pinhole.of(camera, shapes, 80.0)
+    few = position_std(given, pairs, seen, noise_std=NOISE, pinhole=pinhole)
+    monkeypatch.setattr(uncertainty, "REPRESENTATIVES", shapes.shape[1])
+    exact = position_std(given, pairs, seen, noise_std=NOISE, pinhole=pinhole)
+    assert np.ptp(exact, axis=1).max() > 0
+    assert np.median(np.abs(np.log(few / exact))) < 0.04
+    assert np.median(np.abs(np.log(position_std(given, pairs, seen, noise_std=NOISE) / exact))) > 0.1
 
 
 def test_errors_of_the_posterior_mean_are_as_large_as_stated() -> None:
