@@ -16,7 +16,7 @@ help:
 	@echo "make demo    reconstruct a moving face end to end: service, queue, worker, glTF"
 	@echo "make test    run the tests: four minutes on two cores, nothing but Python needed"
 	@echo "make test-slow  run what is slow or needs Chromium, Node.js, an S3 server or root"
-	@echo "make test-long  run what takes most of a minute or more each"
+	@echo "make test-long  run long forms of what the other tests cover"
 	@echo "make matrix  make test with every Python from 3.11 to 3.14 on this machine"
 	@echo "make coverage   make test, with the share of lines that it runs"
 	@echo "make page    bundle the web page"
@@ -69,7 +69,7 @@ test: $(STAMP)
 test-slow: $(STAMP) $(PAGE)
 	$(PYTEST) -m "($(NEEDY)) and not long" $(TESTS)
 
-# What takes most of a minute or more each.
+# Long forms of what other tests cover in less time.
 test-long: $(STAMP) $(PAGE)
 	$(PYTEST) -m long $(TESTS)
 

@@ -1,6 +1,7 @@
 """Size of every result file, and the time and memory that writing takes, on the gallery's face as a finished result.
 
     python -m benchmarks.files                                   99 frames of 29,000 points
+    python -m benchmarks.files --sequence DIR/facescan99_rot30      a recorded sequence
     python -m benchmarks.files --frames 300 --points 2000 --options '{"colours": "error", "normals": "animated"}'
 
 Nothing is solved: the truth stands for the result, since no file's size hangs on how good it is, except what is compressed.
@@ -24,6 +25,8 @@ from pliant.worker.artifacts.kinds import kinds_for
 from pliant.worker.artifacts.result import Result
 from pliant.worker.formats import GroundTruth, Inputs
 
+from benchmarks.sequences import Case, from_gallery, read_case
+
 ALL = "glb,ply,obj,usd,mat,csv"
 
 
@@ -33,8 +36,12 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=99)
     parser.add_argument("--points", type=int, default=29_000)
     parser.add_argument("--options", type=json.loads, default={}, help="JSON object, as a job's")
+    parser.add_argument("--sequence", type=Path, help="a recorded sequence whose true shapes stand for the result")
     given = parser.parse_args()
-    result = finished(given.frames, given.points, Options(**{"outputs": ALL, **given.options}))
+    options = Options(**{"outputs": ALL, **given.options})
+    result = (
+        finished(given.frames, given.points, options) if given.sequence is None else recorded(given.sequence, options)
+    )
     frames, points = result.solution.residuals.shape
     print(
         f"{frames} frames × {points} points, {len(result.faces)} faces; a copy of the shapes is {24e-6 * frames * points:.0f} MB"
@@ -67,14 +74,26 @@ def measured(kind, result: Result, path: Path) -> tuple[int, float, int]:
 
 
 def finished(frames: int, points: int, options: Options) -> Result:
-    """Return the face as the result of a job: truth turned by a little noise, residuals as a solve leaves them."""
+    """Return the face as the result of a job: the truth, one per mille larger, with residuals as a solve leaves them."""
     made = face(frames, points, degrees=30)
-    count = made.shapes.shape[1]
-    random = np.random.default_rng(0)
-    residuals = np.abs(random.normal(0, 0.3, (frames, count))) * (made.tracks.visible > 0)
+    return as_result(from_gallery(made, "face"), options)
+
+
+def recorded(folder: Path, options: Options) -> Result:
+    """Return the true shapes of a recorded sequence as the result of a job."""
+    return as_result(read_case(folder), options)
+
+
+def as_result(case: Case, options: Options) -> Result:
+    """Return the truth of a case as a finished job. Noise of every point by itself would need a mode a frame, which no solve leaves."""
+    frames, count = case.tracks.visible.shape
+    assert case.shapes is not None
+    assert case.cameras is not None
+    residuals = np.abs(np.random.default_rng(0).normal(0, 0.3, (frames, count))) * (case.tracks.visible > 0)
+    scales = np.ones(frames) if case.cameras.scales is None else case.cameras.scales
     solution = Solution(
-        shapes=made.shapes + random.normal(0, 0.5, made.shapes.shape),
-        camera=Camera(made.rotations, made.scales, np.zeros((frames, 2))),
+        shapes=1.001 * case.shapes,
+        camera=Camera(case.cameras.rotations, scales, np.zeros((frames, 2))),
         residuals=residuals,
         weights=1 / (1 + residuals),
         trace=Trace(np.array([2.0, 1.0]), np.array([1.0, 0.5]), np.array([0, 9], dtype=np.int32)),
@@ -86,11 +105,11 @@ def finished(frames: int, points: int, options: Options) -> Result:
         seconds={},
     )  # fmt: skip
     interpretation = Interpretation(
-        num_frames=frames, num_points=count, num_faces=len(made.mesh.faces), hidden_fraction=0.0, mesh_source="grid",
-        has_ground_truth=True, has_rotations=False, layout="tracks (F, P, 2)",
+        num_frames=frames, num_points=count, num_faces=0 if case.mesh is None else len(case.mesh.faces), hidden_fraction=0.0,
+        mesh_source="given", has_ground_truth=True, has_rotations=False, layout="tracks (F, P, 2)",
     )  # fmt: skip
-    truth = GroundTruth.from_arrays(made.shapes, None, like=(frames, count))
-    return Result(Inputs(made.tracks, made.mesh, truth, None, interpretation), solution, options)
+    truth = GroundTruth.from_arrays(case.shapes, None, like=(frames, count))
+    return Result(Inputs(case.tracks, case.mesh, truth, None, interpretation), solution, options)
 
 
 if __name__ == "__main__":

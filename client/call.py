@@ -16,6 +16,9 @@ from pliant.client.multipart import Form, Remainder
 CONNECT_TIMEOUT = 10.0
 """Seconds allowed for opening a connection."""
 
+REDIRECT_TIMEOUT = 5.0
+"""The same for a connection to the object store that the service redirects to; the service is the alternative."""
+
 SILENCE_TIMEOUT = 60.0
 """Seconds without a byte after which a connection counts as lost; longer than the service holds any answer back."""
 
@@ -90,6 +93,19 @@ def request_for(
         content=call.content,
         timeout=_limits(timeout),
     )
+
+
+def redirected(location: str, call: Call, timeout: float) -> httpx.Request:
+    """Build the request that follows a redirect to an object store.
+
+    The token and other headers of the client are for the service alone. The store's entity tag is not the service's, so `If-Range`
+    would never hold there; the service has checked it.
+    """
+    names = ("Accept-Encoding", "Range")
+    headers = {"User-Agent": f"pliant-client/{version('pliant')}"}
+    headers |= {name: call.headers[name] for name in names if name in call.headers}
+    limits = _limits(timeout).as_dict() | {"connect": min(REDIRECT_TIMEOUT, timeout)}
+    return httpx.Request("GET", location, headers=headers, extensions={"timeout": limits})
 
 
 def _raw(http: httpx.Client | httpx.AsyncClient, call: Call, rest: Remainder, timeout: float) -> httpx.Request:

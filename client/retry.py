@@ -57,6 +57,8 @@ class Contact:
 
     made: bool = False
     """True once the service has answered."""
+    follows: bool = True
+    """Whether downloads may be redirected to the object store; False once a redirect led nowhere."""
 
 
 @dataclass(kw_only=True)

@@ -31,7 +31,7 @@ from pliant.worker.formats import InvalidInput, Limits
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.records import Records
 from pliant.worker.tokens import Tokens
-from pliant.worker.uploads.service import Uploads
+from pliant.worker.uploads.shared import open_uploads
 from starlette.middleware import Middleware
 from starlette.middleware.cors import CORSMiddleware
 from starlette.requests import ClientDisconnect
@@ -93,7 +93,7 @@ def create_app(
             incoming=incoming,
             followers=Followers(),
             metrics=metrics,
-            uploads=Uploads.open(jobs_of_all.settings),
+            uploads=open_uploads(jobs_of_all.settings, jobs_of_all.blobs),
             upload_locks=UploadLocks(),
             parsing=ParserSlots(settings.parsers),
         )

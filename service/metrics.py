@@ -21,6 +21,11 @@ __all__ = ["MEDIA_TYPE", "CountRequests", "Metrics"]
 ANSWER_SECONDS = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
 """Upper bounds of the histogram of the time until an answer begins, in seconds."""
 
+FAILURES = ("internal_error", "out_of_memory", "storage_failed", "timed_out", "worker_lost")
+"""Codes of failures that alerts count. Counters of known labels begin at 0, since a rate does not see a counter's first value."""
+
+WEBHOOKS = ("delivered", "given_up", "tried")
+
 METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
 
 
@@ -99,16 +104,21 @@ class StoreCollector(Collector):
             ("pliant_stored_bytes", "Bytes of all jobs' inputs and results.", records.used()),
         ):
             yield GaugeMetricFamily(name, text, value=value)
-        yield _counter(tallies, "pliant_jobs_ended_total", "Jobs that ended, by status.", group="ended", label="status")
-        yield _counter(tallies, "pliant_jobs_failed_total", "Failed jobs, by error code.", group="failed", label="code")
+        final = [each.value for each in Status if each.final]
+        text = "Jobs that ended, by status."
+        yield _counter(tallies, "pliant_jobs_ended_total", text, group="ended", label="status", known=final)
+        text = "Failed jobs, by error code."
+        yield _counter(tallies, "pliant_jobs_failed_total", text, group="failed", label="code", known=FAILURES)
         yield _durations(tallies)
         text = "Webhooks: attempts, and their outcomes."
-        yield _counter(tallies, "pliant_webhooks_total", text, group="webhooks", label="result")
+        yield _counter(tallies, "pliant_webhooks_total", text, group="webhooks", label="result", known=WEBHOOKS)
 
 
-def _counter(tallies: Mapping[str, float], name: str, text: str, *, group: str, label: str) -> Metric:
+def _counter(
+    tallies: Mapping[str, float], name: str, text: str, *, group: str, label: str, known: Iterable[str]
+) -> Metric:
     family = CounterMetricFamily(name, text, labels=[label])
-    for value_of_label, value in sorted(_group(tallies, group).items()):
+    for value_of_label, value in sorted({**dict.fromkeys(known, 0.0), **_group(tallies, group)}.items()):
         family.add_metric([value_of_label], value)
     return family
 
@@ -119,8 +129,6 @@ def _durations(tallies: Mapping[str, float]) -> Metric:
     family = HistogramMetricFamily("pliant_job_run_seconds", text, labels=["status"])
     for status in (each.value for each in Status if each.final):
         held = _group(tallies, f"ran:{status}")
-        if not held:
-            continue
         total, buckets = 0.0, []
         for bound in (*(f"{each:g}" for each in RUN_SECONDS), "+Inf"):
             total += held.get(bound, 0.0)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from pliant.solver.records import Step
-from pliant.solver.stages import Stage
+from pliant.solver.stages import Pace, Stage
 
 MIN_FRACTION_STEP = 0.002
 """Least increase of the fraction that is reported on its own: at most 500 calls of `on_step` besides those of the
@@ -54,7 +54,8 @@ class Monitor:
         self._last = Step("cameras", 0.0)
         self._reported = clock()
         self._done, self._current, self._ahead = 0.0, plan[0], list(plan[1:])
-        self._units, self._share = 0, 0.0
+        self._units, self._share, self._settled = 0, 0.0, 0.0
+        self._pace = Pace(clock())
 
     def __call__(self) -> bool:
         """Count a unit of work; return whether to stop."""
@@ -81,11 +82,12 @@ class Monitor:
         if place is None:
             return
         self._done += self._current.seconds if self._share > 0 else 0.0
+        self._pace.next(self._current, self._share, self._clock())
         self._current, self._ahead = self._ahead[place], self._ahead[place + 1 :]
         if units is not None:
             seconds = self._current.seconds * units / max(self._current.units, 1)
             self._current = replace(self._current, seconds=seconds, units=units)
-        self._units, self._share = 0, 0.0
+        self._units, self._share, self._settled = 0, 0.0, 0.0
 
     def expect(self, stages: Sequence[Stage], *, before: str) -> None:
         """Add stages to the plan that the data turned out to require."""
@@ -100,7 +102,7 @@ class Monitor:
         if step.stage != "cameras":
             if self._current.name != "shapes":
                 self.enter("shapes")
-            self._share, self._units = max(self._share, step.fraction), 0
+            self._share, self._units, self._settled = max(self._share, step.fraction), 0, step.fraction
         self._emit(replace(step, fraction=self._fraction()))
 
     def _fraction(self) -> float:
@@ -108,10 +110,15 @@ class Monitor:
         left = (1 - self._share) * self._current.seconds + sum(stage.seconds for stage in self._ahead)
         return max(self._last.fraction, min(done / max(done + left, 1e-9), MAX_FRACTION))
 
+    def _left(self) -> float:
+        ahead = sum(stage.seconds for stage in self._ahead)
+        return self._pace.left(self._current, self._share, self._settled, ahead, self._clock())
+
     def _emit(self, step: Step) -> None:
-        self._last, self._reported = step, self._clock()
+        left = 0.0 if step.fraction == 1 else self._left()
+        self._last, self._reported = replace(step, seconds_left=left), self._clock()
         if self._on_step is not None:
-            self._on_step(step)
+            self._on_step(self._last)
 
 
 def enter(should_stop: Callable[[], bool] | None, name: str, *, units: int | None = None) -> None:

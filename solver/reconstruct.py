@@ -253,7 +253,7 @@ def _learned(
 ) -> tuple[CameraEstimate, ShapeCovariance | None]:
     """Return the cameras, and the covariance of the shapes if it is the prior; `before` is the estimate with outliers."""
     rank = 0 if before is None else before.rank
-    enter(should_stop, "multistart")
+    enter(should_stop, "completion")
     if cameras is not None:
         estimate = given_cameras(normalized, cameras, settings, rank=rank)
     else:
@@ -472,6 +472,6 @@ def _monitored(
     """Return the monitor of the solve, with its plan."""
     plan = planned(
         tracks.num_frames, tracks.num_points, gaussian=settings.gaussian, known_cameras=cameras is not None,
-        sheet=_tries_isometry(cameras, settings),
+        sheet=_tries_isometry(cameras, settings), hidden=not tracks.all_visible,
     )  # fmt: skip
     return Monitor(on_step, should_stop, plan=plan)

@@ -367,6 +367,9 @@ class Step:
     residual: float | None = None
     """Median visible reprojection residual, the tracks' unit; None before there is one."""
 
+    seconds_left: float | None = None
+    """Estimated time until the solve ends, from the plan and the pace so far."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trace:

@@ -15,8 +15,9 @@ import numpy as np
 UNIT_SECONDS, FRAME_SECONDS = 1e-4, 1.9e-5
 """Seconds per unit of work, and per unit and frame, on one core: .19 ms at 10 frames, .41 at 30, .73 at 48, 1.4 at 74."""
 
-POINT_SECONDS, SETUP_SECONDS = 8e-6, 0.1
-"""Seconds per frame and point of a reweighting times the usual number of them, and of the setup of the shapes."""
+POINT_SECONDS, SETUP_SECONDS = 2.5e-5, 0.1
+"""Seconds per frame and point of the shapes, and of their setup. The former was .3e-5 on a rigid face, 1e-4 on a flag and 1.6e-4 on a
+sphere, because it depends on the conditioning; `Pace` therefore measures it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,27 +32,42 @@ class Stage:
     """Expected units of work."""
 
 
+COMPLETION_SECONDS, MOST_COMPLETED = 1.2e-4, 600
+"""Seconds per frame and point of filling hidden positions, and the largest number of points that takes part."""
+
 UNITS = {
     "multistart": (1600, 120, 1.3),
     "model_order": (1000, 360, 0.6),
     "starts": (2500, 40, 1.0),
     "perspective": (10, 360, 30.0),
     "scales": (1500, 120, 1.0),
-    "refinement": (700, 360, 1.0),
-    "covariance": (500, 360, 1.0),
+    "refinement": (2000, 360, 1.0),
+    "covariance": (380, 360, 1.0),
     "trust": (6, 100, 130.0),
 }
 """Stages of the default prior: typical number of units, maximum number of frames used, and cost of a unit against that of an iteration.
-Measured on sequences of 10 to 74 frames, clean and spoiled."""
+Measured on sequences of 10 to 80 frames, clean and spoiled."""
+
+FIRST_REWEIGHTING = 2.5
+"""Time that the shapes take after their first reweighting has begun, over what it has taken so far; seven reweightings are usual and the
+first takes longest."""
+
+PACE_PRIOR = 0.5
+"""Seconds of the plan that count as measured at the planned pace, so that the first units do not decide the pace alone."""
 
 USUAL_RATIO = 0.4
 """Decrease of the objective of a reweighting over that of the one before, where it is not known yet."""
+
+REFINEMENT_UNITS = {True: 3600, False: 700}
+"""Units of the stage `refinement` with and without scales; the plan has a number between, until it is known."""
 
 UNITS_PER_START = 500
 """Units that one starting point of the stage `starts` takes."""
 
 
-def planned(frames: int, points: int, *, gaussian: bool, known_cameras: bool, sheet: bool) -> tuple[Stage, ...]:
+def planned(
+    frames: int, points: int, *, gaussian: bool, known_cameras: bool, sheet: bool, hidden: bool = False
+) -> tuple[Stage, ...]:
     """Return the stages that a solve is expected to have, in their order.
 
     Parameters
@@ -64,10 +80,14 @@ def planned(frames: int, points: int, *, gaussian: bool, known_cameras: bool, sh
         Whether rotations are given.
     sheet : bool
         Whether an isometric surface is looked for.
+    hidden : bool
+        Whether any point is hidden in any frame.
     """
     shapes = Stage("shapes", SETUP_SECONDS + POINT_SECONDS * frames * points, 100)
     last = [stage_of("trust", frames)] if gaussian else []
-    first = [Stage("surface", 0.5 + 0.1 * min(frames, 24), 150)] if sheet else []
+    first = [Stage("surface", 0.5 + 0.5 * min(frames, 24), 280)] if sheet else []
+    filled = COMPLETION_SECONDS * frames * min(points, MOST_COMPLETED) if hidden else 0.0
+    first.append(Stage("completion", 0.1 + filled, 6))
     return (*first, *learning(frames, gaussian=gaussian, known_cameras=known_cameras), shapes, *last)
 
 
@@ -115,3 +135,59 @@ def settling(objectives: Sequence[float], *, tolerance: float, most: int) -> flo
     ratio = float(np.clip(ratio, 0.1, 0.9))
     left = np.log(tolerance / last) / np.log(ratio)
     return float(taken / (taken + min(left, max(most - taken, 0))))
+
+
+@dataclass(slots=True)
+class Pace:
+    """Remaining time of a plan, from the durations of the stages so far.
+
+    The pace is the measured time of the finished stages over their planned time: it covers machines of other speed and with other load.
+    The shapes stay out of it, because their planned time is uncertain; once they run, they are extrapolated by themselves.
+    """
+
+    began: float
+    """Clock at which the current stage began."""
+
+    measured: float = PACE_PRIOR
+    planned: float = PACE_PRIOR
+
+    def next(self, stage: Stage, share: float, now: float) -> None:
+        """Count a finished stage; `share` of it is done, 0 if it was skipped."""
+        if share > 0 and stage.name != "shapes":
+            self.measured += now - self.began
+            self.planned += stage.seconds
+        self.began = now
+
+    def left(self, stage: Stage, share: float, settled: float, ahead: float, now: float) -> float:
+        """Return the remaining seconds.
+
+        Parameters
+        ----------
+        stage : Stage
+            The current one.
+        share : float
+            Completed part of it by units of work.
+        settled : float
+            Completed part of the shapes by their objective; 0 before the first reweighting ends.
+        ahead : float
+            Planned seconds of the stages that follow.
+        now : float
+            Clock.
+        """
+        spent = now - self.began
+        if stage.name == "shapes":
+            pace = self.measured / self.planned
+            rest = (
+                spent * (1 - settled) / settled
+                if settled > 0
+                else max(pace * stage.seconds - spent, FIRST_REWEIGHTING * spent)
+            )
+            return rest + pace * ahead
+        pace = (
+            (self.measured + spent) / (self.planned + share * stage.seconds)
+            if share > 0
+            else self.measured / self.planned
+        )
+        planned = pace * (1 - share) * stage.seconds
+        rest = planned if share <= 0 else (1 - share) * planned + share * spent * (1 - share) / share
+        return rest + pace * ahead

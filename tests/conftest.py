@@ -2,10 +2,22 @@
 
 from __future__ import annotations
 
+import os
+import secrets
+import shutil
 import signal
+import socket
+import subprocess
+import sys
+import sysconfig
+import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
+
+NANIO = shutil.which("nanio", path=f"{sysconfig.get_path('scripts')}:{Path(sys.executable).parent}")
+"""A small S3 server."""
 
 # A shell that starts the tests in the background has them ignore Ctrl-C, and every process they start inherits that. The tests
 # press Ctrl-C on purpose.
@@ -20,3 +32,36 @@ def service_url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
     with running(tmp_path_factory.mktemp("service"), threads=1) as url:
         yield url
+
+
+@pytest.fixture(scope="session")
+def s3_url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """A small S3 server of its own, with credentials that it checks."""
+    if NANIO is None:
+        pytest.skip("no S3 server here: pip install nanio")
+    folder = tmp_path_factory.mktemp("s3")
+    (folder / "bucket").mkdir()
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    key, secret = "test", secrets.token_hex(8)
+    command = [NANIO, "serve", "--data-dir", str(folder), "--host", "127.0.0.1", "--port", str(port)]
+    env = {**os.environ, "NANIO_ACCESS_KEY": key, "NANIO_SECRET_KEY": secret}
+    server = subprocess.Popen([*command, "--no-access-log", "--log-level", "error"], env=env)
+    variables = {
+        "AWS_ACCESS_KEY_ID": key, "AWS_SECRET_ACCESS_KEY": secret, "AWS_REGION": "us-east-1",
+        "AWS_ENDPOINT_URL": f"http://127.0.0.1:{port}", "AWS_ALLOW_HTTP": "true",
+    }  # fmt: skip
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in variables.items():
+            patch.setenv(name, value)
+        deadline = time.monotonic() + 20
+        while True:
+            with socket.socket() as probe:
+                if probe.connect_ex(("127.0.0.1", port)) == 0:
+                    break
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        yield "s3://bucket/prefix"
+    server.terminate()
+    server.wait(10)

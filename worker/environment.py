@@ -23,7 +23,7 @@ PREFIX = "PLIANT_"
 SECRETS = "/run/secrets"
 """Folder of secret files, as Docker and Kubernetes mount them, unless PLIANT_SECRETS_DIR names another one."""
 
-_KINDS = {int: "a whole number", float: "a number", str: "text", Path: "a path"}
+_KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "text", Path: "a path"}
 
 _BOUNDS = {"ge": "at least", "gt": "more than", "le": "at most", "lt": "less than"}
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Sequence
 from datetime import UTC, datetime
 from typing import NamedTuple
 
-from pliant.schemas.job import Job, Status
+from pliant.schemas.job import Job, Priority, Status
 from pydantic import BaseModel, ConfigDict, Field
 
 EVENTS_KEPT = 256
@@ -131,6 +131,8 @@ class Beat(NamedTuple):
     owner: str
     max_running: int | None
     """See `Stored`."""
+    priority: Priority
+    """Of the job, which orders the waiting jobs of its owner."""
 
 
 Change = Callable[[Stored], Stored]

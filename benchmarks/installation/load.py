@@ -130,7 +130,7 @@ class Poller:
 
 def pollers(instance: Instance, *, number: int, seconds: float, every: float) -> int:
     """Let many clients look at jobs at their own pace, and then all wait for one job at once (`Prefer: wait`)."""
-    ids = instance.acknowledged or [_one(instance)]
+    ids = instance.acknowledged or [one_job(instance)]
     reads: list[float] = []
     lost: list[str] = []
 
@@ -166,7 +166,7 @@ def pollers(instance: Instance, *, number: int, seconds: float, every: float) ->
         )
         print(f"| status reads, ms: median / p99 / largest | {percentiles(reads)} |")
         reads.clear()
-        long = _one(instance, options={"max_reweightings": 1000, "tolerance": 1e-15}, frames=40, points=1200)
+        long = one_job(instance, options={"max_reweightings": 1000, "tolerance": 1e-15}, frames=40, points=1200)
         began = time.monotonic()
         asyncio.run(all_of_them(lambda poller, _: ask(poller, f"/v1/jobs/{long}", wait=15)))
         print(f"| all waiting for one job, `Prefer: wait=15`: all answered after | {time.monotonic() - began:.1f} s |")
@@ -241,7 +241,10 @@ def _children_of(pid: int, largest: list[float]) -> Iterator[None]:
         thread.join()
 
 
-def _one(instance: Instance, *, options: dict[str, object] | None = None, frames: int = 20, points: int = 200) -> str:
+def one_job(
+    instance: Instance, *, options: dict[str, object] | None = None, frames: int = 20, points: int = 200
+) -> str:
+    """Submit a job whose cameras are known; return its id."""
     with instance.client() as client:
         sequence = face(frames, points)
         job = client.submit(

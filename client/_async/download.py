@@ -63,7 +63,7 @@ async def _fill(exchange: Exchange, path: str, artifact: Artifact, part: Path, *
                 headers |= {"Range": f"bytes={file.tell()}-", "If-Range": f'"{artifact.sha256}"'}
             call = Call(method="GET", path=path, headers=headers)
             try:
-                async with exchange.stream(call) as response:
+                async with exchange.download(call) as response:
                     if _first_byte(response) != file.tell():
                         file.seek(0)
                         file.truncate()

@@ -62,7 +62,7 @@ def _fill(exchange: Exchange, path: str, artifact: Artifact, part: Path, *, on_d
                 headers |= {"Range": f"bytes={file.tell()}-", "If-Range": f'"{artifact.sha256}"'}
             call = Call(method="GET", path=path, headers=headers)
             try:
-                with exchange.stream(call) as response:
+                with exchange.download(call) as response:
                     if _first_byte(response) != file.tell():
                         file.seek(0)
                         file.truncate()

@@ -5,11 +5,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import httpx
-from pliant.client.call import Call, request_for
+from pliant.client.call import Call, redirected, request_for
 from pliant.client.errors import PliantError, UnexpectedAnswer, Unreachable, error_from
 from pliant.client.pauses import sleep
 from pliant.client.retry import Attempts, may_repeat
@@ -55,6 +55,38 @@ class Exchange:
             yield response
         finally:
             response.close()
+
+    @contextmanager
+    def download(self, call: Call) -> Iterator[httpx.Response]:
+        """As `stream`, for a file: follow a redirect to the object store, and fetch from the service if it leads nowhere."""
+        contact = self.attempts.contact
+        if contact.follows:
+            with self.stream(replace(call, params={**call.params, "redirect": "true"})) as response:
+                location = response.headers.get("location") if response.status_code == 307 else None
+                if location is None:
+                    yield response
+                    return
+            found = self._from_store(location, call)
+            if found is not None:
+                try:
+                    yield found
+                finally:
+                    found.close()
+                return
+            contact.follows = False
+        with self.stream(call) as response:
+            yield response
+
+    def _from_store(self, location: str, call: Call) -> httpx.Response | None:
+        """Return the answer of the object store, None if it cannot be reached or refuses."""
+        try:
+            response = self.http.send(redirected(location, call, self.attempts.remaining()), stream=True)
+        except (httpx.TransportError, httpx.InvalidURL):
+            return None
+        if response.status_code in (200, 206):
+            return response
+        response.close()
+        return None
 
     def answer(self, call: Call) -> tuple[httpx.Response, bytes]:
         """Send a call and read the whole answer; an interrupted answer counts as a failure. Raises as `stream`."""

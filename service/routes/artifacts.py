@@ -7,14 +7,14 @@ from collections.abc import Iterator
 from itertools import chain
 from typing import Annotated
 
-from fastapi import APIRouter, Path, Request
-from fastapi.responses import Response, StreamingResponse
+from fastapi import APIRouter, Path, Query, Request
+from fastapi.responses import RedirectResponse, Response, StreamingResponse
 from pliant.schemas.job import Artifact
 from pliant.schemas.problems import ProblemCode
-from pliant.service.dependencies import Mine
+from pliant.service.dependencies import Core, Mine
 from pliant.service.openapi import problems
 from pliant.service.problems import Refusal
-from pliant.service.ranges import decide
+from pliant.service.ranges import Slice, decide
 from pliant.service.routes.jobs import Id
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.store.blobs import Blob
@@ -22,6 +22,13 @@ from pliant.worker.store.blobs import Blob
 router = APIRouter(prefix="/v1/jobs/{id}/artifacts", tags=["artifacts"])
 
 Name = Annotated[str, Path(description="A file of the job.", examples=["shapes.npz"])]
+Redirect = Annotated[
+    bool,
+    Query(description="The client follows a redirect to the object store, without its `Authorization` header."),
+]
+LINK_SECONDS = 300.0
+"""Seconds within which a redirect to the object store has to be followed; the transfer itself may take longer."""
+
 _BINARY = {"schema": {"type": "string", "format": "binary"}}
 # Generators of clients take the first; the file's own media type is in its description.
 _BYTES = {"application/octet-stream": _BINARY, "*/*": _BINARY}
@@ -43,11 +50,16 @@ def artifacts(id: Id, jobs: Mine) -> list[Artifact]:
         200: {"description": "The whole file, in its own media type.", "content": _BYTES},
         206: {"description": "The bytes that `Range` names.", "content": _BYTES},
         304: {"description": "The client has this file (`If-None-Match`)."},
+        307: {"description": "With `redirect=true`: the file is at `Location`, in the object store, for five minutes."},
         **problems(401, 404, 410, 412, 416, 503),
     },
 )
-def artifact(id: Id, name: Name, request: Request, jobs: Mine) -> Response:
-    """Return a file. `Range` with `If-Range` resumes a download; `ETag` and `Repr-Digest` are its SHA-256."""
+def artifact(id: Id, name: Name, request: Request, jobs: Mine, core: Core, redirect: Redirect = False) -> Response:
+    """Return a file. `Range` with `If-Range` resumes a download; `ETag` and `Repr-Digest` are its SHA-256.
+
+    With `redirect=true` a service that keeps its files in S3 may answer 307 with a signed URL: send `Range` there too, but neither
+    `If-Range` nor `Authorization`. Elsewhere the parameter has no effect.
+    """
     about, blob = _open(jobs, id, name)
     size = blob.size
     etag = f'"{about.sha256}"'
@@ -73,6 +85,8 @@ def artifact(id: Id, name: Name, request: Request, jobs: Mine) -> Response:
         )
     if part.status == 304:
         return Response(status_code=304, headers=headers)
+    if redirect and core.settings.presigned_redirects and (link := _link(blob, part, request)) is not None:
+        return RedirectResponse(link, 307, headers={**headers, "Cache-Control": "private, no-store"})
     headers |= {
         "Content-Length": str(part.length),
         "Content-Disposition": f'attachment; filename="{about.name}"',
@@ -84,6 +98,15 @@ def artifact(id: Id, name: Name, request: Request, jobs: Mine) -> Response:
         return Response(status_code=part.status, headers=headers, media_type=about.media_type)
     body = _begin(blob.read(part.start, part.start + part.length), jobs, id, name)
     return StreamingResponse(body, status_code=part.status, headers=headers, media_type=about.media_type)
+
+
+def _link(blob: Blob, part: Slice, request: Request) -> str | None:
+    """Return the file's URL in the object store, None if this answer cannot be given from there.
+
+    The store does not know the file's SHA-256, so a `Range` that is ignored, for example because of `If-Range`, is answered here.
+    """
+    ignored = "range" in request.headers and part.status != 206
+    return None if request.method == "HEAD" or ignored else blob.link(seconds=LINK_SECONDS)
 
 
 def _open(jobs: Jobs, id: str, name: str) -> tuple[Artifact, Blob]:

@@ -21,6 +21,7 @@ from pliant.solver.cameras.perspective import Perspective
 from pliant.solver.cameras.planar_ambiguity import is_planar, resolve_pose_signs
 from pliant.solver.cameras.scale import rigid_evidence, rigid_scales
 from pliant.solver.model.so3 import angles_between, start_at_identity
+from pliant.solver.monitor import enter
 from pliant.solver.records import Floats, KnownCamera, Step, read_only
 from pliant.solver.settings import Settings
 from pliant.solver.tracks.completion import Completed, Filling, complete
@@ -115,7 +116,8 @@ def estimate_cameras(
         Of the completion, as an earlier estimate from these tracks had it; 0 chooses it.
     """
     report, ordered = on_step if on_step is not None else _silent, settings.order != "any"
-    completed = complete(normalized, seed=settings.seed, rank=rank)
+    completed = complete(normalized, seed=settings.seed, rank=rank, should_stop=should_stop)
+    enter(should_stop, "multistart")
     report(Step("cameras", 0.4 * PROGRESS_SHARE))
     scales, scale_reason = rigid_evidence(completed.gram, settings)
     gram = completed.gram / np.outer(np.repeat(scales, 2), np.repeat(scales, 2))

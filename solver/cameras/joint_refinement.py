@@ -28,7 +28,7 @@ from pliant.solver.model.shape_covariance import (
 from pliant.solver.model.so3 import angles_between, exponential
 from pliant.solver.monitor import enter
 from pliant.solver.records import Floats, read_only
-from pliant.solver.stages import UNITS_PER_START
+from pliant.solver.stages import REFINEMENT_UNITS, UNITS_PER_START
 from pliant.solver.tracks.noise import OUTLIER_SHARE
 from pliant.solver.tracks.normalization import Normalized
 from scipy.spatial.transform import Rotation
@@ -126,7 +126,7 @@ def learn(
         start_scales, why = _free_scales(unscaled, before, model_order, should_stop)
     rotations, scales, found = before, np.ones(len(used)), None
     if turning:
-        enter(should_stop, "refinement")
+        enter(should_stop, "refinement", units=REFINEMENT_UNITS[start_scales is not None])
         found = refined(
             unscaled, before, scales if start_scales is None else start_scales, with_scales=start_scales is not None,
             rounds=REFINEMENT_ROUNDS, model_order=model_order, should_stop=should_stop,

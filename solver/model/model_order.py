@@ -18,6 +18,7 @@ from pliant.solver.model.image_density import negative_log_likelihoods
 from pliant.solver.model.marginal_likelihood import NOISE_STD_FLOOR
 from pliant.solver.model.shape_covariance import MAX_MODES, ShapeCovariance, annealed
 from pliant.solver.records import Floats
+from pliant.solver.tracks.completion import ranks
 from pliant.solver.tracks.noise import typical_roughness
 
 MODE_COUNTS = (0, 2, 4, 8, 16, 32, MAX_MODES)
@@ -81,7 +82,7 @@ def select_model_order(
         return ModelOrder(ordered=ordered)
     used = np.unique(np.linspace(0, frames - 1, min(frames, JUDGED_FRAMES)).round().astype(np.intp))
     rows = sample[used].transpose(0, 2, 1).reshape(2 * len(used), count)
-    order = np.random.default_rng(seed).permutation(count)
+    order = np.argsort(ranks(sample))[np.random.default_rng(seed).permutation(count)]
     one, other = rows[:, order[0::2]], rows[:, order[1::2]]
     quiet_start, noisy_start = (
         (

@@ -127,7 +127,7 @@ def position_std(
         found = everything
     else:
         sample = _sample(weights, seed)
-        exact = [_variance(*moments[nearest[point]], weights[:, point], noise) for point in sample]
+        exact = [_variance(*moments[int(nearest[point])], weights[:, point], noise) for point in sample]
         found = _predicted(everything, weights, sample, np.stack(exact, axis=1))
     if len(used) < frames:
         at = np.arange(frames)

@@ -9,7 +9,7 @@ P; all points are then projected onto the basis in one pass.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -89,7 +89,9 @@ class Completed:
     """The factor that replaced hidden entries and outliers; None if none were replaced."""
 
 
-def complete(normalized: Normalized, *, seed: int = 0, rank: int = 0) -> Completed:
+def complete(
+    normalized: Normalized, *, seed: int = 0, rank: int = 0, should_stop: Callable[[], bool] | None = None
+) -> Completed:
     """Fill hidden entries, replace gross outliers, and return the Gram matrix of the result.
 
     Parameters
@@ -100,6 +102,8 @@ def complete(normalized: Normalized, *, seed: int = 0, rank: int = 0) -> Complet
         Seed of the sample of points and of the held-out entries.
     rank : int
         Number of basis columns, from an earlier completion of these tracks; 0 selects it.
+    should_stop : callable, optional
+        Called after every number of columns that is tried; once it returns True, the best one so far is used.
 
     Raises
     ------
@@ -118,7 +122,7 @@ def complete(normalized: Normalized, *, seed: int = 0, rank: int = 0) -> Complet
             got=f"{again}", hint="Check that the visibility is not inverted, and that a point keeps its place from frame to frame.",
         )  # fmt: skip
     points, weight = normalized.points[:, chosen], normalized.visible[:, chosen]
-    basis, spread, scale = fit_basis(points, weight, random, rank)
+    basis, spread, scale = fit_basis(points, weight, random, rank, should_stop=should_stop)
     outliers = fill(points, weight, basis, spread, scale)[1]
     clean = outliers == 0.0 and bool((normalized.visible == 1).all())
     filling = None if clean else Filling(basis, spread, scale)
@@ -143,15 +147,25 @@ def choose_points(visible: Floats, random: np.random.Generator) -> NDArray[np.in
     return np.sort(np.concatenate([half, rest]))
 
 
+def ranks(points: Floats) -> NDArray[np.intp]:
+    """Return each point's rank by its mean squared distance from the centroid, shape `(P,)`.
+
+    What is drawn by rank depends neither on the order of the points nor on the image's axes.
+    """
+    squares = (points**2).sum(axis=(0, 2))
+    return np.argsort(np.argsort(squares, kind="stable"), kind="stable")
+
+
 def fit_basis(
-    points: Floats, weight: Floats, random: np.random.Generator, given: int = 0
-) -> tuple[Floats, Floats, float]:
+    points: Floats, weight: Floats, random: np.random.Generator, given: int = 0, *,
+    should_stop: Callable[[], bool] | None = None,
+) -> tuple[Floats, Floats, float]:  # fmt: skip
     """Return the basis (F, 2, r) with the translation last, the covariance of its coefficients, and the residual scale.
 
     Without a given rank, the one with the lowest held-out error is selected; a larger one must be better by 2 %.
     """
     frames, count = weight.shape
-    held = (random.random(weight.shape) < HELD_OUT_SHARE) & (weight > 0)
+    held = (random.random(weight.shape)[:, ranks(points)] < HELD_OUT_SHARE) & (weight > 0)
     kept = np.where(held, 0.0, weight)
     start = _interpolated(points, weight)
     hidden = bool((weight == 0).any())
@@ -168,7 +182,7 @@ def fit_basis(
             best_error, best_rank, best = error, rank, basis
         elif rank > 2 * best_rank:
             break
-        if rank == given:
+        if rank == given or (should_stop is not None and should_stop()):
             break
     if not np.isfinite(best_error):
         best = _widen(np.zeros((frames, 2, 0)), points, weight, start, min(3, min(2 * frames, count) - 1))

@@ -75,8 +75,8 @@ def test_the_installed_wheel_gives_a_working_command(archives: tuple[Path, Path]
     )
     # -S and the dependencies by hand keep the editable installation's import hook out.
     sites = [path for path in sys.path if path.endswith("site-packages")]
-    said = run(sys.executable, "-S", "-c", f"import sys; sys.path += {sites!r}; {program}", cwd=tmp_path)
-    assert said.startswith("pliant ")
+    printed = run(sys.executable, "-S", "-c", f"import sys; sys.path += {sites!r}; {program}", cwd=tmp_path)
+    assert printed.startswith("pliant ")
 
 
 MODULES = {
@@ -133,6 +133,7 @@ def test_the_tests_include_the_server() -> None:
     assert "pliant[server]" in extras["check"]
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_clean_installations(archives: tuple[Path, Path], tmp_path: Path) -> None:

@@ -47,26 +47,26 @@ def test_the_demonstration_ends_with_playable_files_and_a_verdict(tmp_path: Path
     command = [sys.executable, "-m", "pliant.cli", "demo", "--small", "--keep", "--json"]
     process = subprocess.Popen(command, cwd=tmp_path, env=ENVIRONMENT, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
-    said = document(process.stdout)
-    assert said["job"]["status"] == "succeeded"
-    assert httpx.get(f"{said['url']}/v1/jobs").json()["jobs"][0]["id"] == said["job"]["id"]
-    assert "text/html" in httpx.get(said["url"]).headers["content-type"]
+    printed = document(process.stdout)
+    assert printed["job"]["status"] == "succeeded"
+    assert httpx.get(f"{printed['url']}/v1/jobs").json()["jobs"][0]["id"] == printed["job"]["id"]
+    assert "text/html" in httpx.get(printed["url"]).headers["content-type"]
     process.send_signal(signal.SIGINT)
     assert process.stdout.read() == ""
     process.stdout.close()
-    assert process.wait(60) == (0 if said["good"] else 1)
+    assert process.wait(60) == (0 if printed["good"] else 1)
     with pytest.raises(httpx.ConnectError):
-        httpx.get(said["url"])
+        httpx.get(printed["url"])
 
-    assert said["good"] == judge(said["metrics"])
-    assert set(GOOD) <= set(said["metrics"])
-    assert all(value > 0 for value in said["metrics"].values())
-    files = {name: tmp_path / path for name, path in said["files"].items()}
+    assert printed["good"] == judge(printed["metrics"])
+    assert set(GOOD) <= set(printed["metrics"])
+    assert all(value > 0 for value in printed["metrics"].values())
+    files = {name: tmp_path / path for name, path in printed["files"].items()}
     assert files["shapes.glb"].read_bytes()[:4] == b"glTF"
     shapes = arrays(files["shapes.npz"])["shapes"]
     np.testing.assert_allclose(shapes.mean(axis=1), 0, atol=1e-6 * np.abs(shapes).max())
     report = json.loads(files["report.json"].read_text())
-    assert report["options"] == said["job"]["options"]
+    assert report["options"] == printed["job"]["options"]
     assert list(tmp_path.iterdir()) == [tmp_path / "demo-output"]
 
 
@@ -154,8 +154,13 @@ def test_solve_and_the_service_reject_the_same_inputs(tmp_path: Path) -> None:
     np.savez(tmp_path / "tracks.npz", tracks=np.ones((2, 9, 2)))
     ran = pliant("solve", "tracks.npz", "-o", "out", "--json", folder=tmp_path)
     assert ran.returncode == 3
-    said = json.loads(ran.stderr)
-    assert (said["code"], said["field"], said["got"], said["exit_code"]) == ("too_few_frames", "tracks", "2", 3)
+    printed = json.loads(ran.stderr)
+    assert (printed["code"], printed["field"], printed["got"], printed["exit_code"]) == (
+        "too_few_frames",
+        "tracks",
+        "2",
+        3,
+    )
     assert not (tmp_path / "out").exists()
 
 
@@ -174,8 +179,8 @@ def test_inspect_shows_how_a_file_is_interpreted(tmp_path: Path) -> None:
     np.savez(tmp_path / "tapir.npz", tracks=tracked, visibles=np.ones(tracked.shape[:3], bool))
     ran = pliant("inspect", "tapir.npz", "--json", "-O", "layout=points_frames", folder=tmp_path)
     assert ran.returncode == 0, ran.stderr
-    said = json.loads(ran.stdout)
-    assert (said["num_frames"], said["num_points"]) == sequence.tracks.points.shape[:2]
+    printed = json.loads(ran.stdout)
+    assert (printed["num_frames"], printed["num_points"]) == sequence.tracks.points.shape[:2]
     ran = pliant("inspect", "tapir.npz", "-O", "layout=points_frames", folder=tmp_path)
     assert f"12 frames × {sequence.tracks.num_points} points" in ran.stdout
 

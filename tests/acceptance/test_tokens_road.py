@@ -149,7 +149,7 @@ def test_tokens_are_created_and_revoked_while_the_service_runs(url: str, data: P
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (["x", "--scope", "everything"], "read, submit, admin"),
         (["x", "--expires", "soon"], "12h, 90d"),
@@ -157,12 +157,12 @@ def test_tokens_are_created_and_revoked_while_the_service_runs(url: str, data: P
     ],
 )
 def test_invalid_token_arguments_are_rejected_with_a_message(
-    url: str, data: Path, arguments: list[str], said: str
+    url: str, data: Path, arguments: list[str], message: str
 ) -> None:
     del url
     ran = pliant("token", "create", *arguments, "--data", data)
     assert ran.returncode == Exit.REFUSED
-    assert said in ran.stderr
+    assert message in ran.stderr
 
 
 def test_both_clients_work_with_a_token_and_not_without(url: str, first: dict[str, Any], tracks: Path) -> None:

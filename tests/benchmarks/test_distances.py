@@ -83,6 +83,7 @@ def test_distances_are_measured_once_and_drawn(bench, tmp_path, monkeypatch) -> 
     assert sum(len(axes.lines) for axes in drawn.axes) == 1
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_the_choice_of_a_camera_is_tabulated(bench, tmp_path, capsys) -> None:
     choice = bench("accuracy.camera_choice")

@@ -14,6 +14,7 @@ pytestmark = [
 ]
 
 
+@pytest.mark.long
 def test_the_load_loses_nothing_and_prints_its_tables() -> None:
     tiny = ["--jobs", "4", "--clients", "2", "--pollers", "20", "--seconds", "2", "--every", "1", "--megabytes", "70"]
     ran = subprocess.run(
@@ -23,6 +24,6 @@ def test_the_load_loses_nothing_and_prints_its_tables() -> None:
     assert ran.returncode == 0, ran.stdout + ran.stderr
     assert ran.stdout.count("| lost | 0 |") == 3
     assert "the stores are consistent with the job records" in ran.stdout
-    told = ran.stdout.split("API memory before / at most while it arrives / at most until accepted | ")[1]
-    before, arriving, accepted = (int(word) for word in told.split(" MB")[0].split(" / "))
+    figures = ran.stdout.split("API memory before / at most while it arrives / at most until accepted | ")[1]
+    before, arriving, accepted = (int(word) for word in figures.split(" MB")[0].split(" / "))
     assert 0 < before <= arriving <= accepted < before + 100, "the inputs are read in a process of their own"

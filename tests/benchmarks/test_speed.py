@@ -53,6 +53,7 @@ def test_every_baseline_is_timed_beside_the_solver():
         assert 0.02 < float(memory.split()[0]) < 2
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_growth_prints_an_exponent_for_each_size():
     lines = speed("growth", "--against-points", "100,200", "--against-frames", "4,8")
@@ -65,6 +66,7 @@ def test_a_mesh_is_timed_against_a_grid():
     assert any("× the grid's time" in line for line in speed("mesh", "--frames", "6", "--points", "100"))
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_bandwidth_and_profile_run():
     assert any(line.startswith("ratio: ") for line in speed("bandwidth", "--frames", "6", "--points", "100"))

@@ -88,16 +88,16 @@ def test_submit_wait_shapes_is_one_line(client: Client) -> None:
 
 
 def test_a_result_holds_arrays_report_and_job(client: Client, tmp_path: Path) -> None:
-    told: list[Job] = []
+    updates: list[Job] = []
     sent: list[tuple[int, int]] = []
     job = client.submit(moving_points(), options=FAST, name="one", on_upload=lambda *now: sent.append(now))
-    result = job.wait(timeout=60, folder=tmp_path / "kept", on_progress=told.append)
+    result = job.wait(timeout=60, folder=tmp_path / "kept", on_progress=updates.append)
     np.testing.assert_allclose(
         result.rotations @ result.rotations.transpose(0, 2, 1), np.tile(np.eye(3), (6, 1, 1)), atol=1e-9
     )
     assert result.report["outcome"] in ("converged", "max_reweightings")
     assert result.job.name == "one"
-    assert told[-1].status is Status.SUCCEEDED
+    assert updates[-1].status is Status.SUCCEEDED
     assert sent[-1][0] == sent[-1][1] > 0
     assert result.job.status is Status.SUCCEEDED
     assert len(client.log(result.job.id).splitlines()) >= 2
@@ -121,12 +121,12 @@ def test_inspecting_returns_the_interpretation_without_creating_a_job(client: Cl
     points = moving_points()
     points[2, 3] = np.nan
     before = [job.id for job in client.list()]
-    said = client.inspect(points, mesh="none", rotations=np.tile(np.eye(3), (6, 1, 1)))
+    interpretation = client.inspect(points, mesh="none", rotations=np.tile(np.eye(3), (6, 1, 1)))
     assert [job.id for job in client.list()] == before
-    assert (said.num_frames, said.num_points, said.has_rotations) == (6, 16, True)
-    assert said.hidden_fraction == pytest.approx(1 / (6 * 16))
+    assert (interpretation.num_frames, interpretation.num_points, interpretation.has_rotations) == (6, 16, True)
+    assert interpretation.hidden_fraction == pytest.approx(1 / (6 * 16))
     job = client.submit(points, mesh="none", rotations=np.tile(np.eye(3), (6, 1, 1)))
-    assert job.record.interpretation == said
+    assert job.record.interpretation == interpretation
     with pytest.raises(InvalidRequest) as caught:
         client.inspect(np.ones((2, 9, 2)))
     assert caught.value.code == "too_few_frames"
@@ -241,11 +241,11 @@ def test_large_inputs_are_uploaded_first_with_the_same_result(client: Client, mo
     carried = client.submit(points, options=FAST, idempotency_key=key)
     monkeypatch.setattr("pliant.client.multipart.LARGE", 100_000)
     monkeypatch.setattr("pliant.client.multipart.SMALL", 1000)
-    told: list[tuple[int, int]] = []
-    ahead = client.submit(points, options=FAST, idempotency_key=key, on_upload=lambda *now: told.append(now))
+    updates: list[tuple[int, int]] = []
+    ahead = client.submit(points, options=FAST, idempotency_key=key, on_upload=lambda *now: updates.append(now))
     assert ahead.id == carried.id, "the same content is the same request by either road"
-    assert [done for done, _ in told] == sorted(done for done, _ in told)
-    assert told[-1][0] == told[-1][1] > points.nbytes
+    assert [done for done, _ in updates] == sorted(done for done, _ in updates)
+    assert updates[-1][0] == updates[-1][1] > points.nbytes
     truth = np.zeros((6, 4000, 3)) + np.arange(4000)[:, None]
     job = client.submit(points, options=FAST, ground_truth=truth, mesh="none")
     assert job.record.interpretation.has_ground_truth

@@ -65,14 +65,14 @@ def finished_job(service: InMemoryService) -> tuple[Client, str, bytes]:
 def test_an_interrupted_download_resumes(tmp_path: Path) -> None:
     service = Tearing(300_000)
     client, job, data = finished_job(service)
-    told: list[tuple[int, int]] = []
-    paths = client.download(job, tmp_path, names=["shapes.npz"], on_download=lambda *now: told.append(now))
+    updates: list[tuple[int, int]] = []
+    paths = client.download(job, tmp_path, names=["shapes.npz"], on_download=lambda *now: updates.append(now))
     assert paths["shapes.npz"].read_bytes() == data
     ranges = [request.headers.get("range") for request in service.fetches()]
     assert ranges == [None] + [f"bytes={n}-" for n in range(300_000, len(data), 300_000)]
     assert len({request.headers["if-range"] for request in service.fetches()[1:]}) == 1
-    assert told[-1] == (len(data), len(data))
-    assert [done for done, _ in told] == sorted(done for done, _ in told)
+    assert updates[-1] == (len(data), len(data))
+    assert [done for done, _ in updates] == sorted(done for done, _ in updates)
     assert [path.name for path in tmp_path.iterdir()] == ["shapes.npz"]
 
 

@@ -75,10 +75,10 @@ def test_events_end_with_the_final_record_and_never_repeat() -> None:
 def test_an_interrupted_stream_resumes_after_the_last_event() -> None:
     service = Shaky(steps=4)
     with Client("http://pliant.test", transport=service, retries=QUICK) as client:
-        told = []
-        result = client.submit(POINTS).wait(on_progress=told.append, timeout=30)
+        updates = []
+        result = client.submit(POINTS).wait(on_progress=updates.append, timeout=30)
     assert result.job.status is Status.SUCCEEDED
-    assert told[-1].status is Status.SUCCEEDED
+    assert updates[-1].status is Status.SUCCEEDED
     streams = [request for request in service.requests if request.url.path.endswith("/events")]
     assert "last-event-id" not in streams[0].headers
     assert all("last-event-id" in request.headers for request in streams[1:])
@@ -138,9 +138,9 @@ def test_the_asynchronous_client_follows_too() -> None:
         async with AsyncClient("http://pliant.test", transport=InMemoryService(steps=3), retries=QUICK) as client:
             job = await client.submit(POINTS)
             seen = list(dict.fromkeys([now.status async for now in job.events()]))
-            told: list[Status] = []
-            await job.wait(on_progress=lambda now: told.append(now.status))
-            assert told[-1] is Status.SUCCEEDED
+            updates: list[Status] = []
+            await job.wait(on_progress=lambda now: updates.append(now.status))
+            assert updates[-1] is Status.SUCCEEDED
             return seen
 
     assert asyncio.run(use()) == ["queued", "running", "succeeded"]

@@ -40,8 +40,8 @@ def test_every_example_script_is_tested() -> None:
 def test_from_cotracker(run, tmp_path: Path) -> None:
     points = SEQUENCE.tracks.points[None].astype(np.float32)
     np.savez(tmp_path / "tracks.npz", pred_tracks=points, pred_visibility=np.ones(points.shape[:3], bool))
-    said = run("from_cotracker.py", "tracks.npz", "face.glb")
-    assert f"shapes (5, {points.shape[2]}, 3)" in said
+    printed = run("from_cotracker.py", "tracks.npz", "face.glb")
+    assert f"shapes (5, {points.shape[2]}, 3)" in printed
     assert (tmp_path / "face.glb").read_bytes()[:4] == b"glTF"
 
 
@@ -62,9 +62,9 @@ def test_from_tapnext(run, tmp_path: Path, model: str) -> None:
         turned = points.transpose(0, 2, 1, 3)
         low = np.full(turned.shape[:3], -4.0, np.float32)
         np.savez(tmp_path / "tracks.npz", tracks=turned, occlusion=low, expected_dist=low)
-    said = run("from_tapnext.py", "tracks.npz", "640x480", "face.glb")
-    assert f"read as: {model}" in said
-    assert f"shapes ({shape[1]}, {shape[2]}, 3)" in said
+    printed = run("from_tapnext.py", "tracks.npz", "640x480", "face.glb")
+    assert f"read as: {model}" in printed
+    assert f"shapes ({shape[1]}, {shape[2]}, 3)" in printed
     assert (tmp_path / "face.glb").read_bytes()[:4] == b"glTF"
 
 
@@ -84,9 +84,9 @@ def test_from_alltracker(run, tmp_path: Path) -> None:
     mask = np.zeros((2 * height, 2 * width), np.uint8)
     mask[10:40, 12:52] = 255
     Image.fromarray(mask).save(tmp_path / "mask.png")
-    said = run("from_alltracker.py", "tracks.npz", "mask.png", "face.glb")
-    assert "points: 300 one pixel in 1" in said
-    assert f"shapes ({frames}, 300, 3)" in said
+    printed = run("from_alltracker.py", "tracks.npz", "mask.png", "face.glb")
+    assert "points: 300 one pixel in 1" in printed
+    assert f"shapes ({frames}, 300, 3)" in printed
     assert (tmp_path / "face.glb").read_bytes()[:4] == b"glTF"
 
 
@@ -105,9 +105,9 @@ def test_batch_resumes_where_it_stopped(run, tmp_path: Path) -> None:
         np.savez(tmp_path / "clips" / f"{name}.npz", tracks=SEQUENCE.tracks.points)
     np.savez(tmp_path / "clips" / "wrong.npz", tracks=np.ones((2, 9, 2)))
     for _ in range(2):
-        said = run("batch.py", "clips", "out")
-        assert "wrong.npz: " in said
-        assert said.count("files in") == 2
+        printed = run("batch.py", "clips", "out")
+        assert "wrong.npz: " in printed
+        assert printed.count("files in") == 2
     held = [(tmp_path / "out" / name / "report.json").read_text() for name in ("a", "b")]
     assert all(held)
 
@@ -115,14 +115,14 @@ def test_batch_resumes_where_it_stopped(run, tmp_path: Path) -> None:
 def test_many_at_once(run, tmp_path: Path) -> None:
     for name in ("a", "b"):
         np.savez(tmp_path / f"{name}.npz", tracks=SEQUENCE.tracks.points)
-    said = run("many_at_once.py", "a.npz", "b.npz")
-    assert said.count("shapes (5, ") == 2
-    assert "a.npz: succeeded" in said
+    printed = run("many_at_once.py", "a.npz", "b.npz")
+    assert printed.count("shapes (5, ") == 2
+    assert "a.npz: succeeded" in printed
 
 
 def test_evaluate(run, tmp_path: Path) -> None:
     np.savez(tmp_path / "tracks.npz", tracks=SEQUENCE.tracks.points)
     np.savez(tmp_path / "truth.npz", shapes=SEQUENCE.shapes)
-    said = run("evaluate.py", "tracks.npz", "truth.npz", "error.png")
-    assert "e3d_sequence" in said
+    printed = run("evaluate.py", "tracks.npz", "truth.npz", "error.png")
+    assert "e3d_sequence" in printed
     assert (tmp_path / "error.png").read_bytes()[:4] == b"\x89PNG"

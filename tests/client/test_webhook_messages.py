@@ -58,9 +58,9 @@ def test_altered_messages_are_rejected(job: Job) -> None:
         (headers, body, new_secret()),
         *(({name: value for name, value in headers.items() if name != left}, body, SECRET) for left in headers),
     ]
-    for said, sent, secret in changed:
+    for sent_headers, sent, secret in changed:
         with pytest.raises(InvalidSignature):
-            verified(said, sent, secret=secret, now=NOW)
+            verified(sent_headers, sent, secret=secret, now=NOW)
 
 
 @pytest.mark.parametrize("now", [NOW + 301, NOW - 301])

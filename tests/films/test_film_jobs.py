@@ -162,20 +162,20 @@ def test_films_are_recognised_on_the_command_line(film: Path, tmp_path: Path) ->
 
 
 def test_a_film_becomes_shapes_tracks_and_a_contact_sheet(film: Path, region: Path, tmp_path: Path) -> None:
-    told: list[Progress] = []
+    steps: list[Progress] = []
     (tmp_path / "scratch").mkdir()
     options = Options(outputs=(), max_reweightings=2, grid_step=6, refine_rotations=False)
     done = reconstruct_film(
-        FilmSource(film, region), options, tmp_path / "out", scratch=tmp_path / "scratch", on_progress=told.append
+        FilmSource(film, region), options, tmp_path / "out", scratch=tmp_path / "scratch", on_progress=steps.append
     )
     names = [each.name for each in done.artifacts]
     assert names[:2] == ["tracks.npz", "contact_sheet.jpg"]
     assert {"shapes.npz", "report.json"} < set(names)
-    stages = [each.stage for each in told]
+    stages = [each.stage for each in steps]
     assert stages[0] == "track"
     assert stages.count("track") > 2
-    assert [each.fraction for each in told] == sorted(each.fraction for each in told)
-    assert told[-1].fraction == 1.0
+    assert [each.fraction for each in steps] == sorted(each.fraction for each in steps)
+    assert steps[-1].fraction == 1.0
     with np.load(tmp_path / "out" / "tracks.npz") as tracks, np.load(tmp_path / "out" / "shapes.npz") as shapes:
         assert tracks["image_size"].tolist() == list(SIZE)
         assert shapes["shapes"].shape == (*tracks["tracks"].shape[:2], 3)
@@ -186,14 +186,14 @@ def test_a_film_becomes_shapes_tracks_and_a_contact_sheet(film: Path, region: Pa
     assert report["seconds"]["track"] > 0
     with Image.open(tmp_path / "out" / "contact_sheet.jpg") as sheet:
         assert sheet.format == "JPEG"
-    check_followed(told, tmp_path / "out")
+    check_followed(steps, tmp_path / "out")
     check_film_frames(tmp_path / "out", count=10)
 
 
-def check_followed(told: list[Progress], folder: Path) -> None:
+def check_followed(steps: list[Progress], folder: Path) -> None:
     """Points that are reported while tracking runs are those of the finished tracks."""
-    followed = next(each.followed for each in told if each.followed is not None)
-    assert told[-1].followed is None
+    followed = next(each.followed for each in steps if each.followed is not None)
+    assert steps[-1].followed is None
     assert (followed.width, followed.height) == SIZE
     places = np.array(followed.points).reshape(-1, 2)
     assert 4 <= len(places) <= 150

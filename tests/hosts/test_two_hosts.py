@@ -91,7 +91,7 @@ def test_a_cut_cable_loses_nothing_and_the_stale_attempt_writes_nothing(hosts: H
     times = moved(hosts, id, began)
     assert hosts.job_process(host) == [stale], "it computes on, and does not know yet"
     hosts.network.plug(host)
-    hosts.until(lambda: not Path(f"/proc/{stale}").exists(), "the stale attempt is ended once it can be told")
+    hosts.until(lambda: not Path(f"/proc/{stale}").exists(), "the stale attempt ends once its host is reachable")
     assert hosts.get(id)["attempt"] == 2
     hosts.cancelled(id)
     assert hosts.blobs(id) == ["inputs.npz"]
@@ -143,6 +143,25 @@ def test_one_key_at_two_api_processes_makes_one_job(hosts: Hosts) -> None:
     assert httpx.get(f"{hosts.urls[1]}/v1/jobs/{ids[0]}", timeout=20).json()["id"] == ids[0]
     hosts.cancelled(ids[0])
     row("one request at two API processes at once")
+
+
+def test_an_upload_begun_at_a_killed_api_process_continues_at_the_other(hosts: Hosts) -> None:
+    data = hosts.tracks()
+    half = {"Upload-Complete": "?0", "Upload-Length": str(len(data))}
+    begun = httpx.put(f"{hosts.urls[0]}/v1/uploads/across", content=data[:5000], headers=half, timeout=20)
+    assert begun.status_code == 201, begun.text
+    hosts.signal("api", signal.SIGKILL)
+    other = f"{hosts.urls[1]}/v1/uploads/across"
+    arrived = int(httpx.head(other, timeout=20).headers["Upload-Offset"])
+    assert arrived == 5000
+    rest = httpx.patch(other, content=data[arrived:], headers={"Upload-Offset": str(arrived)}, timeout=20)
+    assert rest.json()["complete"], rest.text
+    hosts.restart("api")
+    hosts.until(lambda: hosts.answers(f"{hosts.urls[0]}/healthz"), "the first one is back")
+    id = hosts.submit(upload="across")
+    assert httpx.delete(other, timeout=20).status_code == 204
+    hosts.cancelled(id)
+    row("an upload's API process is killed, and it continues at the other")
 
 
 @contextmanager

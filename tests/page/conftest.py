@@ -38,12 +38,12 @@ def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as up:
         assert up.stdout is not None
         try:
-            said = ""
-            while not said.endswith("}\n"):
+            output = ""
+            while not output.endswith("}\n"):
                 line = up.stdout.readline()
                 assert line != "", "pliant up ended at once"
-                said += line
-            yield json.loads(said)["url"]
+                output += line
+            yield json.loads(output)["url"]
         finally:
             up.send_signal(signal.SIGINT)
             up.wait(30)

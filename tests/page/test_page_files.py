@@ -1,4 +1,4 @@
-"""How the built page is served: what may be cached, what a browser asks for again, and what is said where there is no page."""
+"""How the built page is served: what may be cached, what a browser asks for again, and the answer where there is no page."""
 
 from __future__ import annotations
 

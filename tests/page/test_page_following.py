@@ -32,7 +32,7 @@ def test_a_running_job_survives_a_reload_and_can_be_cancelled(
     objective.wait_for(timeout=DONE)
     until(lambda: steps_of(objective) >= 4)
     page.reload()
-    # The events of before the reload are told again: the curve is whole.
+    # The events of before the reload are sent again: the curve is whole.
     objective.wait_for()
     until(lambda: steps_of(objective) >= 4)
     expect(page.get_by_text(re.compile(r"reweighting \d+ of at most 1000"))).to_be_visible()

@@ -66,8 +66,8 @@ def test_there_are_no_accessibility_findings_and_no_overflow(
         found = page.evaluate("axe.run().then((found) => found.violations)")
         if address == "docs":  # Swagger UI has a link inside the button of each operation
             found = [one for one in found if one["id"] != "nested-interactive"]
-        said = [f"{one['id']} ({one['impact']}): {[node['html'] for node in one['nodes']][:3]}" for one in found]
-        assert said == [], address
+        violations = [f"{one['id']} ({one['impact']}): {[node['html'] for node in one['nodes']][:3]}" for one in found]
+        assert violations == [], address
         assert page.evaluate("document.documentElement.scrollWidth") <= width, address
 
 

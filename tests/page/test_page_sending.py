@@ -72,17 +72,17 @@ def test_files_are_submitted_and_the_result_plays(page: Page, url: str, small: d
 
 
 def test_an_error_is_shown_with_the_services_message(page: Page, url: str) -> None:
-    said = httpx.post(f"{url}/v1/jobs", files={"tracks": ("tracks.npz", b"hello, I am not tracks")}).json()
+    problem = httpx.post(f"{url}/v1/jobs", files={"tracks": ("tracks.npz", b"hello, I am not tracks")}).json()
     choose(page, {TRACKS: b"hello, I am not tracks"})
     page.get_by_role("button", name="Reconstruct").click()
     alert = page.locator("[data-part=tracks]").get_by_role("alert")
-    sentence = said["detail"].removeprefix("tracks: ").removesuffix(said["hint"]).strip()
+    sentence = problem["detail"].removeprefix("tracks: ").removesuffix(problem["hint"]).strip()
     expect(alert).to_contain_text(sentence[0].upper() + sentence[1:])
-    expect(alert).to_contain_text(said["hint"])
+    expect(alert).to_contain_text(problem["hint"])
     expect(alert.get_by_role("link", name="What files can I send?")).to_have_attribute("href", "guide#tracks")
-    expect(alert.get_by_role("link", name="About this error")).to_have_attribute("href", f"errors/{said['code']}")
+    expect(alert.get_by_role("link", name="About this error")).to_have_attribute("href", f"errors/{problem['code']}")
     expect(page.get_by_text("Not sent: see “Tracks” above.")).to_be_visible()
-    expect(alert).to_contain_text(said["code"])
+    expect(alert).to_contain_text(problem["code"])
     assert "#job" not in page.url
     choose(page, {TRACKS: packed(tracks=np.zeros((2, 50, 2)))})
     page.get_by_role("button", name="Reconstruct").click()

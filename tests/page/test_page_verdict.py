@@ -74,8 +74,9 @@ def test_a_job_without_a_verdict_shows_none(page: Page, url: str, finished: str)
     page.reload()
     expect(page.get_by_text("Converged. The quality of this result was not assessed.")).to_be_visible()
     expect(page.get_by_role("region", name="Verdict")).to_have_count(0)
-    expect(page.locator(".badge")).to_have_count(0)
-    expect(page.get_by_role("link", name="a finished face")).to_contain_text("Done")
+    link = page.get_by_role("link", name="a finished face")
+    expect(link).to_contain_text("Done")
+    expect(link.locator(".badge")).to_have_count(0)
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

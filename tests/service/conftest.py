@@ -36,10 +36,17 @@ def serve(valkey_url: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator
     """Start a service with settings of one's own; it ends with the module."""
     started: list[tuple[uvicorn.Server, threading.Thread]] = []
 
-    def start(*, limits: Limits = Limits(), redis_url: str = valkey_url, quota: int = 0, **given: Any) -> Running:  # noqa: B008
+    def start(
+        *,
+        limits: Limits = Limits(),  # noqa: B008
+        redis_url: str = valkey_url,
+        quota: int = 0,
+        blob_url: str | None = None,
+        **given: Any,
+    ) -> Running:
         data = tmp_path_factory.mktemp("data")
         queue = f"test-{secrets.token_hex(4)}"
-        jobs = Jobs.open(Settings(data=data, redis_url=redis_url, queue=queue, disk_quota=quota))
+        jobs = Jobs.open(Settings(data=data, redis_url=redis_url, blob_url=blob_url, queue=queue, disk_quota=quota))
         settings = ServiceSettings(port=0, **given)
         tokens = Tokens.open(jobs.settings)
         app = create_app(jobs, settings, tokens=tokens, limits=limits)

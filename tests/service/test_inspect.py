@@ -38,10 +38,10 @@ def test_inspection_equals_the_interpretation_of_the_job_and_creates_none(
     assert answer.status_code == 200, answer.text
     assert running.waiting == before
     assert running.left_on_disk == []
-    said = Interpretation.model_validate_json(answer.content)
+    interpretation = Interpretation.model_validate_json(answer.content)
     job = http.post("/v1/jobs", files=GOOD[case]).json()
-    assert said == Interpretation.model_validate(job["interpretation"])
-    assert said.mesh_grid == ((3, 4) if case == "a grid" else None)
+    assert interpretation == Interpretation.model_validate(job["interpretation"])
+    assert interpretation.mesh_grid == ((3, 4) if case == "a grid" else None)
 
 
 def test_the_sample_is_the_tracks_upright_and_to_scale(http: httpx.Client) -> None:

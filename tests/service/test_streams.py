@@ -128,10 +128,10 @@ def test_the_log_has_the_lines_of_all_attempts(running: Running, http: httpx.Cli
     empty = http.get(f"/v1/jobs/{job.id}/log")
     assert (empty.status_code, empty.text) == (200, "")
     claim(running, job.id)
-    said = ["2026-05-04T09:30:00Z Attempt 1 began on worker w.", "Größe: 3 × 4 <b>not markup</b>"]
-    running.jobs.records.append_log(job.id, said)
+    written = ["2026-05-04T09:30:00Z Attempt 1 began on worker w.", "Größe: 3 × 4 <b>not markup</b>"]
+    running.jobs.records.append_log(job.id, written)
     answer = http.get(f"/v1/jobs/{job.id}/log")
-    assert answer.text.splitlines() == said
+    assert answer.text.splitlines() == written
     assert answer.headers["content-type"] == "text/plain; charset=utf-8"
     assert answer.headers["x-content-type-options"] == "nosniff"
 
@@ -192,14 +192,14 @@ def test_sigterm_ends_streams_and_waits_at_once_and_cleanly(
         for thread in threads:
             thread.start()
         until(lambda: "pliant_http_under_way 3" in http.get("/metrics").text)  # both, and the one that asks
-        told = time.monotonic()
+        stopped = time.monotonic()
         service.send_signal(signal.SIGTERM)
         assert service.wait(20) == 0
         gone = time.monotonic()
         for thread in threads:
             thread.join(20)
-    assert {name: at - told < 3 for name, at in ended.items()} == {"stream": True, "wait": True}
-    assert gone - told < 5
+    assert {name: at - stopped < 3 for name, at in ended.items()} == {"stream": True, "wait": True}
+    assert gone - stopped < 5
     assert log.read_text() == "", "neither a traceback nor chatter"
 
 
@@ -227,7 +227,7 @@ def test_a_stream_between_check_and_wait_still_ends_on_shutdown(
     service, url, log = process
     with httpx.Client(base_url=url, timeout=60) as http:
         job = submit(http)
-        # What is not told is cut off when the time of grace is over, and reading it raises.
+        # A stream that is not ended is cut off after the grace period, and reading it raises.
         assert http.get(f"/v1/jobs/{job.id}/events").text.endswith("\n\n")
     assert service.wait(20) == 0
     assert log.read_text() == "", "nothing was cancelled"

@@ -100,19 +100,19 @@ def test_a_reconnecting_client_replaces_its_dead_connection(running: Running, ht
 
 
 def test_repeating_a_put_after_a_lost_answer_is_safe(running: Running, http: httpx.Client) -> None:
-    said = {"Repr-Digest": repr_digest(DATA)}
-    assert http.put("/v1/uploads/again", content=DATA, headers=said).status_code == 201
-    assert http.put("/v1/uploads/again", content=DATA, headers=said).status_code == 200
+    digest = {"Repr-Digest": repr_digest(DATA)}
+    assert http.put("/v1/uploads/again", content=DATA, headers=digest).status_code == 201
+    assert http.put("/v1/uploads/again", content=DATA, headers=digest).status_code == 200
     other = http.put("/v1/uploads/again", content=DATA)
     assert (other.status_code, other.json()["code"]) == (409, "upload_complete")
     assert http.get("/v1/uploads/again").json()["complete"]
 
 
 def test_ten_concurrent_uploads_of_one_id_give_one_complete_file(running: Running, http: httpx.Client) -> None:
-    said = {"Repr-Digest": repr_digest(DATA)}
+    digest = {"Repr-Digest": repr_digest(DATA)}
 
     def send() -> None:
-        httpx.put(f"{running.url}/v1/uploads/at-once", content=DATA, headers=said, timeout=30)
+        httpx.put(f"{running.url}/v1/uploads/at-once", content=DATA, headers=digest, timeout=30)
 
     threads = [threading.Thread(target=send) for _ in range(10)]
     for thread in threads:
@@ -137,8 +137,8 @@ REFUSED: dict[str, tuple[dict[str, str], bytes, int, str]] = {
     "not a number": ({"Upload-Length": "many"}, b"x", 422, "invalid_request"),
     "not a boolean": ({"Upload-Complete": "yes"}, b"x", 422, "invalid_request"),
     "not begun": ({"Upload-Offset": "7"}, b"x", 404, "unknown_upload"),
-    "longer than said": ({"Upload-Length": "3"}, b"xxxx", 422, "inconsistent_upload_length"),
-    "shorter than said": ({"Upload-Length": "3"}, b"xx", 422, "inconsistent_upload_length"),
+    "longer than announced": ({"Upload-Length": "3"}, b"xxxx", 422, "inconsistent_upload_length"),
+    "shorter than announced": ({"Upload-Length": "3"}, b"xx", 422, "inconsistent_upload_length"),
 }
 
 

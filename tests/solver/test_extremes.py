@@ -82,7 +82,7 @@ def test_frames_that_show_nothing_lie_between_their_neighbours(
     assert_finite(found)
     error = metrics.e3d_frame(found.shapes[frames], MADE.shapes[frames])
     if method == "pseudo_inverse":
-        assert not found.shapes[frames].any()  # every frame for itself: nothing is known, so nothing is said
+        assert not found.shapes[frames].any()  # independent frames: without observations, zero
     else:
         assert 0.005 < error < 0.2
 

@@ -26,7 +26,7 @@ def errors(sequence: gallery.Sequence, *, estimated: bool) -> list[float]:
 
 
 @pytest.mark.parametrize("estimated", [False, True], ids=["known", "estimated"])
-@pytest.mark.parametrize("outliers", [0.05, 0.10])
+@pytest.mark.parametrize("outliers", [pytest.param(0.05, marks=pytest.mark.long), 0.10])
 @pytest.mark.slow
 def test_every_step_helps_against_outliers(outliers: float, estimated: bool) -> None:
     flat, temporal, spatial, robust = errors(gallery.corrupt(FACE, outliers=outliers, seed=1), estimated=estimated)

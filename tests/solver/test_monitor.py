@@ -56,7 +56,7 @@ def test_a_stop_during_the_default_is_reported() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("noisy", [False, True])
+@pytest.mark.parametrize("noisy", [pytest.param(False, marks=pytest.mark.long), True])
 def test_a_stop_in_every_stage_is_reported(noisy: bool) -> None:
     tracks, settings = small(noisy=noisy), Settings()
     for number in np.linspace(1, questions(tracks, settings), 12).astype(int):
@@ -160,3 +160,43 @@ def test_a_step_that_raises_the_objective_is_rejected_and_reported(monkeypatch: 
     found = solve(small(), settings=Settings(prior="smooth", refine_rotations=False))
     assert found.outcome is Outcome.REJECTED
     assert found.trace.objective[-1] == taken[0]
+
+
+def timed(plan: list[Stage]) -> tuple[Monitor, list[Step], list[float]]:
+    steps: list[Step] = []
+    now = [0.0]
+    return Monitor(steps.append, plan=plan, clock=lambda: now[0]), steps, now
+
+
+def test_a_slow_machine_multiplies_the_planned_time_that_is_left() -> None:
+    monitor, steps, now = timed([Stage("multistart", 10.0, 10), Stage("scales", 5.0, 10), Stage("trust", 5.0, 10)])
+    for unit in range(10):
+        now[0] = 3.0 * (unit + 1)
+        monitor()
+    monitor.enter("scales")
+    now[0] += 1.5
+    monitor()
+    left = steps[-1].seconds_left
+    assert left is not None
+    assert 0.9 * 3 * 10 < left < 1.1 * 3 * 10
+    monitor.report(Step("finish", 1.0))
+    assert steps[-1].seconds_left == 0.0
+
+
+def test_shapes_slower_than_planned_are_extrapolated_by_themselves() -> None:
+    monitor, steps, now = timed([Stage("multistart", 10.0, 10), Stage("shapes", 1.0, 100), Stage("trust", 1.0, 10)])
+    for unit in range(10):
+        now[0] = unit + 1.0
+        monitor()
+    monitor.report(Step("initialise", 0.0))
+    now[0] = 20.0
+    monitor()
+    first = steps[-1].seconds_left
+    assert first is not None
+    assert 20 < first < 30, "the first reweighting alone has taken ten seconds"
+    monitor.report(Step("reweight", 0.5))
+    assert steps[-1].seconds_left == pytest.approx(10 + 1, rel=0.1)
+    now[0] = 30.0
+    monitor.enter("trust")
+    monitor()
+    assert steps[-1].seconds_left == pytest.approx(1, rel=0.3), "slow shapes do not slow the rest down"

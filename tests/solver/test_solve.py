@@ -56,11 +56,11 @@ def test_smoothness_gives_depth_that_the_pseudo_inverse_does_not() -> None:
 
 def test_estimated_cameras_and_a_mesh_run_end_to_end() -> None:
     _, _, tracks, _ = scene()
-    told: list[Step] = []
-    found = solve(tracks, triangulated(sheet()[1]), on_step=told.append)
+    steps: list[Step] = []
+    found = solve(tracks, triangulated(sheet()[1]), on_step=steps.append)
     assert found.outcome is Outcome.CONVERGED
     assert np.isfinite(found.shapes).all()
-    fractions = [s.fraction for s in told]
+    fractions = [s.fraction for s in steps]
     assert fractions == sorted(fractions)
     assert fractions[-1] == 1
     assert (np.diff(found.trace.objective) <= 0).all()

@@ -2,14 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import secrets
-import shutil
-import socket
 import subprocess
-import sys
-import sysconfig
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -26,9 +20,6 @@ from pliant.worker.store.memory import MemoryQueue, MemoryRecords
 from pliant.worker.store.queue import RedisQueue
 from pliant.worker.store.redis import RedisRecords
 from worker_house import make_inputs, make_long_inputs
-
-NANIO = shutil.which("nanio", path=f"{sysconfig.get_path('scripts')}:{Path(sys.executable).parent}")
-"""A small S3 server."""
 
 
 @pytest.fixture(scope="session")
@@ -115,39 +106,6 @@ def inputs_files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     make_inputs(folder / "short.npz", frames=6, points=40)
     make_long_inputs(folder / "long.npz")
     return folder / "short.npz", folder / "long.npz"
-
-
-@pytest.fixture(scope="session")
-def s3_url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """A small S3 server of its own, with credentials that it checks."""
-    if NANIO is None:
-        pytest.skip("no S3 server here: pip install nanio")
-    folder = tmp_path_factory.mktemp("s3")
-    (folder / "bucket").mkdir()
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    key, secret = "test", secrets.token_hex(8)
-    command = [NANIO, "serve", "--data-dir", str(folder), "--host", "127.0.0.1", "--port", str(port)]
-    env = {**os.environ, "NANIO_ACCESS_KEY": key, "NANIO_SECRET_KEY": secret}
-    server = subprocess.Popen([*command, "--no-access-log", "--log-level", "error"], env=env)
-    variables = {
-        "AWS_ACCESS_KEY_ID": key, "AWS_SECRET_ACCESS_KEY": secret, "AWS_REGION": "us-east-1",
-        "AWS_ENDPOINT_URL": f"http://127.0.0.1:{port}", "AWS_ALLOW_HTTP": "true",
-    }  # fmt: skip
-    with pytest.MonkeyPatch.context() as patch:
-        for name, value in variables.items():
-            patch.setenv(name, value)
-        deadline = time.monotonic() + 20
-        while True:
-            with socket.socket() as probe:
-                if probe.connect_ex(("127.0.0.1", port)) == 0:
-                    break
-            assert time.monotonic() < deadline
-            time.sleep(0.05)
-        yield "s3://bucket/prefix"
-    server.terminate()
-    server.wait(10)
 
 
 @pytest.fixture

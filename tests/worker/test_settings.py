@@ -41,10 +41,10 @@ def test_the_environment_round_trips(set_variables: Callable[..., None]) -> None
         time_limit=1.5, memory_limit=10, cancel_grace=2, stop_grace=3, lost_after=4, max_attempts=5, retention=0, disk_quota=7,
         upload_expiry=8, max_running=9, webhook_networks="10.0.0.0/8,::1/128", read_memory=1 << 31,
     )  # fmt: skip
-    told = settings.to_environment()
-    set_variables(**{name.removeprefix("PLIANT_"): value for name, value in told.items()})
+    variables = settings.to_environment()
+    set_variables(**{name.removeprefix("PLIANT_"): value for name, value in variables.items()})
     assert Settings.from_environment() == settings
-    assert set(told) == {variable_of(name) for name in fields_of(Settings)}
+    assert set(variables) == {variable_of(name) for name in fields_of(Settings)}
 
 
 @pytest.mark.parametrize(

@@ -44,6 +44,9 @@ class Animation:
     names: list[str]
     """Names of the targets."""
 
+    frame: Callable[[int], Floats]
+    """Exact points `(P, 3)` of a frame, y up."""
+
     extras: dict[str, Any]
     """Metadata for the file: encoding and error bound, in the tracks' unit."""
 
@@ -80,6 +83,7 @@ def _per_frame(shapes: Floats, y_axis: str) -> Animation:
         target=target,
         weights=np.eye(frames, dtype=np.float32),
         names=[f"frame {index}" for index in range(frames)],
+        frame=lambda index: upright(shapes[index], y_axis),
         extras={"encoding": "one target per frame", "targets": frames, "max_error": worst},
     )
 
@@ -109,6 +113,7 @@ def _modes(shapes: Floats, y_axis: str, most: int) -> Animation:
         target=lambda index: targets[index],
         weights=weights,
         names=[f"mode {index}" for index in range(kept)],
+        frame=lambda index: upright(shapes[index], y_axis),
         extras={"encoding": "modes", "targets": kept, "error_bound": allowed, "max_error": worst, "rms_error": rms},
     )
 

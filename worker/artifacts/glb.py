@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.worker.artifacts.animation import Animation
 from pliant.worker.artifacts.geometry import Ints, Singles, vertex_normals
+from pliant.worker.artifacts.normals import fit_normals
 from pliant.worker.artifacts.view import View
 from pliant.worker.formats import Texture
 
@@ -76,6 +77,14 @@ class Buffer:
         self.bytes += -(-count * stride // 4) * 4
         return len(self.accessors) - 1
 
+    def add_zeros(self, count: int, *, normalised: bool) -> int:
+        """Append an accessor of zeros `(count, 3)`, which takes no bytes: signed bytes if `normalised`, else single precision."""
+        kind = COMPONENTS["int8" if normalised else "float32"]
+        self.accessors.append({"componentType": kind, "count": count, "type": "VEC3"})
+        if normalised:
+            self.accessors[-1]["normalized"] = True
+        return len(self.accessors) - 1
+
     def attach(self, content: bytes) -> int:
         """Append a file as a buffer view; return the view's index."""
         self.views.append({"buffer": 0, "byteOffset": self.bytes, "byteLength": len(content)})
@@ -113,7 +122,7 @@ def write_glb(
     node : dict
         Properties of the node besides the mesh, e.g. `scale`.
     normals : str
-        `static`: of the base shape; `animated`: displaced with every target; `none`.
+        `static`: of the base shape; `animated`: displaced with the targets; `none`.
     quantized : bool
         16-bit positions and 8-bit normals by KHR_mesh_quantization.
     colours : array of uint16, shape (P, 4), optional
@@ -133,10 +142,10 @@ def write_glb(
         positions, target, placed = _quantize(animation, node)
     smooth = normals if len(triangles) else "none"
     attributes = {"POSITION": buffer.add(positions, target=VERTICES, bounds=True, normalised=quantized)}
-    base_normals = vertex_normals(animation.base, triangles) if smooth != "none" else None
-    if base_normals is not None:
+    still, moving = _normals(animation, triangles, smooth)
+    if still is not None:
         attributes["NORMAL"] = buffer.add(
-            _in_bytes(base_normals) if quantized else base_normals, target=VERTICES, normalised=quantized
+            _in_bytes(still) if quantized else still, target=VERTICES, normalised=quantized
         )
     if colours is not None:
         attributes["COLOR_0"] = buffer.add(colours, target=VERTICES, normalised=True)
@@ -152,8 +161,7 @@ def write_glb(
         primitive["indices"] = buffer.add(
             triangles.reshape(-1).astype(np.uint16 if short else np.uint32), target=INDICES
         )
-    moving = base_normals if smooth == "animated" else None
-    primitive["targets"] = _targets(buffer, animation, target, quantized=quantized, triangles=triangles, base=moving)
+    primitive["targets"] = _targets(buffer, animation, target, quantized=quantized, normals=moving)
     times = (np.arange(len(animation.weights)) / fps).astype(np.float32)
     sampler = {
         "input": buffer.add(times, bounds=True),
@@ -205,28 +213,46 @@ def _add_camera(document: dict[str, Any], buffer: Buffer, view: View) -> None:
         )
 
 
-def _targets(
-    buffer: Buffer,
-    animation: Animation,
-    target: Callable[[int], Array],
-    *,
-    quantized: bool,
-    triangles: Ints,
-    base: Singles | None,
-) -> list[dict[str, int]]:
-    def turned(index: int) -> Singles:
-        # A mode's normals are those of the base displaced by the full mode: first order in the motion, as viewers blend them.
-        assert base is not None
-        return vertex_normals(animation.base + animation.target(index), triangles) - base
+def _normals(
+    animation: Animation, triangles: Ints, normals: str
+) -> tuple[Singles | None, Callable[[int], Singles | None] | None]:
+    """Return the normals of the base shape, and what gives their displacement for a target (None: zero); None for what is left out."""
+    if normals == "none":
+        return None, None
+    if normals == "static":
+        return vertex_normals(animation.base, triangles), None
+    if animation.extras["encoding"] == "modes":
+        fitted = fit_normals(animation, triangles)
+        animation.extras.update(normal_targets=len(fitted.targets), normal_rms_error=fitted.rms)
+        return fitted.base, lambda index: fitted.targets[index] if index < len(fitted.targets) else None
+    base = vertex_normals(animation.base, triangles)
+    return base, lambda index: vertex_normals(animation.base + animation.target(index), triangles) - base
 
-    found = []
+
+def _targets(
+    buffer: Buffer, animation: Animation, target: Callable[[int], Array], *, quantized: bool,
+    normals: Callable[[int], Singles | None] | None,
+) -> list[dict[str, int]]:  # fmt: skip
+    found, zeros = [], None
     for index in range(len(animation.names)):
         entry = {"POSITION": buffer.add(partial(target, index), target=VERTICES, bounds=True, normalised=quantized)}
-        if base is not None:
-            small = (lambda index=index: _in_bytes(turned(index))) if quantized else partial(turned, index)
-            entry["NORMAL"] = buffer.add(small, target=VERTICES, normalised=quantized)
+        if normals is not None:
+            if normals(index) is None:
+                # Left out, three.js would take the base's normals for the displacement.
+                zeros = buffer.add_zeros(len(animation.base), normalised=quantized) if zeros is None else zeros
+                entry["NORMAL"] = zeros
+            else:
+                entry["NORMAL"] = buffer.add(
+                    partial(_displacement, normals, index, quantized), target=VERTICES, normalised=quantized
+                )
         found.append(entry)
     return found
+
+
+def _displacement(normals: Callable[[int], Singles | None], index: int, quantized: bool) -> Array:
+    moved = normals(index)
+    assert moved is not None
+    return _in_bytes(moved) if quantized else moved
 
 
 def _in_bytes(normals: Singles) -> NDArray[np.int8]:

@@ -16,6 +16,7 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -182,7 +183,8 @@ class Attempt:
         """
         for artifact in finished.artifacts:
             key, file = f"{self.prefix}{artifact.name}", results / artifact.name
-            self.wait_for_store(lambda key=key, file=file: self.jobs.blobs.put(key, file))  # type: ignore[misc]
+            put = partial(self.jobs.blobs.put, key, file, media_type=artifact.media_type)
+            self.wait_for_store(put)
 
     def wait_for_store(self, call: Callable[[], object]) -> None:
         """Retry a call until the store answers, for at most `PATIENCE` seconds.

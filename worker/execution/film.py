@@ -70,22 +70,23 @@ def reconstruct_film(
     kinds_for(options)
     reporter = Reporter(on_progress if on_progress is not None else silent, shares=FILM_SHARES)
     halt = Halt(should_stop, options.time_limit)
-    reporter.part("track", 0.0)
-    began = time.perf_counter()
-    try:
-        tracked = track_film(
-            source, options, scratch, bounds=bounds, threads=threads,
-            on_progress=lambda done, followed: reporter.part("track", done, followed=followed),
-            should_stop=halt.requested,
-        )  # fmt: skip
-    except Interrupted:
-        halt.check()
-        raise
-    inputs = read_tracked(scratch / "tracks.npz", tracked, options)
-    spent = {"track": time.perf_counter() - began}
-    directory.mkdir(parents=True, exist_ok=True)
-    artifacts = [_moved(scratch / name, directory) for name in FILES if (scratch / name).exists()]
-    finished = solve_and_write(inputs, options, directory, reporter=reporter, halt=halt, spent=spent)
+    with reporter.ticking():
+        reporter.part("track", 0.0)
+        began = time.perf_counter()
+        try:
+            tracked = track_film(
+                source, options, scratch, bounds=bounds, threads=threads,
+                on_progress=lambda done, followed: reporter.part("track", done, followed=followed),
+                should_stop=halt.requested,
+            )  # fmt: skip
+        except Interrupted:
+            halt.check()
+            raise
+        inputs = read_tracked(scratch / "tracks.npz", tracked, options)
+        spent = {"track": time.perf_counter() - began}
+        directory.mkdir(parents=True, exist_ok=True)
+        artifacts = [_moved(scratch / name, directory) for name in FILES if (scratch / name).exists()]
+        finished = solve_and_write(inputs, options, directory, reporter=reporter, halt=halt, spent=spent)
     return replace(
         finished,
         artifacts=(*artifacts, *finished.artifacts),

@@ -17,6 +17,9 @@ from pliant.worker.errors import Interrupted, TimedOut
 from pliant.worker.execution.progress import Reporter
 from pliant.worker.formats import Inputs
 
+EXPORT_SECONDS = 5e-7
+"""Seconds per frame and point of writing a file whose `share` is 1, measured on 99 face scans of 29,299 points."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Finished:
@@ -108,7 +111,8 @@ def reconstruct(
     kinds_for(options, size=(inputs.tracks.num_frames, inputs.tracks.num_points))
     reporter = Reporter(on_progress if on_progress is not None else silent)
     halt = Halt(should_stop, options.time_limit)
-    return solve_and_write(inputs, options, directory, reporter=reporter, halt=halt, solver=solver)
+    with reporter.ticking():
+        return solve_and_write(inputs, options, directory, reporter=reporter, halt=halt, solver=solver)
 
 
 def solve_and_write(
@@ -137,6 +141,9 @@ def solve_and_write(
         As in `reconstruct`.
     """
     directory.mkdir(parents=True, exist_ok=True)
+    size = inputs.tracks.num_frames, inputs.tracks.num_points
+    written = kinds_for(options, size=size, textured=inputs.texture is not None)
+    reporter.export_seconds = EXPORT_SECONDS * size[0] * size[1] * sum(kind.share for kind in written)
     reporter.part("loading", 1.0)
     began = time.perf_counter()
     solution = (solver or solve)(
@@ -213,6 +220,7 @@ def _report_step(reporter: Reporter, step: Step) -> None:
         max_reweightings=step.max_reweightings,
         objective=step.objective,
         residual=step.residual,
+        seconds_left=step.seconds_left,
     )
 
 

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from typing import Any
 
 from pliant.schemas.job import FollowedPoints, Progress
 
 SHARES = {"loading": (0.0, 0.02), "solving": (0.02, 0.85), "exporting": (0.85, 1.0)}
-"""Start and end of each part of a job as fractions of the whole."""
+"""Start and end of each part of a job as fractions of the whole, where no time is known."""
 
 FILM_SHARES = {"track": (0.0, 0.5), "loading": (0.5, 0.51), "solving": (0.51, 0.93), "exporting": (0.93, 1.0)}
 """The same for a film, from the timings of films of a few seconds on two cores."""
@@ -18,15 +21,21 @@ FILM_SHARES = {"track": (0.0, 0.5), "loading": (0.5, 0.51), "solving": (0.51, 0.
 WORTH_ESTIMATING = 0.05
 """Fraction from which the remaining time is extrapolated from the elapsed time."""
 
+TICK = 1.0
+"""Seconds of silence after which the last progress is repeated, with the time that is left by then."""
+
 
 @dataclass(slots=True)
 class Reporter:
     """Combines the progress of parts into one fraction that never decreases.
 
+    Where a part states its remaining seconds, the fraction is the elapsed time over the whole. Otherwise the fraction follows from
+    `shares`, and the remaining time is extrapolated from the elapsed time.
+
     Parameters
     ----------
     on_progress : callable
-        Called with every `Progress`.
+        Called with every `Progress`, by one thread at a time.
     clock : callable
         Monotonic seconds.
     shares : mapping
@@ -36,9 +45,16 @@ class Reporter:
     on_progress: Callable[[Progress], None]
     clock: Callable[[], float] = time.monotonic
     shares: Mapping[str, tuple[float, float]] = field(default_factory=lambda: SHARES)
+    export_seconds: float = 0.0
+    """Expected duration of the part `exporting`."""
     _began: float | None = None
+    _export_began: float | None = None
     _furthest: float = 0.0
-    _last: dict[str, int | float | None] = field(default_factory=dict)
+    _sent: float = 0.0
+    _left: tuple[float, float] | None = None
+    """Seconds, and when they were estimated."""
+    _last: dict[str, Any] = field(default_factory=dict)
+    _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def part(
         self,
@@ -50,6 +66,7 @@ class Reporter:
         max_reweightings: int | None = None,
         objective: float | None = None,
         residual: float | None = None,
+        seconds_left: float | None = None,
         followed: FollowedPoints | None = None,
     ) -> None:
         """Report that the share `done` (0 to 1) of a part is done; omitted numbers keep their last value.
@@ -60,27 +77,77 @@ class Reporter:
             A key of `shares`.
         stage : str, optional
             Stage to report; the name of the part by default.
+        seconds_left : float, optional
+            Until this part ends.
         followed : FollowedPoints, optional
             Points of the film that were just tracked; not repeated later.
         """
-        now = self.clock()
-        if self._began is None:
-            self._began = now
-        given = {
-            "reweighting": reweighting, "max_reweightings": max_reweightings, "objective": objective, "residual": residual,
-        }  # fmt: skip
-        self._last |= {name: value for name, value in given.items() if value is not None}
-        low, high = self.shares[part]
-        self._furthest = max(self._furthest, low + (high - low) * min(max(done, 0.0), 1.0))
-        fraction, spent = self._furthest, now - self._began
-        left = spent * (1 - fraction) / fraction if fraction >= WORTH_ESTIMATING else None
+        with self._lock:
+            now = self.clock()
+            if self._began is None:
+                self._began = now
+            given = {
+                "reweighting": reweighting, "max_reweightings": max_reweightings, "objective": objective, "residual": residual,
+            }  # fmt: skip
+            self._last |= {name: value for name, value in given.items() if value is not None}
+            self._last["stage"] = stage or part
+            done = min(max(done, 0.0), 1.0)
+            low, high = self.shares[part]
+            spent = now - self._began
+            left = self._known_left(part, done, seconds_left, now)
+            if left is None:
+                self._furthest = max(self._furthest, low + (high - low) * done)
+                if self._furthest >= WORTH_ESTIMATING:
+                    left = spent * (1 - self._furthest) / self._furthest
+            else:
+                self._furthest = max(self._furthest, spent / (spent + left) if spent + left > 0 else 0.0)
+            self._left = None if left is None else (left, now)
+            self._send(now, left, followed)
+
+    @contextmanager
+    def ticking(self) -> Iterator[None]:
+        """Repeat the last progress whenever nothing was reported for `TICK` seconds, from a thread of its own."""
+        ended = threading.Event()
+
+        def repeat() -> None:
+            while not ended.wait(TICK / 2):
+                self.tick()
+
+        thread = threading.Thread(target=repeat, name="pliant-ticks", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            thread.join()
+
+    def tick(self) -> None:
+        """Repeat the last progress if nothing was reported for `TICK` seconds, with the time that is left by now."""
+        with self._lock:
+            now = self.clock()
+            if self._began is None or now - self._sent < TICK or self._furthest == 1.0:
+                return
+            left = None if self._left is None else max(0.0, self._left[0] - (now - self._left[1]))
+            self._send(now, left, None)
+
+    def _known_left(self, part: str, done: float, seconds_left: float | None, now: float) -> float | None:
+        if part == "exporting" and done == 1.0:
+            return 0.0
+        if part == "exporting" and self.export_seconds > 0:
+            if self._export_began is None:
+                self._export_began = now
+            # The plan counts less, and the time spent more, the more is done.
+            return (1 - done) * ((1 - done) * self.export_seconds + now - self._export_began)
+        return None if seconds_left is None else seconds_left + self.export_seconds
+
+    def _send(self, now: float, left: float | None, followed: FollowedPoints | None) -> None:
+        self._sent = now
         self.on_progress(
             Progress.model_validate(
                 {
                     **self._last,
-                    "stage": stage or part,
                     "followed": followed,
-                    "fraction": fraction,
+                    "fraction": self._furthest,
                     "seconds_left": None if left is None else round(left, 1),
                     "updated_at": datetime.now(UTC),
                 }

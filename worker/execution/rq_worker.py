@@ -24,6 +24,7 @@ from pliant.worker.execution import attempt as work
 from pliant.worker.execution.monitor import Patience, Watch, finalize
 from pliant.worker.execution.workdir import clean_up
 from pliant.worker.jobs.lifecycle import ACTIVE
+from pliant.worker.jobs.submission import order_waiting
 from pliant.worker.processes.containment import die_with_parent
 from pliant.worker.processes.memory import memory_for_a_job
 from pliant.worker.records import Records
@@ -233,6 +234,7 @@ class PliantWorker(Worker):
             if settled is not None and settled.job.status is Status.QUEUED:
                 fresh = settled.attempt_id
                 patience.retry(lambda: self._deliveries.push(watch.id, fresh, front=True))  # it has waited before
+                patience.retry(lambda: order_waiting(self._records, self._deliveries, [settled.owner]))
             patience.retry(lambda: self._deliveries.remove(job.id))
         except StoreUnavailable as error:
             logger.warning("job %s: %s; the reconciler will requeue it", watch.id, error)

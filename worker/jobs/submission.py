@@ -3,21 +3,28 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 
 from pliant.schemas.job import Priority, Status
 from pliant.schemas.options import Options
-from pliant.worker.errors import QuotaExceeded, StoreUnavailable, TooManyQueued, UnknownJob
+from pliant.worker.errors import QuotaExceeded, StoreUnavailable, TooManyQueued
 from pliant.worker.records import Records, Stored, Webhook
 from pliant.worker.settings import Settings
 from pliant.worker.store.blobs import Blobs
 from pliant.worker.store.queue import Queue
-from pliant.worker.uploads.service import Uploads
+from pliant.worker.uploads.shared import open_uploads
 
 RANKS: dict[Priority, int] = {"high": 0, "normal": 1, "low": 2}
 """Smaller comes first."""
+
+
+def order_waiting(records: Records, queue: Queue, owners: Collection[str]) -> None:
+    """Order the waiting jobs of each of these owners by priority, on the places that they hold: nobody else's job moves."""
+    waiting = set(queue.waiting())
+    beats = [each for each in records.beats(records.ids(Status.QUEUED)).values() if each.attempt_id in waiting]
+    for owner in owners:
+        queue.order({each.attempt_id: RANKS[each.priority] for each in beats if each.owner == owner})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -106,24 +113,13 @@ class Acceptance:
             else:
                 self.queue.push(stored.job.id, stored.attempt_id)
                 if stored.job.priority != "normal":
-                    self._order(stored.owner)
+                    order_waiting(self.records, self.queue, [stored.owner])
         except StoreUnavailable:
             return kept  # the record is stored, and the reconciler adds the missing queue entry
         return kept
 
-    def _order(self, owner: str) -> None:
-        """Order the waiting jobs of one owner by priority, on the places that they hold: nobody else's job moves."""
-        waiting = set(self.queue.waiting())
-        ranks: dict[str, int] = {}
-        for id in self.records.ids(Status.QUEUED):
-            with suppress(UnknownJob):
-                held = self.records.get(id)
-                if held.owner == owner and held.attempt_id in waiting:
-                    ranks[held.attempt_id] = RANKS[held.job.priority]
-        self.queue.order(ranks)
-
     def _uploaded(self) -> int:
-        return Uploads.open(self.settings).used()
+        return open_uploads(self.settings, self.blobs).used()
 
     def _over_running_limit(self, stored: Stored) -> bool:
         """Whether the new job is held back until fewer jobs of its owner run; the reconciler queues it then.

@@ -30,6 +30,7 @@ from pliant.worker.execution.failures import worker_lost
 from pliant.worker.ids import new_attempt_id
 from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.service import Jobs
+from pliant.worker.jobs.submission import order_waiting
 from pliant.worker.records import Stored, utc_now
 from pliant.worker.settings import Settings
 from pliant.worker.store.schema import CURRENT, prepare
@@ -114,12 +115,14 @@ def restore_backup(settings: Settings, source: Path) -> Summary:
     for key in manifest["blobs"]:
         jobs.blobs.put(key, source / "blobs" / key)
     snapshot.write_rest(json.loads(rest.read_text(encoding="utf-8")))
-    count = 0
+    owners = []
     for line in _lines(records):
-        _queue_again(jobs, snapshot.write(json.loads(line)))
-        count += 1
+        stored = snapshot.write(json.loads(line))
+        _queue_again(jobs, stored)
+        owners.append(stored.owner)
+    order_waiting(jobs.records, jobs.queue, set(owners))
     sizes = manifest["blobs"].values()
-    return Summary(jobs=count, blobs=len(sizes), bytes=sum(sizes), copied=len(sizes))
+    return Summary(jobs=len(owners), blobs=len(sizes), bytes=sum(sizes), copied=len(sizes))
 
 
 def _copy_blobs(jobs: Jobs, stored: Stored, target: Path, kept: dict[str, int]) -> int | None:

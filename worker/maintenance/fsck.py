@@ -15,7 +15,7 @@ from pliant.worker.errors import UnknownJob
 from pliant.worker.jobs.lifecycle import ACTIVE
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.records import Stored
-from pliant.worker.uploads.service import Uploads
+from pliant.worker.uploads.shared import open_uploads
 
 
 def findings(jobs: Jobs, *, pause: float = 5.0) -> list[str]:
@@ -40,7 +40,7 @@ def _look(jobs: Jobs) -> Iterator[str]:
         yield from _of_record(stored, sizes)
     yield from _of_files(jobs, records, sizes)
     yield from _of_queue(jobs, records)
-    yield from Uploads.open(jobs.settings).findings(jobs.clock())
+    yield from open_uploads(jobs.settings, jobs.blobs).findings(jobs.clock())
     used, counted = jobs.records.used(), sum(stored.bytes for stored in records)
     if used != counted:
         yield f"The jobs hold {counted:,} bytes, but {used:,} are counted."

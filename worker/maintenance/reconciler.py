@@ -24,6 +24,7 @@ from pliant.worker.execution.workdir import clean_up
 from pliant.worker.ids import new_attempt_id
 from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.service import Jobs
+from pliant.worker.jobs.submission import RANKS, order_waiting
 from pliant.worker.jobs.validation import LARGEST_PAGE
 from pliant.worker.maintenance.retention import Retention, is_wanted
 from pliant.worker.records import Beat
@@ -126,6 +127,7 @@ class Reconciler:
                 self._say(id, f"The worker was lost; the job is {after.job.status.value} now.")
                 if after.job.status is Status.QUEUED:
                     self.jobs.queue.push(id, fresh, front=True)  # it has been queued before
+                    order_waiting(records, self.jobs.queue, [beat.owner])
                 self._taken[id] = self.clock()
                 self._remove_unwanted(id)
 
@@ -147,18 +149,20 @@ class Reconciler:
             if absent[id].attempt_id not in noted:
                 queue.hold(absent[id].attempt_id)
         free = {id: beat.attempt_id for id, beat in absent.items() if id not in held}
-        for id, attempt_id in free.items():
-            if attempt_id in noted:
-                self._queue_again(id, attempt_id, front=False)
+        back = {id for id, attempt_id in free.items() if attempt_id in noted and self._queue_again(id, attempt_id)}
         lost = {id: attempt_id for id, attempt_id in free.items() if attempt_id not in noted}
         for id, still in self._queued.look(dict(lost), gap).items():
             if still >= FORGOTTEN_AFTER and self._queue_again(id, lost[id], front=True):
                 self._say(id, "The job was missing from the queue; queued again.")
+                back.add(id)
+        if back:
+            order_waiting(records, queue, {absent[id].owner for id in back})
 
     def _over_the_limit(self, queued: Mapping[str, Beat], absent: Mapping[str, Beat]) -> set[str]:
         """Return the queued jobs to hold back because their owner has reached the limit of running jobs.
 
-        Jobs in the queue, or on their way to a worker, count as running; the remaining capacity goes to the oldest.
+        Jobs in the queue, or on their way to a worker, count as running; the remaining capacity goes to the oldest of the
+        highest priority.
         """
         usual = self.jobs.settings.max_running
         if usual == 0 and all(beat.max_running is None for beat in absent.values()):
@@ -168,14 +172,16 @@ class Reconciler:
         taken = Counter(beat.owner for beat in active.values())
         taken.update(beat.owner for id, beat in queued.items() if id not in absent)
         held: set[str] = set()
-        for id, beat in absent.items():  # oldest first, as returned by `ids`
+        for id, beat in sorted(
+            absent.items(), key=lambda each: RANKS[each[1].priority]
+        ):  # `ids` returns the oldest first
             taken[beat.owner] += 1
             most = usual if beat.max_running is None else beat.max_running
             if 0 < most < taken[beat.owner]:
                 held.add(id)
         return held
 
-    def _queue_again(self, id: str, old: str, *, front: bool) -> bool:
+    def _queue_again(self, id: str, old: str, *, front: bool = False) -> bool:
         """Queue a job under a new attempt id; return False if another process did so first."""
         fresh = new_attempt_id(id)
         try:

@@ -12,7 +12,7 @@ from pliant.worker.errors import UnknownJob
 from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.jobs.validation import LARGEST_PAGE
-from pliant.worker.uploads.service import Uploads
+from pliant.worker.uploads.shared import open_uploads
 
 logger = logging.getLogger(__name__)
 
@@ -93,7 +93,7 @@ class Retention:
 
     def _expire_uploads(self) -> None:
         """Remove uploads that were neither continued nor used within the retention period."""
-        for id in Uploads.open(self.jobs.settings).expire(self.jobs.clock()):
+        for id in open_uploads(self.jobs.settings, self.jobs.blobs).expire(self.jobs.clock()):
             logger.info("upload %s: expired and removed", id)
 
     def _remove_deleted(self) -> None:

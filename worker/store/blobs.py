@@ -15,7 +15,7 @@ from urllib.parse import unquote, urlsplit
 
 import obstore
 from obstore.exceptions import BaseError
-from obstore.store import MemoryStore, ObjectStore, from_url
+from obstore.store import MemoryStore, ObjectStore, S3Store, from_url
 from pliant.worker.errors import StoreUnavailable
 from pliant.worker.store.calls import RemoteCalls
 
@@ -56,6 +56,16 @@ class Blob:
     key: str
     size: int
     """Bytes."""
+
+    def link(self, *, seconds: float) -> str | None:
+        """Return a URL from which anybody can read the file for some seconds, None if the store has no such URLs.
+
+        Raises
+        ------
+        StoreUnavailable
+            The credentials to sign it with cannot be read.
+        """
+        return self._blobs.link(self.key, seconds=seconds)
 
     def read(self, start: int = 0, end: int | None = None) -> Iterator[bytes]:
         """Yield the bytes from `start` up to, not including, `end` (None: to the end), in chunks.
@@ -112,16 +122,38 @@ class Blobs:
             options: Any = {**CLIENT, **client_options(os.environ)}
             return cls(from_url(url, client_options=options, retry_config=RETRIES), remote=True)
 
-    def put(self, key: str, file: Path) -> int:
+    def put(self, key: str, file: Path, *, media_type: str = "application/octet-stream") -> int:
         """Store a file atomically; return its size in bytes.
 
-        A local store links the file if possible instead of copying it: do not write to it afterwards.
+        A local store links the file if possible instead of copying it: do not write to it afterwards. S3 keeps the media type,
+        and the last part of the key as the file's name, for those who follow a `Blob.link`.
         """
         size = file.stat().st_size
         local = self._local(key)
         if local is None or not _linked(file, local):
-            self._call(lambda: obstore.put(self._store, key, file), seconds=ANSWER_WITHIN + size / SLOWEST)
+            named = f'attachment; filename="{key.rpartition("/")[2]}"'
+            shown: Any = {"Content-Type": media_type, "Content-Disposition": named} if self._calls is not None else None
+            self._call(
+                lambda: obstore.put(self._store, key, file, attributes=shown),
+                seconds=ANSWER_WITHIN + size / SLOWEST,
+            )
         return size
+
+    def write(self, key: str, data: bytes) -> None:
+        """Store bytes atomically."""
+        self._call(lambda: obstore.put(self._store, key, data), seconds=ANSWER_WITHIN + len(data) / SLOWEST)
+
+    @property
+    def remote(self) -> bool:
+        """True for an object store that other hosts can reach, too."""
+        return self._calls is not None
+
+    def link(self, key: str, *, seconds: float) -> str | None:
+        """Return a URL from which anybody can read a file for some seconds, None if the store is not S3. Raises as `Blob.link`."""
+        store = self._store
+        if not isinstance(store, S3Store):
+            return None
+        return self._call(lambda: obstore.sign(store, "GET", key, timedelta(seconds=seconds)))
 
     def get(self, key: str) -> Blob:
         """Return a stored file.

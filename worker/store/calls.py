@@ -1,16 +1,20 @@
-"""Calls to a remote store: with a time limit, in a small thread pool, and rejected when too many are waiting."""
+"""Limits for calls to stores that may hang, so that requests which need nothing of them are served."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from typing import TypeVar
 
+import redis
 from pliant.worker.errors import StoreUnavailable
 
 AT_ONCE = 12
-"""Maximum number of concurrent calls."""
+"""Maximum number of concurrent calls of the blob store."""
 
 WAITING = 12
 """Maximum number of waiting calls. With the concurrent ones they are fewer than the 40 request threads of the service, so that
@@ -55,3 +59,75 @@ class RemoteCalls:
         finally:
             with self._lock:
                 self._waiting -= 1
+
+
+COMMANDS = 24
+"""Maximum number of commands that wait for Redis at once, fewer than the 40 request threads of the service."""
+
+TURN = 1.0
+"""Seconds that a command waits until fewer do."""
+
+SILENT_AFTER = 2.0
+"""Seconds without an answer, although a command waits for one, after which the server counts as silent."""
+
+PROBES = 4
+"""Commands that wait for a silent server; others are refused at once, except one each second."""
+
+
+@dataclass(slots=True)
+class SilentServer:
+    """Counts the commands that wait for one Redis server, and refuses further ones while it does not answer.
+
+    Without it each request would wait for the full time limit, and those without a thread even longer.
+    """
+
+    clock: Callable[[], float] = time.monotonic
+    _room: threading.Condition = field(default_factory=threading.Condition)
+    _since: dict[object, float] = field(default_factory=dict)
+    """When each waiting command was sent."""
+    _answered: float = 0.0
+    _silent: bool = False
+    """The last command that ended waited too long, in vain."""
+    _probed: float = 0.0
+
+    @contextmanager
+    def call(self) -> Iterator[None]:
+        """Send a command in this block.
+
+        Raises
+        ------
+        redis.TimeoutError
+            It was not sent: the server is silent, or too many commands are waiting.
+        """
+        command = object()
+        with self._room:
+            self._wait_for_turn()
+            self._since[command] = self._probed = self.clock()
+        answered = True
+        try:
+            yield
+        except (redis.ConnectionError, redis.TimeoutError):
+            answered = False
+            raise
+        finally:
+            with self._room:
+                now, since = self.clock(), self._since.pop(command)
+                if answered:
+                    self._answered, self._silent = now, False
+                elif now - since > SILENT_AFTER:
+                    self._silent = True
+                self._room.notify()
+
+    def _wait_for_turn(self) -> None:
+        until = self.clock() + TURN
+        while len(self._since) >= COMMANDS and not self._is_silent():
+            left = until - self.clock()
+            if left <= 0:
+                raise redis.TimeoutError("too many commands are waiting for the server")
+            self._room.wait(left)
+        if self._is_silent() and len(self._since) >= PROBES and self.clock() < self._probed + 1:
+            raise redis.TimeoutError("the server does not answer")
+
+    def _is_silent(self) -> bool:
+        oldest = min(self._since.values(), default=self.clock())
+        return self._silent or self.clock() - max(oldest, self._answered) > SILENT_AFTER

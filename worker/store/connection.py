@@ -4,17 +4,50 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import redis
 from pliant.worker.errors import StoreUnavailable
+from pliant.worker.store.calls import SilentServer
 from redis.backoff import ExponentialWithJitterBackoff
+from redis.client import Pipeline
 from redis.retry import Retry
 
-ANSWER_WITHIN = 10.0
-"""Seconds a command may take; while Redis hangs, requests end with 503 after this time."""
+CONNECT_WITHIN = 3.0
+"""Seconds to open a connection."""
+
+ANSWER_WITHIN = 7.0
+"""Seconds a command may take. Together with `CONNECT_WITHIN` the time after which a request ends with 503 while Redis hangs: 10 s."""
 
 BLOCK_WITHIN = 30.0
 """The same for blocking commands: a worker that waits for a delivery."""
+
+
+_SILENCE: dict[str, SilentServer] = {}
+"""Of each server that this process has a client for."""
+
+
+class _Client(redis.Redis):
+    """Sends commands and pipelines only while the server answers. Subscriptions are not counted: they wait for long."""
+
+    server: SilentServer
+
+    def execute_command(self, *command: Any, **options: Any) -> Any:
+        with self.server.call():
+            return super().execute_command(*command, **options)  # type: ignore[no-untyped-call]
+
+    def pipeline(self, transaction: bool = True, shard_hint: Any = None) -> _Pipeline:
+        pipe = _Pipeline(self.connection_pool, self.response_callbacks, transaction, shard_hint)
+        pipe.server = self.server
+        return pipe
+
+
+class _Pipeline(Pipeline):
+    server: SilentServer
+
+    def execute(self, raise_on_error: bool = True) -> list[Any]:
+        with self.server.call():
+            return super().execute(raise_on_error)
 
 
 def connect(url: str, *, decode: bool, retries: int = 3, answer_within: float | None = None) -> redis.Redis:
@@ -30,17 +63,20 @@ def connect(url: str, *, decode: bool, retries: int = 3, answer_within: float | 
         Retries after a broken connection, with growing pauses of up to 0.5 s. All writes are compare-and-set or
         idempotent, so a retry after a lost reply is harmless. Timeouts are not retried: that would multiply the wait.
     answer_within : float, optional
-        Seconds a command may take; `ANSWER_WITHIN` by default.
+        Seconds a command may take; `ANSWER_WITHIN` by default, and then few commands wait at once while the server is silent.
     """
     seconds = ANSWER_WITHIN if answer_within is None else answer_within
-    return redis.Redis.from_url(
+    client = (redis.Redis if answer_within is not None else _Client).from_url(
         url,
         decode_responses=decode,
-        socket_connect_timeout=min(5.0, seconds),
+        socket_connect_timeout=min(CONNECT_WITHIN, seconds),
         socket_timeout=seconds,
         health_check_interval=15,
         retry=Retry(ExponentialWithJitterBackoff(base=0.05, cap=0.5), retries, (redis.ConnectionError,)),
     )
+    if isinstance(client, _Client):
+        client.server = _SILENCE.setdefault(url, SilentServer())
+    return client
 
 
 def check_server(url: str, *, answer_within: float = 3.0) -> str:

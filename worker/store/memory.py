@@ -163,7 +163,8 @@ class MemoryRecords(Records):
         with self._lock:
             held = {id: self._records[id] for id in ids if id in self._records}
             return {
-                id: Beat(each.attempt_id, self._beats[id], each.owner, each.max_running) for id, each in held.items()
+                id: Beat(each.attempt_id, self._beats[id], each.owner, each.max_running, each.job.priority)
+                for id, each in held.items()
             }
 
     def events(self, id: str, *, after: str | None) -> list[Event]:

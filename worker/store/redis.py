@@ -2,7 +2,8 @@
 
 Keys, all under one prefix::
 
-    job:<id>              hash: version, status, token (the attempt id), owner, sort, bytes, key, beat, most, body (JSON of `Stored`)
+    job:<id>              hash: version, status, token (the attempt id), owner, sort, bytes, key, beat, most, priority,
+                          body (JSON of `Stored`)
     index:*:<status>      sorted set of sort keys, all jobs of a status; index:@<owner>:<status> the owner's
     events:<id>, log:<id> stream and list, both capped
     key:<digest>          the job of an idempotency key
@@ -43,7 +44,7 @@ from pliant.worker.store.connection import reachable
 
 # ARGV: 1 prefix, 2 id, 3 version, 4 status, 5 attempt id, 6 owner, 7 sort key, 8 bytes, 9 key digest, 10 body, 11 event, 12 data, 13 cap,
 # 14 most queued jobs of the owner (0: any), 15 most running ones as its owner's token states ('': nothing),
-# 16 bytes that all jobs may hold (0: any)
+# 16 bytes that all jobs may hold (0: any), 17 priority
 _CREATE = """
 local at = ARGV[1]
 if ARGV[9] ~= '' then
@@ -58,7 +59,7 @@ if bytes > 0 and tonumber(redis.call('GET', at .. 'used') or 0) + tonumber(ARGV[
 if ARGV[9] ~= '' then redis.call('SET', at .. 'key:' .. ARGV[9], ARGV[2]) end
 redis.call('HSET', at .. 'job:' .. ARGV[2], 'version', ARGV[3], 'status', ARGV[4], 'token', ARGV[5], 'owner', ARGV[6],
   'sort', ARGV[7], 'bytes', ARGV[8], 'key', ARGV[9], 'body', ARGV[10], 'beat', 0,
-  'most', ARGV[15])
+  'most', ARGV[15], 'priority', ARGV[17])
 redis.call('ZADD', at .. 'index:*:' .. ARGV[4], 0, ARGV[7])
 redis.call('ZADD', at .. 'index:@' .. ARGV[6] .. ':' .. ARGV[4], 0, ARGV[7])
 redis.call('INCRBY', at .. 'used', ARGV[8])
@@ -147,7 +148,7 @@ class RedisRecords(Records):
                 args=[
                     self._at, job.id, stored.version, job.status.value, stored.attempt_id, stored.owner, stored.sort_key,
                     stored.bytes, stored.key or "", stored.model_dump_json(), name, data, events_kept(stored),
-                    max_queued, "" if stored.max_running is None else stored.max_running, max_bytes,
+                    max_queued, "" if stored.max_running is None else stored.max_running, max_bytes, job.priority,
                 ]
             )  # fmt: skip
         if taken == _FULL:
@@ -262,11 +263,11 @@ class RedisRecords(Records):
         with reachable():
             pipe = self._redis.pipeline(transaction=False)
             for id in wanted:
-                pipe.hmget(f"{self._at}job:{id}", "token", "beat", "owner", "most")
+                pipe.hmget(f"{self._at}job:{id}", "token", "beat", "owner", "most", "priority")
             answers = pipe.execute()
         return {
-            id: Beat(attempt_id, int(beat), owner, int(most) if most else None)
-            for id, (attempt_id, beat, owner, most) in zip(wanted, answers, strict=True)
+            id: Beat(attempt_id, int(beat), owner, int(most) if most else None, priority or "normal")
+            for id, (attempt_id, beat, owner, most, priority) in zip(wanted, answers, strict=True)
             if attempt_id is not None
         }
 

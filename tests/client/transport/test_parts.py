@@ -114,16 +114,16 @@ def test_options_are_a_record_or_a_mapping() -> None:
 def test_a_body_is_streamed_counted_and_can_be_sent_again(tmp_path: Path) -> None:
     big = tmp_path / "big.bin"
     big.write_bytes(bytes(300_000))
-    told: list[tuple[int, int]] = []
-    form = Form(fields={"name": "ü"}, files={"tracks": big}, on_upload=lambda *now: told.append(now))
+    updates: list[tuple[int, int]] = []
+    form = Form(fields={"name": "ü"}, files={"tracks": big}, on_upload=lambda *now: updates.append(now))
     for _ in range(2):
-        told.clear()
+        updates.clear()
         with form.open() as files:
             request = httpx.Client().build_request("POST", "http://x/", data=dict(form.fields), files=files)
             pieces = list(request.stream)
         assert max(map(len, pieces)) <= 65536
         assert int(request.headers["content-length"]) == sum(map(len, pieces))
-        assert told[-1] == (300_000, 300_000)
+        assert updates[-1] == (300_000, 300_000)
         body = b"".join(pieces)
         assert 'name="name"\r\n\r\nü\r\n'.encode() in body
         assert b'name="tracks"; filename="big.bin"' in body

@@ -62,14 +62,14 @@ def submit(kind: str, *args: Any, url: str, **kwargs: Any) -> Any:
 @pytest.mark.parametrize("kind", ["sync", "async"])
 def test_an_interrupted_upload_resumes(kind: str, service_url: str, breaking: Callable[[int, int], list[int]]) -> None:
     began = breaking(3, 2)
-    told: list[int] = []
-    job = submit(kind, POINTS, url=service_url, mesh="none", on_upload=lambda done, _: told.append(done))
+    updates: list[int] = []
+    job = submit(kind, POINTS, url=service_url, mesh="none", on_upload=lambda done, _: updates.append(done))
     assert job.record.interpretation.num_points == 30_000
     assert began[0] == 0
     assert len(began) >= 4
     assert sorted(began) == began, "no try began before the one before it"
     assert began[-1] > 0
-    assert told[-1] == max(told) > POINTS.nbytes
+    assert updates[-1] == max(updates) > POINTS.nbytes
     with Client(service_url) as client, suppress(NotAllowedNow):  # it may be done already
         client.cancel(job.id)
 

@@ -93,16 +93,16 @@ def test_wrong_revoked_and_expired_tokens_have_codes_of_their_own(guarded: Runni
     _, short = guarded.tokens.create("short", expires=timedelta(seconds=0.05))
     time.sleep(0.1)
 
-    def said(value: str) -> tuple[int, str, bool]:
+    def answer_to(value: str) -> tuple[int, str, bool]:
         answer = httpx.get(f"{guarded.url}/v1/jobs", headers={"Authorization": f"Bearer {value}"})
         return answer.status_code, answer.json()["code"], 'error="invalid_token"' in answer.headers["www-authenticate"]
 
     assert httpx.get(f"{guarded.url}/v1/jobs").json()["code"] == "unauthorized"
-    assert said("nonsense") == (401, "invalid_token", True)
-    assert said(text[:-2] + "zz") == (401, "invalid_token", True)
-    assert said(short) == (401, "expired_token", True)
+    assert answer_to("nonsense") == (401, "invalid_token", True)
+    assert answer_to(text[:-2] + "zz") == (401, "invalid_token", True)
+    assert answer_to(short) == (401, "expired_token", True)
     guarded.tokens.revoke(token.id)
-    assert said(text) == (401, "invalid_token", True)
+    assert answer_to(text) == (401, "invalid_token", True)
 
 
 def test_the_body_of_a_request_without_a_token_is_never_read(guarded: Running) -> None:

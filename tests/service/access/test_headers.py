@@ -1,4 +1,4 @@
-"""What is said with every answer, and for which hosts there is one."""
+"""Headers of every answer, and the hosts that are accepted."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def test_a_list_of_hosts_is_complete(serve: Serve) -> None:
 
 
 def test_on_another_address_any_name_is_answered_unless_there_is_a_list(serve: Serve) -> None:
-    running = serve(host="0.0.0.0")  # what it is told, not what the test binds
+    running = serve(host="0.0.0.0")  # the setting; the test binds 127.0.0.1
     assert httpx.get(f"{running.url}/healthz", headers={"Host": "anything.example"}).status_code == 200
 
 

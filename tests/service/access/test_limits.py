@@ -1,4 +1,4 @@
-"""What one client may use: requests, queued jobs, the size of a body; and what it is told beyond that."""
+"""Limits of one client: requests, queued jobs, size of a body; and the answers beyond them."""
 
 from __future__ import annotations
 

@@ -108,9 +108,9 @@ def test_level_and_format_are_set_once_for_the_process(capsys: pytest.CaptureFix
         configure_logging("warning", "console")
         logging.getLogger("pliant.test").info("quiet")
         logging.getLogger("pliant.test").warning("loud")
-        said = capsys.readouterr().err
-        assert "quiet" not in said
-        assert said.endswith("WARNING pliant.test [-]: loud\n") or "pliant.test [" in said
+        printed = capsys.readouterr().err
+        assert "quiet" not in printed
+        assert printed.endswith("WARNING pliant.test [-]: loud\n") or "pliant.test [" in printed
     finally:
         root.handlers[:] = before
         root.setLevel(level)

@@ -22,7 +22,7 @@ def read(text: str) -> Numbers:
         for family in text_string_to_metric_families(text)
         for sample in family.samples
     }
-    assert len(found) == sum(not line.startswith("#") for line in text.splitlines()), "no line is said twice"
+    assert len(found) == sum(not line.startswith("#") for line in text.splitlines()), "no line appears twice"
     return found
 
 

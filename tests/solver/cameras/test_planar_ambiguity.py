@@ -118,6 +118,7 @@ def test_orthography_as_set_keeps_the_scales(flag: gallery.Sequence) -> None:
     assert (solve(flag.tracks, settings=Settings(camera="orthographic")).camera.scales == 1).all()
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_sheet_with_outliers_keeps_its_pose_signs() -> None:
     """What stands in for outliers is enough to turn a sheet over: its cameras are not refined with the shapes."""

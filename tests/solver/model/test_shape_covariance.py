@@ -143,7 +143,7 @@ def error(face: gallery.Sequence, *, known: bool, settings: Settings, spoiled: g
     return metrics.e3d_frame(solve(given, cameras=cameras, settings=settings).shapes, face.shapes)
 
 
-@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("known", [True, pytest.param(False, marks=pytest.mark.long)])
 @pytest.mark.slow
 def test_it_reduces_the_error_of_a_face(face: gallery.Sequence, known: bool) -> None:
     smooth = error(face, known=known, settings=Settings(prior="smooth"))

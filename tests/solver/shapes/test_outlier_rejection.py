@@ -15,7 +15,9 @@ OUTLIER_SHARE = gallery.corrupt(MADE, outliers=0.1, seed=4).tracks
 WRONG = np.abs(np.asarray(OUTLIER_SHARE.points) - np.asarray(MADE.tracks.points)).max(axis=2) > 0
 
 
-@pytest.mark.parametrize("cameras", [CAMERAS, None], ids=["known", "estimated"])
+@pytest.mark.parametrize(
+    "cameras", [pytest.param(CAMERAS, id="known"), pytest.param(None, id="estimated", marks=pytest.mark.long)]
+)
 @pytest.mark.slow
 def test_rejected_observations_are_the_corrupted_ones(cameras: KnownCamera | None) -> None:
     found = solve(OUTLIER_SHARE, cameras=cameras)
@@ -24,15 +26,15 @@ def test_rejected_observations_are_the_corrupted_ones(cameras: KnownCamera | Non
     gross = np.linalg.norm(np.asarray(OUTLIER_SHARE.points) - np.asarray(MADE.tracks.points), axis=2) > 0.3 * size
     assert left_out[gross].mean() > 0.97
     assert left_out[~WRONG].mean() < 0.03
-    said = re.match(r"([\d.]+)% of what was seen", found.choices.reasons["outliers"])
-    assert said is not None
-    assert float(said.group(1)) == pytest.approx(100 * left_out.mean(), abs=0.06)
+    share = re.match(r"([\d.]+)% of what was seen", found.choices.reasons["outliers"])
+    assert share is not None
+    assert float(share.group(1)) == pytest.approx(100 * left_out.mean(), abs=0.06)
 
 
 @pytest.mark.parametrize("cameras", [CAMERAS, None], ids=["known", "estimated"])
 @pytest.mark.slow
 @pytest.mark.long
-def test_rejection_equals_hiding_the_outliers(cameras: KnownCamera | None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rejection_equals_hiding_the_outliers(cameras: KnownCamera | None) -> None:
     found = solve(OUTLIER_SHARE, cameras=cameras)
     hidden = solve(Tracks.from_arrays(OUTLIER_SHARE.points, found.weights > 0), cameras=cameras)
     error, least = (metrics.e3d_frame(each.shapes, MADE.shapes) for each in (found, hidden))
@@ -40,11 +42,22 @@ def test_rejection_equals_hiding_the_outliers(cameras: KnownCamera | None, monke
     assert "outliers" not in hidden.choices.reasons
     far = np.linalg.norm(np.asarray(OUTLIER_SHARE.points) - np.asarray(MADE.tracks.points), axis=2) > found.choices.unit
     assert (found.residuals[far] > 0.5 * found.choices.unit).all(), "they are reported all the same"
-    with monkeypatch.context() as patch:
-        patch.setattr("pliant.solver.reconstruct.MIN_POINTS", 10_000)  # too little would be left to begin anew from
-        once = solve(OUTLIER_SHARE, cameras=cameras)
-    assert (once.weights == 0).mean() == pytest.approx(0.1, abs=0.03)
-    assert metrics.e3d_frame(once.shapes, MADE.shapes) > error - 2e-3
+
+
+@pytest.mark.slow
+@pytest.mark.long
+def test_starting_again_without_the_outliers_does_not_lose_accuracy(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On average of three draws: one draw moves by a fifth either way."""
+    again, once = [], []
+    for seed in (4, 5, 6):
+        tracks = gallery.corrupt(MADE, outliers=0.1, seed=seed).tracks
+        again.append(metrics.e3d_frame(solve(tracks).shapes, MADE.shapes))
+        with monkeypatch.context() as patch:
+            patch.setattr("pliant.solver.reconstruct.MIN_POINTS", 10_000)  # too few points would be left
+            found = solve(tracks)
+        assert (found.weights == 0).mean() == pytest.approx(0.1, abs=0.03)
+        once.append(metrics.e3d_frame(found.shapes, MADE.shapes))
+    assert np.mean(once) > np.mean(again) - 1e-3
 
 
 def test_clean_tracks_and_the_published_prior_reject_nothing() -> None:

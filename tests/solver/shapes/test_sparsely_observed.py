@@ -46,7 +46,9 @@ HOLE, SHOWN = patch(190, 2), (0, 7, 15)
 ROWS = np.ix_(SHOWN, HOLE)
 
 
-@pytest.mark.parametrize("cameras", [CAMERAS, None], ids=["known", "estimated"])
+@pytest.mark.parametrize(
+    "cameras", [pytest.param(CAMERAS, id="known"), pytest.param(None, id="estimated", marks=pytest.mark.long)]
+)
 @pytest.mark.slow
 def test_a_hole_in_the_face_is_closed(cameras: KnownCamera | None) -> None:
     assert len(HOLE) > 12

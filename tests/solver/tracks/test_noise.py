@@ -118,7 +118,7 @@ def test_remaining_outliers_are_not_learned_as_modes() -> None:
     assert select_model_order(sample, PAIRS, spoiled=True) == ModelOrder(2, noisy_start=True)
 
 
-@pytest.mark.parametrize("points", [40, 400])
+@pytest.mark.parametrize("points", [40, pytest.param(400, marks=pytest.mark.long)])
 @pytest.mark.parametrize("known", [True, False])
 @pytest.mark.slow
 def test_the_default_has_lower_error_with_strong_noise_than_the_papers_prior(known: bool, points: int) -> None:

@@ -82,9 +82,9 @@ def zeros(megabytes: int, shape: str) -> bytes:
     for _ in range(megabytes):
         check = zlib.crc32(zero, check)
     content = deflated(start, megabytes, window=-15)
-    told = struct.pack("<3H4x3I2H", 20, 0, 8, check, len(content), len(start) + (megabytes << 20), len(name), 0)
-    local = b"PK\x03\x04" + told + name + content
-    entry = b"PK\x01\x02" + struct.pack("<H", 20) + told + bytes(14) + name
+    sizes = struct.pack("<3H4x3I2H", 20, 0, 8, check, len(content), len(start) + (megabytes << 20), len(name), 0)
+    local = b"PK\x03\x04" + sizes + name + content
+    entry = b"PK\x01\x02" + struct.pack("<H", 20) + sizes + bytes(14) + name
     return local + entry + b"PK\x05\x06" + struct.pack("<4H2IH", 0, 0, 1, 1, len(entry), len(local), 0)
 
 

@@ -86,6 +86,7 @@ def honest(parser: str) -> list[bytes]:
         "csv": [
             b"frame,point,x,y,visible\n" + b"".join(b"%d,%d,1.5,-2e1,1\n" % (f, p) for f in range(4) for p in range(5))
         ],
+        "json": [json.dumps([{"pose_landmarks": [[{"x": 0.5, "y": 0.25, "visibility": 1.0}] * 3]}] * 4).encode()],
         "obj": [(OBJ_POINTS + "vt 0 0\nf 1/1 2/1 3/1\nf -1 -2 -3 -4\n").encode()],
         "ply": [
             ply(vertices + faces, np.zeros((4, 3), "<f4").tobytes() + quad),
@@ -96,8 +97,8 @@ def honest(parser: str) -> list[bytes]:
         "png": [png(4, 5, data=__import__("zlib").compress(bytes(25)))],
     }[parser]
     starts = {
-        "npy": (b"\x93NUMPY",), "npz": (b"PK",), "matlab5": (b"MATLAB",), "matlab73": (b"\x89HDF",), "csv": (b"frame",), "obj": (b"v ",),
-        "ply": (b"ply",), "glb": (b"glTF",), "gltf": (b"{",), "png": (b"\x89PNG",),
+        "npy": (b"\x93NUMPY",), "npz": (b"PK",), "matlab5": (b"MATLAB",), "matlab73": (b"\x89HDF",), "csv": (b"frame",),
+        "json": (b"[",), "obj": (b"v ",), "ply": (b"ply",), "glb": (b"glTF",), "gltf": (b"{",), "png": (b"\x89PNG",),
     }[parser]  # fmt: skip
     slow = ("bomb", "small bomb", "many", "million", "5,000", "count")
     attacks = [
@@ -179,8 +180,8 @@ def in_a_fork(act: Callable[[], str]) -> str:
             traceback.print_exc()
             os._exit(1)
     os.close(into)
-    with os.fdopen(out, "rb") as said:
-        text = said.read().decode()
+    with os.fdopen(out, "rb") as stream:
+        text = stream.read().decode()
     code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
     assert code <= 0, "not a refusal; the exception is printed above"
     return text if code == 0 else CRASHED

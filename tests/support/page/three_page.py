@@ -116,10 +116,10 @@ class Played:
     def __init__(self, page: Page, path: Path) -> None:
         self._page = page
         page.route(f"{ORIGIN}/shapes.glb", lambda route: route.fulfill(path=path, content_type=TYPES[".glb"]))
-        told = page.evaluate("open_glb('/shapes.glb')")
-        self.targets: int = told["targets"]
-        self.duration: float = told["duration"]
-        self.kind: str = told["kind"]
+        opened = page.evaluate("open_glb('/shapes.glb')")
+        self.targets: int = opened["targets"]
+        self.duration: float = opened["duration"]
+        self.kind: str = opened["kind"]
 
     def positions(self, time: float) -> np.ndarray:
         """Every vertex `(P, 3)` at a time in seconds, in the scene."""

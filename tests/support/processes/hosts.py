@@ -115,9 +115,11 @@ class Hosts:
         self.start(host, host, [sys.executable, "-m", "pliant.cli", "work"], more)
 
     def restart(self, name: str) -> None:
-        """Start Valkey or S3 again."""
+        """Start Valkey, S3 or the first API process again."""
         if name == "valkey":
             self.start("valkey", "valkey", self._valkey)
+        elif name == "api":
+            self.start("api", "front", [sys.executable, "-m", "pliant.service"], {"PLIANT_PORT": "8000"})
         else:
             self.start("s3", "s3", self._s3, self._credentials)
 
@@ -148,10 +150,20 @@ class Hosts:
         workers = [pid for pid in self.tree(host) if b"pliant.worker\0work" in _command(pid)]
         return [child for pid in workers for child in children(pid)]
 
-    def submit(self, *, reweightings: int = 1000, url: str = "", **more: Any) -> str:
-        """Submit a job that lasts for so many reweightings; return its id."""
+    def tracks(self) -> bytes:
+        """Return the tracks of the jobs, as a file's bytes."""
+        return self._files["tracks"][1]
+
+    def submit(self, *, reweightings: int = 1000, url: str = "", upload: str = "", **more: Any) -> str:
+        """Submit a job that lasts for so many reweightings, with these tracks or those of an upload; return its id."""
         options = {**LONG, "max_reweightings": reweightings, "outputs": []}
-        files = {**self._files, "mesh": (None, "none"), "options": (None, json.dumps(options))}
+        tracks = {"tracks_upload": (None, upload)} if upload else {"tracks": self._files["tracks"]}
+        files = {
+            **tracks,
+            "rotations": self._files["rotations"],
+            "mesh": (None, "none"),
+            "options": (None, json.dumps(options)),
+        }
         answer = self.http.post(f"{url or self.urls[0]}/v1/jobs", files=files, **more)
         answer.raise_for_status()
         id = str(answer.json()["id"])

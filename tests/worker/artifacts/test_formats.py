@@ -34,7 +34,7 @@ def write(directory: Path, made) -> dict[str, Path]:
     return {artifact.name: directory / artifact.name for artifact in written}
 
 
-def told(files: dict[str, Path], name: str) -> dict[str, object]:
+def description(files: dict[str, Path], name: str) -> dict[str, object]:
     return json.loads(files["report.json"].read_text())["artifacts"][name]
 
 
@@ -196,8 +196,8 @@ def test_ply_carries_normals_and_colours_of_its_frame(tmp_path: Path) -> None:
     files = write(tmp_path, made)
     distances = point_errors(solution.shapes, inputs.ground_truth.shapes)
     top = np.quantile(distances, 0.99)
-    assert told(files, "shapes_ply.zip")["colours"]["quantity"] == "distance from the truth"
-    assert told(files, "shapes_ply.zip")["colours"]["top"] == pytest.approx(top)
+    assert description(files, "shapes_ply.zip")["colours"]["quantity"] == "distance from the truth"
+    assert description(files, "shapes_ply.zip")["colours"]["top"] == pytest.approx(top)
     for frame, content in enumerate(members(files["shapes_ply.zip"])):
         vertex = plyfile.PlyData.read(io.BytesIO(content))["vertex"]
         np.testing.assert_array_equal(
@@ -239,7 +239,7 @@ def test_obj_colours_are_read_by_other_programs(tmp_path: Path) -> None:
     top = np.quantile(solution.residuals[inputs.tracks.visible > 0], 0.99)
     expected = np.where(seen[:, None], shade(solution.residuals[6] / top), 0.5)
     np.testing.assert_allclose(read.visual.vertex_colors[:, :3], 255 * expected, atol=1)
-    assert told(files, "shapes_obj.zip")["colours"]["quantity"] == "reprojection residual"
+    assert description(files, "shapes_obj.zip")["colours"]["quantity"] == "reprojection residual"
 
 
 def test_expected_error_is_painted_in_percent_and_hidden_positions_grey(tmp_path: Path) -> None:
@@ -250,7 +250,7 @@ def test_expected_error_is_painted_in_percent_and_hidden_positions_grey(tmp_path
     share = 100 * solution.shapes_std / np.sqrt(np.square(solution.shapes).sum(axis=2).mean())
     top = np.quantile(share[seen], 0.99)
     for name in ("shapes_ply.zip", "shapes.glb"):
-        described = told(files, name)["colours"]
+        described = description(files, name)["colours"]
         assert (described["quantity"], described["unit"]) == ("expected error", "percent of the object's size")
         assert described["top"] == pytest.approx(top)
     for frame, content in enumerate(members(files["shapes_ply.zip"])):

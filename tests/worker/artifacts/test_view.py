@@ -113,9 +113,9 @@ def test_the_file_holds_a_moving_camera_and_is_valid(tmp_path: Path, focal: floa
     np.testing.assert_allclose(found["translation"][0], node.translation, rtol=1e-6)
     np.testing.assert_allclose(found["rotation"][0], node.rotation, rtol=1e-6)
     lens = gltf.cameras[0]
-    told = {"type": lens.type, "extras": lens.extras, lens.type: vars(getattr(lens, lens.type))}
+    camera_record = {"type": lens.type, "extras": lens.extras, lens.type: vars(getattr(lens, lens.type))}
     scene = viewer_scale(solution.shapes) * solution.shapes * [1, -1, -1]
-    pixels = seen_by(told, found["rotation"], found["translation"], scene, "down")
+    pixels = seen_by(camera_record, found["rotation"], found["translation"], scene, "down")
     np.testing.assert_allclose(pixels, camera.project(solution.shapes), atol=1e-2)
     between = Slerp([0, 1], Rotation.from_quat(found["rotation"][:2]))(0.5)
     assert between.magnitude() == pytest.approx(Rotation.from_matrix(camera.rotations[1]).magnitude() / 2, abs=1e-5)

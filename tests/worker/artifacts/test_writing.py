@@ -128,12 +128,12 @@ def test_a_long_animation_is_written_in_modes_within_its_stated_bound(tmp_path: 
     shown, _, _ = played(files["shapes.glb"])
     extras = pygltflib.GLTF2.load_binary(files["shapes.glb"]).meshes[0].extras
     error = np.linalg.norm(shown / viewer_scale(shapes) - shapes, axis=2)
-    told = extras["pliant"]
-    assert told["encoding"] == "modes"
-    assert told["targets"] == len(extras["targetNames"]) < 20
-    assert 0 < error.max() == pytest.approx(told["max_error"], rel=0.05)
-    assert told["max_error"] <= told["error_bound"] < 0.0011 * np.linalg.norm(np.ptp(shapes, axis=(0, 1)))
-    assert json.loads(files["report.json"].read_text())["artifacts"]["shapes.glb"]["max_error"] == told["max_error"]
+    details = extras["pliant"]
+    assert details["encoding"] == "modes"
+    assert details["targets"] == len(extras["targetNames"]) < 20
+    assert 0 < error.max() == pytest.approx(details["max_error"], rel=0.05)
+    assert details["max_error"] <= details["error_bound"] < 0.0011 * np.linalg.norm(np.ptp(shapes, axis=(0, 1)))
+    assert json.loads(files["report.json"].read_text())["artifacts"]["shapes.glb"]["max_error"] == details["max_error"]
 
 
 def test_a_short_animation_is_written_in_modes_where_that_is_smaller(tmp_path: Path) -> None:
@@ -147,17 +147,17 @@ def test_a_short_animation_is_written_in_modes_where_that_is_smaller(tmp_path: P
     assert small.stat().st_size < large.stat().st_size / 3
     shapes = upright(made[1].shapes, "down")
     shown, _, _ = played(small)
-    told = pygltflib.GLTF2.load_binary(small).meshes[0].extras["pliant"]
+    details = pygltflib.GLTF2.load_binary(small).meshes[0].extras["pliant"]
     error = np.linalg.norm(shown / viewer_scale(shapes) - shapes, axis=2).max()
-    assert error == pytest.approx(told["max_error"], rel=0.05)
-    assert told["max_error"] <= told["error_bound"]
-    assert (told["encoding"], told["targets"] < 40) == ("modes", True)
+    assert error == pytest.approx(details["max_error"], rel=0.05)
+    assert details["max_error"] <= details["error_bound"]
+    assert (details["encoding"], details["targets"] < 40) == ("modes", True)
 
 
 def test_motion_of_full_rank_takes_one_target_less_than_frames() -> None:
-    told = animate(np.random.default_rng(0).normal(size=(6, 30, 3))).extras
-    assert told["targets"] == 5
-    assert told["max_error"] < 1e-6
+    details = animate(np.random.default_rng(0).normal(size=(6, 30, 3))).extras
+    assert details["targets"] == 5
+    assert details["max_error"] < 1e-6
 
 
 def test_every_file_of_a_job_shows_the_same_pose(tmp_path: Path) -> None:
@@ -258,12 +258,12 @@ def test_options_reach_the_glb(tmp_path: Path, frames: int) -> None:
     assert gltf.extensionsRequired == ["KHR_mesh_quantization"]
     primitive = gltf.meshes[0].primitives[0]
     assert primitive.targets[0]["NORMAL"] is not None
-    told = gltf.meshes[0].extras["pliant"]["colours"]
+    details = gltf.meshes[0].extras["pliant"]["colours"]
     assert inputs.ground_truth is not None
     mean = point_errors(solution.shapes, inputs.ground_truth.shapes).mean(axis=0)
-    assert told["quantity"] == "distance from the truth"
+    assert details["quantity"] == "distance from the truth"
     colours = accessor(gltf, primitive.attributes.COLOR_0)
-    np.testing.assert_allclose(colours[:, :3], linear(shade(mean / told["top"])), atol=1e-4)
+    np.testing.assert_allclose(colours[:, :3], linear(shade(mean / details["top"])), atol=1e-4)
     np.testing.assert_array_equal(colours[:, 3], 1)
 
 
@@ -404,12 +404,12 @@ def test_a_failed_write_keeps_the_old_file_and_no_partial_one(tmp_path: Path, mo
 
 def test_progress_rises_to_one(tmp_path: Path) -> None:
     inputs, solution, options = make_result()
-    told: list[float] = []
+    details: list[float] = []
     report = build_report(inputs, solution, options, metrics={})
-    write_artifacts(inputs, solution, options, report, tmp_path, on_progress=told.append)
-    assert told == sorted(told)
-    assert told[-1] == 1.0
-    assert len(told) > 10
+    write_artifacts(inputs, solution, options, report, tmp_path, on_progress=details.append)
+    assert details == sorted(details)
+    assert details[-1] == 1.0
+    assert len(details) > 10
 
 
 def test_normals_have_unit_length_and_point_out_of_the_face() -> None:

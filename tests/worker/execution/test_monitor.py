@@ -5,12 +5,13 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import signal
+import threading
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
-from pliant.schemas.job import Interpretation, Problem, Status
+from pliant.schemas.job import Interpretation, Problem, Progress, Status
 from pliant.schemas.options import Options
 from pliant.solver import InvalidInput
 from pliant.worker.errors import StoreUnavailable
@@ -227,25 +228,25 @@ def test_limits_are_stated_in_messages() -> None:
 
 
 def test_progress_never_falls_and_estimates_what_is_left() -> None:
-    told = []
+    reports = []
     time = [100.0]
-    reporter = Reporter(told.append, clock=lambda: time[0])
+    reporter = Reporter(reports.append, clock=lambda: time[0])
     reporter.part("loading", 1.0)
     reporter.part("solving", 0.5, stage="cameras", max_reweightings=30)
     time[0] = 110.0
     reporter.part("solving", 0.25, stage="reweight", reweighting=3, objective=2.0)
     reporter.part("exporting", 0.5, residual=0.125)
     reporter.part("exporting", 7.0)
-    fractions = [each.fraction for each in told]
+    fractions = [each.fraction for each in reports]
     assert fractions == sorted(fractions)
     assert fractions[-1] == 1.0
-    assert told[0].seconds_left is None, "nothing to base it on"
+    assert reports[0].seconds_left is None, "nothing to base it on"
     middle = fractions[2]
     assert middle == pytest.approx(0.02 + 0.83 / 2)
-    assert told[2].seconds_left == pytest.approx(10 * (1 - middle) / middle, abs=0.05)
-    assert told[-1].seconds_left == 0
-    assert [each.stage for each in told] == ["loading", "cameras", "reweight", "exporting", "exporting"]
-    assert (told[-1].reweighting, told[-1].max_reweightings, told[-1].objective, told[-1].residual) == (
+    assert reports[2].seconds_left == pytest.approx(10 * (1 - middle) / middle, abs=0.05)
+    assert reports[-1].seconds_left == 0
+    assert [each.stage for each in reports] == ["loading", "cameras", "reweight", "exporting", "exporting"]
+    assert (reports[-1].reweighting, reports[-1].max_reweightings, reports[-1].objective, reports[-1].residual) == (
         3,
         30,
         2.0,
@@ -255,6 +256,63 @@ def test_progress_never_falls_and_estimates_what_is_left() -> None:
     assert edges[0][0] == 0
     assert edges[-1][1] == 1
     assert all(before[1] == after[0] for before, after in itertools.pairwise(edges))
+
+
+def test_stated_seconds_decide_fraction_and_time_left() -> None:
+    told: list[Progress] = []
+    time = [0.0]
+    reporter = Reporter(told.append, clock=lambda: time[0], export_seconds=2.0)
+    time[0] = 5.0
+    reporter.part("solving", 0.9, stage="cameras", seconds_left=13.0)  # the first report begins the clock
+    time[0] = 10.0
+    reporter.part("solving", 0.9, stage="reweight", seconds_left=3.0)
+    assert (told[-1].seconds_left, told[-1].fraction) == (5.0, pytest.approx(5 / 10))
+    reporter.part("solving", 0.9, stage="reweight", seconds_left=93.0)
+    assert (told[-1].seconds_left, told[-1].fraction) == (95.0, pytest.approx(5 / 10)), "it does not go back"
+    reporter.part("exporting", 0.0)
+    assert told[-1].seconds_left == 2.0
+    time[0] = 14.0  # twice as slow as expected
+    reporter.part("exporting", 0.5)
+    assert told[-1].seconds_left == pytest.approx(0.5 * (1 + 4))
+    reporter.part("exporting", 1.0)
+    assert (told[-1].seconds_left, told[-1].fraction) == (0.0, 1.0)
+
+
+def test_silence_is_filled_with_the_seconds_counted_down() -> None:
+    told: list[Progress] = []
+    time = [0.0]
+    reporter = Reporter(told.append, clock=lambda: time[0])
+    reporter.tick()
+    assert told == [], "nothing was reported yet"
+    reporter.part("solving", 0.5, stage="cameras", seconds_left=3.0)
+    time[0] = 0.9
+    reporter.tick()
+    assert len(told) == 1
+    for now, left in ((1.1, 1.9), (2.2, 0.8), (3.3, 0.0)):
+        time[0] = now
+        reporter.tick()
+        assert (told[-1].stage, told[-1].seconds_left) == ("cameras", pytest.approx(left, abs=0.05))
+    time[0] = 9.0
+    reporter.part("exporting", 1.0)
+    time[0] = 20.0
+    reporter.tick()
+    assert [each.fraction for each in told].count(1.0) == 1, "the end is reported once"
+
+
+def test_ticks_come_from_a_thread_while_a_part_is_silent() -> None:
+    ticked = threading.Event()
+    told: list[Progress] = []
+
+    def hear(progress: Progress) -> None:
+        told.append(progress)
+        if len(told) > 1:
+            ticked.set()
+
+    reporter = Reporter(hear)
+    with reporter.ticking():
+        reporter.part("solving", 0.1, stage="cameras")
+        assert ticked.wait(60)
+    assert not any(thread.name == "pliant-ticks" for thread in threading.enumerate())
 
 
 def test_the_log_is_complete_before_the_record_is_final(

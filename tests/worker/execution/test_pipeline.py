@@ -29,8 +29,8 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Inputs:
 
 
 def test_the_files_hold_what_the_call_returns(inputs: Inputs, tmp_path: Path) -> None:
-    told: list[Progress] = []
-    finished = reconstruct(inputs, Options(max_reweightings=4), tmp_path / "new", on_progress=told.append)
+    steps: list[Progress] = []
+    finished = reconstruct(inputs, Options(max_reweightings=4), tmp_path / "new", on_progress=steps.append)
     report = json.loads((tmp_path / "new" / "report.json").read_text())
     assert (report["outcome"], report["sentence"]) == (finished.outcome, finished.sentence)
     assert report["metrics"] == pytest.approx(finished.metrics)
@@ -44,27 +44,27 @@ def test_the_files_hold_what_the_call_returns(inputs: Inputs, tmp_path: Path) ->
         assert arrays["shapes"].shape == (8, 60, 3)
         assert inputs.ground_truth is not None
         assert finished.metrics["e3d_frame"] == pytest.approx(e3d_frame(arrays["shapes"], inputs.ground_truth.shapes))
-    stages = [each.stage for each in told]
+    stages = [each.stage for each in steps]
     assert stages[0] == "loading"
     assert stages[-1] == "exporting"
     assert {"cameras", "reweight"} <= set(stages)
-    fractions = [each.fraction for each in told]
+    fractions = [each.fraction for each in steps]
     assert fractions == sorted(fractions)
     assert fractions[-1] == 1
 
 
 @pytest.mark.parametrize("stage", ["loading", "cameras", "initialise", "reweight", "exporting"])
 def test_it_stops_at_every_stage(inputs: Inputs, tmp_path: Path, stage: str) -> None:
-    told: list[Progress] = []
+    steps: list[Progress] = []
     with pytest.raises(Interrupted, match="stopped on request"):
         reconstruct(
             inputs,
             CHEAP,
             tmp_path,
-            on_progress=told.append,
-            should_stop=lambda: any(p.stage == stage for p in told),
+            on_progress=steps.append,
+            should_stop=lambda: any(p.stage == stage for p in steps),
         )
-    assert stage == "exporting" or (told[-1].stage != "exporting" and told[-1].reweighting <= 1)
+    assert stage == "exporting" or (steps[-1].stage != "exporting" and steps[-1].reweighting <= 1)
     assert not (tmp_path / "report.json").exists(), "the report is the last to be written"
     assert not list(tmp_path.glob(".*")), "no half-written file"
 

@@ -50,12 +50,17 @@ def test_all_that_the_tracker_found_is_used(tmp_path: Path) -> None:
     np.testing.assert_array_equal(inputs.mesh.grid, given["grid"])
     assert inputs.texture is not None
     np.testing.assert_allclose(inputs.texture.uv, given["uv"])
-    told = inputs.interpretation
-    assert (told.format, told.mesh_source, told.image_size, told.fps) == ("Pliant", "film", "64x48", 24.0)
-    assert tracks_options(Options(), told) == Options(image_size="64x48", fps=24)
+    interpretation = inputs.interpretation
+    assert (interpretation.format, interpretation.mesh_source, interpretation.image_size, interpretation.fps) == (
+        "Pliant",
+        "film",
+        "64x48",
+        24.0,
+    )
+    assert tracks_options(Options(), interpretation) == Options(image_size="64x48", fps=24)
     save_inputs(inputs, tmp_path / "stored.npz")
     back = load_inputs(tmp_path / "stored.npz")
-    assert back.interpretation == told
+    assert back.interpretation == interpretation
     assert back.texture == inputs.texture or back.texture.jpeg == inputs.texture.jpeg  # type: ignore[union-attr]
 
 

@@ -32,14 +32,14 @@ def test_the_stored_file_and_the_interpretation_are_the_same(all_apart: None, tm
     options = Options(stride=2)
     inputs = read_inputs(tracks=tmp_path / "t.npz", mesh="6x7", ground_truth=tmp_path / "g.npz", options=options)
     save_inputs(inputs, tmp_path / "here.npz")
-    said = store_inputs(
+    interpretation = store_inputs(
         tracks=tmp_path / "t.npz",
         mesh="6x7",
         ground_truth=tmp_path / "g.npz",
         options=options,
         target=tmp_path / "there.npz",
     )
-    assert said == inputs.interpretation
+    assert interpretation == inputs.interpretation
     assert (tmp_path / "here.npz").read_bytes() == (tmp_path / "there.npz").read_bytes()
     assert store_inputs(tracks=tmp_path / "t.npz", mesh="none", options=Options(), target=None).num_points == 42
     assert sorted(path.name for path in tmp_path.iterdir()) == ["g.npz", "here.npz", "t.npz", "there.npz"]
@@ -85,8 +85,8 @@ def test_isolated_reading_keeps_no_memory_in_the_parent(tmp_path: Path) -> None:
     np.savez(path, tracks=np.linspace(0, 900, 20 * 220_000 * 2).reshape(220_000, 20, 2).swapaxes(0, 1))
     assert declared_bytes(path, field="tracks") > isolated_reader.LARGE
     before = peak_now()
-    said = store_inputs(tracks=path, mesh="none", options=Options(), target=tmp_path / "c.npz")
-    assert (said.num_frames, said.num_points) == (20, 220_000)
+    interpretation = store_inputs(tracks=path, mesh="none", options=Options(), target=tmp_path / "c.npz")
+    assert (interpretation.num_frames, interpretation.num_points) == (20, 220_000)
     assert peak_of(os.getpid()) - before < 40 << 20  # the arrays are 70 MB
 
 

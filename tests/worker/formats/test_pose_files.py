@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import zipfile
 from pathlib import Path
 
@@ -107,6 +108,46 @@ def test_mediapipe_landmarks_are_fractions_of_the_picture(tmp_path: Path) -> Non
     np.testing.assert_allclose(read.tracks.points[seen], (places[..., :2] * [640, 480])[seen], atol=1e-2)
 
 
+LANDMARKS = np.round(np.random.default_rng(5).uniform(0.2, 0.8, (1, P, 2)) + np.arange(F)[:, None, None] * 0.01, 4)
+
+
+def landmarks(frame: int) -> list[dict[str, float]]:
+    return [
+        {"x": x, "y": y, "z": 0.1, "visibility": float(SURE[frame, point])}
+        for point, (x, y) in enumerate(LANDMARKS[frame].tolist())
+    ]
+
+
+MEDIAPIPE = {
+    "lists": [landmarks(frame) for frame in range(F)],
+    "message": [{"landmark": landmarks(frame)} for frame in range(F)],
+    "tasks": [
+        {"pose_world_landmarks": [[{"x": 9, "y": 9}]], "pose_landmarks": [landmarks(frame)]} for frame in range(F)
+    ],
+    "javascript": {"frames": [{"time": frame / 25, "faceLandmarks": [landmarks(frame)]} for frame in range(F)]},
+    "named otherwise": {"video": "a.mp4", "results": [landmarks(frame) for frame in range(F)]},
+}
+
+
+@pytest.mark.parametrize("case", MEDIAPIPE)
+def test_mediapipe_json(case: str, tmp_path: Path) -> None:
+    (tmp_path / "pose.json").write_text("\ufeff" * (case == "lists") + json.dumps(MEDIAPIPE[case]), encoding="utf-8")
+    read = read_inputs(tracks=tmp_path / "pose.json", mesh="none", options=Options(image_size="641x481"))
+    assert (read.interpretation.format, read.interpretation.coordinates) == ("MediaPipe", "unit")
+    np.testing.assert_allclose(read.tracks.visible, np.where(SURE > 0.5, 0.9, 0.0))
+    seen = SURE > 0.5
+    np.testing.assert_allclose(read.tracks.points[seen], (LANDMARKS * [640, 480])[seen])
+
+
+@pytest.mark.parametrize("nothing", [None, [], {"landmarks": []}, {"poseLandmarks": None}])
+def test_a_frame_of_mediapipe_without_a_detection_is_hidden(nothing: object, tmp_path: Path) -> None:
+    frames = [*MEDIAPIPE["lists"][:2], nothing, *MEDIAPIPE["lists"][3:]]
+    (tmp_path / "pose.json").write_text(json.dumps(frames))
+    read = read_inputs(tracks=tmp_path / "pose.json", mesh="none", options=Options(image_size="641x481"))
+    assert (read.tracks.visible[2] == 0).all()
+    assert (read.tracks.visible[3] > 0).any()
+
+
 @pytest.mark.parametrize("kind", ["table", "fixed"])
 def test_deeplabcut_hdf5(kind: str, tmp_path: Path) -> None:
     values = np.concatenate([POINTS, SURE[..., None]], axis=2).reshape(F, 3 * P)
@@ -150,6 +191,10 @@ def pictures() -> bytes:
 
 
 TABLE = "tracks: expected a table with the columns frame, point, x and y, or with one row a frame, got line"
+JSON = "tracks: expected MediaPipe landmarks: a list of frames, each with landmarks x, y and visibility, got"
+JSON_EXAMPLE = (
+    'Write it as [[{"x": 0.51, "y": 0.32, "z": -0.1, "visibility": 0.99}, …], …], a list of landmarks for each frame.'
+)
 REFUSED: dict[str, tuple[bytes, str, str]] = {
     "an mp4": (b"\0\0\0\x18ftypmp42" + bytes(600), "film_as_tracks", f"tracks: expected point tracks, got a film (mp4 or mov). {FILM}"),
     "a webm": (b"\x1aE\xdf\xa3" + bytes(600), "film_as_tracks", f"tracks: expected point tracks, got a film (webm or mkv). {FILM}"),
@@ -169,6 +214,33 @@ REFUSED: dict[str, tuple[bytes, str, str]] = {
     ),
     "a short row": (b"x0,y0,x1,y1\n1,2,3,4\n1,2,3\n", "unreadable_table", f"{TABLE} 3: '1,2,3'. {EXAMPLE}"),
     "half of DeepLabCut's head": (b"scorer,a,a,a\nbodyparts,b,b,b\n0,1,2,3\n", "unreadable_table", f"{TABLE} 1: 'scorer,a,a,a'. {EXAMPLE}"),
+    "JSON that is cut off": (
+        b'[[{"x": 0.5,\n', "damaged_file",
+        "tracks: expected valid JSON, got a file in which line 2, column 1 is not: Expecting property name enclosed in double quotes. "
+        "Write it with json.dump or JSON.stringify.",
+    ),
+    "JSON that is not UTF-8": (
+        b'["\xff\xfe"]', "damaged_file",
+        "tracks: expected valid JSON, got a file in which the text is not UTF-8. Write it with json.dump or JSON.stringify.",
+    ),
+    "JSON nested too deeply": (
+        b"[" * 200_000, "damaged_file",
+        "tracks: expected valid JSON, got a file in which lists are nested too deeply. Write it with json.dump or JSON.stringify.",
+    ),
+    "JSON of something else": (b'{"name": "a", "size": 3}', "unreadable_table", f"{JSON} JSON without one list of frames. {JSON_EXAMPLE}"),
+    "frames without landmarks": (b'[{"time": 0}]', "unreadable_table", f"{JSON} no landmarks in frame 0. {JSON_EXAMPLE}"),
+    "a frame that is a number": (b'[[], 5]', "unreadable_table", f"{JSON} no landmarks in frame 1. {JSON_EXAMPLE}"),
+    "nothing detected": (b"[null, []]", "unreadable_table", f"{JSON} no landmark in any frame. {JSON_EXAMPLE}"),
+    "numbers of landmarks that change": (
+        b'[[{"x": 1, "y": 2}], [{"x": 1, "y": 2}, {"x": 3, "y": 4}]]', "unreadable_table",
+        f"{JSON} frames with 1 and 2 landmarks. {JSON_EXAMPLE}",
+    ),
+    "a landmark without y": (b'[[{"x": 1}]]', "unreadable_table", f'{JSON} landmark 0 of frame 0: {{"x": 1}}. {JSON_EXAMPLE}'),
+    "a landmark that is a list": (b'[["a"]]', "unreadable_table", f'{JSON} landmark 0 of frame 0: "a". {JSON_EXAMPLE}'),
+    "a number beyond all bounds": (
+        b'[[{"x": 1' + b"0" * 400 + b', "y": 2}]]', "unreadable_table",
+        f'{JSON} landmark 0 of frame 0: {{"x": 1{"0" * 73}. {JSON_EXAMPLE}',
+    ),
 }  # fmt: skip
 
 
@@ -222,6 +294,12 @@ def test_tables_beyond_the_limits_are_refused(tmp_path: Path) -> None:
     path.write_text("x0,y0,x1,y1\n" + "1,2,3,4\n" * 200)
     with pytest.raises(InvalidInput, match="as a table"), path.open("rb") as stream:
         PARSERS["csv"](stream, field="tracks", limits=Limits(max_bytes=4096))
+    path.write_text(json.dumps(MEDIAPIPE["lists"]))
+    with pytest.raises(InvalidInput, match="of JSON"), path.open("rb") as stream:
+        PARSERS["json"](stream, field="tracks", limits=Limits(max_bytes=512))
+    path.write_text("[" + ",".join(['[{"x":1,"y":2}]'] * 100) + "]")  # 16 bytes each, 24 as arrays
+    with pytest.raises(InvalidInput, match="as arrays"), path.open("rb") as stream:
+        PARSERS["json"](stream, field="tracks", limits=Limits(max_bytes=2000))
     path.write_text("x0,y0,x1,y1\n" + "1" * ((1 << 20) + 5))
     with pytest.raises(InvalidInput, match="rows of at most 1048576 characters"), path.open("rb") as stream:
         PARSERS["csv"](stream, field="tracks", limits=Limits())

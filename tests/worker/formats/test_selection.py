@@ -59,9 +59,9 @@ def follows(got: Inputs, frames: np.ndarray, points: np.ndarray) -> None:
     np.testing.assert_array_equal(got.cameras.scales, frames + 1.0)
     np.testing.assert_array_equal(got.selection.frames, frames)
     np.testing.assert_array_equal(got.selection.points, points)
-    told = got.interpretation
-    assert (told.given_frames, told.given_points) == (F, P)
-    assert (told.num_frames, told.num_points) == (len(frames), len(points))
+    interpretation = got.interpretation
+    assert (interpretation.given_frames, interpretation.given_points) == (F, P)
+    assert (interpretation.num_frames, interpretation.num_points) == (len(frames), len(points))
 
 
 numbers = st.one_of(st.none(), st.integers(-15, 15))

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 from pliant.worker.jobs.service import Jobs
+from reconciler_world import World
 
 
 def names(jobs: Jobs) -> list[str]:
@@ -45,3 +47,45 @@ def test_held_back_jobs_are_not_queued_by_their_priority(jobs: Jobs, submit) -> 
     submit(ada, name="a1")
     submit(ada, name="a2-high", priority="high")
     assert names(jobs) == ["a1"], "fairness between owners stays: one of hers at once"
+
+
+def test_a_job_of_a_lost_worker_passes_only_those_of_less_priority(tmp_path: Path, submit) -> None:  # type: ignore[no-untyped-def]
+    world = World(tmp_path)
+    lost = {name: submit(world.jobs, name=name, priority=name).id for name in ("low", "normal", "high")}  # type: ignore[arg-type]
+    attempts = [world.claim(id) for id in lost.values()]
+    others = [submit(world.jobs, name=f"waiting-{name}", priority=name).id for name in ("high", "normal", "low")]
+    assert names(world.jobs) == ["waiting-high", "waiting-normal", "waiting-low"]
+    world.pass_seconds(7)
+    assert [world.jobs.get(id).attempt for id in lost.values()] == [1, 1, 1]
+    assert not set(attempts) & set(world.jobs.queue.waiting())
+    order = names(world.jobs)
+    ranks = {"high": 0, "normal": 1, "low": 2}
+    assert [ranks[name.rpartition("-")[2]] for name in order] == [0, 0, 1, 1, 2, 2]
+    assert order[0] == "high", "it has been at the front before"
+    assert len(others) == 3
+
+
+def test_a_lost_delivery_is_queued_by_its_priority(tmp_path: Path, submit) -> None:  # type: ignore[no-untyped-def]
+    world = World(tmp_path)
+    forgotten = submit(world.jobs, name="low", priority="low")
+    submit(world.jobs, name="normal")
+    world.jobs.queue.remove(world.jobs.records.get(forgotten.id).attempt_id)
+    world.pass_seconds(5)
+    assert names(world.jobs) == ["normal", "low"]
+
+
+def test_of_held_back_jobs_the_highest_priority_comes_first(tmp_path: Path, submit) -> None:  # type: ignore[no-untyped-def]
+    world = World(tmp_path, max_running=1)
+    first = submit(world.jobs, name="first")
+    submit(world.jobs, name="second")
+    submit(world.jobs, name="urgent", priority="high")
+    assert names(world.jobs) == ["first"]
+    world.pass_seconds(2)
+    world.jobs.cancel(first.id)
+    world.pass_seconds(2)
+    assert names(world.jobs) == ["urgent"]
+
+
+def test_the_stores_keep_the_priority_of_an_attempt(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
+    id = submit(priority="high").id
+    assert jobs.records.beats([id])[id].priority == "high"

@@ -35,7 +35,7 @@ LOOPBACK = "127.0.0.0/8"
 
 
 class Receiver:
-    """A web server that remembers what it got and answers as it is told."""
+    """A web server that records requests and sends the answers it was given."""
 
     def __init__(self) -> None:
         self.got: list[tuple[str, dict[str, str], bytes]] = []
@@ -138,8 +138,8 @@ def test_the_end_of_a_job_is_sent_once_with_signature_and_body(
     content = f"{headers['webhook-id']}.{headers['webhook-timestamp']}.".encode() + body
     digest = hmac.new(b"k" * 32, content, hashlib.sha256).digest()
     assert headers["webhook-signature"] == f"v1,{base64.b64encode(digest).decode()}"
-    said = json.loads(body)
-    assert (said["type"], Job.model_validate(said["data"])) == ("job.cancelled", job)
+    event = json.loads(body)
+    assert (event["type"], Job.model_validate(event["data"])) == ("job.cancelled", job)
     assert SECRET.encode() not in body
     until(lambda: "Webhook delivered: the receiver returned 204 (attempt 1)." in door.log(job.id))
     time.sleep(0.7)

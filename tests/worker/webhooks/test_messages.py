@@ -128,7 +128,7 @@ def test_a_message_contains_event_and_job_but_no_secret(interpretation: Interpre
         options=Options(),
         interpretation=interpretation,
     )
-    said = json.loads(message(job))
-    assert (said["type"], said["timestamp"]) == ("job.cancelled", moment.isoformat())
-    assert Job.model_validate(said["data"]) == job
+    event = json.loads(message(job))
+    assert (event["type"], event["timestamp"]) == ("job.cancelled", moment.isoformat())
+    assert Job.model_validate(event["data"]) == job
     assert message(job) == message(job)

@@ -37,6 +37,7 @@ PARSERS = {
     "matlab5": Parser("matlab", "read_matlab5"),
     "matlab73": Parser("pose_hdf5", "read_hdf5"),
     "csv": Parser("csv", "read_csv"),
+    "json": Parser("pose_json", "read_landmarks"),
     "obj": Parser("meshes", "read_obj"),
     "ply": Parser("meshes", "read_ply"),
     "glb": Parser("gltf", "read_glb"),
@@ -69,6 +70,8 @@ def recognise(head: bytes, field: str) -> str:
     if _is_text(head):
         if field == "mesh":
             return "gltf" if head.lstrip().startswith(b"{") else "obj"
+        if field == "tracks" and head.lstrip(b"\xef\xbb\xbf \t\r\n").startswith((b"[", b"{")):
+            return "json"
         if looks_like_csv(head):
             return "csv"
     raise unknown_format(field, head)

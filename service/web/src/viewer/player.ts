@@ -1,5 +1,8 @@
 // Time: which moment of the animation is shown, and how it moves on.
 
+import { h } from "../dom";
+import { choice, group } from "./controls";
+
 export type Ending = "loop" | "back and forth" | "once";
 
 export class Player {
@@ -62,4 +65,19 @@ export class Player {
       this.pause();
     }
   }
+}
+
+/** The choices of speed and of what follows the last frame. */
+export function paceControls(player: Player): HTMLElement {
+  const speeds: [string, string][] = [["1", "1 ×"], ["0.5", "½ ×"], ["0.25", "¼ ×"], ["2", "2 ×"], ["4", "4 ×"]];
+  const endings: [string, string][] = [["loop", "loop"], ["back and forth", "back and forth"], ["once", "stop"]];
+  return group(
+    "Pace",
+    h(
+      "div",
+      { class: "row pace" },
+      choice("Speed", speeds, (value) => (player.speed = Number(value))),
+      choice("At the end", endings, (value) => (player.ending = value as Ending)),
+    ),
+  );
 }

@@ -1,0 +1,167 @@
+"""Seconds left, as shown while a job runs, against the true ones: ten runs over HTTP and on the command line.
+
+    python -m benchmarks.installation.progress --results benchmarks/results/progress.jsonl
+    python -m benchmarks.installation.progress --only flag,sphere
+
+Each run writes one line: the ticks as [seconds since the start, seconds left as shown], the longest time without a tick, and how far the
+shown time was from the true one after a quarter of the way. Over HTTP the ticks are the events that the page follows; on the command line
+they are what `pliant solve` writes on a terminal.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import pty
+import re
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pliant.client import Client
+from pliant.solver.gallery import Sequence, corrupt, face, flag, sphere
+
+from benchmarks.commit import commit
+from benchmarks.installation.instance import Instance
+
+SHOWN = re.compile(rb"(\d+) s left")
+LEAST = 2.0
+"""Seconds left from which the ratio counts: both are shown as whole seconds."""
+TICKS = 80
+"""Ticks that a line keeps, evenly spaced."""
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    name: str
+    make: Callable[[], Sequence]
+    line: bool = False
+    """Whether it runs on the command line."""
+    options: dict[str, str] = field(default_factory=dict)
+    cameras: bool = False
+    """Whether the true rotations are given."""
+
+
+RUNS = (
+    Run("face", lambda: face(30, 1000, degrees=30)),
+    Run("face, larger", lambda: face(60, 4000, degrees=30, scale_change=0.05), line=True),
+    Run("flag", lambda: flag(40, 800, degrees=40)),
+    Run("sphere", lambda: sphere(40, 1500), line=True),
+    Run("outliers", lambda: corrupt(face(30, 800, degrees=40), outliers=0.08)),
+    Run("hidden points", lambda: corrupt(face(60, 600, degrees=40), hidden=0.3), line=True),
+    Run("few frames", lambda: face(10, 20_000, degrees=60)),
+    Run("smooth prior", lambda: face(60, 10_000, degrees=40), line=True, options={"prior": "smooth"}),
+    Run("known cameras", lambda: face(99, 6000, degrees=40), cameras=True),
+    Run("size of the picture", lambda: face(40, 600, degrees=40), line=True, options={"image_size": "640x480"}),
+)
+
+
+def main() -> None:
+    """Run, print a table, and append a line a run."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", default="", help="names or parts of them, separated by commas")
+    parser.add_argument("--results", type=Path, help="JSON lines to append to")
+    given = parser.parse_args()
+    wanted = [word for word in given.only.split(",") if word]
+    print("| run | size | seconds | after a quarter: shown, true | longest silence | ticks within a factor of two |")
+    print("|---|---|---|---|---|---|")
+    with tempfile.TemporaryDirectory() as scratch, Instance(Path(scratch) / "service", workers=1) as instance:
+        for run in RUNS:
+            if wanted and not any(word in run.name for word in wanted):
+                continue
+            row = measured(run, Path(scratch), instance)
+            quarter = row["quarter"]
+            print(
+                f"| {run.name}, {row['door']} | {row['frames']} × {row['points']} | {row['seconds']:.0f} | {quarter[1]:.0f}, "
+                f"{row['seconds'] - quarter[0]:.0f} | {row['silence']:.1f} | {row['within']:.0%} |",
+                flush=True,
+            )
+            if given.results is not None:
+                with given.results.open("a") as file:
+                    file.write(json.dumps(row) + "\n")
+
+
+def measured(run: Run, scratch: Path, instance: Instance) -> dict[str, Any]:
+    """Run once."""
+    sequence = run.make()
+    files = {"tracks": scratch / "tracks.npz", "mesh": scratch / "mesh.npz"}
+    np.savez(files["tracks"], tracks=sequence.tracks.points, visibility=sequence.tracks.visible > 0)
+    np.savez(files["mesh"], faces=sequence.mesh.faces)
+    if run.cameras:
+        files["rotations"] = scratch / "rotations.npz"
+        np.savez(files["rotations"], rotations=sequence.rotations)
+    seen = list(
+        on_the_command_line(files, run.options, scratch) if run.line else over_http(files, run.options, instance)
+    )
+    end = seen[-1][0]
+    ticks = [(at, left) for at, left in seen[:-1] if left is not None]
+    later = [(at, left) for at, left in ticks if at >= end / 4 and end - at >= LEAST]
+    fits = [0.5 <= left / (end - at) <= 2 for at, left in later]
+    quarter = later[0] if later else (end, 0.0)
+    frames, points = sequence.tracks.visible.shape
+    chosen = sorted({round(place) for place in np.linspace(0, len(ticks) - 1, min(TICKS, len(ticks)))}) if ticks else []
+    return {
+        "run": run.name, "door": "command line" if run.line else "HTTP", "frames": frames, "points": points, "seconds": round(end, 1),
+        "silence": round(max(after[0] - before[0] for before, after in zip([(0.0, None), *seen], seen, strict=False)), 2),
+        "quarter": [round(each, 1) for each in quarter], "within": round(float(np.mean(fits)), 3) if fits else 1.0,
+        "ticks": [[round(ticks[place][0], 1), round(ticks[place][1], 1)] for place in chosen],
+        "load": round(os.getloadavg()[0], 1), "machine": f"{platform.machine()}, {os.cpu_count()} cores", "commit": commit(),
+    }  # fmt: skip
+
+
+def over_http(
+    files: dict[str, Path], options: dict[str, str], instance: Instance
+) -> Iterator[tuple[float, float | None]]:
+    """Yield time and seconds left of every event since the job runs; the last one is the end."""
+    with Client(instance.url) as client:
+        job = client.submit(**files, options=options)
+        instance.acknowledged.append(job.id)
+        began = None
+        for now in job.events():
+            if now.status == "queued":
+                continue
+            began = time.monotonic() if began is None else began
+            left = None if now.progress is None else now.progress.seconds_left
+            yield time.monotonic() - began, None if now.status.final else left
+
+
+def on_the_command_line(
+    files: dict[str, Path], options: dict[str, str], scratch: Path
+) -> Iterator[tuple[float, float | None]]:
+    """Yield time and seconds left of everything that `pliant solve` writes on a terminal; the last one is the end."""
+    command = [sys.executable, "-m", "pliant.cli", "solve", str(files["tracks"]), "-o", str(scratch / "out"), "--force"]
+    command += [f"--{name}={path}" for name, path in files.items() if name != "tracks"]
+    for name, value in options.items():
+        command += ["-O", f"{name}={value}"]
+    here, there = pty.openpty()
+    began: float | None = None
+    with subprocess.Popen(command, stdout=there, stderr=there, env={**os.environ, "COLUMNS": "200"}) as process:
+        os.close(there)
+        while True:
+            try:
+                text = os.read(here, 1 << 16)
+            except OSError:  # the other end is closed
+                break
+            if not text:
+                break
+            now = time.monotonic()
+            shown = SHOWN.findall(text)
+            if b"%" in text:
+                began = now if began is None else began
+                yield now - began, float(shown[-1]) if shown else None
+    os.close(here)
+    assert process.returncode == 0, command
+    assert began is not None
+    yield time.monotonic() - began, None
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,94 @@
+// Another job beside this one: its choice, its pane, its curve in the timeline, and the difference of the errors.
+
+import { h, say } from "../dom";
+import { type Values, errorDifference, percent } from "./colours";
+import { Companion, type Other, meanError } from "./companion";
+import { choice, group } from "./controls";
+import type { Preview } from "./preview";
+import type { Timeline } from "./timeline";
+
+/** The parts of the viewer that a comparison changes. */
+export interface Compared {
+  preview: Preview;
+  timeline: Timeline;
+  /** Where the other job's pane is added. */
+  panes: HTMLElement;
+  signal: AbortSignal;
+  /** The choice of colours, once it is there. */
+  colours: () => HTMLSelectElement | null;
+  paint: (values: Values | null) => void;
+  repaint: () => void;
+  /** Runs what may fail and shows the failure. */
+  guarded: (action: () => Promise<void>) => Promise<void>;
+}
+
+export class Comparison {
+  /** The figures in words. */
+  readonly summary = h("p", { class: "hint", role: "status" });
+  companion: Companion | null = null;
+
+  constructor(private readonly parts: Compared) {}
+
+  /** The choice of a job; the jobs are fetched now, and again when the list is opened. */
+  choice(others: () => Promise<Other[]>): HTMLElement {
+    let known: Other[] = [];
+    const made = choice("Compare with", [["", "no other job"]], (id) => void this.show(known.find((one) => one.id === id) ?? null));
+    const select = made.querySelector("select") as HTMLSelectElement;
+    const load = (): void => {
+      void this.parts.guarded(async () => {
+        known = await others();
+        const have = new Set([...select.options].map(({ value }) => value));
+        select.append(...known.filter(({ id }) => !have.has(id)).map(({ id, title }) => h("option", { value: id }, title)));
+      });
+    };
+    load();
+    select.addEventListener("focus", load);
+    return group("Compare", made);
+  }
+
+  private async show(other: Other | null): Promise<void> {
+    const { preview, timeline, panes, signal, paint, repaint, guarded } = this.parts;
+    await guarded(async () => {
+      this.companion?.dispose();
+      this.companion = null;
+      timeline.compare(null);
+      say(this.summary, "");
+      if (this.offerDifference(false)) paint(null);
+      if (other === null) return;
+      const companion = await Companion.open(other, signal);
+      this.companion = companion;
+      companion.element.append(h("span", { class: "view-name" }, other.title));
+      panes.append(companion.element);
+      timeline.compare(companion.preview, other.title);
+      const values = await errorDifference(preview, companion.preview, signal);
+      if (values) {
+        this.offerDifference(true);
+        paint(values);
+      }
+      say(this.summary, this.words(other, companion.preview, values !== null));
+      repaint();
+    });
+  }
+
+  /** Add the difference of errors to the colours, chosen, or remove it; returns true if it was the one shown. */
+  private offerDifference(on: boolean): boolean {
+    const select = this.parts.colours();
+    if (select === null) return false;
+    const shown = select.value === "difference";
+    select.querySelector("option[value=difference]")?.remove();
+    if (on) select.append(h("option", { value: "difference", selected: true }, "error difference"));
+    if (on) select.value = "difference";
+    else if (shown) select.value = "plain";
+    return shown;
+  }
+
+  private words(other: Other, theirs: Preview, sharesPoints: boolean): string {
+    const { preview } = this.parts;
+    const name = [preview, theirs].every((one) => meanError(one, "error") !== null) ? "error" : "expected";
+    const [here, there] = [meanError(preview, name), meanError(theirs, name)];
+    const words = name === "error" ? "3-D error" : "Expected error";
+    const figures = here !== null && there !== null ? `${words}: this job ${percent(here)}, ${other.title} ${percent(there)}.` : "";
+    const shares = sharesPoints ? "The colours show where this job's error is larger (red) or smaller (blue)." : "The two jobs do not have the same points, so errors are not compared point by point.";
+    return `${figures} ${shares}`.trim();
+  }
+}

@@ -1,0 +1,149 @@
+"""The alert rules fire on faults of a live service, and the dashboard's queries have values on its /metrics."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+import yaml
+from long_jobs import LONG, long_sequence
+from prometheus import Prometheus, binary, quantile
+from serving import Running, Serve, form, npz
+from serving import until as until_
+from worker_house import children
+
+DEPLOY = Path(__file__).parents[3] / "deploy"
+RULES: list[dict[str, Any]] = yaml.safe_load((DEPLOY / "prometheus" / "alerts.yml").read_text())["groups"][0]["rules"]
+PANELS = json.loads((DEPLOY / "grafana" / "pliant.json").read_text())["panels"]
+EVERY = 15.0
+"""Seconds between two scrapes, as Prometheus counts them; the test does not wait for them."""
+
+
+class Observer:
+    """Scrapes a live service on a clock of its own, and evaluates the rules each time, as Prometheus does."""
+
+    def __init__(self, http: httpx.Client) -> None:
+        self.http, self.prometheus, self.now = http, Prometheus(), 0.0
+
+    def look(self, times: int = 1) -> set[str]:
+        """Scrape and return the alerts that fire."""
+        firing: set[str] = set()
+        for _ in range(times):
+            self.now += EVERY
+            self.prometheus.scrape(self.http.get("/metrics").text, at=self.now)
+            firing = self.prometheus.firing(RULES)
+        return firing
+
+
+@contextmanager
+def worker(running: Running, log: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """Run one worker, which nothing restarts."""
+    env = {**os.environ, **running.jobs.settings.to_environment(), "PLIANT_THREADS": "1"}
+    with log.open("ab") as out:
+        process = subprocess.Popen([sys.executable, "-m", "pliant.worker", "work"], env=env, stderr=out)
+    try:
+        until_(lambda: running.jobs.queue.workers(), seconds=60)
+        yield process
+    finally:
+        process.kill()
+        process.wait(30)
+
+
+def long_job(http: httpx.Client) -> str:
+    sequence = long_sequence()
+    parts = form(
+        npz(tracks=sequence.tracks.points), mesh="none", rotations=npz(rotations=sequence.rotations),
+        options={**LONG, "outputs": []},
+    )  # fmt: skip
+    answer = http.post("/v1/jobs", files=parts)
+    assert answer.status_code == 202, answer.text
+    return str(answer.json()["id"])
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="finds processes in /proc")
+def test_killed_processes_fire_their_alerts(serve: Serve, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    running = serve()
+    with httpx.Client(base_url=running.url, timeout=20) as http:
+        observer = Observer(http)
+        with worker(running, tmp_path / "log") as process:
+            assert observer.look(8) == set()
+            for _ in range(3):
+                id = long_job(http)
+                until_(lambda id=id: http.get(f"/v1/jobs/{id}").json()["progress"], seconds=60)  # type: ignore[misc]
+                (job_process,) = children(process.pid)
+                os.kill(job_process, signal.SIGKILL)
+                until_(lambda id=id: http.get(f"/v1/jobs/{id}").json()["status"] == "failed", seconds=60)  # type: ignore[misc]
+                assert http.get(f"/v1/jobs/{id}").json()["error"]["code"] == "worker_lost"
+                firing = observer.look(2)
+            assert firing == {"PliantWorkersLost"}
+            process.kill()
+            process.wait(30)
+            for name in running.jobs.queue.workers():  # its heartbeat expires within 20 s
+                running.jobs.queue._redis.pexpire(f"{running.jobs.settings.queue}:worker:{name}", 1)  # type: ignore[attr-defined]
+            until_(lambda: not running.jobs.queue.workers(), seconds=60)
+            assert "PliantNoWorker" not in observer.look(), "it may be restarted within a minute"
+            assert observer.look(4) == {"PliantNoWorker", "PliantWorkersLost"}
+        with worker(running, tmp_path / "log"):
+            assert observer.look() == {"PliantWorkersLost"}, "half an hour looks back"
+            assert observer.look(125) == set()
+            began = time.time()
+            id = http.post(
+                "/v1/jobs", files=form(mesh="none", options={"method": "pseudo_inverse", "outputs": []})
+            ).json()["id"]
+            until_(lambda: http.get(f"/v1/jobs/{id}").json()["status"] in ("succeeded", "failed"), seconds=60)
+            assert http.get(f"/v1/jobs/{id}").json()["status"] == "succeeded", time.time() - began
+            observer.look(4)
+            for panel in PANELS:
+                for target in panel["targets"]:
+                    assert observer.prometheus.query(target["expr"]), (panel["title"], target["expr"])
+
+
+def test_an_unreachable_store_fires_its_alert(serve: Serve) -> None:
+    running = serve(redis_url="redis://127.0.0.1:1")
+    with httpx.Client(base_url=running.url, timeout=20) as http:
+        observer = Observer(http)
+        assert observer.look() == set()
+        assert "PliantStoreDown" in observer.look(5)
+
+
+def test_alerts_that_need_load_fire_on_what_metrics_say() -> None:
+    prometheus = Prometheus()
+    told = (
+        'pliant_http_requests_total{{status="200"}} {ok}\npliant_http_requests_total{{status="503"}} {failed}\n'
+        'pliant_http_answer_seconds_bucket{{route="/v1/jobs/{{id}}",le="1.0"}} {fast}\n'
+        'pliant_http_answer_seconds_bucket{{route="/v1/jobs/{{id}}",le="2.5"}} {ok}\n'
+        'pliant_http_answer_seconds_bucket{{route="/v1/jobs/{{id}}",le="+Inf"}} {ok}\n'
+        'pliant_webhooks_total{{result="given_up"}} {given_up}\npliant_queue_oldest_seconds {age}\n'
+    )
+    for step in range(50):
+        now = {"ok": 100 * step, "failed": 10 * step, "fast": 90 * step, "given_up": step // 40, "age": 60 * step}
+        prometheus.scrape(told.format(**now), at=EVERY * step)
+        firing = prometheus.firing(RULES)
+    assert firing == {"PliantErrors", "PliantSlow", "PliantWebhooksFail", "PliantQueueStuck"}
+
+
+def test_the_evaluation_follows_prometheus() -> None:
+    prometheus = Prometheus()
+    for at, counts in ((0, (5, 1)), (60, (7, 2)), (120, (1, 4))):  # the first counter is reset at 120 s
+        text = "\n".join(f'c_total{{k="{k}"}} {n}' for k, n in zip("ab", counts, strict=True))
+        prometheus.scrape(f"# TYPE c counter\n{text}\n", at=float(at))
+    a, b = frozenset({("k", "a")}), frozenset({("k", "b")})
+    assert prometheus.query("increase(c_total[2m])") == {a: 2.0, b: 3.0}
+    assert prometheus.query('rate(c_total{k!~"a|x"}[1m])') == {b: 2 / 60}
+    assert prometheus.query("sum(c_total) / sum(c_total) * 2") == {frozenset(): 2.0}
+    assert prometheus.query("max by (k) (c_total) >= 4") == {b: 4.0}
+    assert binary("==", {a: 1.0, b: 2.0}, {a: 1.0}) == {a: 1.0}
+    buckets = {frozenset({("le", le)}): n for le, n in (("1", 5.0), ("2", 10.0), ("+Inf", 10.0))}
+    assert quantile(0.75, buckets) == {frozenset(): 1.5}
+    assert quantile(0.5, {frozenset({("le", "+Inf")}): 0.0}) == {}
