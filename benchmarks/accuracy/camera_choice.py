@@ -1,10 +1,11 @@
 """`camera=auto` beside orthography on sequences as they are recorded: it should cost nothing where there is no perspective.
 
-    python -m benchmarks.accuracy.camera_choice --data DIR [--only NAME] [--points 300] [--out FILE]
+    python -m benchmarks.accuracy.camera_choice --data DIR [--only NAME] [--points 300] [--distance 3] [--out FILE]
     python -m benchmarks.accuracy.camera_choice --table
 
 Both camera models solve the same tracks one after the other. Every sequence is a line of JSON in FILE: errors, processor seconds, the
-focal length if one was found, and whether the shapes are the same to the bit. Sequences that are there are skipped.
+focal length if one was found, and whether the shapes are the same to the bit. Sequences that are there are skipped. `--distance` projects
+the true shapes by a pinhole so many half-sizes away (`benchmarks.accuracy.distances`), to compare the times where perspective is found.
 """
 
 from __future__ import annotations
@@ -12,13 +13,14 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from pliant.solver import Settings, solve
 from pliant.solver.evaluation.metrics import e3d_frame
 
-from benchmarks.accuracy.distances import rows
+from benchmarks.accuracy.distances import PICTURE, rows, seen_from
 from benchmarks.sequences import Case, cases
 
 RESULTS = Path(__file__).parent.parent / "results" / "camera_choice.jsonl"
@@ -27,13 +29,13 @@ WORST_ERROR, WORST_TIME = 1.02, 1.6
 """Largest ratios of error and time, `auto` over orthography, that the choice may cost."""
 
 
-def measure(case: Case) -> dict[str, Any]:
+def measure(case: Case, *, image_size: tuple[float, float] | None = None) -> dict[str, Any]:
     """Return one row: the sequence solved with both camera models."""
     found: dict[str, Any] = {"sequence": f"{case.name} P={case.tracks.num_points}"}
     shapes = []
     for name, camera in (("orthographic", "scaled_orthographic"), ("auto", "auto")):
         began = time.process_time()
-        solution = solve(case.tracks, case.mesh, settings=Settings(camera=camera))  # type: ignore[arg-type]
+        solution = solve(case.tracks, case.mesh, settings=Settings(camera=camera, image_size=image_size))  # type: ignore[arg-type]
         found[f"seconds_{name}"] = round(time.process_time() - began, 2)
         found[f"e3d_frame_{name}"] = None if case.shapes is None else e3d_frame(solution.shapes, case.shapes)
         shapes.append(solution.shapes)
@@ -61,13 +63,20 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--data", type=Path, help="directory of recorded sequences; the gallery without it")
     parser.add_argument("--only", action="append", default=[], help="names that hold this word")
     parser.add_argument("--points", type=int, default=300, help="keep at most so many points")
+    parser.add_argument("--distance", help="of a pinhole camera, in half-sizes; the tracks as recorded without it")
     parser.add_argument("--out", type=Path, default=RESULTS)
     parser.add_argument("--table", action="store_true", help="only print what was measured")
     given = parser.parse_args(arguments)
     done = {row["sequence"] for row in rows(given.out)}
     for case in () if given.table else cases(given.data, points=given.points, visibility="file", only=given.only):
+        size = None
+        if given.distance is not None:
+            if case.shapes is None or case.cameras is None:
+                continue
+            tracks, shapes, _ = seen_from(case, float(given.distance))
+            case, size = replace(case, name=f"{case.name} d={given.distance}", tracks=tracks, shapes=shapes), PICTURE
         if f"{case.name} P={case.tracks.num_points}" not in done:
-            row = measure(case)
+            row = measure(case, image_size=size)
             given.out.parent.mkdir(parents=True, exist_ok=True)
             with given.out.open("a") as file:
                 file.write(json.dumps(row) + "\n")

@@ -1,0 +1,96 @@
+"""Coverage from quantiles, pooled over sequences, and the table of real sheets."""
+
+from __future__ import annotations
+
+import json
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+ROOT = Path(__file__).parent.parent.parent
+
+
+@pytest.fixture
+def bench(monkeypatch):
+    """Import a module of the benchmarks as they import each other: from the root of the repository."""
+    monkeypatch.syspath_prepend(str(ROOT))
+    return lambda name: import_module(f"benchmarks.{name}")
+
+
+def solve_of(name: str, *, too_small: float, kind: str = "clean", count: int = 99) -> dict:
+    """A solve whose errors are normal with a standard deviation `too_small` times the one stated."""
+    levels = np.arange(1, count + 1) / (count + 1)
+    return {
+        "sequence": name, "kind": kind, "true": 0.1, "interval": [0.05, 0.2],
+        "quantiles": (too_small * norm.ppf((1 + levels) / 2)).tolist(),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("count", [19, 99])
+def test_coverage_follows_from_quantiles(bench, count: int) -> None:
+    tables = bench("trust_tables")
+    row = solve_of("one", too_small=2.0, count=count)
+    assert tables.within(row, 2 * 1.645) == pytest.approx(0.9, abs=1e-3)
+    assert tables.within(row, 2 * 0.6745) == pytest.approx(0.5, abs=1e-3)
+    assert tables.within(row, 1e6) == pytest.approx(1, abs=0.03)
+    assert tables.within({"sequence": "none"}) is None
+
+
+def test_sequences_count_equally_however_often_they_were_solved(bench) -> None:
+    tables = bench("trust_tables")
+    often = [solve_of("often", too_small=1.0, kind=str(number)) for number in range(5)]
+    often.append(solve_of("often with image_size", too_small=1.0))
+    rows = [*often, solve_of("once", too_small=4.0)]
+    expected = (tables.within(often[0], 1.645) + tables.within(rows[-1], 1.645)) / 2
+    assert tables.pooled(rows, 1.645) == pytest.approx(expected)
+    width = tables.calibrated(rows)
+    assert tables.pooled(rows, width) == pytest.approx(0.9, abs=1e-3)
+    assert width > 1.645
+    assert tables.calibrated(often) == pytest.approx(1.645, abs=0.01)
+    assert "once clean" in tables.exceptions([*often, solve_of("once", too_small=20.0)])
+    assert "no solve" in tables.exceptions(often)
+
+
+def rolled_sheet(folder: Path) -> None:
+    """A sheet rolled onto cylinders, 12 views of a pinhole camera, as a recorded sequence."""
+    across, down = np.meshgrid(np.linspace(-1, 1, 7), np.linspace(-0.7, 0.7, 6))
+    shapes = []
+    for turn, bend in zip(np.linspace(-0.6, 0.6, 12), np.linspace(0.3, 1.3, 12), strict=True):
+        rolled = np.stack([np.sin(bend * across) / bend, down, (1 - np.cos(bend * across)) / bend], axis=-1).reshape(
+            -1, 3
+        )
+        rotation = np.array([[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]])
+        shapes.append(rolled @ rotation.T + [0, 0, 4])
+    truth = np.array(shapes)
+    (folder / "rolled").mkdir(parents=True)
+    np.savez(folder / "rolled" / "tracks.npz", tracks=[319.5, 239.5] + 600 * truth[..., :2] / truth[..., 2:])
+    np.savez(folder / "rolled" / "truth.npz", shapes=truth, focal=600.0)
+    (folder / "rolled" / "about.json").write_text(json.dumps({"units": "pixels", "image_size": [640, 480]}))
+
+
+def test_other_methods_on_a_sheet_are_measured_once_and_tabulated(bench, tmp_path, capsys) -> None:
+    sheets = bench("accuracy.sheets")
+    rolled_sheet(tmp_path / "data")
+    out = tmp_path / "sheets.jsonl"
+    given = [
+        "--data",
+        str(tmp_path / "data"),
+        "--methods",
+        "plane,mdh",
+        "--kinds",
+        "clean,shuffled,all",
+        "--out",
+        str(out),
+    ]
+    sheets.main(given)
+    found = {(row["method"], row["kind"]): row["error"] for row in map(json.loads, out.read_text().splitlines())}
+    assert set(found) == {("plane", "clean"), ("mdh", "clean"), ("mdh", "shuffled")}
+    assert found["mdh", "clean"] < 0.5 * found["plane", "clean"]
+    assert found["mdh", "shuffled"] == pytest.approx(found["mdh", "clean"], rel=0.05)
+    first = out.read_text()
+    sheets.main(given)
+    assert out.read_text() == first
+    assert "| rolled | clean | – | – | – |" in capsys.readouterr().out
