@@ -62,7 +62,8 @@ USUAL_RATIO = 0.4
 """Decrease of the objective of a reweighting over that of the one before, where it is not known yet."""
 
 REFINEMENT_UNITS = {True: 3600, False: 700}
-"""Units of the stage `refinement` with and without scales; the plan has a number between, until it is known."""
+"""Units of the stage `refinement` where the covariance may couple the modes, and where the model order rules that out. The plan has a
+number between, until this is known."""
 
 UNITS_PER_START = 500
 """Units that one starting point of the stage `starts` takes."""

@@ -126,7 +126,8 @@ def learn(
         start_scales, why = _free_scales(unscaled, before, model_order, should_stop)
     rotations, scales, found = before, np.ones(len(used)), None
     if turning:
-        enter(should_stop, "refinement", units=REFINEMENT_UNITS[start_scales is not None])
+        may_couple = model_order == ModelOrder(ordered=estimate.ordered)
+        enter(should_stop, "refinement", units=REFINEMENT_UNITS[may_couple])
         found = refined(
             unscaled, before, scales if start_scales is None else start_scales, with_scales=start_scales is not None,
             rounds=REFINEMENT_ROUNDS, model_order=model_order, should_stop=should_stop,
@@ -142,9 +143,7 @@ def learn(
 
         if bends:
             estimate, found, unscaled, sample = again(found)
-        if model_order == ModelOrder(ordered=estimate.ordered) and full_mode_covariance.is_identifiable(
-            found.covariance, estimate.sample.shape[1]
-        ):
+        if may_couple and full_mode_covariance.is_identifiable(found.covariance, estimate.sample.shape[1]):
             found = _coupled(unscaled, found, with_scales=start_scales is not None, should_stop=should_stop)
             if bends:
                 estimate, found, unscaled, sample = again(found)
