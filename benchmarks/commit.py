@@ -14,7 +14,7 @@ def commit() -> str:
     """Return the short hash of the checked-out commit, with a `+` if files under version control differ from it."""
     try:
         head = _git("rev-parse", "--short", "HEAD")
-        return head + ("+" if _git("status", "--porcelain", "--untracked-files=no", "--", "solver") else "")
+        return head + ("+" if _git("status", "--porcelain", "--untracked-files=no", "--", "solver", "tracking") else "")
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
 

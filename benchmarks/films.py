@@ -1,13 +1,14 @@
 """Films end to end: accuracy of tracks and shapes, and what tracking costs.
 
-    python -m benchmarks.films rendered [--only NAME] [--frames N] [--size WxH] [--points N] [--out FILE]
-    python -m benchmarks.films recorded FOLDER [--points N] [--out FILE]
+    python -m benchmarks.films rendered [--only NAME] [--frames N] [--size WxH] [--points N] [--tracks-only] [--out FILE]
+    python -m benchmarks.films recorded FOLDER [--tracks-only] [--out FILE]
     python -m benchmarks.films speed [--seconds S] [--size WxH] [--threads N] [--out FILE]
 
 `rendered` renders gallery surfaces with texture, background, blur and noise, tracks them, and solves the tracks found and, for the same
 points, the exact ones. `recorded` takes a folder with `film.mp4`, `mask.png` and `truth.npz` (`frames`, `pixels (K, N, 2)`, `shapes
-(K, N, 3)`). The focal length is never given. `speed` tracks a made-up film of moving texture in a process of its own and prints seconds
-and peak memory, for the film and for its first quarter. Results are appended as JSON lines; what FILE holds is not measured again.
+(K, N, 3)`). The focal length is never given. `--tracks-only` solves nothing; names of its rows end in "tracks". `speed` tracks a made-up
+film of moving texture in a process of its own and prints seconds and peak memory, for the film and for its first quarter. Results are
+appended as JSON lines; what FILE holds is not measured again.
 """
 
 from __future__ import annotations
@@ -52,14 +53,19 @@ def rendered(given: argparse.Namespace) -> None:
     for name, (make, occluder) in SCENES.items():
         if given.only and not any(word in name for word in given.only):
             continue
-        label = f"{name} {given.size} F={given.frames}"
+        label = _label(f"{name} {given.size} F={given.frames}", given)
         if any(row["film"] == label for row in _rows(given.out)):
             continue
         film = render_film(make(given.frames), size=size, distance=DISTANCE, occluder=occluder)
-        _keep(given.out, {"film": label, **_end_to_end(film, given.points)})
+        _keep(given.out, {"film": label, **_end_to_end(film, 0 if given.tracks_only else given.points)})
+
+
+def _label(film: str, given: argparse.Namespace) -> str:
+    return f"{film} tracks" if given.tracks_only else film
 
 
 def _end_to_end(film: RenderedFilm, points: int) -> dict[str, Any]:
+    """Track a film, and solve at most so many of its points and the exact tracks; 0 solves nothing."""
     start = film.num_frames // 2
     with tempfile.TemporaryDirectory() as folder:
         path = film.write(Path(folder) / "film.mkv")
@@ -68,6 +74,14 @@ def _end_to_end(film: RenderedFilm, points: int) -> dict[str, Any]:
         seconds = time.perf_counter() - began
     truth = Truth.of(film, tracked.tracks, tracked.template)
     accuracy = truth.track_accuracy(tracked.tracks, tracked.visibility)
+    row = {
+        "track_median": accuracy.median, "track_p95": accuracy.p95, "precision": accuracy.precision, "recall": accuracy.recall,
+        "track_seconds": seconds, "points": tracked.tracks.shape[1],
+    }  # fmt: skip
+    return row if points == 0 else row | _shapes(film, tracked, truth, points)
+
+
+def _shapes(film: RenderedFilm, tracked: TrackedFilm, truth: Truth, points: int) -> dict[str, Any]:
     mesh, kept = _thinned(tracked, points, truth)
     visible = np.where(tracked.visibility, tracked.confidence, 0)[:, kept]
     place = np.cumsum(truth.on) - 1
@@ -75,8 +89,7 @@ def _end_to_end(film: RenderedFilm, points: int) -> dict[str, Any]:
     found = _solved(tracked.tracks[:, kept], visible, mesh, film.size)
     ideal = _solved(exact, seen, mesh, film.size)
     return {
-        "track_median": accuracy.median, "track_p95": accuracy.p95, "precision": accuracy.precision, "recall": accuracy.recall,
-        "track_seconds": seconds, "points": len(kept), "e3d_frame_scaled": truth.shape_error(found, kept),
+        "points": len(kept), "e3d_frame_scaled": truth.shape_error(found, kept),
         "e3d_frame_scaled_exact_tracks": truth.shape_error(ideal, kept),
     }  # fmt: skip
 
@@ -110,16 +123,19 @@ def recorded(given: argparse.Namespace) -> None:
     followed = _carried(here, tracked.tracks[rows], pixels[first])
     seen = _carried(here, tracked.visibility[rows, :, None].astype(float), pixels[first])[..., 0] > 0.99
     error = np.linalg.norm(followed - pixels, axis=2)[seen]
-    visible = np.where(tracked.visibility, tracked.confidence, 0)
-    began = time.perf_counter()
-    found = _solved(tracked.tracks, visible, Mesh.from_grid(tracked.grid), tracked.image_size)
-    at = _carried(here, found[rows], pixels[first])
-    on = np.isfinite(at).all(axis=(0, 2))
     row = {
-        "film": given.folder.name, "track_median": float(np.median(error)), "track_p95": float(np.percentile(error, 95)),
-        "kept": float(seen[:, on].mean()), "points": tracked.tracks.shape[1], "track_seconds": tracking,
-        "solve_seconds": time.perf_counter() - began, "e3d_frame_scaled": e3d_frame_scaled(at[:, on], shapes[:, on]),
+        "film": _label(given.folder.name, given), "track_median": float(np.median(error)),
+        "track_p95": float(np.percentile(error, 95)), "kept": float(seen[:, np.isfinite(followed).all(axis=(0, 2))].mean()),
+        "points": tracked.tracks.shape[1], "track_seconds": tracking,
     }  # fmt: skip
+    if not given.tracks_only:
+        visible = np.where(tracked.visibility, tracked.confidence, 0)
+        began = time.perf_counter()
+        solved = _solved(tracked.tracks, visible, Mesh.from_grid(tracked.grid), tracked.image_size)
+        at = _carried(here, solved[rows], pixels[first])
+        on = np.isfinite(at).all(axis=(0, 2))
+        row["solve_seconds"] = time.perf_counter() - began
+        row["e3d_frame_scaled"] = e3d_frame_scaled(at[:, on], shapes[:, on])
     _keep(given.out, row)
 
 
@@ -212,6 +228,8 @@ def main(arguments: list[str] | None = None) -> None:
     two = commands.add_parser("recorded")
     two.add_argument("folder", type=Path)
     two.set_defaults(run=recorded)
+    for each in (one, two):
+        each.add_argument("--tracks-only", action="store_true", help="solve nothing")
     three = commands.add_parser("speed")
     three.add_argument("--seconds", type=float, default=10.0)
     three.add_argument("--size", default="640x480")

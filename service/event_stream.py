@@ -12,6 +12,7 @@ import time
 from collections import deque
 from collections.abc import AsyncGenerator, Callable
 from contextlib import suppress
+from functools import lru_cache
 from typing import Any
 
 from pliant.schemas.job import Job
@@ -25,6 +26,10 @@ KEPT = 256
 
 WAIT = 1.0
 """Seconds the reader waits for a change before it looks whether anybody still follows."""
+
+WOKEN_AT_ONCE = 25
+"""Followers that are woken in one turn of the event loop: between two turns it serves other requests, which would otherwise wait
+until the last of a thousand followers has been written to."""
 
 READ_AGAIN = 10.0
 """Seconds after which every followed job is read again: a change's message is lost while a connection is re-established."""
@@ -183,7 +188,7 @@ class _Watcher:
         self.read_up_to: str | None = None
         """The last event that the reader has read."""
         self._events: deque[Event] = deque(maxlen=KEPT)
-        self._next = asyncio.Event()
+        self._waiting: dict[asyncio.Future[None], None] = {}
 
     def publish(self, events: list[Event]) -> None:
         """Add events and wake the followers."""
@@ -196,24 +201,42 @@ class _Watcher:
         self.wake()
 
     def wake(self) -> None:
-        """Wake the followers."""
-        self._next.set()
-        self._next = asyncio.Event()
+        """Wake the followers, some in each turn of the event loop."""
+        waiting, self._waiting = self._waiting, {}
+        self._wake_some(deque(waiting))
+
+    def _wake_some(self, waiting: deque[asyncio.Future[None]]) -> None:
+        for _ in range(min(WOKEN_AT_ONCE, len(waiting))):
+            follower = waiting.popleft()
+            if not follower.done():  # it may have given up meanwhile
+                follower.set_result(None)
+        if waiting:
+            asyncio.get_running_loop().call_soon(self._wake_some, waiting)
 
     def newer(self, last: str) -> list[Event]:
         """Return the events after one."""
-        return [event for event in self._events if _order(event.id) > _order(last)]
+        known, found = _order(last), []
+        for event in reversed(self._events):
+            if _order(event.id) <= known:
+                break
+            found.append(event)
+        return found[::-1]
 
     async def changed(self, seconds: float) -> bool:
         """Wait for the next event; False if none came in this time."""
+        follower: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._waiting[follower] = None
         try:
             async with asyncio.timeout(seconds):
-                await self._next.wait()
+                await follower
         except TimeoutError:
             return False
+        finally:
+            self._waiting.pop(follower, None)
         return True
 
 
+@lru_cache(maxsize=KEPT)
 def is_final(event: Event) -> bool:
     """Return True if nothing follows this event."""
     return event.name == "job" and Job.model_validate_json(event.data).status.final

@@ -15,9 +15,12 @@ import numpy as np
 UNIT_SECONDS, FRAME_SECONDS = 1e-4, 1.9e-5
 """Seconds per unit of work, and per unit and frame, on one core: .19 ms at 10 frames, .41 at 30, .73 at 48, 1.4 at 74."""
 
-POINT_SECONDS, SETUP_SECONDS = 2.5e-5, 0.1
-"""Seconds per frame and point of the shapes, and of their setup. The former was .3e-5 on a rigid face, 1e-4 on a flag and 1.6e-4 on a
-sphere, because it depends on the conditioning; `Pace` therefore measures it."""
+POINT_SECONDS = {True: 1.2e-5, False: 6e-6}
+"""Seconds per frame and point of the shapes with and without a learned prior. With one they depend on the conditioning: .3e-5 on a
+rigid face, 2.4e-5 on ten frames of a face, 1e-4 on a flag, 1.6e-4 on a sphere; `Pace` therefore measures them."""
+
+SETUP_SECONDS = 0.1
+"""Of the shapes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +86,7 @@ def planned(
     hidden : bool
         Whether any point is hidden in any frame.
     """
-    shapes = Stage("shapes", SETUP_SECONDS + POINT_SECONDS * frames * points, 100)
+    shapes = Stage("shapes", SETUP_SECONDS + POINT_SECONDS[gaussian] * frames * points, 100)
     last = [stage_of("trust", frames)] if gaussian else []
     first = [Stage("surface", 0.5 + 0.5 * min(frames, 24), 280)] if sheet else []
     filled = COMPLETION_SECONDS * frames * min(points, MOST_COMPLETED) if hidden else 0.0
@@ -132,7 +135,7 @@ def settling(objectives: Sequence[float], *, tolerance: float, most: int) -> flo
     if last <= tolerance:
         return 1.0
     ratio = last / float(decreases[-2]) if taken > 1 and decreases[-2] > 0 else USUAL_RATIO
-    ratio = float(np.clip(ratio, 0.1, 0.9))
+    ratio = float(np.clip(ratio, 0.25, 0.9))  # the decrease slows down later
     left = np.log(tolerance / last) / np.log(ratio)
     return float(taken / (taken + min(left, max(most - taken, 0))))
 
@@ -177,11 +180,10 @@ class Pace:
         spent = now - self.began
         if stage.name == "shapes":
             pace = self.measured / self.planned
-            rest = (
-                spent * (1 - settled) / settled
-                if settled > 0
-                else max(pace * stage.seconds - spent, FIRST_REWEIGHTING * spent)
-            )
+            if settled > 0:  # the first reweighting takes longest, so those that are left take less each than it did
+                rest = min(spent * (1 - settled) / settled, FIRST_REWEIGHTING * spent)
+            else:
+                rest = max(pace * stage.seconds - spent, FIRST_REWEIGHTING * spent)
             return rest + pace * ahead
         pace = (
             (self.measured + spent) / (self.planned + share * stage.seconds)

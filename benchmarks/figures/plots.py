@@ -201,12 +201,33 @@ def distance(records: Records) -> Figure:
     return figure
 
 
+def progress(records: Records) -> Figure:
+    """Seconds left as shown against the true ones, each run as shares of its duration."""
+    figure, axes = plt.subplots(figsize=(6.5, 4))
+    ends = np.array([0.0, 1.0])
+    axes.fill_between(ends, (1 - ends) / 2, (1 - ends) * 2, color="#dddddd", label="within a factor of two")
+    axes.plot(ends, 1 - ends, color="black", lw=1)
+    for number, r in enumerate(records):
+        at, left = np.array(r["ticks"]).T / r["seconds"]
+        dashes = "--" if r["door"] == "command line" else "-"
+        label = f"{r['run']}, {r['frames']} × {r['points']}, {r['door']}, {r['seconds']:.0f} s"
+        axes.plot(at, left, dashes, color=f"C{number % 10}", lw=1.2, label=label)
+    axes.axvline(0.25, color="black", lw=0.5)
+    axes.set_xlim(0, 1)
+    axes.set_ylim(0, 1.6)
+    axes.set_xlabel("elapsed time / duration")
+    axes.set_ylabel("seconds left as shown / duration")
+    axes.legend(fontsize=7, frameon=False, loc="center left", bbox_to_anchor=(1, 0.5))
+    return figure
+
+
 FIGURES: dict[str, tuple[str, Callable[[Records], Figure]]] = {
     "error-by-sequence": ("accuracy", error_by_sequence),
     "error-by-corruption": ("accuracy", error_by_corruption),
     "growth": ("growth", growth),
     "baselines": ("baselines", baselines),
     "error-by-distance": ("distances", distance),
+    "seconds-left": ("progress", progress),
 }
 """Name of the picture → results it is drawn from, and how."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable
 from contextlib import aclosing
-from functools import partial
+from functools import lru_cache, partial
 from typing import Annotated
 
 from anyio import to_thread
@@ -13,6 +13,7 @@ from fastapi import APIRouter, Header, Request
 from fastapi.responses import PlainTextResponse, Response, StreamingResponse
 from fastapi.sse import KEEPALIVE_COMMENT, EventSourceResponse, format_sse_event
 from pliant.service.dependencies import Core, Mine
+from pliant.service.event_stream import KEPT
 from pliant.service.openapi import problems
 from pliant.service.routes.jobs import Id
 from pliant.worker.errors import WorkerError
@@ -86,6 +87,12 @@ def log(id: Id, jobs: Mine) -> Response:
     return PlainTextResponse(jobs.log(id))
 
 
+@lru_cache(maxsize=KEPT)
+def _encoded(event: Event) -> bytes:
+    """Return an event in the format of text/event-stream; all its followers share the bytes."""
+    return format_sse_event(id=event.id, event=event.name, data_str=event.data)
+
+
 async def _encode(
     stream: AsyncGenerator[Event | None], *, still_valid: Callable[[], Awaitable[bool]] | None
 ) -> AsyncIterator[bytes]:
@@ -99,7 +106,7 @@ async def _encode(
                 if event is None:
                     yield KEEPALIVE_COMMENT
                 else:
-                    yield format_sse_event(id=event.id, event=event.name, data_str=event.data)
+                    yield _encoded(event)
     except WorkerError as error:
         # The store does not answer or the job was deleted: the client reconnects with Last-Event-ID and gets a status.
         _log.warning("an event stream ended early: %s", error)

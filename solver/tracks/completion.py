@@ -148,12 +148,12 @@ def choose_points(visible: Floats, random: np.random.Generator) -> NDArray[np.in
 
 
 def ranks(points: Floats) -> NDArray[np.intp]:
-    """Return each point's rank by its mean squared distance from the centroid, shape `(P,)`.
+    """Return each point's rank by its distance from the centroid, root mean square and farthest first, shape `(P,)`.
 
     What is drawn by rank depends neither on the order of the points nor on the image's axes.
     """
-    squares = (points**2).sum(axis=(0, 2))
-    return np.argsort(np.argsort(squares, kind="stable"), kind="stable")
+    nearness = -(points**2).sum(axis=(0, 2))
+    return np.argsort(np.argsort(nearness, kind="stable"), kind="stable")
 
 
 def fit_basis(

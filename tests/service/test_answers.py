@@ -17,8 +17,9 @@ from pliant.service.app import STATUS_OF
 from pliant.service.settings import MB
 from pliant.service.spool import Incoming
 from pliant.worker import errors
-from pliant.worker.errors import InvalidSetting
+from pliant.worker.errors import InvalidSetting, StoreUnavailable
 from pliant.worker.records import utc_now
+from pliant.worker.store.blobs import Blobs
 from serving import Running, Serve, finish, settings_from, submit, until
 
 CONTENTS = os.urandom(3_000_000)
@@ -168,6 +169,22 @@ def test_without_its_store_the_service_returns_503_and_keeps_nothing(serve: Serv
     assert (answer.status_code, answer.json()["code"]) == (503, "store_unavailable")
     assert answer.json()["retryable"]
     assert answer.headers["retry-after"] == "2"
+
+
+def test_a_job_is_deleted_while_the_blob_store_is_away(
+    running: Running, http: httpx.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    id = submit(http).id
+    finish(running, id, b"result")
+
+    def away(*_: object) -> None:
+        raise StoreUnavailable("The blob store", reason="no answer")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Blobs, "delete", away)
+        assert http.delete(f"/v1/jobs/{id}").status_code == 204
+        assert http.get(f"/v1/jobs/{id}").status_code == 404, "the record is gone, and nothing else is stated"
+    assert set(running.jobs.records.deleted()) >= {id}, "the reconciler removes the files later"
 
 
 def test_every_error_of_the_worker_has_a_status() -> None:

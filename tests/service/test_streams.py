@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import signal
 import socket
@@ -11,11 +12,13 @@ import threading
 import time
 from collections.abc import Iterator
 from datetime import timedelta
+from itertools import pairwise
 from pathlib import Path
 
 import httpx
 import pytest
-from pliant.worker.records import utc_now
+from pliant.service.event_stream import WOKEN_AT_ONCE, _Watcher
+from pliant.worker.records import Event, utc_now
 from pliant.worker.settings import Settings
 from serving import Running, Serve, claim, finish, form, submit, tracks, until
 
@@ -36,6 +39,32 @@ def test_an_idle_stream_sends_comment_lines(restless: Running) -> None:
             signs = [next(line for line in lines if line.startswith(":")) for _ in range(4)]
         assert signs == [": ping"] * 4
         assert 0.6 < time.monotonic() - begun < 5
+
+
+def test_between_followers_the_service_answers_others() -> None:
+    async def turns() -> list[int]:
+        watcher, woken = _Watcher(), [0]
+
+        async def follow() -> None:
+            assert await watcher.changed(20)
+            woken[0] += 1
+
+        followers = [asyncio.create_task(follow()) for _ in range(4 * WOKEN_AT_ONCE + 1)]
+        await asyncio.sleep(0)
+        followers.pop().cancel()
+        watcher.publish([Event("1-0", "progress", "{}"), Event("2-0", "progress", "{}")])
+        assert [event.id for event in watcher.newer("1-0")] == ["2-0"]
+        seen = []
+        while not all(task.done() for task in followers):
+            await asyncio.sleep(0)  # as another request does
+            seen.append(woken[0])
+        assert not await watcher.changed(0.01)
+        assert watcher._waiting == {}
+        return seen
+
+    seen = asyncio.run(turns())
+    assert seen[-1] == 4 * WOKEN_AT_ONCE
+    assert max(after - before for before, after in pairwise([0, *seen])) <= WOKEN_AT_ONCE
 
 
 def test_a_client_that_disconnects_is_forgotten(restless: Running) -> None:

@@ -165,16 +165,16 @@ def _preview(result: Result, file: IO[bytes]) -> None:
 
 
 KINDS = (
-    Kind("shapes.npz", None, "application/zip", "All arrays: shapes (F, P, 3), deviations, cameras, faces, residuals, weights.", 2, _npz),
-    Kind("shapes.glb", "glb", "model/gltf-binary", "The moving mesh and its camera as animated glTF, y up.", 2, _glb),
-    Kind("shapes_ply.zip", "ply", "application/zip", "One binary PLY for each frame.", 6, _painted(write_ply_zip)),
-    Kind("shapes_obj.zip", "obj", "application/zip", "One OBJ for each frame.", 30, _painted(write_obj_zip)),
-    Kind("shapes.usdc", "usd", "application/octet-stream", "The moving mesh as USD, y up.", 3, _painted(usd.write_usd), textured=False),
-    Kind("shapes.usdz", "usd", "model/vnd.usdz+zip", "USD, y up, with its picture.", 3, _painted(usd.write_usdz), textured=True),
-    Kind("shapes.abc", "abc", "application/octet-stream", "The moving mesh as Alembic, y up.", 3, _painted(alembic.write_alembic)),
+    Kind("shapes.npz", None, "application/zip", "All arrays: shapes (F, P, 3), deviations, cameras, faces, residuals, weights.", 1, _npz),
+    Kind("shapes.glb", "glb", "model/gltf-binary", "The moving mesh and its camera as animated glTF, y up.", 4, _glb),
+    Kind("shapes_ply.zip", "ply", "application/zip", "One binary PLY for each frame.", 5, _painted(write_ply_zip)),
+    Kind("shapes_obj.zip", "obj", "application/zip", "One OBJ for each frame.", 13, _painted(write_obj_zip)),
+    Kind("shapes.usdc", "usd", "application/octet-stream", "The moving mesh as USD, y up.", 8, _painted(usd.write_usd), textured=False),
+    Kind("shapes.usdz", "usd", "model/vnd.usdz+zip", "USD, y up, with its picture.", 8, _painted(usd.write_usdz), textured=True),
+    Kind("shapes.abc", "abc", "application/octet-stream", "The moving mesh as Alembic, y up.", 8, _painted(alembic.write_alembic)),
     Kind("shapes.mat", "mat", "application/x-matlab-data", "The same arrays for MATLAB; faces from 1.", 2, _at_once(matlab.write_mat)),
     Kind("shapes.mdd", "mdd", "application/octet-stream", "Point cache for Blender, Maya and Houdini, y up.", 2, _painted(write_mdd)),
     Kind("metrics_frames.csv", "csv", "text/csv", "Metrics of every frame.", 2, _at_once(write_frames_csv)),
-    Kind("metrics_points.csv", "csv", "text/csv", "Metrics of every point.", 2, _at_once(write_points_csv)),
-    Kind(preview.NAME, None, preview.MEDIA_TYPE, preview.DESCRIPTION, 1, _at_once(_preview)),
+    Kind("metrics_points.csv", "csv", "text/csv", "Metrics of every point.", 1, _at_once(write_points_csv)),
+    Kind(preview.NAME, None, preview.MEDIA_TYPE, preview.DESCRIPTION, 4, _at_once(_preview)),
 )  # fmt: skip

@@ -17,8 +17,8 @@ from pliant.worker.errors import Interrupted, TimedOut
 from pliant.worker.execution.progress import Reporter
 from pliant.worker.formats import Inputs
 
-EXPORT_SECONDS = 5e-7
-"""Seconds per frame and point of writing a file whose `share` is 1, measured on 99 face scans of 29,299 points."""
+EXPORT_SECONDS = 1.5e-7
+"""Seconds per frame and point of writing a file whose `share` is 1, measured on a face of 99 frames and 3,000 points."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

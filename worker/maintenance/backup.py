@@ -112,8 +112,9 @@ def restore_backup(settings: Settings, source: Path) -> Summary:
     snapshot, jobs = Snapshot(settings), Jobs.open(settings)
     if not snapshot.is_empty():
         raise BadBackup("The installation has jobs or tokens already. Restore into an empty one.")
+    kinds = _media_types(records)
     for key in manifest["blobs"]:
-        jobs.blobs.put(key, source / "blobs" / key)
+        jobs.blobs.put(key, source / "blobs" / key, media_type=kinds.get(key, "application/octet-stream"))
     snapshot.write_rest(json.loads(rest.read_text(encoding="utf-8")))
     owners = []
     for line in _lines(records):
@@ -146,6 +147,12 @@ def _copy_blobs(jobs: Jobs, stored: Stored, target: Path, kept: dict[str, int]) 
         found[key] = size
     kept.update(found)
     return new
+
+
+def _media_types(records: Path) -> dict[str, str]:
+    """Return the media type of each artifact by its blob key."""
+    held = (json.loads(line)["record"] for line in _lines(records))
+    return {f"{each['prefix']}{one['name']}": one["media_type"] for each in held for one in each["job"]["artifacts"]}
 
 
 def _queue_again(jobs: Jobs, stored: Stored) -> None:

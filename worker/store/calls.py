@@ -64,7 +64,7 @@ class RemoteCalls:
 COMMANDS = 24
 """Maximum number of commands that wait for Redis at once, fewer than the 40 request threads of the service."""
 
-TURN = 1.0
+TURN = 2.0
 """Seconds that a command waits until fewer do."""
 
 SILENT_AFTER = 2.0
@@ -72,6 +72,11 @@ SILENT_AFTER = 2.0
 
 PROBES = 4
 """Commands that wait for a silent server; others are refused at once, except one each second."""
+
+
+LAST_LOOK = 0.05
+"""Seconds that a command waits for a sign of a silent server before it is refused: after a pause of this process itself, such as on
+an overloaded machine, the answers are there and have only to be read."""
 
 
 @dataclass(slots=True)
@@ -116,7 +121,7 @@ class SilentServer:
                     self._answered, self._silent = now, False
                 elif now - since > SILENT_AFTER:
                     self._silent = True
-                self._room.notify()
+                self._room.notify_all()
 
     def _wait_for_turn(self) -> None:
         until = self.clock() + TURN
@@ -125,8 +130,13 @@ class SilentServer:
             if left <= 0:
                 raise redis.TimeoutError("too many commands are waiting for the server")
             self._room.wait(left)
-        if self._is_silent() and len(self._since) >= PROBES and self.clock() < self._probed + 1:
-            raise redis.TimeoutError("the server does not answer")
+        if self._refuses():
+            self._room.wait(LAST_LOOK)
+            if self._refuses():
+                raise redis.TimeoutError("the server does not answer")
+
+    def _refuses(self) -> bool:
+        return self._is_silent() and len(self._since) >= PROBES and self.clock() < self._probed + 1
 
     def _is_silent(self) -> bool:
         oldest = min(self._since.values(), default=self.clock())

@@ -17,12 +17,22 @@ export function setToken(token: string): void {
   else sessionStorage.removeItem(TOKEN);
 }
 
+/** Whether a token is kept. */
+export function hasToken(): boolean {
+  return sessionStorage.getItem(TOKEN) !== null;
+}
+
 /** The token of the share link that this page was opened with: it goes before a token of one's own. */
 let share: string | null = null;
 
 /** Read through a share link from now on. */
 export function setShare(token: string): void {
   share = token;
+}
+
+/** Whether the page reads through a share link, which shows one job and no others. */
+export function isShared(): boolean {
+  return share !== null;
 }
 
 export function headers(): Record<string, string> {

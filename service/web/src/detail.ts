@@ -1,6 +1,6 @@
 // One job: where it stands, what it was understood as, and what came of it.
 
-import { Refusal, artifactPath, cancelJob, deleteJob, getReport, listJobs, retryJob } from "./api";
+import { Refusal, artifactPath, cancelJob, deleteJob, getReport, isShared, listJobs, retryJob } from "./api";
 import { Afterwards } from "./afterwards";
 import { Countdown } from "./countdown";
 import { Curves } from "./curves";
@@ -16,6 +16,7 @@ import { Tab } from "./tab";
 import { type Job, type Progress, isFinal } from "./types";
 import { Understood } from "./understood";
 import { VerdictBox } from "./verdict";
+import type { Other } from "./viewer/companion";
 import type { Sources } from "./viewer/viewer";
 import { STATUS_WORDS, ago, bytes, percent, standing, title } from "./words";
 
@@ -256,16 +257,17 @@ export class Detail {
   private sources(job: Job): Sources {
     const path = (name: string): string | undefined =>
       job.artifacts.some((artifact) => artifact.name === name) ? artifactPath(job.id, name) : undefined;
+    const others = async (): Promise<Other[]> => {
+      const { jobs } = await listJobs();
+      const finished = jobs.filter((one) => one.id !== job.id && one.artifacts.some(({ name }) => name === PREVIEW));
+      return finished.map((one) => ({ id: one.id, title: title(one), preview: artifactPath(one.id, PREVIEW) }));
+    };
     return {
       title: title(job),
       preview: artifactPath(job.id, PREVIEW),
       film: path(FILM),
       usdz: path(USDZ),
-      others: async () => {
-        const { jobs } = await listJobs();
-        const finished = jobs.filter((one) => one.id !== job.id && one.artifacts.some(({ name }) => name === PREVIEW));
-        return finished.map((one) => ({ id: one.id, title: title(one), preview: artifactPath(one.id, PREVIEW) }));
-      },
+      ...(isShared() ? {} : { others }),
     };
   }
 }

@@ -1,7 +1,7 @@
 // The page: a form, a list, and the job that the address names (#job=…), so that a reload comes back to it.
 
 import { AGAIN, sharedJob } from "./afterwards";
-import { Refusal, setShare, setToken } from "./api";
+import { Refusal, hasToken, setShare, setToken } from "./api";
 import { Compose } from "./compose";
 import { Detail } from "./detail";
 import { button, h } from "./dom";
@@ -53,18 +53,23 @@ function named(): string | null {
   return new URLSearchParams(location.hash.slice(1)).get("job") || null;
 }
 
+const GATE = "This service needs a token. Paste the one that you were given for this service. It is kept until you close this tab.";
+
 /** Show a failure that concerns the whole page at its top, with a form for a token if one is missing. */
 function report(error: unknown): void {
   if (!(error instanceof Refusal)) throw error;
-  const parts: Node[] = [refusalBox(error.problem)];
-  if (error.problem.status === 401) parts.push(tokenForm());
-  if (trouble.childElementCount === 0 || error.problem.status !== 401) trouble.replaceChildren(...parts);
+  const { problem } = error;
+  // Without a token the service's sentence is about a header, which concerns programs.
+  const words = problem.code === "unauthorized" ? { ...problem, detail: GATE } : problem;
+  const parts: Node[] = [refusalBox(words)];
+  if (problem.status === 401) parts.push(tokenForm());
+  if (trouble.childElementCount === 0 || problem.status !== 401) trouble.replaceChildren(...parts);
 }
 
 function tokenForm(): HTMLElement {
   const input = h("input", { type: "password", id: "token", autocomplete: "off", required: true });
   const form = h("form", { class: "row" }, h("label", { for: "token" }, "Token"), input, h("button", { type: "submit" }, "Use"));
-  form.append(button("Remove", () => setToken(""), { class: "quiet" }));
+  if (hasToken()) form.append(button("Forget the token that was refused", () => setToken(""), { class: "quiet" }));
   form.addEventListener("submit", (event) => {
     event.preventDefault();
     setToken(input.value.trim());

@@ -6,6 +6,12 @@ import type { Problem } from "./types";
 /** Codes that the page itself gives: the service has no explanation of them. */
 const OURS = ["unreachable", "unknown", "no_events"];
 
+/** What to do, where the service's own words are about requests. */
+const ON_THE_PAGE: Record<string, string> = {
+  film_as_tracks: "Choose it under Film instead: its points are followed for you.",
+  picture_as_tracks: "Depth comes from motion: choose a film, or a zip of all its pictures, under Film.",
+};
+
 /**
  * Make the box that shows a problem. `choose` is called with the reading a person picks where several fit; `inPlace` means that
  * the box stands where the fault is, which need not be named again.
@@ -20,7 +26,8 @@ export function refusalBox(problem: Problem, choose?: ((choice: Record<string, u
     ["Got", problem.got],
   ];
   const shown = inPlace ? [] : facts.filter(([, value]) => value && !detail.includes(value));
-  const hint = problem.hint && (hintInside || !whole.includes(problem.hint)) ? h("p", {}, ...withCode(problem.hint)) : null;
+  const advice = (inPlace && ON_THE_PAGE[problem.code]) || problem.hint;
+  const hint = advice && (hintInside || !whole.includes(advice)) ? h("p", {}, ...withCode(advice)) : null;
   const list = h("dl", { class: "facts" }, ...shown.flatMap(([term, value]) => [h("dt", {}, term), h("dd", {}, value as string)]));
   const choices = choose ? (problem.choices ?? []).map((choice) => choiceButton(choice, choose)) : [];
   return h(

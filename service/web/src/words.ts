@@ -108,6 +108,6 @@ export function standing(job: Job): string {
     case "failed":
       return job.error?.detail ?? "The job failed; its log has the details.";
     case "cancelled":
-      return "Cancelled. Its results were not kept.";
+      return "This job was cancelled before it was done, so it has no results. “Try again” runs it from the same files.";
   }
 }

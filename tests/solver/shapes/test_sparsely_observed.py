@@ -132,7 +132,7 @@ def test_outliers_of_sparsely_observed_points_cost_little_more_than_hiding_them(
     assert (found.weights[wrong & in_hole] == 0).all()
     assert (found.weights[visible & ~wrong & in_hole] > 0).mean() > 0.97
     errors = [np.linalg.norm((each.shapes - TRUE)[:, HOLE]) for each in (found, spared)]
-    assert errors[0] < 1.08 * errors[1]
+    assert errors[0] < 1.05 * errors[1]
 
 
 @given(seed=st.integers(0, 2**32 - 1))

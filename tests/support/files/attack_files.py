@@ -248,6 +248,12 @@ FILMS = (
     Attack("film of huge pictures", "a zip of pictures that state 6,000 × 6,000 pixels", lambda: archive(*((f"{n}.png", LARGE_PICTURE)
            for n in range(3))), ("too_many_pixels",), part="film"),
     Attack("film of no pictures", "a zip of tracks as film", lambda: archive(("tracks.npy", HONEST)), ("no_picture",), part="film"),
+    Attack("film of sound alone", "an MP4 whose only track is sound", lambda: FTYP + mp4_box(b"moov", mp4_box(b"trak", mp4_box(b"mdia",
+           mp4_box(b"hdlr", bytes(8) + b"soun" + bytes(13))))) + mp4_box(b"mdat", bytes(1000)), ("no_picture",), part="film"),
+    Attack("film of boxes", "an MP4 of 30,000 empty boxes", lambda: FTYP + mp4_box(b"free") * 30_000, ("unsupported_film",), part="film"),
+    Attack("headless AVI", "an AVI that ends inside its header", lambda: b"RIFF\0\0\0\0AVI LIST", ("truncated_film",), part="film"),
+    Attack("film zip bomb", "a zip of pictures that unpack to 64 MB of zeros each", lambda: archive(*((f"{n}.png", bytes(64 << 20)) for n in range(3))),
+           ("too_many_bytes", "broken_picture"), part="film"),
     Attack("GIF of 60,000 × 60,000", "an animated GIF that states a huge size", lambda: b"GIF89a" + struct.pack("<HH", 60_000, 60_000) + bytes(20),
            ("too_many_pixels", "broken_picture"), part="film"),
 )  # fmt: skip

@@ -83,11 +83,11 @@ def test_a_finished_job_waits_for_an_unavailable_blob_store(
     finished = Finished(metrics={}, outcome="converged", sentence="Done.", warnings=(), artifacts=(artifact,))
     put, away = jobs.blobs.put, [3]
 
-    def sometimes(self: Blobs, key: str, file: Path) -> int:
+    def sometimes(self: Blobs, key: str, file: Path, **more: str) -> int:
         if away[0]:
             away[0] -= 1
             raise StoreUnavailable("The blob store", reason="away")
-        return put(key, file)
+        return put(key, file, **more)
 
     monkeypatch.setattr(Blobs, "put", sometimes)
     monkeypatch.setattr("pliant.worker.execution.monitor.time.sleep", lambda seconds: None)

@@ -11,6 +11,7 @@ from datetime import UTC, datetime
 from hashlib import sha256
 from pathlib import Path
 
+import httpx
 import pytest
 from pliant.schemas.job import Artifact, Job, Status
 from pliant.worker.errors import BadBackup, NewerData
@@ -187,3 +188,19 @@ def test_a_damaged_backup_is_refused_before_anything_is_written(backup: Path, em
         restore_backup(empty, backup)
     there = Jobs.open(empty)
     assert (there.count(list(Status)), there.blobs.list()) == (0, [])
+
+
+@pytest.mark.s3
+def test_files_restored_to_s3_have_their_media_type(
+    jobs: Jobs, submit: Submit, empty: Settings, s3_url: str, tmp_path: Path
+) -> None:
+    id = submit(name="done").id
+    succeed(jobs, id, b"result", tmp_path)
+    write_backup(jobs.settings, tmp_path / "backup")
+    there = replace(empty, blob_url=f"{s3_url}-{secrets.token_hex(3)}")
+    restore_backup(there, tmp_path / "backup")
+    _, blob = Jobs.open(there).artifact(id, "shapes.npz")
+    link = blob.link(seconds=60)
+    assert link is not None
+    answer = httpx.get(link)
+    assert (answer.content, answer.headers["content-type"]) == (b"result", "application/zip")

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from obstore.store import MemoryStore
 from pliant.worker.errors import StoreUnavailable
-from pliant.worker.store.blobs import CHUNK, CLIENT, Blobs, client_options
+from pliant.worker.store.blobs import CHUNK, CLIENT, SWITCHES, TEXTS, Blobs, client_options
 from pliant.worker.store.calls import AT_ONCE, WAITING, RemoteCalls
 
 
@@ -175,6 +175,13 @@ def test_a_store_that_accepts_connections_without_replying(monkeypatch: pytest.M
         for problem in problems:
             assert isinstance(problem, StoreUnavailable)
             assert "127.0.0.1" not in str(problem)
+
+
+def test_every_variable_about_the_store_is_documented() -> None:
+    page = (Path(__file__).parents[3] / "docs" / "how-to" / "s3.md").read_text()
+    credentials = ("access_key_id", "secret_access_key", "session_token", "region", "endpoint_url", "ca_bundle")
+    for name in (*SWITCHES, *TEXTS, *credentials):
+        assert f"`AWS_{name.upper()}`" in page, name
 
 
 def written() -> int:

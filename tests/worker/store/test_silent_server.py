@@ -108,3 +108,22 @@ def test_commands_and_pipelines_of_all_clients_count(monkeypatch: pytest.MonkeyP
             pipe.execute()
         text.close()
         raw.close()
+
+
+def test_an_answer_that_comes_at_the_last_moment_lets_others_through() -> None:
+    clock, end = Clock(), threading.Event()
+    server = SilentServer(clock=clock)
+    with ThreadPoolExecutor(PROBES) as pool:
+        waiting(server, PROBES, pool, end)
+        clock.now += SILENT_AFTER + 0.1
+        server._probed = clock.now
+        look = server._room.wait
+
+        def answered(seconds: float) -> bool:
+            server._answered = clock.now  # as the thread does that reads it
+            return look(0)
+
+        server._room.wait = answered  # type: ignore[assignment]
+        with server.call():
+            pass
+        end.set()

@@ -1,0 +1,115 @@
+"""Every state that a first-time user meets: no accessibility finding, no overflow, targets of 24 px.
+
+With PLIANT_SCREENSHOTS=FOLDER also a picture of each, in both widths and themes.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import httpx
+import pytest
+from browsing import why_not
+from paging import DONE, TRACKS, drop
+from playwright.sync_api import Page, Route, expect
+
+pytestmark = [
+    pytest.mark.chromium,
+    pytest.mark.skipif(why_not() is not None and not os.environ.get("CI"), reason=str(why_not())),
+]
+
+AXE = Path(__file__).parents[2] / "service" / "web" / "node_modules" / "axe-core" / "axe.min.js"
+RUN = "axe.run({rules: {'target-size': {enabled: true}}}).then((found) => found.violations)"
+"""With the rule of WCAG 2.2 that axe leaves out by default: targets of 24 px, or as much space around them."""
+
+VIEWS = ((390, "light"), (1280, "dark"))
+MORE_VIEWS = ((390, "dark"), (1280, "light"))
+VIDEO = b"\0\0\0\x18ftypmp42" + bytes(600)
+
+
+@pytest.fixture
+def check(page: Page) -> Callable[[str], None]:
+    if not AXE.is_file() and not os.environ.get("CI"):
+        pytest.skip("axe-core is not installed; say `make page`")
+
+    def checked(state: str) -> None:
+        page.evaluate(AXE.read_text())
+        folder = os.environ.get("PLIANT_SCREENSHOTS")
+        for width, scheme in (*VIEWS, *(MORE_VIEWS if folder else ())):
+            page.emulate_media(color_scheme=scheme, reduced_motion="reduce")  # type: ignore[arg-type]
+            page.set_viewport_size({"width": width, "height": 800 if width == 1280 else 844})
+            if folder:
+                page.screenshot(path=f"{folder}/{state}-{width}-{scheme}.png")
+            found = page.evaluate(RUN)
+            nodes = [(one["id"], [node["html"][:200] for node in one["nodes"]][:3]) for one in found]
+            assert nodes == [], (state, width, scheme)
+            assert page.evaluate("document.documentElement.scrollWidth") <= width, (state, width)
+
+    return checked
+
+
+def test_before_a_job(page: Page, url: str, small: dict[str, bytes], check: Callable[[str], None]) -> None:
+    page.get_by_role("button", name="breathing sphere").wait_for()
+    check("first-view")
+    drop(page, {name: small[name] for name in (TRACKS, "mesh.npz", "truth.npz")})
+    expect(page.locator("[data-part=tracks]")).to_contain_text("tracks 10 × 300 × 2 float64")
+    page.get_by_role("img", name="Sample of the tracks").wait_for()
+    check("dropped-files")
+    page.reload()
+    page.get_by_role("button", name="breathing sphere").wait_for()
+    page.get_by_label("Tracks", exact=True).set_input_files(
+        {"name": "holiday.npz", "mimeType": "application/octet-stream", "buffer": VIDEO}
+    )
+    page.get_by_role("button", name="Reconstruct").click()
+    expect(page.locator("[data-part=tracks]").get_by_role("alert")).to_contain_text(
+        "Expected point tracks, got a film (mp4 or mov).Choose it under Film instead: its points are followed for you."
+    )
+    check("refused-video")
+
+
+def test_while_a_job_runs(page: Page, url: str, long_job: Callable[[str], str], check: Callable[[str], None]) -> None:
+    id = long_job("running")
+    behind = long_job("behind it")
+    page.goto(f"{url}/#job={id}")
+    page.get_by_text("left.").first.wait_for(timeout=DONE)
+    check("running")
+    page.goto(f"{url}/#job={behind}")
+    expect(page.get_by_text("Next in the queue.")).to_be_visible()
+    check("queued")
+    page.get_by_role("button", name="Cancel").click()
+    expect(page.get_by_text("This job was cancelled before it was done")).to_be_visible()
+    check("cancelled")
+
+
+def test_a_finished_job(page: Page, url: str, finished: str, check: Callable[[str], None]) -> None:
+    page.goto(f"{url}/#job={finished}")
+    page.locator(".view canvas").wait_for(timeout=DONE)
+    page.get_by_role("region", name="Verdict").wait_for()
+    check("done")
+    link = httpx.post(f"{url}/v1/jobs/{finished}/shares", json={}).json()["path"]
+    page.goto("about:blank")  # otherwise only the part after # changes, and the page reloads itself
+    page.goto(f"{url}/{link.removeprefix('/')}")
+    page.get_by_text("You see a shared result, read-only.").wait_for()
+    page.locator(".view canvas").wait_for(timeout=DONE)
+    expect(page.get_by_label("Compare with")).to_have_count(0)
+    expect(page.get_by_text("Use a token for anything else")).to_have_count(0)
+    check("shared")
+
+
+def test_what_cannot_be_shown(page: Page, url: str, finished: str, check: Callable[[str], None]) -> None:
+    page.goto(f"{url}/#job=0123456789abcdef")
+    expect(page.get_by_role("heading", name="This job does not exist")).to_be_visible()
+    check("deleted-job")
+    problem = {"title": "Token required", "status": 401, "detail": "Send a header.", "code": "unauthorized"}
+
+    def guarded(route: Route) -> None:
+        route.fulfill(status=401, content_type="application/problem+json", body=json.dumps(problem))
+
+    page.route("**/v1/**", guarded)
+    page.goto(url)
+    page.reload()
+    expect(page.get_by_role("alert").first).to_contain_text("This service needs a token")
+    check("token-gate")
