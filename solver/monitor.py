@@ -81,7 +81,7 @@ class Monitor:
         place = next((number for number, stage in enumerate(self._ahead) if stage.name == name), None)
         if place is None:
             return
-        self._done += self._current.seconds if self._share > 0 else 0.0
+        self._done += self._share * self._current.seconds  # less than planned where it ended early
         self._pace.next(self._current, self._share, self._clock())
         self._current, self._ahead = self._ahead[place], self._ahead[place + 1 :]
         if units is not None:

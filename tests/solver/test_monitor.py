@@ -77,7 +77,7 @@ def test_progress_moves_evenly_and_never_falls() -> None:
     fractions = np.array([step.fraction for step in steps])
     assert (np.diff(fractions) >= 0).all()
     assert fractions[-1] == 1
-    assert np.diff(fractions[fractions < 0.9]).max() < 0.45, "more only where a stage ends early"
+    assert np.diff(fractions[fractions < 0.9]).max() < 0.25
     assert {"cameras", "initialise", "reweight", "finish"} <= {step.stage for step in steps}
 
 
@@ -103,15 +103,15 @@ def test_stages_that_do_not_run_leave_the_plan_and_others_join_it() -> None:
     monitor.enter("nothing of that name")
     monitor.enter("shapes")  # scales are left out
     monitor.report(Step("reweight", 0.5))
-    assert steps[-1].fraction == pytest.approx((2 + 0.5 * 2) / 5)
+    assert steps[-1].fraction == pytest.approx((0.9 + 0.5 * 2) / 3.9)  # 0.9 of 2 s were done when it ended early
     monitor.expect([Stage("scales", 5.0, 10)], before="trust")
     monitor.enter("scales", units=20)  # twice as long as planned
     monitor()
     monitor.report(Step("cameras", 0.0))
-    assert steps[-1].fraction == pytest.approx(3 / 5)  # a plan that grows does not go back
+    assert steps[-1].fraction == pytest.approx(1.9 / 3.9)  # a plan that grows does not go back
     monitor.enter("trust")
     assert monitor() is False
-    assert steps[-1].fraction == pytest.approx((4 + 10 + 0.09) / 15)
+    assert steps[-1].fraction == pytest.approx((1.9 + 0.45 + 0.09) / (1.9 + 0.45 + 1))
     monitor.report(Step("finish", 1.0))
     assert steps[-1].fraction == 1.0
 
