@@ -89,7 +89,7 @@ def planned(
     """
     shapes = Stage("shapes", SETUP_SECONDS + POINT_SECONDS[gaussian] * frames * points, 100)
     last = [stage_of("trust", frames)] if gaussian else []
-    first = [Stage("surface", 0.5 + 0.5 * min(frames, 24), 280)] if sheet else []
+    first = [Stage("surface", 0.5 + 0.35 * min(frames, 24), 280)] if sheet else []
     filled = COMPLETION_SECONDS * frames * min(points, MOST_COMPLETED) if hidden else 0.0
     first.append(Stage("completion", 0.1 + filled, 6))
     return (*first, *learning(frames, gaussian=gaussian, known_cameras=known_cameras), shapes, *last)
