@@ -195,7 +195,7 @@ def test_the_page_asks_for_the_token_and_shows_its_jobs(url: str, first: dict[st
     with Browsing() as browser:
         page = browser.new_page()
         page.goto(f"{url}/#job=paged")
-        expect(page.get_by_role("alert").first).to_contain_text("requires a token", timeout=20_000)
+        expect(page.get_by_role("alert").first).to_contain_text("This service needs a token", timeout=20_000)
         page.get_by_label("Token").fill("nonsense")
         page.get_by_role("button", name="Use", exact=True).click()
         expect(page.get_by_role("alert").first).to_contain_text("not known")

@@ -64,6 +64,7 @@ def test_tracks_begin_and_end_anywhere_and_some_jump(bench) -> None:
     assert (np.linalg.norm(everything.points - tracks.points, axis=2)[everything.visible > 0] > 20).mean() > 0.08
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_distances_are_measured_once_and_drawn(bench, tmp_path, monkeypatch) -> None:
     distances, plots = bench("accuracy.distances"), bench("figures.plots")

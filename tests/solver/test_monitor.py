@@ -59,7 +59,7 @@ def test_a_stop_during_the_default_is_reported() -> None:
 @pytest.mark.parametrize("noisy", [pytest.param(False, marks=pytest.mark.long), True])
 def test_a_stop_in_every_stage_is_reported(noisy: bool) -> None:
     tracks, settings = small(noisy=noisy), Settings()
-    for number in np.linspace(1, questions(tracks, settings), 12).astype(int):
+    for number in np.linspace(1, questions(tracks, settings), 8).astype(int):
         stopped_at(tracks, settings, number)
 
 

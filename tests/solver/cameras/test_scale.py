@@ -27,7 +27,7 @@ def test_scales_of_a_zooming_camera_are_recovered(frames: int, points: int) -> N
     assert found.choices.reasons["scales"].startswith("Scales from")
 
 
-@pytest.mark.parametrize("name", ["face", "flag"])
+@pytest.mark.parametrize("name", ["face", pytest.param("flag", marks=pytest.mark.long)])
 @pytest.mark.slow
 def test_a_camera_that_does_not_zoom_has_scales_of_one(name: str) -> None:
     film = {"face": gallery.face, "flag": gallery.flag}[name](30, 300)

@@ -132,6 +132,7 @@ def test_the_default_has_lower_error_with_strong_noise_than_the_papers_prior(kno
     assert error(Settings()) < 0.8 * error(Settings(prior="smooth"))
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_the_report_states_the_number_of_modes_and_the_reason() -> None:
     face = gallery.face(30, 60)
