@@ -25,7 +25,9 @@ def errors(sequence: gallery.Sequence, *, estimated: bool) -> list[float]:
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize("estimated", [False, True], ids=["known", "estimated"])
+@pytest.mark.parametrize(
+    "estimated", [pytest.param(False, id="known"), pytest.param(True, id="estimated", marks=pytest.mark.long)]
+)
 @pytest.mark.parametrize("outliers", [pytest.param(0.05, marks=pytest.mark.long), 0.10])
 @pytest.mark.slow
 def test_every_step_helps_against_outliers(outliers: float, estimated: bool) -> None:

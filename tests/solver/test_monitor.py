@@ -56,7 +56,8 @@ def test_a_stop_during_the_default_is_reported() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("noisy", [pytest.param(False, marks=pytest.mark.long), True])
+@pytest.mark.long
+@pytest.mark.parametrize("noisy", [False, True])
 def test_a_stop_in_every_stage_is_reported(noisy: bool) -> None:
     tracks, settings = small(noisy=noisy), Settings()
     for number in np.linspace(1, questions(tracks, settings), 8).astype(int):

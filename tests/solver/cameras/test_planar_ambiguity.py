@@ -77,6 +77,7 @@ def flag() -> gallery.Sequence:
     return gallery.flag(24, 300)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_the_pose_signs_of_a_flag_are_found(flag: gallery.Sequence) -> None:
     # without the sheet's own search the cameras are 23° off, and the shapes .34

@@ -118,7 +118,7 @@ def test_the_order_of_the_frames_has_no_effect() -> None:
     assert one_scale_error(other.points, plain.points[order]) < 2e-3
 
 
-@pytest.mark.parametrize("focal", [FOCAL, pytest.param(None, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("focal", [FOCAL, pytest.param(None, marks=[pytest.mark.slow, pytest.mark.long])])
 def test_a_stretching_sheet_is_not_taken_as_isometric(focal: float | None) -> None:
     verdict = isometric_surface(rolled("cone", stretch=0.2).tracks, focal=focal, image_size=SIZE)
     assert verdict.surface is None

@@ -151,6 +151,7 @@ def test_it_reduces_the_error_of_a_face(face: gallery.Sequence, known: bool) -> 
     assert 1e-4 < gaussian < 0.6 * smooth
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_gross_outliers_are_rejected_and_reported(face: gallery.Sequence) -> None:
     spoiled = gallery.corrupt(face, outliers=0.1, seed=1)
