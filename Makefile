@@ -59,15 +59,13 @@ demo: $(RUNS) $(PAGE)
 
 # Two processes share the tests. PROCESSES=1 runs them one after the other.
 PROCESSES ?= 2
-SHARED = $(if $(filter-out 1,$(PROCESSES)),-n $(PROCESSES) --dist loadfile)
-PYTEST = OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest $(SHARED)
+SHARED := $(if $(filter-out 1,$(PROCESSES)),-n $(PROCESSES) --dist loadfile)
+PYTEST := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest $(SHARED)
 NEEDY := slow or chromium or node or s3 or root
 
 test: $(STAMP)
 	$(PYTEST) -m "not ($(NEEDY))" $(TESTS)
 
-# Slow tests often wait for a lease, a time limit or a browser, so three processes keep two cores busy.
-test-slow: PROCESSES = 3
 test-slow: $(STAMP) $(PAGE)
 	$(PYTEST) -m "($(NEEDY)) and not long" $(TESTS)
 
