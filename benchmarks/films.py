@@ -20,7 +20,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +33,7 @@ from pliant.tracking import TrackedFilm, open_film, track_film
 from pliant.tracking.rendering import RenderedFilm, Truth, render_film
 from scipy.interpolate import LinearNDInterpolator
 
-from benchmarks.commit import commit
+from benchmarks.rows import append_row, rows
 
 SCENES: dict[str, tuple[Callable[[int], Sequence], bool]] = {
     "face": (lambda frames: face(frames, 3000, degrees=30), False),
@@ -54,7 +54,7 @@ def rendered(given: argparse.Namespace) -> None:
         if given.only and not any(word in name for word in given.only):
             continue
         label = _label(f"{name} {given.size} F={given.frames}", given)
-        if any(row["film"] == label for row in _rows(given.out)):
+        if any(row["film"] == label for row in rows(given.out)):
             continue
         film = render_film(make(given.frames), size=size, distance=DISTANCE, occluder=occluder)
         _keep(given.out, {"film": label, **_end_to_end(film, 0 if given.tracks_only else given.points)})
@@ -200,18 +200,10 @@ def _size(text: str) -> tuple[int, int]:
     return int(width), int(height)
 
 
-def _rows(path: Path) -> Iterator[dict[str, Any]]:
-    for line in path.read_text().splitlines() if path.exists() else []:
-        yield json.loads(line)
-
-
 def _keep(path: Path, row: dict[str, Any]) -> None:
-    row["commit"] = commit()
     rounded = {name: float(f"{value:.4g}") if isinstance(value, float) else value for name, value in row.items()}
     print(json.dumps(rounded, ensure_ascii=False), flush=True)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a") as file:
-        file.write(json.dumps(rounded, ensure_ascii=False) + "\n")
+    append_row(path, rounded)
 
 
 def main(arguments: list[str] | None = None) -> None:

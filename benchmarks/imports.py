@@ -26,8 +26,8 @@ from pliant.schemas.options import Options
 from pliant.worker.artifacts.geometry import upright, viewer_scale
 from pliant.worker.artifacts.kinds import kinds_for
 
-from benchmarks.commit import commit
 from benchmarks.files import finished, recorded
+from benchmarks.rows import append_row
 
 BLENDER_SCRIPT = Path(__file__).parent / "figures" / "blender_points.py"
 
@@ -54,8 +54,8 @@ def main() -> None:
             f"| {row['file']} | {row['bytes'] / 1e6:.1f} | {row['program']} | {row['distance']:.2e} | {row['share']:.1e} |"
         )
     if given.results is not None:
-        with given.results.open("a") as file:
-            file.writelines(json.dumps(row) + "\n" for row in rows)
+        for row in rows:
+            append_row(given.results, row)
 
 
 def written(folder: Path, given: argparse.Namespace) -> Path:
@@ -92,7 +92,7 @@ def compared(folder: Path, scratch: Path, blender: Path | None) -> list[dict[str
             {
                 "file": name, "program": program, "bytes": (folder / name).stat().st_size, "distance": distance / scale,
                 "share": distance / diagonal, "frames": len(shapes), "points": shapes.shape[1],
-                "encoding": told["encoding"] if name == "shapes.glb" else None, "commit": commit(),
+                "encoding": told["encoding"] if name == "shapes.glb" else None,
             }
         )  # fmt: skip
     return rows

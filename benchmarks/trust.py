@@ -29,6 +29,7 @@ from pliant.solver.evaluation.alignment import align
 from pliant.solver.evaluation.metrics import coverage, e3d_frame
 from pliant.solver.gallery import corrupt_tracks
 
+from benchmarks.rows import append_row, rows
 from benchmarks.sequences import Case, cases
 from benchmarks.trust_tables import written
 
@@ -129,17 +130,6 @@ def measured(case: Case, solution: Solution, *, scale_free: bool) -> dict[str, A
     return row
 
 
-def rows(path: Path) -> list[dict[str, Any]]:
-    """Return the measurements there are; a line that was cut off is skipped."""
-    found = []
-    for line in path.read_text().splitlines() if path.exists() else []:
-        try:
-            found.append(json.loads(line))
-        except json.JSONDecodeError:
-            continue
-    return found
-
-
 def main(arguments: list[str] | None = None) -> None:
     """Measure what is missing, or print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -155,7 +145,6 @@ def main(arguments: list[str] | None = None) -> None:
         written(rows(given.out), CALIBRATION, given.into)
         return
     done = {(row["sequence"], row["kind"]) for row in rows(given.out)}
-    given.out.parent.mkdir(parents=True, exist_ok=True)
     for name, kind, case, settings, scale_free in jobs(
         given.data, points=given.points, only=given.only, kinds=given.kinds.split(",")
     ):
@@ -171,8 +160,7 @@ def main(arguments: list[str] | None = None) -> None:
             **measured(case, solution, scale_free=scale_free),
             "cpu_seconds": seconds,
         }
-        with given.out.open("a") as file:
-            file.write(json.dumps(row) + "\n")
+        append_row(given.out, row)
         expected, true = (np.nan if row[key] is None else row[key] for key in ("expected", "true"))
         print(f"{name:36} {kind:10} {row['verdict']:11} expected {expected:.4f} true {true:.4f}", flush=True)
 

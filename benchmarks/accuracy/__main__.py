@@ -24,11 +24,12 @@ from pliant.solver import InvalidInput
 
 from benchmarks.accuracy import gate
 from benchmarks.accuracy.aims import aims_table
-from benchmarks.accuracy.cells import CORRUPTIONS, METHODS, Key, append_row, measure, read_rows
+from benchmarks.accuracy.cells import CORRUPTIONS, METHODS, Key, measure, read_rows
 from benchmarks.accuracy.plan import PARTS
 from benchmarks.accuracy.summary import write_summary
 from benchmarks.accuracy.tables import METRICS, clean_table, corruption_table, cost_table, number
 from benchmarks.commit import commit
+from benchmarks.rows import append_row
 from benchmarks.sequences import Case, cases, wanted
 
 SLOW = 10.0

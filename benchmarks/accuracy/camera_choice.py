@@ -20,7 +20,8 @@ from typing import Any
 from pliant.solver import Settings, solve
 from pliant.solver.evaluation.metrics import e3d_frame
 
-from benchmarks.accuracy.distances import PICTURE, rows, seen_from
+from benchmarks.accuracy.distances import PICTURE, seen_from
+from benchmarks.rows import append_row, rows
 from benchmarks.sequences import Case, cases
 
 RESULTS = Path(__file__).parent.parent / "results" / "camera_choice.jsonl"
@@ -77,9 +78,7 @@ def main(arguments: list[str] | None = None) -> None:
             case, size = replace(case, name=f"{case.name} d={given.distance}", tracks=tracks, shapes=shapes), PICTURE
         if f"{case.name} P={case.tracks.num_points}" not in done:
             row = measure(case, image_size=size)
-            given.out.parent.mkdir(parents=True, exist_ok=True)
-            with given.out.open("a") as file:
-                file.write(json.dumps(row) + "\n")
+            append_row(given.out, row)
             print(json.dumps(row), flush=True)
     print(table(given.out))
 

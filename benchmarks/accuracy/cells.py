@@ -14,6 +14,7 @@ from pliant.solver.evaluation.metrics import evaluate
 from pliant.solver.gallery import corrupt_tracks
 
 from benchmarks.commit import commit
+from benchmarks.rows import rows
 from benchmarks.sequences import Case
 
 METHODS: dict[str, dict[str, str]] = {
@@ -117,20 +118,4 @@ def key_of(row: dict[str, Any]) -> Key:
 
 def read_rows(path: Path) -> dict[Key, dict[str, Any]]:
     """Read finished cells; a line cut off by an interrupted run is measured again."""
-    rows: dict[Key, dict[str, Any]] = {}
-    for line in path.read_text().splitlines() if path.exists() else []:
-        try:
-            row = json.loads(line)
-        except json.JSONDecodeError:
-            continue
-        rows[key_of(row)] = row
-    return rows
-
-
-def append_row(path: Path, row: dict[str, Any]) -> None:
-    """Add one finished cell on a line of its own, even behind a line that was cut off."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a+") as file:
-        file.seek(0)
-        text = file.read()
-        file.write(("" if not text or text.endswith("\n") else "\n") + json.dumps(row) + "\n")
+    return {key_of(row): row for row in rows(path)}

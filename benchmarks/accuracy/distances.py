@@ -12,17 +12,15 @@ solver gets `image_size`, not φ. Distance `inf` is orthography. `--spoil noise,
 from __future__ import annotations
 
 import argparse
-import json
 import time
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from pliant.solver import Settings, Tracks, solve
 from pliant.solver.evaluation.metrics import evaluate
 
 from benchmarks.accuracy.spoiling import SPOILINGS, spoiled
+from benchmarks.rows import append_row, rows
 from benchmarks.sequences import Case, cases
 
 HALF_SIZE = 300.0
@@ -90,15 +88,6 @@ def measure(case: Case, distance: str, method: str, *, spoil: str = "clean") -> 
     return values
 
 
-def rows(path: Path) -> Iterator[dict[str, Any]]:
-    """Yield the measurements there are; a line that was cut off is skipped."""
-    for line in path.read_text().splitlines() if path.exists() else []:
-        try:
-            yield json.loads(line)
-        except json.JSONDecodeError:
-            continue
-
-
 def main(arguments: list[str] | None = None) -> None:
     """Measure what is missing, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -135,16 +124,15 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _keep(path: Path, name: str, distance: str, method: str, values: dict[str, float]) -> None:
-    with path.open("a") as file:
-        for metric in (*METRICS, "mirrored", "settled"):
-            value = values.get(metric)
-            if value is None:
-                continue
-            row = {
-                "method": method, "sequence": name, "metric": metric, "value": value if np.isfinite(value) else None,
-                "trial": 0, "distance": distance, "seconds": values["seconds"],
-            }  # fmt: skip
-            file.write(json.dumps(row) + "\n")
+    for metric in (*METRICS, "mirrored", "settled"):
+        value = values.get(metric)
+        if value is None:
+            continue
+        row = {
+            "method": method, "sequence": name, "metric": metric, "value": value if np.isfinite(value) else None,
+            "trial": 0, "distance": distance, "seconds": values["seconds"],
+        }  # fmt: skip
+        append_row(path, row)
 
 
 if __name__ == "__main__":

@@ -31,8 +31,8 @@ from pliant.solver.evaluation.alignment import align
 from pliant.solver.isometry.anchors import Anchors, connected, farthest_points, nearest_neighbours
 from pliant.solver.isometry.inextensible import SurfaceGraph, maximum_depth
 
-from benchmarks.accuracy.distances import rows
 from benchmarks.accuracy.spoiling import SPOILINGS, spoiled
+from benchmarks.rows import append_row, rows
 from benchmarks.sequences import Case, cases
 from benchmarks.trust import image_size
 
@@ -178,9 +178,7 @@ def main(arguments: list[str] | None = None) -> None:
                 "sequence": sheet.case.name, "points": sheet.case.tracks.num_points, "kind": kind, "method": method, **row,
                 "seconds": round(time.perf_counter() - began, 1), "cpu_seconds": round(time.process_time() - spent, 1),
             }  # fmt: skip
-            given.out.parent.mkdir(parents=True, exist_ok=True)
-            with given.out.open("a") as file:
-                file.write(json.dumps(row) + "\n")
+            append_row(given.out, row)
             print(json.dumps(row), flush=True)
     print(table(given.out))
 

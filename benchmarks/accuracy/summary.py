@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-import os
-import platform
 from collections import defaultdict
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from benchmarks.rows import machine
 
 FIELDS = ("case", "frames", "points", "visibility", "cameras", "corruption", "method")
 
@@ -36,6 +36,6 @@ def summarised(cell: dict[str, Any], trials: list[dict[str, Any]]) -> Iterable[d
         if len(values) > 1:
             record["std"] = float(np.std(values, ddof=1))
         record["seconds"] = round(float(np.mean([trial["seconds"] for trial in trials])), 1)
-        record["machine"] = f"{platform.machine()}, {os.cpu_count()} cores"
+        record["machine"] = machine()
         record["commit"] = trials[-1]["commit"]
         yield record

@@ -11,9 +11,7 @@ they are what `pliant solve` writes on a terminal.
 from __future__ import annotations
 
 import argparse
-import json
 import os
-import platform
 import pty
 import re
 import subprocess
@@ -29,8 +27,8 @@ import numpy as np
 from pliant.client import Client
 from pliant.solver.gallery import Sequence, corrupt, face, flag, sphere
 
-from benchmarks.commit import commit
 from benchmarks.installation.instance import Instance
+from benchmarks.rows import append_row
 
 SHOWN = re.compile(rb"(\d+) s left")
 LEAST = 2.0
@@ -85,8 +83,7 @@ def main() -> None:
                 flush=True,
             )
             if given.results is not None:
-                with given.results.open("a") as file:
-                    file.write(json.dumps(row) + "\n")
+                append_row(given.results, row)
 
 
 def measured(run: Run, scratch: Path, instance: Instance) -> dict[str, Any]:
@@ -113,7 +110,7 @@ def measured(run: Run, scratch: Path, instance: Instance) -> dict[str, Any]:
         "silence": round(max(after[0] - before[0] for before, after in zip([(0.0, None), *seen], seen, strict=False)), 2),
         "quarter": [round(each, 1) for each in quarter], "within": round(float(np.mean(fits)), 3) if fits else 1.0,
         "ticks": [[round(ticks[place][0], 1), round(ticks[place][1], 1)] for place in chosen],
-        "load": round(os.getloadavg()[0], 1), "machine": f"{platform.machine()}, {os.cpu_count()} cores", "commit": commit(),
+        "load": round(os.getloadavg()[0], 1),
     }  # fmt: skip
 
 

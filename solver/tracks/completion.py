@@ -148,7 +148,7 @@ def choose_points(visible: Floats, random: np.random.Generator) -> NDArray[np.in
 
 
 def ranks(points: Floats) -> NDArray[np.intp]:
-    """Return each point's rank by its distance from the centroid, root mean square and farthest first, shape `(P,)`.
+    """Return each point's rank by the sum of its squared distances from the centroid, largest first, shape `(P,)`.
 
     What is drawn by rank depends neither on the order of the points nor on the image's axes.
     """

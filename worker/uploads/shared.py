@@ -132,8 +132,9 @@ class SharedUploads(Uploads):
             late = self.expiry > 0 and state.touched + self.expiry <= now.timestamp()
             if late and self.discard(name, state):
                 gone.append(name.rpartition("/")[2])
+        named = _keys(held)
         for key, written in self.blobs.list(FOLDER):
-            if written < now - STRAY and not _named(key, held):
+            if written < now - STRAY and key not in named:
                 self.blobs.delete(key)
         return gone
 
@@ -146,8 +147,9 @@ class SharedUploads(Uploads):
                 yield f"Upload {name.rpartition('/')[2]} has lost {len(lost)} of its {len(state.pieces)} pieces."
             if self.expiry > 0 and state.touched + self.expiry + LATE.total_seconds() <= now.timestamp():
                 yield f"Upload {name.rpartition('/')[2]} should have expired."
+        named = _keys(held)
         for key, written in self.blobs.list(FOLDER):
-            if written < now - STRAY - LATE and not _named(key, held):
+            if written < now - STRAY - LATE and key not in named:
                 yield f"File {key} belongs to no upload."
 
     def name(self, id: str) -> str:
@@ -188,11 +190,9 @@ class SharedUploads(Uploads):
         return self.states.get(self.name(id))
 
 
-def _named(key: str, held: dict[str, State]) -> bool:
-    """Return whether a state names a piece."""
-    name, generation, piece = key.removeprefix(FOLDER).rsplit("/", 2)
-    state = held.get(name)
-    return state is not None and state.generation == generation and any(piece == each for each, _ in state.pieces)
+def _keys(held: dict[str, State]) -> set[str]:
+    """Return the blob keys of all pieces that the states name."""
+    return {f"{FOLDER}{name}/{state.generation}/{piece}" for name, state in held.items() for piece, _ in state.pieces}
 
 
 @dataclass(slots=True, kw_only=True)

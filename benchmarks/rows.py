@@ -1,0 +1,37 @@
+"""Results files: one JSON object on each line, with the machine and the commit that it was measured on."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+from pathlib import Path
+from typing import Any
+
+from benchmarks.commit import commit
+
+
+def machine() -> str:
+    """Return architecture and number of cores."""
+    return f"{platform.machine()}, {os.cpu_count()} cores"
+
+
+def rows(path: Path) -> list[dict[str, Any]]:
+    """Return the measurements there are; a line that an interrupted run cut off is skipped."""
+    found = []
+    for line in path.read_text().splitlines() if path.exists() else []:
+        try:
+            found.append(json.loads(line))
+        except json.JSONDecodeError:
+            continue
+    return found
+
+
+def append_row(path: Path, row: dict[str, Any]) -> None:
+    """Add a measurement on a line of its own, even behind a line that was cut off."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a+") as file:
+        file.seek(0)
+        text = file.read()
+        whole = {**row, "machine": machine(), "commit": commit()}
+        file.write(("" if not text or text.endswith("\n") else "\n") + json.dumps(whole, ensure_ascii=False) + "\n")
