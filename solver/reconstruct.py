@@ -14,6 +14,7 @@ from pliant.solver.cameras.joint_refinement import informative_frames, learn, le
 from pliant.solver.cameras.lens import given_lens
 from pliant.solver.cameras.perspective import Perspective, orthographic
 from pliant.solver.cameras.planar_ambiguity import is_planar
+from pliant.solver.descent import Descent
 from pliant.solver.energy.objective import residuals
 from pliant.solver.energy.problem import Problem
 from pliant.solver.energy.robust_loss import largest_weight
@@ -46,7 +47,7 @@ from pliant.solver.shapes.perspective_shapes import corrected_again, seen_in_per
 from pliant.solver.shapes.setup import build_problem, with_bending
 from pliant.solver.shapes.sparsely_observed import WELL_OBSERVED_SHARE, WellObserved, place_the_rest, well_observed
 from pliant.solver.shapes.state import State
-from pliant.solver.stages import learning, planned, settling
+from pliant.solver.stages import ITERATION_SECONDS, learning, planned, unseen_frames
 from pliant.solver.tracks.completion import seen_again
 from pliant.solver.tracks.frame_order import as_they_came, content_order, differences, in_order, resolved_order
 from pliant.solver.tracks.noise import OUTLIER_SHARE
@@ -149,10 +150,13 @@ def _solved(
 
     began = time.perf_counter()
     kept = None if part is None else part.kept
+    corrections = DEPTH_ROUNDS if estimate.perspective is not None and estimate.perspective.bends else 0
+    monitor.expect_corrections(corrections)
     history, outcome = _loop(problem, [state], settings, normalized.unit, report, should_stop)
-    for _ in range(DEPTH_ROUNDS if estimate.perspective is not None and estimate.perspective.bends else 0):
+    for ahead in reversed(range(corrections)):
         if outcome is Outcome.STOPPED:
             break
+        monitor.expect_corrections(ahead)
         problem, flat, changed = corrected_again(problem, history[-1], normalized, flat, estimate, kept)
         corrected = init(problem, history[-1].shapes, history[-1].translations)
         history.append(replace(corrected, reweighting=history[-1].reweighting))
@@ -387,10 +391,7 @@ def _loop(
         after = no_higher(before, computed)
         history[-1] = before.summary()
         history.append(after)
-        share = settling(
-            [state.objective for state in history], tolerance=settings.tolerance, most=settings.max_reweightings
-        )
-        report(_step_of("reweight", after, settings, unit, fraction=share))
+        report(_step_of("reweight", after, settings, unit))
         outcome = terminate(before, computed, tolerance=settings.tolerance, max_reweightings=settings.max_reweightings)
         if outcome is not None:
             return history, outcome
@@ -470,8 +471,11 @@ def _monitored(
     should_stop: Callable[[], bool] | None,
 ) -> Monitor:
     """Return the monitor of the solve, with its plan."""
+    unseen = 0.0 if tracks.all_visible else unseen_frames(tracks.visible)
     plan = planned(
         tracks.num_frames, tracks.num_points, gaussian=settings.gaussian, known_cameras=cameras is not None,
-        sheet=_tries_isometry(cameras, settings), hidden=not tracks.all_visible,
+        sheet=_tries_isometry(cameras, settings), unseen=unseen,
     )  # fmt: skip
-    return Monitor(on_step, should_stop, plan=plan)
+    descent = Descent(unseen, settings.tolerance, settings.max_reweightings)
+    per_iteration = ITERATION_SECONDS[settings.gaussian] * tracks.num_frames * tracks.num_points
+    return Monitor(on_step, should_stop, plan=plan, descent=descent, seconds_per_iteration=per_iteration)
