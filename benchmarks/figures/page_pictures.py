@@ -10,6 +10,7 @@ Chromium, the built page (`python build_page.py`) and, for the film, `pliant[fil
 from __future__ import annotations
 
 import argparse
+import contextlib
 import sys
 import tempfile
 from collections.abc import Callable
@@ -18,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 from playwright.sync_api import Browser, Page
-from pliant.client import Client
+from pliant.client import Client, NotAllowedNow
 from pliant.solver.gallery import Sequence, corrupt, face, flag
 from pliant.tracking.rendering import face_paint, render_film
 
@@ -64,6 +65,8 @@ def dropped_files(page: Page, url: str, jobs: Jobs) -> None:
     sequence = face(30, 400, degrees=40)
     drop(page, {"tracks.npz": packed(tracks=sequence.tracks.points), "mesh.npz": packed(faces=sequence.mesh.faces)})
     page.get_by_role("img", name="Sample of the tracks").wait_for()
+    if page.viewport_size is not None and page.viewport_size["width"] < 800:  # there, files are chosen in the form
+        page.get_by_role("region", name="How your files are interpreted").scroll_into_view_if_needed()
 
 
 def refused_file(page: Page, url: str, jobs: Jobs) -> None:
@@ -143,7 +146,8 @@ def main() -> None:
         jobs = submitted(client)
         for state in states:
             take(browser, url, jobs, state, given.folder, whole=given.whole)
-        client.get(jobs.running).cancel()
+        with contextlib.suppress(NotAllowedNow):  # it has ended meanwhile
+            client.get(jobs.running).cancel()
 
 
 def submitted(client: Client) -> Jobs:
@@ -156,11 +160,12 @@ def submitted(client: Client) -> Jobs:
         path = Path(scratch) / "talking.webm"
         rest = face(24, 900, degrees=50)
         render_film(rest, size=(320, 240), paint=face_paint(900)).write(path)
-        film = client.submit(film=path, name="talking")
+        corners = [[160 + 88 * np.cos(turn), 118 + 100 * np.sin(turn)] for turn in np.linspace(0, 6, 24)]
+        film = client.submit(film=path, name="talking", options={"region_polygon": corners})
         film.wait(timeout=PATIENCE / 1000, load=False)
     shared = client.share(good).path
-    long = face(120, 3000, degrees=40)
-    running = client.submit(long.tracks.points, mesh=long.mesh.faces, name="face, two minutes")
+    long = face(200, 3000, degrees=40)
+    running = client.submit(long.tracks.points, mesh=long.mesh.faces, name="face, long")
     return Jobs(good, care, other, film.id, running.id, shared)
 
 
