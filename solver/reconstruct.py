@@ -387,7 +387,7 @@ def _loop(
         if should_stop is not None and should_stop():
             return history, Outcome.STOPPED
         before = history[-1]
-        computed = step(problem, before, should_stop=should_stop)
+        computed = step(problem, before, tolerance=settings.tolerance, should_stop=should_stop)
         after = no_higher(before, computed)
         history[-1] = before.summary()
         history.append(after)
