@@ -145,6 +145,9 @@ def estimate_with(cameras: Cameras, prior: Prior) -> CameraEstimate:
     """Return the cameras with the depths that follow from the prior, for the correction of perspective."""
     if prior.estimate.rotations is cameras.estimate.rotations:
         return prior.estimate
-    estimate = replace(cameras.estimate, reasons={**cameras.estimate.reasons, "modes": prior.reason})
-    rotations, scales = np.asarray(estimate.rotations), np.asarray(estimate.scales)
+    reasons = {**cameras.estimate.reasons, "modes": prior.reason}
+    rotations, scales = np.asarray(cameras.estimate.rotations), np.asarray(cameras.estimate.scales)
+    if np.array_equal(rotations, prior.estimate.rotations) and np.array_equal(scales, prior.estimate.scales):
+        return replace(prior.estimate, reasons=reasons, warnings=cameras.warnings)  # with completed tracks
+    estimate = replace(cameras.estimate, reasons=reasons)
     return with_depth_map(estimate, prior.normalized, rotations, scales)

@@ -124,10 +124,10 @@ def prepared(
     """
     check_fit(tracks, mesh, None)
     observations = cameras.observations.of(tracks)
-    settings = observations.settings if settings is None else replace(settings, order=observations.settings.order)
+    settings = observations.settings if settings is None else settings
     if prior is None:
         estimate, covariance = cameras.estimate, None
-        settings = replace(settings, prior="smooth") if settings.gaussian else settings
+        settings = replace(settings, prior="smooth", order="film") if settings.gaussian else settings
     elif settings.gaussian:
         estimate, covariance = estimate_with(cameras, prior), prior.normalized
     else:

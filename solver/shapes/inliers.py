@@ -8,7 +8,7 @@ the area A that the tracks cover about their frames' centroids. With a share α 
 For an observation of confidence v the density is p(r) = v² / (2 s²) exp(−√2 v (|r_x| + |r_y|) / s) with the loss `l1`, whose smoothed
 absolute value is the negative logarithm of a Laplace density of standard deviation s, and p(r) = v / (2π s²) exp(−v |r|² / 2s²) with
 the other losses. s is the standard deviation of the noise that the solve used (`Choices.noise`), or that of the residuals if that is
-larger because the model does not fit: their median length over √(2 ln 2). α = (n + 1) / (N + 2) for n of N visible
+larger because the model does not fit: their median length, weighted by confidence, over √(2 ln 2). α = (n + 1) / (N + 2) for n of N visible
 observations rejected, the mean under a uniform prior (Laplace's rule of succession).
 """
 
@@ -18,6 +18,7 @@ from dataclasses import replace
 
 import numpy as np
 from pliant.solver.records import Floats, Solution, Tracks, read_only
+from pliant.solver.tracks.noise import weighted_median
 from scipy.special import expit
 
 MEDIAN_LENGTH = float(np.sqrt(2 * np.log(2)))
@@ -75,7 +76,7 @@ def inlier_probability(
     if not used.any():
         return found
     residual, weight = left[used], confidence[used]
-    typical = float(np.median(np.hypot(residual[:, 0], residual[:, 1]))) / MEDIAN_LENGTH
+    typical = weighted_median(np.hypot(residual[:, 0], residual[:, 1]), weight) / MEDIAN_LENGTH
     scale = max(noise_std, typical, float(np.finfo(float).tiny) ** 0.25)
     if loss == "l1":
         logs = 2 * np.log(weight) - np.log(2) - np.sqrt(2) * weight * np.abs(residual / scale).sum(axis=1)
