@@ -51,3 +51,12 @@ def white_noise(gram: Floats) -> float:
     values = np.linalg.eigvalsh(gram)
     median = float(values[len(values) // 2])
     return median if median > MIN_EIGENVALUE_RATIO * float(values[-1]) else roughness(gram)
+
+
+def weighted_median(values: Floats, weights: Floats) -> float:
+    """Return the least value with at least half of the weight at or below it; the usual median for equal weights."""
+    if (weights == weights[0]).all():
+        return float(np.median(values))
+    order = np.argsort(values, kind="stable")
+    below = np.cumsum(weights[order])
+    return float(values[order[int(np.searchsorted(below, 0.5 * below[-1]))]])

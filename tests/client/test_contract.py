@@ -91,7 +91,10 @@ def test_submit_wait_shapes_is_one_line(client: Client) -> None:
 def test_a_result_holds_arrays_report_and_job(client: Client, tmp_path: Path) -> None:
     updates: list[Job] = []
     sent: list[tuple[int, int]] = []
-    job = client.submit(moving_points(), options=FAST, name="one", on_upload=lambda *now: sent.append(now))
+    points = moving_points()
+    points[2, 3] = np.nan
+    hidden = np.isnan(points).any(axis=2)
+    job = client.submit(points, options=FAST, name="one", on_upload=lambda *now: sent.append(now))
     result = job.wait(timeout=60, folder=tmp_path / "kept", on_progress=updates.append)
     np.testing.assert_allclose(
         result.rotations @ result.rotations.transpose(0, 2, 1), np.tile(np.eye(3), (6, 1, 1)), atol=1e-9
@@ -102,6 +105,12 @@ def test_a_result_holds_arrays_report_and_job(client: Client, tmp_path: Path) ->
     assert sent[-1][0] == sent[-1][1] > 0
     assert result.job.status is Status.SUCCEEDED
     assert len(client.log(result.job.id).splitlines()) >= 2
+    probability, weights = result.inlier_probability, result.arrays["weights"]
+    assert probability is not None
+    assert probability.shape == weights.shape == (6, 16)
+    np.testing.assert_array_equal(np.isnan(probability), hidden)
+    assert ((probability >= 0) & (probability <= 1) | hidden).all()
+    assert (weights[hidden] == 0).all()
     assert result.save_glb(tmp_path / "deep" / "it.glb").read_bytes()[:4] == b"glTF"
     assert {path.name for path in (tmp_path / "kept").iterdir()} == {"shapes.npz", "report.json", "shapes.glb"}
     everything = result.download(tmp_path / "all")

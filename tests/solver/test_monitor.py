@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 from pliant.solver import Outcome, Settings, Step, Tracks, gallery, solve
@@ -215,7 +218,7 @@ def test_a_stop_is_remembered() -> None:
 def test_a_step_that_raises_the_objective_is_rejected_and_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     from dataclasses import replace
 
-    from pliant.solver import reconstruct
+    from pliant.solver.reconstruction import shapes
 
     taken: list[float] = []
 
@@ -223,7 +226,7 @@ def test_a_step_that_raises_the_objective_is_rejected_and_reported(monkeypatch: 
         taken.append(state.objective)
         return replace(state, shapes=state.shapes + 1, objective=2 * state.objective, reweighting=state.reweighting + 1)
 
-    monkeypatch.setattr(reconstruct, "step", worse)
+    monkeypatch.setattr(shapes, "step", worse)
     found = solve(small(), settings=Settings(prior="smooth", refine_rotations=False))
     assert found.outcome is Outcome.REJECTED
     assert found.trace.objective[-1] == taken[0]
@@ -289,3 +292,43 @@ def test_shapes_slower_than_planned_are_extrapolated_by_themselves() -> None:
     now[0] += 0.1
     monitor()
     assert steps[-1].seconds_left == pytest.approx(0.9, rel=0.3), "slow shapes do not slow the rest down"
+
+
+def places(tracks: Tracks, settings: Settings) -> dict[str, int]:
+    """The number of the first question that each place in the source asks, while nothing stops."""
+    first: dict[str, int] = {}
+    asked = 0
+
+    def never() -> bool:
+        nonlocal asked
+        asked += 1
+        caller = sys._getframe(2)  # the place that calls the monitor, which calls this
+        first.setdefault(f"{Path(caller.f_code.co_filename).name}:{caller.f_lineno}", asked)
+        return False
+
+    solve(tracks, settings=settings, should_stop=never)
+    return first
+
+
+CASES = {
+    "default": (gallery.face(3, 6, degrees=60).tracks, Settings()),
+    "outliers": (small(noisy=True), Settings(order="any", camera="orthographic")),
+    "perspective": (gallery.face(3, 6, degrees=60).tracks, Settings(camera="perspective", focal=900.0, prior="smooth")),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", ["default", pytest.param("outliers", marks=pytest.mark.long), "perspective"])
+def test_a_stop_at_every_place_that_asks_is_reported(case: str) -> None:
+    tracks, settings = CASES[case]
+    asking = places(tracks, settings)
+    assert len(asking) > 5, "the monitor is asked in many places"
+    for number in asking.values():
+        stopped_at(tracks, settings, number)
+
+
+@pytest.mark.slow
+def test_a_stop_at_every_single_question_of_a_small_solve_is_reported() -> None:
+    tracks, settings = gallery.face(3, 6, degrees=60).tracks, Settings(prior="smooth", refine_rotations=False)
+    for number in range(1, questions(tracks, settings) + 1):
+        stopped_at(tracks, settings, number)

@@ -125,7 +125,11 @@ def read_solution(path: Path, *, y_up: bool) -> Solution:
             low_rank_weight=unknown, laplacian="", unit=unknown, noise=unknown,
         ),
         seconds={},
-        shapes_std=np.asarray(arrays["shapes_std"], dtype=np.float64) if "shapes_std" in arrays else None,
+        **{
+            name: np.asarray(arrays[name], dtype=np.float64)
+            for name in ("shapes_std", "inlier_probability")
+            if name in arrays
+        },
     )  # fmt: skip
 
 
