@@ -17,8 +17,8 @@ UNIT_SECONDS, FRAME_SECONDS = 7e-5, 1.3e-5
 """Seconds per unit of work, and per unit and frame, on one core: .2 ms at 10 frames, .46 at 30, .7 at 48, 1 at 74. The other times
 below are of the same core."""
 
-ITERATION_SECONDS = {True: 2e-7, False: 1e-7}
-"""Seconds per iteration of conjugate gradients, frame and point, with and without a learned prior; measured 1.2e-7 to 2.4e-7 and 1e-7."""
+ITERATION_SECONDS = {True: 2.5e-7, False: 1e-7}
+"""Seconds per iteration of conjugate gradients, frame and point, with and without a learned prior; measured 2.1e-7 to 3e-7 and 1e-7."""
 
 SETUP_SECONDS = 0.1
 """Of the shapes."""
@@ -98,7 +98,7 @@ def planned(
         Of the tracks, see `unseen_frames`.
     """
     iterations = expected_iterations(unseen)
-    work = expected_reweightings(iterations, hidden=unseen > 0) * (1 + iterations)
+    work = expected_reweightings(unseen) * (1 + iterations)
     shapes = Stage("shapes", SETUP_SECONDS + ITERATION_SECONDS[gaussian] * work * frames * points, 100)
     last = [stage_of("trust", frames)] if gaussian else []
     first = [Stage("surface", SURFACE_SECONDS * min(frames, 24), 280, setup=SURFACE_SETUP)] if sheet else []
