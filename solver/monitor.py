@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+from pliant.solver.descent import Descent
 from pliant.solver.records import Step
 from pliant.solver.stages import Pace, Stage
 
@@ -36,6 +37,10 @@ class Monitor:
         The user's.
     plan : sequence of Stage
         Stages of the solve in their order.
+    descent : Descent, optional
+        What is known about the reweightings before they begin.
+    seconds_per_iteration : float
+        Planned time of an iteration of conjugate gradients.
     clock : callable
         Monotonic seconds, for `MAX_SILENCE`.
     """
@@ -46,6 +51,8 @@ class Monitor:
         should_stop: Callable[[], bool] | None = None,
         *,
         plan: Sequence[Stage] = (Stage("shapes", 1.0, 1000),),
+        descent: Descent | None = None,
+        seconds_per_iteration: float = 0.0,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.stopped = False
@@ -54,15 +61,20 @@ class Monitor:
         self._last = Step("cameras", 0.0)
         self._reported = clock()
         self._done, self._current, self._ahead = 0.0, plan[0], list(plan[1:])
-        self._units, self._share, self._settled = 0, 0.0, 0.0
+        self._units, self._share = 0, 0.0
         self._pace = Pace(clock())
+        self._descent = Descent() if descent is None else descent
+        self._seconds_per_iteration = seconds_per_iteration
 
     def __call__(self) -> bool:
         """Count a unit of work; return whether to stop."""
         if not self.stopped and self._should_stop is not None:
             self.stopped = bool(self._should_stop())
         self._units += 1
-        self._share = max(self._share, _filled(self._units / max(self._current.units, 1)))
+        if self._current.name == "shapes":
+            self._descent.current += 1
+        else:
+            self._share = max(self._share, _filled(self._units, self._current))
         fraction = self._fraction()
         if fraction >= self._last.fraction + MIN_FRACTION_STEP or self._clock() - self._reported >= MAX_SILENCE:
             self._emit(replace(self._last, fraction=fraction))
@@ -87,22 +99,30 @@ class Monitor:
         if units is not None:
             seconds = self._current.seconds * units / max(self._current.units, 1)
             self._current = replace(self._current, seconds=seconds, units=units)
-        self._units, self._share, self._settled = 0, 0.0, 0.0
+        self._units, self._share = 0, 0.0
+        if name == "shapes":
+            self._descent.begin(None, self._clock())
 
     def expect(self, stages: Sequence[Stage], *, before: str) -> None:
         """Add stages to the plan that the data turned out to require."""
         place = next((number for number, stage in enumerate(self._ahead) if stage.name == before), len(self._ahead))
         self._ahead[place:place] = stages
 
+    def expect_corrections(self, ahead: int) -> None:
+        """Expect at most so many corrections of the tracks for perspective; called before the first and after each."""
+        self._descent.expect_corrections(ahead)
+
     def report(self, step: Step) -> None:
-        """Report a step; the fraction of a step after the cameras is the completed part of the stage `shapes`."""
+        """Report a step; those after the cameras belong to the stage `shapes`, whose completed part follows from their objectives."""
         if step.stage == "finish":
             self._emit(replace(step, fraction=step.fraction if step.fraction == 1 else self._fraction()))
             return
-        if step.stage != "cameras":
-            if self._current.name != "shapes":
-                self.enter("shapes")
-            self._share, self._units, self._settled = max(self._share, step.fraction), 0, step.fraction
+        if step.stage == "initialise":
+            self.enter("shapes")
+            self._descent.begin(step.objective, self._clock())
+        elif step.stage == "reweight" and step.objective is not None:
+            self._descent.reweighted(step.objective)
+            self._share = max(self._share, self._descent.share())
         self._emit(replace(step, fraction=self._fraction()))
 
     def _fraction(self) -> float:
@@ -111,8 +131,11 @@ class Monitor:
         return max(self._last.fraction, min(done / max(done + left, 1e-9), MAX_FRACTION))
 
     def _left(self) -> float:
-        ahead = sum(stage.seconds for stage in self._ahead)
-        return self._pace.left(self._current, self._share, self._settled, ahead, self._clock())
+        ahead, now = sum(stage.seconds for stage in self._ahead), self._clock()
+        if self._current.name != "shapes":
+            return self._pace.left(self._current, self._share, ahead, now)
+        per_iteration = self._pace.known * self._seconds_per_iteration
+        return self._descent.seconds_left(now, seconds_per_iteration=per_iteration) + self._pace.known * ahead
 
     def _emit(self, step: Step) -> None:
         left = 0.0 if step.fraction == 1 else self._left()
@@ -127,6 +150,11 @@ def enter(should_stop: Callable[[], bool] | None, name: str, *, units: int | Non
         should_stop.enter(name, units=units)
 
 
-def _filled(share: float) -> float:
-    """Return the completed part of a stage after this share of its expected units: increasing and below 1."""
-    return EXPECTED_SHARE * share if share <= 1 else 1 - (1 - EXPECTED_SHARE) / share
+def _filled(units: int, stage: Stage) -> float:
+    """Return the completed part of a stage after so many units of work: increasing and below 1."""
+    share = (units + stage.setup) / max(stage.units + stage.setup, 1)
+    if share > 1:
+        return 1 - (1 - EXPECTED_SHARE) / share
+    if stage.growth == 1:
+        return EXPECTED_SHARE * share
+    return float((stage.growth**units - 1) / (stage.growth ** (stage.units + 1) - 1))

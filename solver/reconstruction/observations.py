@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.cameras.lens import given_lens
 from pliant.solver.cameras.perspective import Perspective
+from pliant.solver.descent import Descent
 from pliant.solver.errors import InvalidInput
 from pliant.solver.monitor import Monitor
 from pliant.solver.records import KnownCamera, Mesh, Step, Tracks
 from pliant.solver.settings import Settings
-from pliant.solver.stages import planned
+from pliant.solver.stages import ITERATION_SECONDS, planned, unseen_frames
 from pliant.solver.tracks.normalization import Normalized, normalize
 
 OnStep = Callable[[Step], None]
@@ -128,8 +129,13 @@ def monitored(
     only: Collection[str] = (),
 ) -> Monitor:
     """Return the monitor of a solve, or of the stages named by `only`."""
+    unseen = 0.0 if tracks.all_visible else unseen_frames(tracks.visible)
     plan = planned(
         tracks.num_frames, tracks.num_points, gaussian=settings.gaussian, known_cameras=known is not None,
-        sheet=sheet, hidden=not tracks.all_visible,
+        sheet=sheet, unseen=unseen,
     )  # fmt: skip
-    return Monitor(on_step, should_stop, plan=[stage for stage in plan if not only or stage.name in only])
+    return Monitor(
+        on_step, should_stop, plan=[stage for stage in plan if not only or stage.name in only],
+        descent=Descent(unseen, settings.tolerance, settings.max_reweightings),
+        seconds_per_iteration=ITERATION_SECONDS[settings.gaussian] * tracks.num_frames * tracks.num_points,
+    )  # fmt: skip

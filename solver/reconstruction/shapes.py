@@ -24,7 +24,6 @@ from pliant.solver.shapes.perspective_shapes import corrected_again, seen_in_per
 from pliant.solver.shapes.setup import build_problem
 from pliant.solver.shapes.sparsely_observed import WELL_OBSERVED_SHARE, place_the_rest
 from pliant.solver.shapes.state import State
-from pliant.solver.stages import settling
 from pliant.solver.tracks.noise import OUTLIER_SHARE
 
 DEPTH_ROUNDS, DEPTH_SETTLED = 4, 1e-4
@@ -121,10 +120,13 @@ def shapes_from(start: Start, monitor: Monitor, *, seconds: dict[str, float]) ->
 def _minimised(start: Start, monitor: Monitor) -> tuple[Start, list[State], Outcome]:
     """Return the start with its tracks corrected for perspective by the shapes found, the history, and how it ended."""
     view = start.estimate.perspective
+    corrections = DEPTH_ROUNDS if view is not None and view.bends else 0
+    monitor.expect_corrections(corrections)
     history, outcome = _loop(start, [start.state], monitor)
-    for _ in range(DEPTH_ROUNDS if view is not None and view.bends else 0):
+    for ahead in reversed(range(corrections)):
         if outcome is Outcome.STOPPED:
             break
+        monitor.expect_corrections(ahead)
         problem, flat, changed = corrected_again(
             start.problem, history[-1], start.observations.normalized, start.flat, start.estimate, start.kept
         )
@@ -146,14 +148,11 @@ def _loop(start: Start, history: list[State], monitor: Monitor) -> tuple[list[St
         if monitor():
             return history, Outcome.STOPPED
         before = history[-1]
-        computed = step(start.problem, before, should_stop=monitor)
+        computed = step(start.problem, before, tolerance=settings.tolerance, should_stop=monitor)
         after = no_higher(before, computed)
         history[-1] = before.summary()
         history.append(after)
-        share = settling(
-            [state.objective for state in history], tolerance=settings.tolerance, most=settings.max_reweightings
-        )
-        monitor.report(_step_of("reweight", after, start, fraction=share))
+        monitor.report(_step_of("reweight", after, start))
         outcome = terminate(before, computed, tolerance=settings.tolerance, max_reweightings=settings.max_reweightings)
         if outcome is not None:
             return history, outcome

@@ -66,7 +66,7 @@ def reject_outliers(
     for _ in range(MAX_STIFF_REWEIGHTINGS):
         if should_stop is not None and should_stop():
             return problem, state
-        after = no_higher(before, step(stiff, before, should_stop=should_stop))
+        after = no_higher(before, step(stiff, before, tolerance=STIFF_FIT_TOLERANCE, should_stop=should_stop))
         settled = before.objective - after.objective <= STIFF_FIT_TOLERANCE * before.objective
         before = after
         if settled:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+import re
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -169,7 +170,9 @@ def test_jobs_are_listed_newest_first_over_pages_and_by_status(client: Client) -
 
 def test_a_finished_job_can_be_deleted_but_not_cancelled(client: Client) -> None:
     job = client.submit(moving_points(), options=FAST)
-    job.wait(timeout=60)
+    result = job.wait(timeout=60)
+    assert job.status is Status.SUCCEEDED, "the record is that of the end, without another request"
+    assert re.fullmatch(rf"<(Async)?Result of job {job.id}: 6 frames × 16 points, [\w, ]+>", repr(result))
     with pytest.raises(NotAllowedNow):
         job.cancel()
     assert job.refresh().status is Status.SUCCEEDED
@@ -355,4 +358,4 @@ def test_a_job_that_failed_is_failed_after_the_wait(kind: str) -> None:
         with pytest.raises(JobFailed):
             job.wait(timeout=60)
         assert job.status is Status.FAILED
-        assert kind == "async" or repr(job) == f"<RemoteJob {job.id} failed>"
+        assert repr(job) == f"<{'Async' if kind == 'async' else ''}RemoteJob {job.id} failed>"
