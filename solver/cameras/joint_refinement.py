@@ -197,16 +197,33 @@ def refined(
     should_stop: Callable[[], bool] | None = None,
 ) -> Learned:
     """Return cameras and covariance after rounds of alternating refinement; scales stay 1 without `with_scales`."""
-    projections = rotations[:, :2] * scales[:, None, None]
+    start = _learned_at(gram, rotations, scales, model_order, should_stop)
+    return _turned(gram, start, with_scales=with_scales, rounds=rounds, should_stop=should_stop)
+
+
+def _learned_at(
+    gram: Floats,
+    rotations: Floats,
+    scales: Floats,
+    model_order: ModelOrder,
+    should_stop: Callable[[], bool] | None,
+) -> Learned:
+    """Return given cameras and the covariance learned with them from scratch."""
     covariance = learned(
         gram,
-        projections,
+        rotations[:, :2] * scales[:, None, None],
         max_modes=model_order.max_modes,
         noisy_start=model_order.noisy_start,
         ordered=model_order.ordered,
         should_stop=should_stop,
     )
-    found = Learned(rotations, scales, covariance, np.inf)
+    return Learned(rotations, scales, covariance, np.inf)
+
+
+def _turned(
+    gram: Floats, found: Learned, *, with_scales: bool, rounds: int, should_stop: Callable[[], bool] | None
+) -> Learned:
+    """Return cameras and covariance after rounds of refinement."""
     for _ in range(rounds):
         if should_stop is not None and should_stop():
             break
@@ -253,19 +270,13 @@ def _free_scales(
     used = _some(np.arange(len(rotations)), SCALE_FRAMES)
     part, given, none = _of_frames(gram, used), rotations[used], np.ones(len(used))
 
-    def energies(scales: Floats, *, with_scales: bool) -> Learned:
-        return refined(
-            part,
-            given,
-            scales,
-            with_scales=with_scales,
-            rounds=SCALE_ROUNDS,
-            model_order=model_order,
-            should_stop=should_stop,
-        )
+    def turned(start: Learned, *, with_scales: bool) -> Learned:
+        return _turned(part, start, with_scales=with_scales, rounds=SCALE_ROUNDS, should_stop=should_stop)
 
-    fixed = energies(none, with_scales=False)
-    runs = [energies(scales, with_scales=True) for scales in (none, rigid_scales(part, given))]
+    even, rigid = (
+        _learned_at(part, given, scales, model_order, should_stop) for scales in (none, rigid_scales(part, given))
+    )
+    fixed, runs = turned(even, with_scales=False), [turned(each, with_scales=True) for each in (even, rigid)]
     best = min(runs, key=lambda run: run.energy)
     gain, least, largest = fixed.energy - best.energy, float(best.scales.min()), float(best.scales.max())
     if np.log(best.scales).std() > WIDEST:
