@@ -22,6 +22,7 @@ from pliant.solver.model.marginal_likelihood import fit
 from pliant.solver.model.model_order import ModelOrder, select_model_order
 from pliant.solver.model.shape_covariance import (
     MAX_MODES,
+    MIN_ITERATIONS,
     ShapeCovariance,
     learned,
 )
@@ -120,18 +121,22 @@ def learn(
         unscaled, sample = _of_corrected(estimate, start, used)
     at_first = np.asarray(estimate.rotations)
     before = at_first[used]
-    start_scales, why = None, None
+    start_scales, why, fixed = None, None, None
     if turning and estimates_scales and (start == 1).all():
         enter(should_stop, "scales")
-        start_scales, why = _free_scales(unscaled, before, model_order, should_stop)
+        start_scales, why, fixed = _free_scales(unscaled, before, model_order, should_stop)
     rotations, scales, found = before, np.ones(len(used)), None
     if turning:
         may_couple = model_order == ModelOrder(ordered=estimate.ordered)
         enter(should_stop, "refinement", units=REFINEMENT_UNITS[may_couple])
-        found = refined(
-            unscaled, before, scales if start_scales is None else start_scales, with_scales=start_scales is not None,
-            rounds=REFINEMENT_ROUNDS, model_order=model_order, should_stop=should_stop,
-        )  # fmt: skip
+        if fixed is None or start_scales is not None or len(fixed.rotations) < len(used):
+            found = refined(
+                unscaled, before, scales if start_scales is None else start_scales, with_scales=start_scales is not None,
+                rounds=REFINEMENT_ROUNDS, model_order=model_order, should_stop=should_stop,
+            )  # fmt: skip
+        else:
+            rounds = REFINEMENT_ROUNDS - SCALE_ROUNDS
+            found = _turned(unscaled, fixed, with_scales=False, rounds=rounds, should_stop=should_stop)
         bends = estimate.perspective is not None and estimate.perspective.bends
 
         def again(found: Learned) -> tuple[CameraEstimate, Learned, Floats, Floats]:
@@ -215,6 +220,7 @@ def _learned_at(
         max_modes=model_order.max_modes,
         noisy_start=model_order.noisy_start,
         ordered=model_order.ordered,
+        iterations=MIN_ITERATIONS,  # L-BFGS, which follows, gains more in the same time
         should_stop=should_stop,
     )
     return Learned(rotations, scales, covariance, np.inf)
@@ -261,8 +267,8 @@ def _best_start(
 
 def _free_scales(
     gram: Floats, rotations: Floats, model_order: ModelOrder, should_stop: Callable[[], bool] | None
-) -> tuple[Floats | None, str]:
-    """Return scales to start from, or None where free scales gain no more than chance, and a sentence.
+) -> tuple[Floats | None, str, Learned]:
+    """Return scales to start from, or None where free scales gain no more than chance, a sentence, and what was found without.
 
     Scales are free from two starts, 1 and those of a rigid shape, on a subset of the frames. Deformation that is
     mistaken for scale ends in a worse minimum than fixed scales, or in one with nearly constant scales.
@@ -283,17 +289,18 @@ def _free_scales(
         return (
             None,
             f"Every scale is 1: those found, from {least:.3f} to {largest:.3f}, are wider apart than any camera's.",
+            fixed,
         )
     share = _scale_gain_share(np.log(best.scales)) if model_order.ordered else 1.0
     if not (gain > MIN_SCALE_GAIN * share and np.log(best.scales).std() > MIN_SCALE_STD):
-        return None, (
+        why = (
             f"Every scale is 1: free ones, from {least:.3f} to {largest:.3f}, would gain {gain:.3f} in the logarithm of the "
             "likelihood, no more than deformation alone does."
         )
+        return None, why, fixed
     logs = _between(used, np.log(best.scales)[:, None], len(rotations))[:, 0]
-    return np.exp(logs - logs.mean()), (
-        f"Scales from {least:.3f} to {largest:.3f} gain {gain:.3f} in the logarithm of the likelihood, per point and frame."
-    )
+    why = f"Scales from {least:.3f} to {largest:.3f} gain {gain:.3f} in the logarithm of the likelihood, per point and frame."
+    return np.exp(logs - logs.mean()), why, fixed
 
 
 def _scale_gain_share(logs: Floats) -> float:
