@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 from pliant.solver import (
@@ -179,13 +182,27 @@ def test_every_stage_stops(cameras: Cameras, prior: Prior) -> None:
     assert np.isfinite(found.shapes).all()
 
 
-def test_the_seed_reaches_the_split_of_the_points() -> None:
-    """Fewer points than coordinates are learned with early stopping on folds, which the seed draws."""
-    noisy = gallery.corrupt(MADE, noise=0.02, seed=0).tracks
-    few = Tracks.from_arrays(noisy.points[:, :14])
-    cameras = estimate_cameras(few, KNOWN)
-    first, other = (learn_prior(few, cameras, seed=seed) for seed in (0, 5))
-    assert not np.array_equal(first.covariance, other.covariance)
+@pytest.mark.slow
+def test_the_seed_reaches_every_random_choice(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each generator that a solve makes has the seed of the settings."""
+    made, original = set(), np.random.default_rng
+
+    def seeded(seed: object = None) -> np.random.Generator:
+        made.add((Path(sys._getframe(1).f_code.co_filename).stem, seed))
+        return original(seed)  # type: ignore[arg-type]
+
+    few = Tracks.from_arrays(MADE.tracks.points[:, :14])
+    many = gallery.face(4, 150, degrees=60)
+    visible = original(0).random(many.tracks.visible.shape) > 0.2
+    monkeypatch.setattr(np.random, "default_rng", seeded)
+    settings = Settings(seed=7, max_reweightings=2)
+    solve(few, cameras=KNOWN, settings=settings)
+    solve(
+        Tracks.from_arrays(many.tracks.points, visible), many.mesh,
+        cameras=KnownCamera.from_arrays(many.rotations, many.scales), settings=settings,
+    )  # fmt: skip
+    assert {seed for _, seed in made} == {7}
+    assert {name for name, _ in made} == {"completion", "model_order", "early_stopping", "uncertainty", "aggregation"}
 
 
 def test_inputs_that_do_not_belong_together_are_refused(cameras: Cameras, prior: Prior, solution: Solution) -> None:
