@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from pliant.solver.descent import Descent
 from pliant.solver.records import Step
-from pliant.solver.stages import Pace, Stage
+from pliant.solver.stages import Load, Pace, Stage
 
 MIN_FRACTION_STEP = 0.002
 """Least increase of the fraction that is reported on its own: at most 500 calls of `on_step` besides those of the
@@ -42,7 +42,10 @@ class Monitor:
     seconds_per_iteration : float
         Planned time of an iteration of conjugate gradients.
     clock : callable
-        Monotonic seconds, for `MAX_SILENCE`.
+        Monotonic seconds.
+    work : callable
+        Processor seconds of this process: the pace of the work is measured in these, so that other load on the machine does not count as
+        slow work; what is left is converted by the latest seconds per processor second.
     """
 
     def __init__(
@@ -54,15 +57,16 @@ class Monitor:
         descent: Descent | None = None,
         seconds_per_iteration: float = 0.0,
         clock: Callable[[], float] = time.monotonic,
+        work: Callable[[], float] = time.process_time,
     ) -> None:
         self.stopped = False
         """Whether a stop was requested when somebody looked."""
-        self._on_step, self._should_stop, self._clock = on_step, should_stop, clock
+        self._on_step, self._should_stop, self._clock, self._work = on_step, should_stop, clock, work
         self._last = Step("cameras", 0.0)
         self._reported = clock()
         self._done, self._current, self._ahead = 0.0, plan[0], list(plan[1:])
         self._units, self._share = 0, 0.0
-        self._pace = Pace(clock())
+        self._pace, self._load = Pace(work()), Load(clock(), work())
         self._descent = Descent() if descent is None else descent
         self._seconds_per_iteration = seconds_per_iteration
 
@@ -94,14 +98,14 @@ class Monitor:
         if place is None:
             return
         self._done += self._share * self._current.seconds  # less than planned where it ended early
-        self._pace.next(self._current, self._share, self._clock())
+        self._pace.next(self._current, self._share, self._work())
         self._current, self._ahead = self._ahead[place], self._ahead[place + 1 :]
         if units is not None:
             seconds = self._current.seconds * units / max(self._current.units, 1)
             self._current = replace(self._current, seconds=seconds, units=units)
         self._units, self._share = 0, 0.0
         if name == "shapes":
-            self._descent.begin(None, self._clock())
+            self._descent.begin(None, self._work())
 
     def expect(self, stages: Sequence[Stage], *, before: str) -> None:
         """Add stages to the plan that the data turned out to require."""
@@ -119,7 +123,7 @@ class Monitor:
             return
         if step.stage == "initialise":
             self.enter("shapes")
-            self._descent.begin(step.objective, self._clock())
+            self._descent.begin(step.objective, self._work())
         elif step.stage == "reweight" and step.objective is not None:
             self._descent.reweighted(step.objective)
             self._share = max(self._share, self._descent.share())
@@ -131,11 +135,13 @@ class Monitor:
         return max(self._last.fraction, min(done / max(done + left, 1e-9), MAX_FRACTION))
 
     def _left(self) -> float:
-        ahead, now = sum(stage.seconds for stage in self._ahead), self._clock()
+        ahead, now = sum(stage.seconds for stage in self._ahead), self._work()
         if self._current.name != "shapes":
-            return self._pace.left(self._current, self._share, ahead, now)
-        per_iteration = self._pace.known * self._seconds_per_iteration
-        return self._descent.seconds_left(now, seconds_per_iteration=per_iteration) + self._pace.known * ahead
+            left = self._pace.left(self._current, self._share, ahead, now)
+        else:
+            per_iteration = self._pace.known * self._seconds_per_iteration
+            left = self._descent.seconds_left(now, seconds_per_iteration=per_iteration) + self._pace.known * ahead
+        return left * self._load.seconds_per_work(self._clock(), now)
 
     def _emit(self, step: Step) -> None:
         left = 0.0 if step.fraction == 1 else self._left()

@@ -69,6 +69,9 @@ REFINEMENT_UNITS = {True: 3600, False: 700}
 """Units of the stage `refinement` where the covariance may couple the modes, and where the model order rules that out. The plan has a
 number between, until this is known."""
 
+LOAD_SECONDS, LOAD_PRIOR = 20.0, 1.0
+"""Seconds over which the load of the machine is measured, and processor seconds that count as measured without any load."""
+
 OWN_PACE = 4.0
 """Weight of a stage's own pace, per completed share of it, beside that of all stages: its units take about the same time."""
 
@@ -141,7 +144,7 @@ class Pace:
     """
 
     began: float
-    """Clock at which the current stage began."""
+    """Processor time at which the current stage began."""
 
     measured: float = PACE_PRIOR
     planned: float = PACE_PRIOR
@@ -179,3 +182,19 @@ class Pace:
         own = min(OWN_PACE * share, 1.0)
         rest = (1 - share) * ((1 - own) * pace * stage.seconds + own * spent / share)
         return rest + pace * ahead
+
+
+class Load:
+    """Seconds that pass in one processor second of this process, measured over the last `LOAD_SECONDS`.
+
+    More than 1 where others use the cores, less than 1 where the process uses several.
+    """
+
+    def __init__(self, now: float, work: float) -> None:
+        self._old = self._middle = (now, work)
+
+    def seconds_per_work(self, now: float, work: float) -> float:
+        """Return the latest ratio, given the clock and the processor time."""
+        if now - self._middle[0] > LOAD_SECONDS / 2:
+            self._old, self._middle = self._middle, (now, work)
+        return (now - self._old[0] + LOAD_PRIOR) / (work - self._old[1] + LOAD_PRIOR)

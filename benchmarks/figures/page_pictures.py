@@ -160,7 +160,7 @@ def submitted(client: Client) -> Jobs:
         path = Path(scratch) / "talking.webm"
         rest = face(24, 900, degrees=50)
         render_film(rest, size=(320, 240), paint=face_paint(900)).write(path)
-        corners = [[160 + 88 * np.cos(turn), 118 + 100 * np.sin(turn)] for turn in np.linspace(0, 6, 24)]
+        corners = [[160 + 62 * np.cos(turn), 120 + 82 * np.sin(turn)] for turn in np.linspace(0, 6, 24)]
         film = client.submit(film=path, name="talking", options={"region_polygon": corners})
         film.wait(timeout=PATIENCE / 1000, load=False)
     shared = client.share(good).path

@@ -20,7 +20,7 @@ from pliant.solver.cameras.scale import WIDEST, rigid_scales
 from pliant.solver.model import full_mode_covariance
 from pliant.solver.model.marginal_likelihood import fit
 from pliant.solver.model.model_order import ModelOrder, select_model_order
-from pliant.solver.model.shape_covariance import MAX_MODES, ShapeCovariance, learned
+from pliant.solver.model.shape_covariance import MAX_MODES, MIN_ITERATIONS, ShapeCovariance, learned
 from pliant.solver.model.so3 import angles_between, exponential
 from pliant.solver.monitor import enter
 from pliant.solver.records import Floats, read_only
@@ -134,18 +134,22 @@ def refine_cameras(
         unscaled, sample = _of_corrected(estimate, start, used)
     at_first = np.asarray(estimate.rotations)
     before = at_first[used]
-    start_scales, why = None, None
+    start_scales, why, fixed = None, None, None
     if turning and estimates_scales and (start == 1).all():
         enter(should_stop, "scales")
-        start_scales, why = _free_scales(unscaled, before, model_order, should_stop)
+        start_scales, why, fixed = _free_scales(unscaled, before, model_order, should_stop)
     rotations, scales, found = before, np.ones(len(used)), None
     if turning:
         may_couple = model_order == ModelOrder(ordered=estimate.ordered)
         enter(should_stop, "refinement", units=REFINEMENT_UNITS[may_couple])
-        found = refined(
-            unscaled, before, scales if start_scales is None else start_scales, with_scales=start_scales is not None,
-            rounds=REFINEMENT_ROUNDS, model_order=model_order, should_stop=should_stop,
-        )  # fmt: skip
+        if fixed is None or start_scales is not None or len(fixed.rotations) < len(used):
+            found = refined(
+                unscaled, before, scales if start_scales is None else start_scales, with_scales=start_scales is not None,
+                rounds=REFINEMENT_ROUNDS, model_order=model_order, should_stop=should_stop,
+            )  # fmt: skip
+        else:
+            rounds = REFINEMENT_ROUNDS - SCALE_ROUNDS
+            found = _turned(unscaled, fixed, with_scales=False, rounds=rounds, should_stop=should_stop)
         bends = estimate.perspective is not None and estimate.perspective.bends
 
         def again(found: Learned) -> tuple[CameraEstimate, Learned, Floats, Floats]:
@@ -201,16 +205,34 @@ def refined(
     should_stop: Callable[[], bool] | None = None,
 ) -> Learned:
     """Return cameras and covariance after rounds of alternating refinement; scales stay 1 without `with_scales`."""
-    projections = rotations[:, :2] * scales[:, None, None]
+    start = _learned_at(gram, rotations, scales, model_order, should_stop)
+    return _turned(gram, start, with_scales=with_scales, rounds=rounds, should_stop=should_stop)
+
+
+def _learned_at(
+    gram: Floats,
+    rotations: Floats,
+    scales: Floats,
+    model_order: ModelOrder,
+    should_stop: Callable[[], bool] | None,
+) -> Learned:
+    """Return given cameras and the covariance learned with them from scratch."""
     covariance = learned(
         gram,
-        projections,
+        rotations[:, :2] * scales[:, None, None],
         max_modes=model_order.max_modes,
         noisy_start=model_order.noisy_start,
         ordered=model_order.ordered,
+        iterations=MIN_ITERATIONS,  # L-BFGS, which follows, gains more in the same time
         should_stop=should_stop,
     )
-    found = Learned(rotations, scales, covariance, np.inf)
+    return Learned(rotations, scales, covariance, np.inf)
+
+
+def _turned(
+    gram: Floats, found: Learned, *, with_scales: bool, rounds: int, should_stop: Callable[[], bool] | None
+) -> Learned:
+    """Return cameras and covariance after rounds of refinement."""
     for _ in range(rounds):
         if should_stop is not None and should_stop():
             break
@@ -248,8 +270,8 @@ def _best_start(
 
 def _free_scales(
     gram: Floats, rotations: Floats, model_order: ModelOrder, should_stop: Callable[[], bool] | None
-) -> tuple[Floats | None, str]:
-    """Return scales to start from, or None where free scales gain no more than chance, and a sentence.
+) -> tuple[Floats | None, str, Learned]:
+    """Return scales to start from, or None where free scales gain no more than chance, a sentence, and what was found without.
 
     Scales are free from two starts, 1 and those of a rigid shape, on a subset of the frames. Deformation that is
     mistaken for scale ends in a worse minimum than fixed scales, or in one with nearly constant scales.
@@ -257,36 +279,31 @@ def _free_scales(
     used = _some(np.arange(len(rotations)), SCALE_FRAMES)
     part, given, none = _of_frames(gram, used), rotations[used], np.ones(len(used))
 
-    def energies(scales: Floats, *, with_scales: bool) -> Learned:
-        return refined(
-            part,
-            given,
-            scales,
-            with_scales=with_scales,
-            rounds=SCALE_ROUNDS,
-            model_order=model_order,
-            should_stop=should_stop,
-        )
+    def turned(start: Learned, *, with_scales: bool) -> Learned:
+        return _turned(part, start, with_scales=with_scales, rounds=SCALE_ROUNDS, should_stop=should_stop)
 
-    fixed = energies(none, with_scales=False)
-    runs = [energies(scales, with_scales=True) for scales in (none, rigid_scales(part, given))]
+    even, rigid = (
+        _learned_at(part, given, scales, model_order, should_stop) for scales in (none, rigid_scales(part, given))
+    )
+    fixed, runs = turned(even, with_scales=False), [turned(each, with_scales=True) for each in (even, rigid)]
     best = min(runs, key=lambda run: run.energy)
     gain, least, largest = fixed.energy - best.energy, float(best.scales.min()), float(best.scales.max())
     if np.log(best.scales).std() > WIDEST:
         return (
             None,
             f"Every scale is 1: those found, from {least:.3f} to {largest:.3f}, are wider apart than any camera's.",
+            fixed,
         )
     share = _scale_gain_share(np.log(best.scales)) if model_order.ordered else 1.0
     if not (gain > MIN_SCALE_GAIN * share and np.log(best.scales).std() > MIN_SCALE_STD):
-        return None, (
+        why = (
             f"Every scale is 1: free ones, from {least:.3f} to {largest:.3f}, would gain {gain:.3f} in the logarithm of the "
             "likelihood, no more than deformation alone does."
         )
+        return None, why, fixed
     logs = _between(used, np.log(best.scales)[:, None], len(rotations))[:, 0]
-    return np.exp(logs - logs.mean()), (
-        f"Scales from {least:.3f} to {largest:.3f} gain {gain:.3f} in the logarithm of the likelihood, per point and frame."
-    )
+    why = f"Scales from {least:.3f} to {largest:.3f} gain {gain:.3f} in the logarithm of the likelihood, per point and frame."
+    return np.exp(logs - logs.mean()), why, fixed
 
 
 def _scale_gain_share(logs: Floats) -> float:

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.operators.normal_equations import Operator
-from pliant.solver.records import Floats, Ints
+from pliant.solver.records import Floats
 from pliant.solver.threads import over_ranges
 
 Array = NDArray[np.floating]
@@ -42,7 +42,7 @@ class Coarse:
     modes: tuple[Floats, Floats, Floats]
     """U of every coordinate, shape `(F, m_c)` each."""
 
-    points: Ints
+    points: NDArray[np.intp]
     """The points with deviating weights, shape `(D,)`."""
 
     inverses: Array

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.errors import InvalidInput
 from pliant.solver.records import MIN_POINTS, Floats
+from pliant.solver.threads import SMALLEST, over_ranges
 from pliant.solver.tracks.noise import weighted_median
 from pliant.solver.tracks.normalization import Normalized
 
@@ -203,9 +204,9 @@ def alternate(points: Floats, weight: Floats, basis: Floats, *, sweeps: int) -> 
         scale = max(_typical(lengths, weight), MIN_RESIDUAL_SCALE)
         robust = weight / (1 + (lengths / (3 * scale)) ** 2)
         extended = np.concatenate([coefficients, np.ones((len(coefficients), 1))], axis=1)
-        normal = np.einsum("fp,pi,pj->fij", robust, extended, extended, optimize=True)
+        normal = extended.T @ (robust[..., None] * extended)
         normal += _ridge(normal)
-        right = np.einsum("fp,fpc,pi->fic", robust, points, extended, optimize=True)
+        right = extended.T @ (robust[..., None] * points)
         basis = np.linalg.solve(normal, right).transpose(0, 2, 1)
         basis, change = _orthonormal(basis)
         coefficients, spread = coefficients_of(points, robust, basis, change @ spread @ change.T, scale, sweeps=1)
@@ -213,37 +214,57 @@ def alternate(points: Floats, weight: Floats, basis: Floats, *, sweeps: int) -> 
 
 
 def coefficients_of(
-    points: Floats, weight: Floats, basis: Floats, spread: Floats | None, scale: float, *, sweeps: int
+    points: Floats,
+    weight: Floats,
+    basis: Floats,
+    spread: Floats | None,
+    scale: float,
+    *,
+    sweeps: int,
+    with_moment: bool = True,
 ) -> tuple[Floats, Floats]:
     """Return each point's coefficients on the basis, shape (S, r−1), and their covariance, shape (r−1, r−1).
 
     Reweighted least squares with a Gaussian prior. A point visible in few frames determines few of its coefficients;
     without a prior the others, and with them the hidden positions, are unbounded. The covariance is the second moment
-    over the points, posterior variance included (one EM step); the first estimate comes from damped least squares.
+    over the points, posterior variance included (one EM step); the first estimate comes from damped least squares. Without
+    `with_moment` it is not computed.
     """
     columns, shift = basis[:, :, :-1], basis[:, :, -1]
     products = np.einsum("fci,fcj->fij", columns, columns).reshape(len(basis), -1)
     robust, size = weight, columns.shape[2]
-    coefficients, moment = np.zeros((points.shape[1], size)), np.eye(size)
+    coefficients, normal = np.zeros((points.shape[1], size)), np.zeros((points.shape[1], size, size))
     for sweep in range(sweeps):
         normal = (robust.T @ products).reshape(-1, size, size)
         normal += _ridge(normal, DAMPING) if spread is None else _prior(spread, scale) + _ridge(normal)
-        right = np.einsum("fp,fpc,fci->pi", robust, points - shift[:, None], columns, optimize=True)
-        inverse = np.linalg.inv(normal)
-        coefficients = np.einsum("pij,pj->pi", inverse, right)
-        moment = coefficients.T @ coefficients / len(coefficients)
-        if spread is not None:
-            moment = moment + scale**2 * inverse.mean(axis=0)
+        pulled = (robust[..., None] * (points - shift[:, None])).transpose(1, 0, 2).reshape(len(coefficients), -1)
+        coefficients = _solved(normal, pulled @ columns.reshape(-1, size))
         if sweep + 1 < sweeps:
             lengths = _lengths(points - predict(basis, coefficients))
             typical = max(_typical(lengths, weight), MIN_RESIDUAL_SCALE)
             robust = weight / (1 + (lengths / (3 * typical)) ** 2)
-    return coefficients, moment
+    if not with_moment:
+        return coefficients, np.eye(size)
+    moment = coefficients.T @ coefficients / len(coefficients)
+    return coefficients, moment if spread is None else moment + scale**2 * np.linalg.inv(normal).mean(axis=0)
+
+
+def _solved(normal: Floats, right: Floats) -> Floats:
+    """Return the solutions of P systems, `(P, n, n)` and `(P, n)`."""
+    found = np.empty_like(right)
+
+    def work(start: int, stop: int) -> None:
+        found[start:stop] = np.linalg.solve(normal[start:stop], right[start:stop, :, None])[..., 0]
+
+    over_ranges(work, len(right), smallest=max(1, SMALLEST // right.shape[1] ** 2))
+    return found
 
 
 def predict(basis: Floats, coefficients: Floats) -> Floats:
     """Return M B + t as points, shape `(F, S, 2)`."""
-    return np.asarray(np.einsum("fci,pi->fpc", basis[:, :, :-1], coefficients, optimize=True) + basis[:, None, :, -1])
+    frames, _, rank = basis.shape
+    along = (basis[:, :, :-1].reshape(2 * frames, rank - 1) @ coefficients.T).reshape(frames, 2, -1)
+    return np.asarray((along + basis[:, :, -1:]).transpose(0, 2, 1))
 
 
 def fill(points: Floats, weight: Floats, basis: Floats, spread: Floats, scale: float) -> tuple[Floats, float]:
@@ -252,7 +273,7 @@ def fill(points: Floats, weight: Floats, basis: Floats, spread: Floats, scale: f
     An entry with confidence 0 < c < 1 becomes c times itself plus 1 − c times its prediction: the EM completion of an
     observation whose noise variance is larger by 1/c.
     """
-    coefficients, _ = coefficients_of(points, weight, basis, spread, scale, sweeps=4)
+    coefficients, _ = coefficients_of(points, weight, basis, spread, scale, sweeps=4, with_moment=False)
     predicted = predict(basis, coefficients)
     wrong = gross(points, weight, predicted, scale)
     trust = np.where(wrong, 0.0, weight)[..., None]
@@ -316,7 +337,7 @@ def _widen(basis: Floats, points: Floats, weight: Floats, start: Floats, rank: i
         left, shift = start, start.mean(axis=1)
         old = np.zeros((frames, 2, 0))
     else:
-        coefficients, _ = coefficients_of(points, weight, basis, None, 1.0, sweeps=2)
+        coefficients, _ = coefficients_of(points, weight, basis, None, 1.0, sweeps=2, with_moment=False)
         left = points - predict(basis, coefficients)
         scale = max(_typical(_lengths(left), weight), MIN_RESIDUAL_SCALE)
         left *= (weight / (1 + (_lengths(left) / (3 * scale)) ** 2))[..., None]
@@ -349,7 +370,7 @@ def _ridge(normal: Floats, share: float = COEFFICIENT_RIDGE) -> Floats:
 
 
 def _lengths(difference: Floats) -> Floats:
-    return np.asarray(np.sqrt(np.einsum("fpc,fpc->fp", difference, difference)))
+    return np.asarray(np.sqrt(difference[..., 0] ** 2 + difference[..., 1] ** 2))
 
 
 def _typical(lengths: Floats, weight: Floats) -> float:

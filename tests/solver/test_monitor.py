@@ -235,7 +235,7 @@ def test_a_step_that_raises_the_objective_is_rejected_and_reported(monkeypatch: 
 def timed(plan: list[Stage]) -> tuple[Monitor, list[Step], list[float]]:
     steps: list[Step] = []
     now = [0.0]
-    return Monitor(steps.append, plan=plan, clock=lambda: now[0]), steps, now
+    return Monitor(steps.append, plan=plan, clock=lambda: now[0], work=lambda: now[0]), steps, now
 
 
 def test_a_slow_machine_multiplies_the_planned_time_that_is_left() -> None:
@@ -251,6 +251,22 @@ def test_a_slow_machine_multiplies_the_planned_time_that_is_left() -> None:
     assert 0.9 * 3 * 10 < left < 1.1 * 3 * 10
     monitor.report(Step("finish", 1.0))
     assert steps[-1].seconds_left == 0.0
+
+
+def test_the_latest_load_of_the_machine_converts_work_into_time() -> None:
+    steps: list[Step] = []
+    now, work = [0.0], [0.0]
+    plan = [Stage("multistart", 100.0, 100)]
+    monitor = Monitor(steps.append, plan=plan, clock=lambda: now[0], work=lambda: work[0])
+    left = []
+    for slow in [1] * 10 + [4] * 10:  # others come to use the cores
+        work[0] += 5.0
+        now[0] += 5.0 * slow
+        monitor()
+        assert steps[-1].seconds_left is not None
+        left.append(steps[-1].seconds_left)
+    assert left[9] == pytest.approx(5 * 90, rel=0.2)
+    assert left[19] == pytest.approx(4 * 5 * 80, rel=0.2)
 
 
 def test_shapes_slower_than_planned_are_extrapolated_by_themselves() -> None:
