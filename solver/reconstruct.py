@@ -282,6 +282,7 @@ def _learned(
         estimates_scales=settings.estimates_scales,
         seed=settings.seed,
         normalized=normalized,
+        y_up=settings.y_up,
         should_stop=should_stop,
     )
 

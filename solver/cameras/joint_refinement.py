@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from pliant.solver.cameras.bas_relief import DECIDED, facing, settled_depth
 from pliant.solver.cameras.depth_rounds import settled, settled_again, with_depth_map
 from pliant.solver.cameras.estimation import CameraEstimate, restarted
 from pliant.solver.cameras.learned import Learned, motion_of, moved_to, scene_at
@@ -72,6 +73,7 @@ def learn(
     estimates_scales: bool = False,
     seed: int = 0,
     normalized: Normalized | None = None,
+    y_up: bool = False,
     should_stop: Callable[[], bool] | None = None,
 ) -> tuple[CameraEstimate, ShapeCovariance]:
     """Return the cameras, refined if `turning`, and the shape covariance of all frames.
@@ -90,6 +92,8 @@ def learn(
         Seed of the split of the points where some are held out.
     normalized : Normalized, optional
         The tracks themselves, needed where `estimate.perspective` says that perspective is possible.
+    y_up : bool
+        Whether y points up in the images.
     should_stop : callable, optional
         Called between refinements; once it returns True, the best so far is returned.
     """
@@ -147,6 +151,11 @@ def learn(
             found = _coupled(unscaled, found, with_scales=start_scales is not None, should_stop=should_stop)
             if bends:
                 estimate, found, unscaled, sample = again(found)
+        if not bends and np.isfinite(found.energy):
+            found, stretch = settled_depth(unscaled, found)
+            estimate = _with_depth_choice(estimate, stretch)
+            if estimate.depth_is_typical:
+                found = facing(found, sample, y_up=y_up)
         before = np.asarray(estimate.rotations)[used] if bends else before
         rotations, scales = found.rotations, found.scales
     if found is not None and not np.isfinite(found.energy):  # stopped
@@ -237,6 +246,8 @@ def _best_start(
         found = refined(
             part, given, ones, with_scales=False, rounds=START_ROUNDS, model_order=model_order, should_stop=should_stop
         )
+        if estimate.turns_little:
+            found, _ = settled_depth(part, found)
         if found.energy < lowest:
             best, lowest = start, found.energy
     return best
@@ -357,3 +368,14 @@ def _with_rotation_reason(estimate: CameraEstimate, rotations: Floats, before: F
     return replace(
         estimate, rotations=rotations, reasons={**estimate.reasons, "rotations": f"{known} {sentence}".strip()}
     )
+
+
+def _with_depth_choice(estimate: CameraEstimate, stretch: float) -> CameraEstimate:
+    """Return the estimate, with a sentence where the tracks leave the extent of depth to the prior: λ or 1/λ is at least `DECIDED`."""
+    if abs(np.log(stretch)) < np.log(DECIDED):
+        return estimate
+    sentence = (
+        f"The tracks hardly tell depth from rotation: {1 / stretch:.2g} times the depth with {stretch:.2g} times the rotation explains "
+        "them about as well. The depth is one that is usual for the width, as of half a sphere."
+    )
+    return replace(estimate, depth_is_typical=True, reasons={**estimate.reasons, "depth_extent": sentence})
