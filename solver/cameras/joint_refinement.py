@@ -13,19 +13,15 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.cameras.bas_relief import DECIDED, facing, settled_depth
-from pliant.solver.cameras.depth_rounds import settled, settled_again, with_depth_map
+from pliant.solver.cameras.covariance_learning import LearningData, learn_covariance
+from pliant.solver.cameras.depth_rounds import settled, settled_again
 from pliant.solver.cameras.estimation import CameraEstimate, restarted
 from pliant.solver.cameras.learned import Learned, motion_of, moved_to, scene_at
 from pliant.solver.cameras.scale import WIDEST, rigid_scales
 from pliant.solver.model import full_mode_covariance
-from pliant.solver.model.early_stopping import described, learn_with_early_stopping
 from pliant.solver.model.marginal_likelihood import fit
 from pliant.solver.model.model_order import ModelOrder, select_model_order
-from pliant.solver.model.shape_covariance import (
-    MAX_MODES,
-    ShapeCovariance,
-    learned,
-)
+from pliant.solver.model.shape_covariance import MAX_MODES, MIN_ITERATIONS, ShapeCovariance, learned
 from pliant.solver.model.so3 import angles_between, exponential
 from pliant.solver.monitor import enter
 from pliant.solver.records import Floats, read_only
@@ -76,7 +72,26 @@ def learn(
     y_up: bool = False,
     should_stop: Callable[[], bool] | None = None,
 ) -> tuple[CameraEstimate, ShapeCovariance]:
-    """Return the cameras, refined if `turning`, and the shape covariance of all frames.
+    """Return the cameras of `refine_cameras` and the covariance of `learn_covariance`."""
+    estimate, data = refine_cameras(
+        estimate, shown, turning=turning, estimates_scales=estimates_scales, seed=seed, normalized=normalized,
+        y_up=y_up, should_stop=should_stop,
+    )  # fmt: skip
+    return learn_covariance(estimate, data, seed=seed, should_stop=should_stop)
+
+
+def refine_cameras(
+    estimate: CameraEstimate,
+    shown: NDArray[np.bool_],
+    *,
+    turning: bool,
+    estimates_scales: bool = False,
+    seed: int = 0,
+    normalized: Normalized | None = None,
+    y_up: bool = False,
+    should_stop: Callable[[], bool] | None = None,
+) -> tuple[CameraEstimate, LearningData]:
+    """Return the cameras, refined if `turning`, and what the shape covariance of all frames is learned from.
 
     Parameters
     ----------
@@ -124,18 +139,22 @@ def learn(
         unscaled, sample = _of_corrected(estimate, start, used)
     at_first = np.asarray(estimate.rotations)
     before = at_first[used]
-    start_scales, why = None, None
+    start_scales, why, fixed = None, None, None
     if turning and estimates_scales and (start == 1).all():
         enter(should_stop, "scales")
-        start_scales, why = _free_scales(unscaled, before, model_order, should_stop)
+        start_scales, why, fixed = _free_scales(unscaled, before, model_order, should_stop)
     rotations, scales, found = before, np.ones(len(used)), None
     if turning:
         may_couple = model_order == ModelOrder(ordered=estimate.ordered)
         enter(should_stop, "refinement", units=REFINEMENT_UNITS[may_couple])
-        found = refined(
-            unscaled, before, scales if start_scales is None else start_scales, with_scales=start_scales is not None,
-            rounds=REFINEMENT_ROUNDS, model_order=model_order, should_stop=should_stop,
-        )  # fmt: skip
+        if fixed is None or start_scales is not None or len(fixed.rotations) < len(used):
+            found = refined(
+                unscaled, before, scales if start_scales is None else start_scales, with_scales=start_scales is not None,
+                rounds=REFINEMENT_ROUNDS, model_order=model_order, should_stop=should_stop,
+            )  # fmt: skip
+        else:
+            rounds = REFINEMENT_ROUNDS - SCALE_ROUNDS
+            found = _turned(unscaled, fixed, with_scales=False, rounds=rounds, should_stop=should_stop)
         bends = estimate.perspective is not None and estimate.perspective.bends
 
         def again(found: Learned) -> tuple[CameraEstimate, Learned, Floats, Floats]:
@@ -158,24 +177,14 @@ def learn(
                 found = facing(found, sample, y_up=y_up)
         before = np.asarray(estimate.rotations)[used] if bends else before
         rotations, scales = found.rotations, found.scales
-    if found is not None and not np.isfinite(found.energy):  # stopped
-        covariance, modes = found.covariance, described(found.covariance)
-    else:
-        # Learn from scratch: modes learned along the way to these cameras overstate their likelihood.
-        projections = rotations[:, :2] * scales[:, None, None]
-        if spoiled and turning:
-            model_order = select_model_order(
-                sample, projections, spoiled=True, ordered=estimate.ordered, seed=seed, should_stop=should_stop
-            )
-        enter(should_stop, "covariance")
-        covariance, modes = learn_with_early_stopping(
-            sample, unscaled, projections, model_order, seed=seed, should_stop=should_stop
-        )
-    if len(used) < frames:
-        covariance = covariance.stretched(used, frames)
-    estimate = replace(estimate, reasons={**estimate.reasons, "modes": modes})
+    stopped = found.covariance if found is not None and not np.isfinite(found.energy) else None
+    projections = rotations[:, :2] * scales[:, None, None]
+    data = LearningData(
+        unscaled, sample, projections, used, model_order, spoiled and turning, stopped,
+        np.asarray(estimate.rotations), np.asarray(estimate.scales), turning,
+    )  # fmt: skip
     if not turning:
-        return with_depth_map(estimate, covariance), covariance
+        return estimate, data
     turns = Rotation.from_matrix(rotations @ before.transpose(0, 2, 1)).as_rotvec()
     whole = exponential(_between(used, turns, frames)) @ estimate.rotations
     if why is not None:
@@ -185,8 +194,8 @@ def learn(
         scales = np.exp(logs - logs.mean())
         read_only(scales)
         estimate = replace(estimate, scales=scales)
-    estimate = with_depth_map(replace(estimate, rotations=whole), covariance)
-    return _with_rotation_reason(estimate, whole, at_first), _seen_from(covariance, whole[0])
+    data = replace(data, rotations=whole, scales=np.asarray(estimate.scales))
+    return _with_rotation_reason(estimate, whole, at_first), data
 
 
 def _of_corrected(estimate: CameraEstimate, scales: Floats, used: NDArray[np.intp]) -> tuple[Floats, Floats]:
@@ -206,16 +215,34 @@ def refined(
     should_stop: Callable[[], bool] | None = None,
 ) -> Learned:
     """Return cameras and covariance after rounds of alternating refinement; scales stay 1 without `with_scales`."""
-    projections = rotations[:, :2] * scales[:, None, None]
+    start = _learned_at(gram, rotations, scales, model_order, should_stop)
+    return _turned(gram, start, with_scales=with_scales, rounds=rounds, should_stop=should_stop)
+
+
+def _learned_at(
+    gram: Floats,
+    rotations: Floats,
+    scales: Floats,
+    model_order: ModelOrder,
+    should_stop: Callable[[], bool] | None,
+) -> Learned:
+    """Return given cameras and the covariance learned with them from scratch."""
     covariance = learned(
         gram,
-        projections,
+        rotations[:, :2] * scales[:, None, None],
         max_modes=model_order.max_modes,
         noisy_start=model_order.noisy_start,
         ordered=model_order.ordered,
+        iterations=MIN_ITERATIONS,  # L-BFGS, which follows, gains more in the same time
         should_stop=should_stop,
     )
-    found = Learned(rotations, scales, covariance, np.inf)
+    return Learned(rotations, scales, covariance, np.inf)
+
+
+def _turned(
+    gram: Floats, found: Learned, *, with_scales: bool, rounds: int, should_stop: Callable[[], bool] | None
+) -> Learned:
+    """Return cameras and covariance after rounds of refinement."""
     for _ in range(rounds):
         if should_stop is not None and should_stop():
             break
@@ -255,8 +282,8 @@ def _best_start(
 
 def _free_scales(
     gram: Floats, rotations: Floats, model_order: ModelOrder, should_stop: Callable[[], bool] | None
-) -> tuple[Floats | None, str]:
-    """Return scales to start from, or None where free scales gain no more than chance, and a sentence.
+) -> tuple[Floats | None, str, Learned]:
+    """Return scales to start from, or None where free scales gain no more than chance, a sentence, and what was found without.
 
     Scales are free from two starts, 1 and those of a rigid shape, on a subset of the frames. Deformation that is
     mistaken for scale ends in a worse minimum than fixed scales, or in one with nearly constant scales.
@@ -264,36 +291,31 @@ def _free_scales(
     used = _some(np.arange(len(rotations)), SCALE_FRAMES)
     part, given, none = _of_frames(gram, used), rotations[used], np.ones(len(used))
 
-    def energies(scales: Floats, *, with_scales: bool) -> Learned:
-        return refined(
-            part,
-            given,
-            scales,
-            with_scales=with_scales,
-            rounds=SCALE_ROUNDS,
-            model_order=model_order,
-            should_stop=should_stop,
-        )
+    def turned(start: Learned, *, with_scales: bool) -> Learned:
+        return _turned(part, start, with_scales=with_scales, rounds=SCALE_ROUNDS, should_stop=should_stop)
 
-    fixed = energies(none, with_scales=False)
-    runs = [energies(scales, with_scales=True) for scales in (none, rigid_scales(part, given))]
+    even, rigid = (
+        _learned_at(part, given, scales, model_order, should_stop) for scales in (none, rigid_scales(part, given))
+    )
+    fixed, runs = turned(even, with_scales=False), [turned(each, with_scales=True) for each in (even, rigid)]
     best = min(runs, key=lambda run: run.energy)
     gain, least, largest = fixed.energy - best.energy, float(best.scales.min()), float(best.scales.max())
     if np.log(best.scales).std() > WIDEST:
         return (
             None,
             f"Every scale is 1: those found, from {least:.3f} to {largest:.3f}, are wider apart than any camera's.",
+            fixed,
         )
     share = _scale_gain_share(np.log(best.scales)) if model_order.ordered else 1.0
     if not (gain > MIN_SCALE_GAIN * share and np.log(best.scales).std() > MIN_SCALE_STD):
-        return None, (
+        why = (
             f"Every scale is 1: free ones, from {least:.3f} to {largest:.3f}, would gain {gain:.3f} in the logarithm of the "
             "likelihood, no more than deformation alone does."
         )
+        return None, why, fixed
     logs = _between(used, np.log(best.scales)[:, None], len(rotations))[:, 0]
-    return np.exp(logs - logs.mean()), (
-        f"Scales from {least:.3f} to {largest:.3f} gain {gain:.3f} in the logarithm of the likelihood, per point and frame."
-    )
+    why = f"Scales from {least:.3f} to {largest:.3f} gain {gain:.3f} in the logarithm of the likelihood, per point and frame."
+    return np.exp(logs - logs.mean()), why, fixed
 
 
 def _scale_gain_share(logs: Floats) -> float:
@@ -347,15 +369,6 @@ def _coupled(gram: Floats, found: Learned, *, with_scales: bool, should_stop: Ca
 def _between(used: NDArray[np.intp], turns: Floats, frames: int) -> Floats:
     """Return turns of all frames, interpolated between those of the frames used."""
     return np.stack([np.interp(np.arange(frames), used, axis) for axis in turns.T], axis=1)
-
-
-def _seen_from(covariance: ShapeCovariance, first: Floats) -> ShapeCovariance:
-    """Return the covariance in the axes of the first camera."""
-    return replace(
-        covariance,
-        mean_covariance=first @ covariance.mean_covariance @ first.T,
-        axis_covariance=first @ covariance.axis_covariance @ first.T,
-    )
 
 
 def _with_rotation_reason(estimate: CameraEstimate, rotations: Floats, before: Floats) -> CameraEstimate:

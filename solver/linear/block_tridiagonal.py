@@ -31,6 +31,9 @@ DIAGONAL_RIDGE = 1e-9
 ROUNDING = 64.0
 """Lower bound of the ridge in units of machine epsilon: bounds the rounding error of the elimination."""
 
+SINGLE_SPAN = 1e5
+"""Maximum ratio of an observation's weight to the stiffness of a path for which single precision is used."""
+
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 """Row and column indices of the six distinct entries of a symmetric 3×3 block."""
 
@@ -47,6 +50,13 @@ def stiffness_of_neighbours(operator: Operator) -> Floats:
         return np.zeros(points)
     squared = operator.laplacian.matrix.power(2).sum(axis=0)
     return operator.spatial_weight * np.asarray(squared, dtype=np.float64).ravel()
+
+
+def suits_single_precision(operator: Operator) -> bool:
+    """Whether the blocks are well enough conditioned to be inverted in single precision."""
+    stiff = float(operator.stencil[0].max()) + float(stiffness_of_neighbours(operator).mean())
+    data = float(operator.weights.max()) * float((operator.projections**2).sum(axis=(1, 2)).max())
+    return data < SINGLE_SPAN * stiff
 
 
 def build(operator: Operator, stiffness: Floats | None = None) -> Linear:

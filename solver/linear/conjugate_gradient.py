@@ -28,6 +28,8 @@ class Solved:
     iterations: int
     relative: float
     """Final over initial preconditioned residual norm √(rᵀM⁻¹r)."""
+    decrease: float = 0.0
+    """Decrease of xᵀ𝒜x − 2bᵀx."""
 
 
 def conjugate_gradient(
@@ -38,12 +40,14 @@ def conjugate_gradient(
     precondition: Linear,
     reduction: float,
     max_iterations: int,
+    negligible: float = 0.0,
     should_stop: Callable[[], bool] | None = None,
 ) -> Solved:
     """Improve x, or 0, towards 𝒜 x = b for a symmetric positive (semi)definite 𝒜.
 
     Every iteration decreases ½ xᵀ𝒜x − bᵀx, so majorise–minimise descends even when the inner solve is stopped early.
-    Stops when √(rᵀM⁻¹r) has fallen to `reduction` times its initial value, or to rounding level relative to √(bᵀM⁻¹b).
+    Stops when √(rᵀM⁻¹r) has fallen to `reduction` times its initial value, or to rounding level relative to √(bᵀM⁻¹b),
+    or when rᵀM⁻¹r, about what is left to gain of xᵀ𝒜x − 2bᵀx, is at most `negligible`.
     Saad, Iterative Methods for Sparse Linear Systems (2003), algorithm 9.1.
 
     Five arrays of the size of x are allocated once and reused; allocating them in every iteration would cost more in
@@ -60,9 +64,9 @@ def conjugate_gradient(
         z, direction = precondition(residual), precondition(b)
         first, beside = dot(residual, z), abs(dot(b, direction))
         rz = first
-    enough = max(reduction**2 * first, (10 * float(np.finfo(b.dtype).eps)) ** 2 * beside)
+    enough = max(negligible, reduction**2 * first, (10 * float(np.finfo(b.dtype).eps)) ** 2 * beside)
     direction[...] = z
-    done = 0
+    done, decrease = 0, 0.0
     while done < max_iterations and rz > enough:
         if should_stop is not None and should_stop():
             break
@@ -70,12 +74,13 @@ def conjugate_gradient(
         curvature = dot(direction, image)
         if not curvature > 0:  # null direction: no further decrease along it
             break
+        decrease += rz * (rz / curvature)
         _advance(rz / curvature, direction, image, x=x, residual=residual)
         z = precondition(residual, out=z)
         before, rz = rz, dot(residual, z)
         _turn(rz / before, z, direction)
         done += 1
-    return Solved(x, done, float(np.sqrt(max(rz, 0.0) / first)) if first > 0 else 0.0)
+    return Solved(x, done, float(np.sqrt(max(rz, 0.0) / first)) if first > 0 else 0.0, decrease)
 
 
 def _advance(step: float, direction: Array, image: Array, *, x: Array, residual: Array) -> None:

@@ -42,8 +42,11 @@ class Coarse:
     modes: tuple[Floats, Floats, Floats]
     """U of every coordinate, shape `(F, m_c)` each."""
 
+    points: NDArray[np.intp]
+    """The points with deviating weights, shape `(D,)`."""
+
     inverses: Array
-    """N_p⁻¹, shape `(P, m, m)`, m the sum of all m_c."""
+    """N_p⁻¹ of these, shape `(D, m, m)`, m the sum of all m_c."""
 
     def add(self, r: Array, out: Array) -> None:
         """Add U N⁻¹ Uᵀ r to `out`, both of shape `(F, 3, P)`."""
@@ -51,23 +54,27 @@ class Coarse:
         cuts = np.cumsum([0] + [each.shape[1] for each in modes])
 
         def work(start: int, stop: int) -> None:
-            inner = np.concatenate([modes[c].T @ r[:, c, start:stop] for c in range(3)])
+            chosen = self.points[start:stop]
+            inner = np.concatenate([modes[c].T @ r[:, c, chosen] for c in range(3)])
             inner = np.matmul(self.inverses[start:stop], np.ascontiguousarray(inner.T)[:, :, None])[:, :, 0]
             for c in range(3):
-                out[:, c, start:stop] += modes[c] @ inner[:, cuts[c] : cuts[c + 1]].T
+                out[:, c, chosen] += modes[c] @ inner[:, cuts[c] : cuts[c + 1]].T
 
-        over_ranges(work, r.shape[2], smallest=256)
+        over_ranges(work, len(self.points), smallest=256)
 
 
-def build_coarse(operator: Operator) -> Coarse | None:
-    """Return the correction for this reweighting, or None if the mean weights are accurate enough."""
+def build_coarse(operator: Operator, stiffness: Floats) -> Coarse | None:
+    """Return the correction for this reweighting, or None if the mean weights are accurate enough.
+
+    `stiffness` is the diagonal of the spatial term, shape `(P,)`.
+    """
     if operator.quadratic is None:
         return None
     mean = operator.weights.mean(axis=2, dtype=np.float64)
-    unlike = float((operator.weights < UNLIKE * mean[:, :, None]).mean())
-    if unlike < ENOUGH:
+    unlike = operator.weights < UNLIKE * mean[:, :, None]
+    if float(unlike.mean()) < ENOUGH:
         return None
-    limit = HELD * float(mean.mean())
+    limit = HELD * float(mean.mean()) - float(stiffness.mean())
     modes, held = _free_modes(operator, limit)
     if sum(len(each) for each in held) == 0:
         return None
@@ -75,21 +82,22 @@ def build_coarse(operator: Operator) -> Coarse | None:
     size = seen.shape[2]
     upper = np.triu_indices(size)
     products = (seen[:, :, upper[0]] * seen[:, :, upper[1]]).reshape(-1, len(upper[0])).astype(operator.weights.dtype)
-    points = operator.weights.shape[2]
-    inverses = np.zeros((points, size, size), dtype=operator.weights.dtype)
+    points = np.flatnonzero(unlike.any(axis=(0, 1)))
+    inverses = np.zeros((len(points), size, size), dtype=operator.weights.dtype)
     prior = np.diag(np.concatenate(held))
 
     def work(start: int, stop: int) -> None:
         for low in range(start, stop, MODE_BLOCK):
             high = min(low + MODE_BLOCK, stop)
-            flat = operator.weights[:, :, low:high].reshape(-1, high - low).T @ products
+            flat = operator.weights[:, :, points[low:high]].reshape(-1, high - low).T @ products
             normal = np.zeros((high - low, size, size))
             normal[:, upper[0], upper[1]] = flat
             normal[:, upper[1], upper[0]] = flat
-            inverses[low:high] = np.linalg.inv(normal + prior)
+            normal += prior + stiffness[points[low:high], None, None] * np.eye(size)
+            inverses[low:high] = np.linalg.inv(normal)
 
-    over_ranges(work, points, smallest=MODE_BLOCK)
-    return Coarse(modes, inverses)
+    over_ranges(work, len(points), smallest=MODE_BLOCK)
+    return Coarse(modes, points, inverses)
 
 
 MODE_BLOCK = 256

@@ -1,4 +1,4 @@
-"""Additive multilevel preconditioner: block elimination over frames on the points and on every coarser level."""
+"""Additive multilevel preconditioner: the inverse for single points (`linear.points`) on the points and on every coarser level."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.solver.linear import block_tridiagonal
+from pliant.solver.linear import points
 from pliant.solver.linear.conjugate_gradient import Linear
 from pliant.solver.operators.aggregation import Level, Matrix
 from pliant.solver.operators.bending import add_transposed, frames_together, transposed
@@ -19,13 +19,13 @@ Array = NDArray[np.floating]
 def build(operator: Operator) -> Linear:
     """Factor every level for one reweighting and return r ↦ Σ_l Π_l M_l⁻¹ Π_lᵀ r."""
     assert operator.laplacian is not None
-    fine = block_tridiagonal.build(operator)
+    fine = points.build(operator)
     coarse: list[Coarser] = []
     weights = operator.weights
     for level in operator.laplacian.levels:
         weights = _carried(level.mean, weights)
         alike = replace(operator, weights=weights, laplacian=None)
-        inverse = block_tridiagonal.build(alike, operator.spatial_weight * level.bending)
+        inverse = points.build(alike, operator.spatial_weight * level.bending)
         coarse.append(Coarser(level, inverse))
 
     def apply(r: Array, /, out: Array | None = None) -> Array:

@@ -29,8 +29,8 @@ class MeanModes:
     along: Array
 
     @classmethod
-    def of(cls, operator: Operator) -> MeanModes:
-        """Compute Z for an operator with a Gaussian prior."""
+    def of(cls, operator: Operator, stiffness: float = 0.0) -> MeanModes:
+        """Compute Z for an operator with a Gaussian prior, and one diagonal of the spatial term for all points."""
         assert operator.quadratic is not None
         frames, sizes = len(operator.projections), [each.shape[1] for each in operator.quadratic.modes]
         cuts = np.cumsum([0, *sizes])
@@ -44,7 +44,7 @@ class MeanModes:
             weights=np.broadcast_to(mean[:, :, None], (frames, 2, cuts[-1])),
             laplacian=None,
         )
-        pushed = block_tridiagonal.build(alike)(columns).reshape(3 * frames, -1)
+        pushed = block_tridiagonal.build(alike, np.full(cuts[-1], stiffness))(columns).reshape(3 * frames, -1)
         values, vectors = np.linalg.eigh(np.eye(cuts[-1]) - columns.reshape(3 * frames, -1).T @ pushed)
         return cls((pushed @ (vectors / np.sqrt(np.maximum(values, LEAST)))).astype(operator.weights.dtype))
 

@@ -156,6 +156,7 @@ def learned(
     max_modes: int = MAX_MODES,
     noisy_start: bool = False,
     ordered: bool = True,
+    iterations: int = MAX_ITERATIONS,
     should_stop: Callable[[], bool] | None = None,
 ) -> ShapeCovariance:
     """Return the more probable of two covariances learned by EM from scratch.
@@ -172,10 +173,12 @@ def learned(
         Maximum number of columns of L.
     noisy_start : bool
         Start with the roughness of the tracks as noise instead of a low noise.
+    iterations : int
+        Maximum number of EM rounds of a run.
     should_stop : callable, optional
         Called after every round; once it returns True, the best so far is returned.
     """
-    count = min(MAX_ITERATIONS, max(MIN_ITERATIONS, ITERATION_FRAMES // len(projections)))
+    count = min(iterations, max(MIN_ITERATIONS, ITERATION_FRAMES // len(projections)))
     warm = freed(
         annealed(
             gram,

@@ -22,53 +22,55 @@ from pliant.solver.records import Floats, Outcome
 from pliant.solver.shapes.state import State
 from pliant.solver.threads import SMALLEST, over_ranges
 
-INNER_REDUCTION = 0.2
-"""Factor by which an inner solve reduces the residual; the weights change next, so more is wasted. CPU seconds to within
-1 % of the final energy and to the end, 99 × 29,000 with outliers: 0.1: 8.0, 10.3; 0.2: 6.4, 9.0; 0.3: 7.2, 10.2; 0.5:
-9.9, 12.4."""
+INNER_REDUCTION = 0.1
+"""Largest factor by which an inner solve reduces the residual; the weights change next, so more is wasted."""
+NEGLIGIBLE = 0.1
+"""What an inner solve may leave to gain, as a share of what ends the reweightings."""
 MAX_INNER = 60
 """Maximum number of conjugate gradient iterations per reweighting."""
 SINGLE_REDUCTION = 1e-3
 """Smallest reduction of the residual for which single precision is used."""
-SINGLE_SPAN = 1e5
-"""Maximum ratio of an observation's weight to the stiffness of a path for which single precision is used."""
 
 
 def init(problem: Problem, shapes: Array, translations: Floats) -> State:
     """Return the state at the starting shapes."""
-    return _evaluated(problem, shapes.copy(), translations, None, reweighting=0, iterations=0)
+    return _evaluated(problem, shapes.copy(), translations, None, reweighting=0)
 
 
 def step(
     problem: Problem,
     state: State,
     *,
-    reduction: float = INNER_REDUCTION,
+    reduction: float | None = None,
     max_inner: int = MAX_INNER,
+    tolerance: float = 0.0,
     should_stop: Callable[[], bool] | None = None,
 ) -> State:
     """Do one reweighting: shapes for the weights of `state`, then translations, then new weights.
 
     Conjugate gradients solve for the correction to the shapes, which needs one or two digits only, so single precision
     is enough where `inner_precision` allows it. Gradient, sum and energy keep the problem's precision.
+
+    The reduction of the residual, unless given, is the share of the last decrease that the quadratic majoriser did not
+    predict (Eisenstat, Walker 1996, choice 1): weights that hardly change make an accurate solution worthwhile. It ends
+    where a negligible part of `tolerance`, relative to the energy, is left to gain.
     """
+    reduction = state.reduction if reduction is None else reduction
     operator = operator_at(problem, state)
     target = problem.points - state.translations[:, :, None].astype(problem.points.dtype)
     gradient = operator.gradient(state.shapes, target)
     inner = operator.rounded(inner_precision(operator, reduction))
     solved = conjugate_gradient(
         inner.apply, (-gradient).astype(inner.weights.dtype), precondition=build_preconditioner(inner),
-        reduction=reduction, max_iterations=max_inner, should_stop=should_stop,
+        reduction=reduction, max_iterations=max_inner, negligible=NEGLIGIBLE * tolerance * abs(state.objective),
+        should_stop=should_stop,
     )  # fmt: skip
     shapes = np.add(state.shapes, solved.x, out=gradient)
-    return _evaluated(
-        problem,
-        shapes,
-        state.translations,
-        state.omega,
-        reweighting=state.reweighting + 1,
-        iterations=solved.iterations,
-    )
+    after = _evaluated(problem, shapes, state.translations, state.omega, reweighting=state.reweighting + 1)
+    gained = state.objective - after.objective
+    unforeseen = abs(gained - solved.decrease) / gained if gained > 0 else INNER_REDUCTION
+    reduction = float(np.clip(unforeseen, SINGLE_REDUCTION, INNER_REDUCTION))
+    return replace(after, iterations=solved.iterations, reduction=reduction)
 
 
 def inner_precision(operator: Operator, reduction: float) -> np.dtype[np.floating]:
@@ -81,9 +83,7 @@ def inner_precision(operator: Operator, reduction: float) -> np.dtype[np.floatin
         return operator.weights.dtype
     if reduction < SINGLE_REDUCTION or not block_tridiagonal.fits(operator):
         return operator.weights.dtype
-    stiff = float(operator.stencil[0].max()) + float(block_tridiagonal.stiffness_of_neighbours(operator).mean())
-    data = float(operator.weights.max()) * float((operator.projections**2).sum(axis=(1, 2)).max())
-    return np.dtype(np.float32) if data < SINGLE_SPAN * stiff else operator.weights.dtype
+    return np.dtype(np.float32) if block_tridiagonal.suits_single_precision(operator) else operator.weights.dtype
 
 
 def operator_at(problem: Problem, state: State) -> Operator:
@@ -122,7 +122,7 @@ def no_higher(before: State, after: State) -> State:
 
 
 def _evaluated(
-    problem: Problem, shapes: Array, translations: Floats, omega: Array | None, *, reweighting: int, iterations: int
+    problem: Problem, shapes: Array, translations: Floats, omega: Array | None, *, reweighting: int
 ) -> State:
     """Centre every frame's shape, in place, and return the state there.
 
@@ -165,7 +165,8 @@ def _evaluated(
         objective=value,
         residual=float(np.sqrt(np.median(squared if seen.all() else squared[seen]))),
         reweighting=reweighting,
-        iterations=iterations,
+        iterations=0,
+        reduction=INNER_REDUCTION,
     )
 
 

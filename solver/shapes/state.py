@@ -28,6 +28,8 @@ class State:
     reweighting: int
     iterations: int
     """Conjugate-gradient iterations of the last step."""
+    reduction: float
+    """Factor by which the next inner solve reduces the residual."""
 
     def summary(self) -> State:
         """Return the numbers without the arrays, for the history."""

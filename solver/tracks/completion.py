@@ -16,6 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.errors import InvalidInput
 from pliant.solver.records import MIN_POINTS, Floats
+from pliant.solver.threads import SMALLEST, over_ranges
+from pliant.solver.tracks.noise import weighted_median
 from pliant.solver.tracks.normalization import Normalized
 
 MAX_SAMPLE_POINTS = 600
@@ -83,7 +85,7 @@ class Completed:
     """Columns of the basis, translation included; 0 if nothing was filled."""
 
     outliers: float
-    """Share of the visible entries of the sample that was replaced as outliers."""
+    """Share of the visible entries of the sample, weighted by confidence, that was replaced as outliers."""
 
     filling: Filling | None = None
     """The factor that replaced hidden entries and outliers; None if none were replaced."""
@@ -177,7 +179,7 @@ def fit_basis(
         basis, coefficients, spread, scale = alternate(points, kept, basis, sweeps=ALTERNATIONS)
         if not hidden and not gross(points, weight, predict(basis, coefficients), scale).any():
             return basis, spread, scale
-        error = _typical(_lengths(points - predict(basis, coefficients)), held & (weight > 0))
+        error = _typical(_lengths(points - predict(basis, coefficients)), np.where(held, weight, 0.0))
         if error < 0.98 * best_error or rank <= given:
             best_error, best_rank, best = error, rank, basis
         elif rank > 2 * best_rank:
@@ -199,12 +201,12 @@ def alternate(points: Floats, weight: Floats, basis: Floats, *, sweeps: int) -> 
     scale = MIN_RESIDUAL_SCALE
     for _ in range(sweeps):
         lengths = _lengths(points - predict(basis, coefficients))
-        scale = max(_typical(lengths, weight > 0), MIN_RESIDUAL_SCALE)
+        scale = max(_typical(lengths, weight), MIN_RESIDUAL_SCALE)
         robust = weight / (1 + (lengths / (3 * scale)) ** 2)
         extended = np.concatenate([coefficients, np.ones((len(coefficients), 1))], axis=1)
-        normal = np.einsum("fp,pi,pj->fij", robust, extended, extended, optimize=True)
+        normal = extended.T @ (robust[..., None] * extended)
         normal += _ridge(normal)
-        right = np.einsum("fp,fpc,pi->fic", robust, points, extended, optimize=True)
+        right = extended.T @ (robust[..., None] * points)
         basis = np.linalg.solve(normal, right).transpose(0, 2, 1)
         basis, change = _orthonormal(basis)
         coefficients, spread = coefficients_of(points, robust, basis, change @ spread @ change.T, scale, sweeps=1)
@@ -212,51 +214,71 @@ def alternate(points: Floats, weight: Floats, basis: Floats, *, sweeps: int) -> 
 
 
 def coefficients_of(
-    points: Floats, weight: Floats, basis: Floats, spread: Floats | None, scale: float, *, sweeps: int
+    points: Floats,
+    weight: Floats,
+    basis: Floats,
+    spread: Floats | None,
+    scale: float,
+    *,
+    sweeps: int,
+    with_moment: bool = True,
 ) -> tuple[Floats, Floats]:
     """Return each point's coefficients on the basis, shape (S, r−1), and their covariance, shape (r−1, r−1).
 
     Reweighted least squares with a Gaussian prior. A point visible in few frames determines few of its coefficients;
     without a prior the others, and with them the hidden positions, are unbounded. The covariance is the second moment
-    over the points, posterior variance included (one EM step); the first estimate comes from damped least squares.
+    over the points, posterior variance included (one EM step); the first estimate comes from damped least squares. Without
+    `with_moment` it is not computed.
     """
     columns, shift = basis[:, :, :-1], basis[:, :, -1]
     products = np.einsum("fci,fcj->fij", columns, columns).reshape(len(basis), -1)
     robust, size = weight, columns.shape[2]
-    coefficients, moment = np.zeros((points.shape[1], size)), np.eye(size)
+    coefficients, normal = np.zeros((points.shape[1], size)), np.zeros((points.shape[1], size, size))
     for sweep in range(sweeps):
         normal = (robust.T @ products).reshape(-1, size, size)
         normal += _ridge(normal, DAMPING) if spread is None else _prior(spread, scale) + _ridge(normal)
-        right = np.einsum("fp,fpc,fci->pi", robust, points - shift[:, None], columns, optimize=True)
-        inverse = np.linalg.inv(normal)
-        coefficients = np.einsum("pij,pj->pi", inverse, right)
-        moment = coefficients.T @ coefficients / len(coefficients)
-        if spread is not None:
-            moment = moment + scale**2 * inverse.mean(axis=0)
+        pulled = (robust[..., None] * (points - shift[:, None])).transpose(1, 0, 2).reshape(len(coefficients), -1)
+        coefficients = _solved(normal, pulled @ columns.reshape(-1, size))
         if sweep + 1 < sweeps:
             lengths = _lengths(points - predict(basis, coefficients))
-            typical = max(_typical(lengths, weight > 0), MIN_RESIDUAL_SCALE)
+            typical = max(_typical(lengths, weight), MIN_RESIDUAL_SCALE)
             robust = weight / (1 + (lengths / (3 * typical)) ** 2)
-    return coefficients, moment
+    if not with_moment:
+        return coefficients, np.eye(size)
+    moment = coefficients.T @ coefficients / len(coefficients)
+    return coefficients, moment if spread is None else moment + scale**2 * np.linalg.inv(normal).mean(axis=0)
+
+
+def _solved(normal: Floats, right: Floats) -> Floats:
+    """Return the solutions of P systems, `(P, n, n)` and `(P, n)`."""
+    found = np.empty_like(right)
+
+    def work(start: int, stop: int) -> None:
+        found[start:stop] = np.linalg.solve(normal[start:stop], right[start:stop, :, None])[..., 0]
+
+    over_ranges(work, len(right), smallest=max(1, SMALLEST // right.shape[1] ** 2))
+    return found
 
 
 def predict(basis: Floats, coefficients: Floats) -> Floats:
     """Return M B + t as points, shape `(F, S, 2)`."""
-    return np.asarray(np.einsum("fci,pi->fpc", basis[:, :, :-1], coefficients, optimize=True) + basis[:, None, :, -1])
+    frames, _, rank = basis.shape
+    along = (basis[:, :, :-1].reshape(2 * frames, rank - 1) @ coefficients.T).reshape(frames, 2, -1)
+    return np.asarray((along + basis[:, :, -1:]).transpose(0, 2, 1))
 
 
 def fill(points: Floats, weight: Floats, basis: Floats, spread: Floats, scale: float) -> tuple[Floats, float]:
-    """Return points with hidden entries predicted and outliers replaced, and the share of visible entries replaced.
+    """Return points with hidden entries predicted and outliers replaced, and the share of the visible entries' confidence replaced.
 
     An entry with confidence 0 < c < 1 becomes c times itself plus 1 − c times its prediction: the EM completion of an
     observation whose noise variance is larger by 1/c.
     """
-    coefficients, _ = coefficients_of(points, weight, basis, spread, scale, sweeps=4)
+    coefficients, _ = coefficients_of(points, weight, basis, spread, scale, sweeps=4, with_moment=False)
     predicted = predict(basis, coefficients)
     wrong = gross(points, weight, predicted, scale)
     trust = np.where(wrong, 0.0, weight)[..., None]
     filled = np.where(trust == 1, points, predicted + trust * (points - predicted))
-    return filled, float(wrong.sum() / max((weight > 0).sum(), 1))
+    return filled, float(weight[wrong].sum() / max(weight.sum(), np.finfo(float).tiny))
 
 
 def gross(points: Floats, weight: Floats, predicted: Floats, scale: float) -> NDArray[np.bool_]:
@@ -315,9 +337,9 @@ def _widen(basis: Floats, points: Floats, weight: Floats, start: Floats, rank: i
         left, shift = start, start.mean(axis=1)
         old = np.zeros((frames, 2, 0))
     else:
-        coefficients, _ = coefficients_of(points, weight, basis, None, 1.0, sweeps=2)
+        coefficients, _ = coefficients_of(points, weight, basis, None, 1.0, sweeps=2, with_moment=False)
         left = points - predict(basis, coefficients)
-        scale = max(_typical(_lengths(left), weight > 0), MIN_RESIDUAL_SCALE)
+        scale = max(_typical(_lengths(left), weight), MIN_RESIDUAL_SCALE)
         left *= (weight / (1 + (_lengths(left) / (3 * scale)) ** 2))[..., None]
         old, shift = basis[:, :, :-1], basis[:, :, -1]
     stacked = (left - left.mean(axis=1, keepdims=True)).transpose(0, 2, 1).reshape(2 * frames, -1)
@@ -348,12 +370,13 @@ def _ridge(normal: Floats, share: float = COEFFICIENT_RIDGE) -> Floats:
 
 
 def _lengths(difference: Floats) -> Floats:
-    return np.asarray(np.sqrt(np.einsum("fpc,fpc->fp", difference, difference)))
+    return np.asarray(np.sqrt(difference[..., 0] ** 2 + difference[..., 1] ** 2))
 
 
-def _typical(lengths: Floats, mask: NDArray[np.bool_]) -> float:
-    """Return the standard deviation per coordinate of an isotropic Gaussian with this median length."""
-    return float(np.median(lengths[mask]) / 1.1774) if mask.any() else 0.0
+def _typical(lengths: Floats, weight: Floats) -> float:
+    """Return the standard deviation per coordinate of an isotropic Gaussian with this median length, weighted by confidence."""
+    mask = weight > 0
+    return weighted_median(lengths[mask], weight[mask]) / 1.1774 if mask.any() else 0.0
 
 
 def _leading(matrix: Floats, count: int) -> Floats:

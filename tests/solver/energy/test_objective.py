@@ -9,11 +9,11 @@ import pytest
 from pliant.solver import Mesh
 from pliant.solver.energy.objective import objective, residuals
 from pliant.solver.energy.problem import Problem
+from pliant.solver.linear import block_tridiagonal
 from pliant.solver.model.random_walk import walk_bands
 from pliant.solver.operators.gauss_markov import PathPrior
 from pliant.solver.operators.mesh_laplacian import build_laplacian
-from pliant.solver.shapes import irls
-from pliant.solver.shapes.irls import init, no_higher, operator_at, step
+from pliant.solver.shapes.irls import init, inner_precision, no_higher, operator_at, step
 from pliant.solver.shapes.state import State
 from waving_sheet import sheet, small_problem, triangulated, with_weights
 
@@ -152,7 +152,7 @@ def test_corrections_in_single_precision_lead_to_the_same_energy(mesh: str, monk
         return state
 
     single = descended()
-    monkeypatch.setattr(irls, "SINGLE_SPAN", 0.0)
+    monkeypatch.setattr(block_tridiagonal, "SINGLE_SPAN", 0.0)
     double = descended()
     assert single.shapes.dtype == np.float64
     assert not np.array_equal(single.shapes, double.shapes)  # or single precision was not taken
@@ -162,9 +162,9 @@ def test_corrections_in_single_precision_lead_to_the_same_energy(mesh: str, monk
 def test_single_precision_is_used_where_it_reaches_the_tolerance() -> None:
     problem = small_problem(MESHES["triangles"], prior="smooth", temporal_weight=30.0, spatial_weight=0.009)
     given = operator_at(problem, started(problem))
-    assert irls.inner_precision(given, 0.1) == np.float32
-    assert irls.inner_precision(given, 1e-6) == np.float64
-    assert irls.inner_precision(replace(given, weights=1e8 * given.weights), 0.1) == np.float64
-    assert irls.inner_precision(given.rounded(np.dtype(np.float32)), 1e-6) == np.float32
+    assert inner_precision(given, 0.1) == np.float32
+    assert inner_precision(given, 1e-6) == np.float64
+    assert inner_precision(replace(given, weights=1e8 * given.weights), 0.1) == np.float64
+    assert inner_precision(given.rounded(np.dtype(np.float32)), 1e-6) == np.float32
     prior = PathPrior.of(walk_bands(4)[0], (np.ones((4, 1)),) * 3)
-    assert irls.inner_precision(replace(given, quadratic=prior), 0.1) == np.float64
+    assert inner_precision(replace(given, quadratic=prior), 0.1) == np.float64

@@ -1,0 +1,40 @@
+"""Conjugate gradients: the decrease that they report, and where they end."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pliant.solver.linear.conjugate_gradient import conjugate_gradient
+
+SHAPE = (4, 3, 5)
+RANDOM = np.random.default_rng(0)
+ROOT = RANDOM.standard_normal((60, 60))
+MATRIX, B = ROOT @ ROOT.T + np.eye(60), RANDOM.standard_normal(SHAPE)
+
+
+def product(x: np.ndarray, /, out: np.ndarray | None = None) -> np.ndarray:
+    return np.asarray((MATRIX @ x.ravel()).reshape(SHAPE))
+
+
+def same(x: np.ndarray, /, out: np.ndarray | None = None) -> np.ndarray:
+    return x.copy()
+
+
+def inverse(x: np.ndarray, /, out: np.ndarray | None = None) -> np.ndarray:
+    return np.asarray(np.linalg.solve(MATRIX, x.ravel()).reshape(SHAPE))
+
+
+@pytest.mark.parametrize("iterations", [1, 7, 200])
+def test_the_decrease_is_that_of_the_quadratic(iterations: int) -> None:
+    found = conjugate_gradient(product, B, precondition=same, reduction=1e-9, max_iterations=iterations)
+    value = float(np.vdot(found.x, product(found.x)) - 2 * np.vdot(B, found.x))
+    assert found.decrease == pytest.approx(-value, rel=1e-6)
+
+
+def test_it_ends_where_little_is_left_to_gain() -> None:
+    whole = float(np.vdot(B, inverse(B)))  # with M = 𝒜, rᵀM⁻¹r is what is left to gain
+    for share, expected in ((1.1, 0), (0.9, 1)):
+        found = conjugate_gradient(
+            product, B, precondition=inverse, reduction=1e-9, max_iterations=1, negligible=share * whole
+        )
+        assert found.iterations == expected
