@@ -36,10 +36,6 @@ MAX_STRETCH = 30.0
 DECIDED = 1.25
 """λ or 1/λ below which the depth counts as decided by the tracks."""
 
-LITTLE_TURN = np.radians(2.0)
-"""Angle from d, rad, below which the cameras of the multistart are taken to have given up their turn for depth: its candidates are then
-compared at their most probable depths, where steadiness means the same for all."""
-
 MAX_ANGLE = np.radians(60.0)
 """Angle from d, rad, that no frame may exceed after the step: bas-relief is an approximation for small angles."""
 
@@ -107,11 +103,6 @@ def facing(found: Learned, sample: Floats, *, y_up: bool) -> Learned:
         return found
     rotations, covariance = mirrored(found.rotations, found.covariance)
     return replace(found, rotations=rotations, covariance=covariance)
-
-
-def hardly_turn(rotations: Floats) -> bool:
-    """Whether no camera, shape `(F, 3, 3)`, looks more than `LITTLE_TURN` away from the mean direction."""
-    return bool(np.linalg.norm(_decomposed(rotations)[2], axis=1).max() < LITTLE_TURN)
 
 
 def extent_penalty(ratio: float) -> float:

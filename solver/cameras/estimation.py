@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from pliant.solver.cameras.bas_relief import hardly_turn
 from pliant.solver.cameras.factorization import Upgrade, upgrade
 from pliant.solver.cameras.multistart import (
     CANDIDATES,
@@ -92,8 +91,8 @@ class CameraEstimate:
     warnings: tuple[str, ...] = ()
     """Reasons to distrust the result."""
 
-    turns_little: bool = False
-    """Whether the cameras hardly turn, so that hypotheses are compared at a typical depth."""
+    candidates: tuple[Floats, ...] = ()
+    """Rotations of all candidates of the multistart, to be compared at a typical depth where the tracks do not determine it."""
 
     depth_is_typical: bool = False
     """Whether the extent of depth rests on its prior and not on the tracks (`cameras.bas_relief`)."""
@@ -154,15 +153,13 @@ def estimate_cameras(
     report(Step("cameras", 0.8 * PROGRESS_SHARE))
     rotations, refined = _everywhere(own.rotations, best, used, settings)
     hypotheses: tuple[tuple[int, Floats], ...] = ()
-    little = False
+    candidates: tuple[Floats, ...] = ()
     if settings.refine_rotations and is_planar(gram):
         rotations, sheet = resolve_pose_signs(gram, rotations, ordered=ordered, should_stop=should_stop)
         refined = f"{refined} {sheet}"
-    elif settings.refine_rotations and hardly_turn(rotations):
-        little = True
-        hypotheses = tuple((each.basis_size, _everywhere(own.rotations, each, used, settings)[0]) for each in ran)
     elif settings.refine_rotations:
         hypotheses = _hypotheses(upgrades, ran, part, used)
+        candidates = tuple(_everywhere(own.rotations, each, used, settings)[0] for each in ran)
     read_only(rotations)
     read_only(scales)
     report(Step("cameras", PROGRESS_SHARE))
@@ -170,7 +167,7 @@ def estimate_cameras(
     return CameraEstimate(
         rotations, scales, completed.translations, best.basis_size, completed.gram, completed.sample,
         hypotheses, completed.outliers, completed.rank, completed.filling, None, ordered, reasons, _warnings(rotations),
-        turns_little=little,
+        candidates=candidates,
     )  # fmt: skip
 
 

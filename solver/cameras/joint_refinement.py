@@ -43,6 +43,9 @@ ROTATION_ITERATIONS = 60
 START_FRAMES, START_ROUNDS = 40, 2
 """Frames and refinements used to compare the starting cameras."""
 
+CANDIDATE_ROUNDS = 3
+"""Refinements of every candidate where they are compared at settled depths."""
+
 SCALE_FRAMES = 120
 """Frames used to decide whether scales are free; with 60 instead of 120 chance gains of fixed scales reach .054."""
 
@@ -174,6 +177,7 @@ def refine_cameras(
             found, stretch = settled_depth(unscaled, found)
             estimate = _with_depth_choice(estimate, stretch)
             if estimate.depth_is_typical:
+                found = _steadiest(estimate, unscaled, used, found, model_order, should_stop)
                 found = facing(found, sample, y_up=y_up)
         before = np.asarray(estimate.rotations)[used] if bends else before
         rotations, scales = found.rotations, found.scales
@@ -273,11 +277,36 @@ def _best_start(
         found = refined(
             part, given, ones, with_scales=False, rounds=START_ROUNDS, model_order=model_order, should_stop=should_stop
         )
-        if estimate.turns_little:
-            found, _ = settled_depth(part, found)
         if found.energy < lowest:
             best, lowest = start, found.energy
     return best
+
+
+def _steadiest(
+    estimate: CameraEstimate,
+    gram: Floats,
+    used: NDArray[np.intp],
+    found: Learned,
+    model_order: ModelOrder,
+    should_stop: Callable[[], bool] | None,
+) -> Learned:
+    """Return the most probable cameras among `found` and those from every candidate of the multistart, each at its settled depth.
+
+    Rotations that are too small by different factors are not equally steady; only at comparable depths does steadiness tell a turn of the
+    object from its deformation.
+    """
+    for rotations in estimate.candidates:
+        if should_stop is not None and should_stop():
+            break
+        other = refined(
+            gram, np.asarray(rotations)[used], found.scales, with_scales=False, rounds=CANDIDATE_ROUNDS,
+            model_order=model_order, should_stop=should_stop,
+        )  # fmt: skip
+        if not np.isfinite(other.energy):
+            break
+        other, _ = settled_depth(gram, other)
+        found = min(found, other, key=lambda each: each.energy)
+    return found
 
 
 def _free_scales(
