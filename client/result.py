@@ -67,6 +67,14 @@ class Reconstruction:
         return self.arrays.get("shapes_std")
 
     @property
+    def inlier_probability(self) -> NDArray[np.float32] | None:
+        """Posterior probability that an observation is an inlier, shape (F, P): 0 where rejected, NaN where hidden.
+
+        None in results of earlier versions.
+        """
+        return self.arrays.get("inlier_probability")
+
+    @property
     def verdict(self) -> str | None:
         """Whether the result can be used: `good`, `with_care` or `do_not_use`; None where it was not judged."""
         return self.job.verdict

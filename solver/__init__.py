@@ -13,6 +13,10 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from pliant.solver.errors import InvalidInput, InvalidSettings, NotFinite, SolverError
     from pliant.solver.reconstruct import solve
+    from pliant.solver.reconstruction.cameras import Cameras, estimate_cameras
+    from pliant.solver.reconstruction.prior import Prior, learn_prior
+    from pliant.solver.reconstruction.shapes import solve_shapes
+    from pliant.solver.reconstruction.start import find_outliers
     from pliant.solver.records import Camera, Choices, KnownCamera, Mesh, Outcome, Solution, Step, Trace, Tracks
     from pliant.solver.settings import Settings
     from pliant.solver.threads import threads_limited
@@ -26,6 +30,10 @@ _HOMES = {
     ),
     "threads": ("threads_limited",),
     "reconstruct": ("solve",),
+    "reconstruction.cameras": ("Cameras", "estimate_cameras"),
+    "reconstruction.prior": ("Prior", "learn_prior"),
+    "reconstruction.shapes": ("solve_shapes",),
+    "reconstruction.start": ("find_outliers",),
     "records": (
         "Camera",
         "Choices",
@@ -43,6 +51,7 @@ _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 
 __all__ = [
     "Camera",
+    "Cameras",
     "Choices",
     "InvalidInput",
     "InvalidSettings",
@@ -50,13 +59,18 @@ __all__ = [
     "Mesh",
     "NotFinite",
     "Outcome",
+    "Prior",
     "Settings",
     "Solution",
     "SolverError",
     "Step",
     "Trace",
     "Tracks",
+    "estimate_cameras",
+    "find_outliers",
+    "learn_prior",
     "solve",
+    "solve_shapes",
     "threads_limited",
 ]
 

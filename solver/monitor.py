@@ -6,8 +6,9 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+from pliant.solver.descent import Descent
 from pliant.solver.records import Step
-from pliant.solver.stages import Pace, Stage
+from pliant.solver.stages import Load, Pace, Stage
 
 MIN_FRACTION_STEP = 0.002
 """Least increase of the fraction that is reported on its own: at most 500 calls of `on_step` besides those of the
@@ -36,8 +37,15 @@ class Monitor:
         The user's.
     plan : sequence of Stage
         Stages of the solve in their order.
+    descent : Descent, optional
+        What is known about the reweightings before they begin.
+    seconds_per_iteration : float
+        Planned time of an iteration of conjugate gradients.
     clock : callable
-        Monotonic seconds, for `MAX_SILENCE`.
+        Monotonic seconds.
+    work : callable
+        Processor seconds of this process: the pace of the work is measured in these, so that other load on the machine does not count as
+        slow work; what is left is converted by the latest seconds per processor second.
     """
 
     def __init__(
@@ -46,23 +54,31 @@ class Monitor:
         should_stop: Callable[[], bool] | None = None,
         *,
         plan: Sequence[Stage] = (Stage("shapes", 1.0, 1000),),
+        descent: Descent | None = None,
+        seconds_per_iteration: float = 0.0,
         clock: Callable[[], float] = time.monotonic,
+        work: Callable[[], float] = time.process_time,
     ) -> None:
         self.stopped = False
         """Whether a stop was requested when somebody looked."""
-        self._on_step, self._should_stop, self._clock = on_step, should_stop, clock
+        self._on_step, self._should_stop, self._clock, self._work = on_step, should_stop, clock, work
         self._last = Step("cameras", 0.0)
         self._reported = clock()
         self._done, self._current, self._ahead = 0.0, plan[0], list(plan[1:])
-        self._units, self._share, self._settled = 0, 0.0, 0.0
-        self._pace = Pace(clock())
+        self._units, self._share = 0, 0.0
+        self._pace, self._load = Pace(work()), Load(clock(), work())
+        self._descent = Descent() if descent is None else descent
+        self._seconds_per_iteration = seconds_per_iteration
 
     def __call__(self) -> bool:
         """Count a unit of work; return whether to stop."""
         if not self.stopped and self._should_stop is not None:
             self.stopped = bool(self._should_stop())
         self._units += 1
-        self._share = max(self._share, _filled(self._units / max(self._current.units, 1)))
+        if self._current.name == "shapes":
+            self._descent.current += 1
+        else:
+            self._share = max(self._share, _filled(self._units, self._current))
         fraction = self._fraction()
         if fraction >= self._last.fraction + MIN_FRACTION_STEP or self._clock() - self._reported >= MAX_SILENCE:
             self._emit(replace(self._last, fraction=fraction))
@@ -82,27 +98,35 @@ class Monitor:
         if place is None:
             return
         self._done += self._share * self._current.seconds  # less than planned where it ended early
-        self._pace.next(self._current, self._share, self._clock())
+        self._pace.next(self._current, self._share, self._work())
         self._current, self._ahead = self._ahead[place], self._ahead[place + 1 :]
         if units is not None:
             seconds = self._current.seconds * units / max(self._current.units, 1)
             self._current = replace(self._current, seconds=seconds, units=units)
-        self._units, self._share, self._settled = 0, 0.0, 0.0
+        self._units, self._share = 0, 0.0
+        if name == "shapes":
+            self._descent.begin(None, self._work())
 
     def expect(self, stages: Sequence[Stage], *, before: str) -> None:
         """Add stages to the plan that the data turned out to require."""
         place = next((number for number, stage in enumerate(self._ahead) if stage.name == before), len(self._ahead))
         self._ahead[place:place] = stages
 
+    def expect_corrections(self, ahead: int) -> None:
+        """Expect at most so many corrections of the tracks for perspective; called before the first and after each."""
+        self._descent.expect_corrections(ahead)
+
     def report(self, step: Step) -> None:
-        """Report a step; the fraction of a step after the cameras is the completed part of the stage `shapes`."""
+        """Report a step; those after the cameras belong to the stage `shapes`, whose completed part follows from their objectives."""
         if step.stage == "finish":
             self._emit(replace(step, fraction=step.fraction if step.fraction == 1 else self._fraction()))
             return
-        if step.stage != "cameras":
-            if self._current.name != "shapes":
-                self.enter("shapes")
-            self._share, self._units, self._settled = max(self._share, step.fraction), 0, step.fraction
+        if step.stage == "initialise":
+            self.enter("shapes")
+            self._descent.begin(step.objective, self._work())
+        elif step.stage == "reweight" and step.objective is not None:
+            self._descent.reweighted(step.objective)
+            self._share = max(self._share, self._descent.share())
         self._emit(replace(step, fraction=self._fraction()))
 
     def _fraction(self) -> float:
@@ -111,8 +135,13 @@ class Monitor:
         return max(self._last.fraction, min(done / max(done + left, 1e-9), MAX_FRACTION))
 
     def _left(self) -> float:
-        ahead = sum(stage.seconds for stage in self._ahead)
-        return self._pace.left(self._current, self._share, self._settled, ahead, self._clock())
+        ahead, now = sum(stage.seconds for stage in self._ahead), self._work()
+        if self._current.name != "shapes":
+            left = self._pace.left(self._current, self._share, ahead, now)
+        else:
+            per_iteration = self._pace.known * self._seconds_per_iteration
+            left = self._descent.seconds_left(now, seconds_per_iteration=per_iteration) + self._pace.known * ahead
+        return left * self._load.seconds_per_work(self._clock(), now)
 
     def _emit(self, step: Step) -> None:
         left = 0.0 if step.fraction == 1 else self._left()
@@ -127,6 +156,11 @@ def enter(should_stop: Callable[[], bool] | None, name: str, *, units: int | Non
         should_stop.enter(name, units=units)
 
 
-def _filled(share: float) -> float:
-    """Return the completed part of a stage after this share of its expected units: increasing and below 1."""
-    return EXPECTED_SHARE * share if share <= 1 else 1 - (1 - EXPECTED_SHARE) / share
+def _filled(units: int, stage: Stage) -> float:
+    """Return the completed part of a stage after so many units of work: increasing and below 1."""
+    share = (units + stage.setup) / max(stage.units + stage.setup, 1)
+    if share > 1:
+        return 1 - (1 - EXPECTED_SHARE) / share
+    if stage.growth == 1:
+        return EXPECTED_SHARE * share
+    return float((stage.growth**units - 1) / (stage.growth ** (stage.units + 1) - 1))

@@ -428,7 +428,7 @@ class Choices:
     """Focal lengths that were compared for an isometric surface, pixels, each with its isometric inconsistency I; empty if none were."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Solution:
     """Result of a solve."""
 
@@ -455,6 +455,16 @@ class Solution:
 
     trust: Trust | None = None
     """Expected error, verdict and its reasons."""
+
+    inlier_probability: Floats | None = None
+    """Posterior probability that an observation is an inlier, shape `(F, P)`; 0 where rejected, NaN where hidden. With α the share of
+    outliers, A the area of the tracks, and p the density of the loss at the scale of the noise: (1 − α) p / ((1 − α) p + α / A); in full in
+    `pliant.solver.shapes.inliers`."""
+
+    def __repr__(self) -> str:
+        frames, points, _ = self.shapes.shape
+        verdict = "" if self.trust is None else f", {self.trust.verdict}"
+        return f"<Solution of {frames} frames × {points} points, {self.outcome}{verdict}>"
 
 
 def _confidence(visible: ArrayLike | None, shape: tuple[int, int]) -> Floats:

@@ -7,20 +7,24 @@ stages run depends on the data: one that is skipped is dropped from the plan whe
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from pliant.solver.descent import expected_iterations, expected_reweightings
+from pliant.solver.records import Floats
 
-UNIT_SECONDS, FRAME_SECONDS = 1e-4, 1.9e-5
-"""Seconds per unit of work, and per unit and frame, on one core: .19 ms at 10 frames, .41 at 30, .73 at 48, 1.4 at 74."""
+UNIT_SECONDS, FRAME_SECONDS = 7e-5, 1.3e-5
+"""Seconds per unit of work, and per unit and frame, on one core: .2 ms at 10 frames, .46 at 30, .7 at 48, 1 at 74. The other times
+below are of the same core."""
 
-POINT_SECONDS = {True: 1.2e-5, False: 6e-6}
-"""Seconds per frame and point of the shapes with and without a learned prior. With one they depend on the conditioning: .3e-5 on a
-rigid face, 2.4e-5 on ten frames of a face, 1e-4 on a flag, 1.6e-4 on a sphere; `Pace` therefore measures them."""
+ITERATION_SECONDS = {True: 2e-7, False: 1e-7}
+"""Seconds per iteration of conjugate gradients, frame and point, with and without a learned prior; measured 1.2e-7 to 2.4e-7 and 1e-7."""
 
 SETUP_SECONDS = 0.1
 """Of the shapes."""
+
+SURFACE_SECONDS, SURFACE_SETUP = 0.7, 40
+"""Seconds per frame of the search for an isometric surface, on at most 24 frames, and the units that its preparation takes as long as."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,9 +38,16 @@ class Stage:
     units: int
     """Expected units of work."""
 
+    growth: float = 1.0
+    """Time of a unit over that of the one before."""
 
-COMPLETION_SECONDS, MOST_COMPLETED = 1.2e-4, 600
-"""Seconds per frame and point of filling hidden positions, and the largest number of points that takes part."""
+    setup: int = 0
+    """Units that what comes before the first one takes as long as."""
+
+
+COMPLETION_SECONDS, MOST_COMPLETED, RANK_GROWTH = 8e-7, (60, 600), 2.0
+"""Seconds per frame, frame and point of filling hidden positions; the largest numbers of frames and points that count, because the ranks
+that are tried end at 40; and the growth of the time from one rank to the next."""
 
 UNITS = {
     "multistart": (1600, 120, 1.3),
@@ -51,26 +62,25 @@ UNITS = {
 """Stages of the default prior: typical number of units, maximum number of frames used, and cost of a unit against that of an iteration.
 Measured on sequences of 10 to 80 frames, clean and spoiled."""
 
-FIRST_REWEIGHTING = 2.5
-"""Time that the shapes take after their first reweighting has begun, over what it has taken so far; seven reweightings are usual and the
-first takes longest."""
-
 PACE_PRIOR = 0.5
 """Seconds of the plan that count as measured at the planned pace, so that the first units do not decide the pace alone."""
-
-USUAL_RATIO = 0.4
-"""Decrease of the objective of a reweighting over that of the one before, where it is not known yet."""
 
 REFINEMENT_UNITS = {True: 3600, False: 700}
 """Units of the stage `refinement` where the covariance may couple the modes, and where the model order rules that out. The plan has a
 number between, until this is known."""
+
+LOAD_SECONDS, LOAD_PRIOR = 20.0, 1.0
+"""Seconds over which the load of the machine is measured, and processor seconds that count as measured without any load."""
+
+OWN_PACE = 4.0
+"""Weight of a stage's own pace, per completed share of it, beside that of all stages: its units take about the same time."""
 
 UNITS_PER_START = 500
 """Units that one starting point of the stage `starts` takes."""
 
 
 def planned(
-    frames: int, points: int, *, gaussian: bool, known_cameras: bool, sheet: bool, hidden: bool = False
+    frames: int, points: int, *, gaussian: bool, known_cameras: bool, sheet: bool, unseen: float = 0.0
 ) -> tuple[Stage, ...]:
     """Return the stages that a solve is expected to have, in their order.
 
@@ -84,15 +94,28 @@ def planned(
         Whether rotations are given.
     sheet : bool
         Whether an isometric surface is looked for.
-    hidden : bool
-        Whether any point is hidden in any frame.
+    unseen : float
+        Of the tracks, see `unseen_frames`.
     """
-    shapes = Stage("shapes", SETUP_SECONDS + POINT_SECONDS[gaussian] * frames * points, 100)
+    iterations = expected_iterations(unseen)
+    work = expected_reweightings(iterations, hidden=unseen > 0) * (1 + iterations)
+    shapes = Stage("shapes", SETUP_SECONDS + ITERATION_SECONDS[gaussian] * work * frames * points, 100)
     last = [stage_of("trust", frames)] if gaussian else []
-    first = [Stage("surface", 0.5 + 0.35 * min(frames, 24), 280)] if sheet else []
-    filled = COMPLETION_SECONDS * frames * min(points, MOST_COMPLETED) if hidden else 0.0
-    first.append(Stage("completion", 0.1 + filled, 6))
+    first = [Stage("surface", SURFACE_SECONDS * min(frames, 24), 280, setup=SURFACE_SETUP)] if sheet else []
+    most_frames, most_points = MOST_COMPLETED
+    filled = COMPLETION_SECONDS * frames * min(frames, most_frames) * min(points, most_points) if unseen > 0 else 0.0
+    first.append(Stage("completion", 0.1 + filled, 6, growth=RANK_GROWTH))
     return (*first, *learning(frames, gaussian=gaussian, known_cameras=known_cameras), shapes, *last)
+
+
+def unseen_frames(visible: Floats) -> float:
+    """Return the longest run of frames in which a point is hidden, averaged over the points of `visible (F, P)`."""
+    current = np.zeros(visible.shape[1])
+    longest = current.copy()
+    for hidden in visible <= 0:
+        current = np.where(hidden, current + 1, 0.0)
+        np.maximum(longest, current, out=longest)
+    return float(longest.mean())
 
 
 def learning(frames: int, *, gaussian: bool, known_cameras: bool) -> tuple[Stage, ...]:
@@ -112,45 +135,16 @@ def stage_of(name: str, frames: int, *, units: int | None = None) -> Stage:
     return Stage(name, used * cost * (UNIT_SECONDS + FRAME_SECONDS * min(frames, most_frames)), used)
 
 
-def settling(objectives: Sequence[float], *, tolerance: float, most: int) -> float:
-    """Return the completed part of a minimisation, from the decrease of its objective.
-
-    The relative decrease falls about geometrically from step to step, so the number of steps until it is below `tolerance` follows from the
-    last two; at most `most` steps are taken. With fewer than two decreases the ratio is taken as `USUAL_RATIO`.
-
-    Parameters
-    ----------
-    objectives : sequence of float
-        After every step, that of the start first.
-    tolerance : float
-        Relative decrease at which the minimisation ends.
-    most : int
-        Largest number of steps.
-    """
-    taken = len(objectives) - 1
-    if taken < 1:
-        return 0.0
-    values = np.asarray(objectives, dtype=np.float64)
-    decreases = np.maximum(-np.diff(values), 0.0) / np.maximum(np.abs(values[:-1]), np.finfo(float).tiny)
-    last = float(decreases[-1])
-    if last <= tolerance:
-        return 1.0
-    ratio = last / float(decreases[-2]) if taken > 1 and decreases[-2] > 0 else USUAL_RATIO
-    ratio = float(np.clip(ratio, 0.25, 0.9))  # the decrease slows down later
-    left = np.log(tolerance / last) / np.log(ratio)
-    return float(taken / (taken + min(left, max(most - taken, 0))))
-
-
 @dataclass(slots=True)
 class Pace:
     """Remaining time of a plan, from the durations of the stages so far.
 
     The pace is the measured time of the finished stages over their planned time: it covers machines of other speed and with other load.
-    The shapes stay out of it, because their planned time is uncertain; once they run, they are extrapolated by themselves.
+    The shapes stay out of it, because `Descent` extrapolates them by themselves.
     """
 
     began: float
-    """Clock at which the current stage began."""
+    """Processor time at which the current stage began."""
 
     measured: float = PACE_PRIOR
     planned: float = PACE_PRIOR
@@ -162,35 +156,45 @@ class Pace:
             self.planned += stage.seconds
         self.began = now
 
-    def left(self, stage: Stage, share: float, settled: float, ahead: float, now: float) -> float:
+    @property
+    def known(self) -> float:
+        """Measured over planned time of the finished stages."""
+        return self.measured / self.planned
+
+    def left(self, stage: Stage, share: float, ahead: float, now: float) -> float:
         """Return the remaining seconds.
 
         Parameters
         ----------
         stage : Stage
-            The current one.
+            The current one, not the shapes.
         share : float
-            Completed part of it by units of work.
-        settled : float
-            Completed part of the shapes by their objective; 0 before the first reweighting ends.
+            Completed part of it.
         ahead : float
             Planned seconds of the stages that follow.
         now : float
             Clock.
         """
         spent = now - self.began
-        if stage.name == "shapes":
-            pace = self.measured / self.planned
-            if settled > 0:  # the first reweighting takes longest, so those that are left take less each than it did
-                rest = min(spent * (1 - settled) / settled, FIRST_REWEIGHTING * spent)
-            else:
-                rest = max(pace * stage.seconds - spent, FIRST_REWEIGHTING * spent)
-            return rest + pace * ahead
-        pace = (
-            (self.measured + spent) / (self.planned + share * stage.seconds)
-            if share > 0
-            else self.measured / self.planned
-        )
-        planned = pace * (1 - share) * stage.seconds
-        rest = planned if share <= 0 else (1 - share) * planned + share * spent * (1 - share) / share
+        if share <= 0:
+            return max(self.known * stage.seconds - spent, 0.0) + self.known * ahead
+        pace = (self.measured + spent) / (self.planned + share * stage.seconds)
+        own = min(OWN_PACE * share, 1.0)
+        rest = (1 - share) * ((1 - own) * pace * stage.seconds + own * spent / share)
         return rest + pace * ahead
+
+
+class Load:
+    """Seconds that pass in one processor second of this process, measured over the last `LOAD_SECONDS`.
+
+    More than 1 where others use the cores, less than 1 where the process uses several.
+    """
+
+    def __init__(self, now: float, work: float) -> None:
+        self._old = self._middle = (now, work)
+
+    def seconds_per_work(self, now: float, work: float) -> float:
+        """Return the latest ratio, given the clock and the processor time."""
+        if now - self._middle[0] > LOAD_SECONDS / 2:
+            self._old, self._middle = self._middle, (now, work)
+        return (now - self._old[0] + LOAD_PRIOR) / (work - self._old[1] + LOAD_PRIOR)

@@ -32,7 +32,8 @@ SHOWN = {"text", "mermaid", "http"}
 SLOW = {
     "docs/explanation/depth.md", "docs/explanation/trust.md", "docs/how-to/camera.md", "docs/how-to/film-to-tracks.md",
     "docs/how-to/outliers.md", "docs/how-to/tokens.md", "docs/reference/artifacts.md", "docs/reference/cli.md", "docs/reference/rest.md",
-    "docs/reference/sdk.md", "docs/tutorials/blender.md", "docs/tutorials/compare.md", "docs/tutorials/python.md",
+    "docs/reference/sdk.md", "docs/tutorials/blender.md", "docs/tutorials/compare.md", "docs/tutorials/priors.md",
+    "docs/tutorials/python.md",
 }  # fmt: skip
 """Pages whose code solves several jobs, tracks a film or starts an embedded Valkey, left to `make test-slow`."""
 

@@ -129,8 +129,8 @@ def _advance(
     best = np.lexsort((variance, ~visible), axis=0)[0]
     every = np.arange(len(best))
     points = np.stack([m.points for m in matches])[best, every]
-    points = appearance.refine(frame, points, visible[best, every])
-    seen = appearance.agrees(frame, points, visible[best, every])
+    points = appearance.refine(frame, points, visible[best, every], pool=pool)
+    seen = appearance.agrees(frame, points, visible[best, every], pool=pool)
     return _State(points, seen, variance[best, every])
 
 

@@ -136,15 +136,16 @@ class Worker:
 
 def solution(shapes: NDArray[np.float64], points: NDArray[np.float64], outcome: Outcome) -> Solution:
     """Return shapes as a solution with the identity as camera."""
-    frames, count, _ = shapes.shape
+    frames = len(shapes)
     began = time.perf_counter()
+    seen = np.isfinite(points).all(axis=2)
     means = np.nan_to_num(points).mean(axis=1)
     residuals = np.nan_to_num(np.linalg.norm(points - means[:, None] - shapes[..., :2], axis=2))
     return Solution(
         shapes=shapes,
         camera=Camera(np.tile(np.eye(3), (frames, 1, 1)), np.ones(frames), means),
         residuals=residuals,
-        weights=np.ones((frames, count)),
+        weights=np.where(seen, 1.0, 0.0),
         trace=Trace(np.zeros(1), np.zeros(1), np.zeros(1, dtype=np.int64)),
         outcome=outcome,
         choices=Choices(
@@ -152,4 +153,5 @@ def solution(shapes: NDArray[np.float64], points: NDArray[np.float64], outcome: 
             low_rank_weight=0.0, laplacian="none", unit=1.0, noise=0.0,
         ),
         seconds={"reweight": time.perf_counter() - began},
+        inlier_probability=np.where(seen, 1.0, np.nan),
     )  # fmt: skip

@@ -133,12 +133,14 @@ def settled_again(
     return _applied(estimate, normalized, used, whole, view), replace(whole, scales=whole.scales / scales)
 
 
-def with_depth_map(estimate: CameraEstimate, covariance: ShapeCovariance) -> CameraEstimate:
-    """Return the estimate with the depths of this covariance, where tracks are corrected."""
+def with_depth_map(
+    estimate: CameraEstimate, covariance: ShapeCovariance, rotations: Floats, scales: Floats
+) -> CameraEstimate:
+    """Return the estimate with the depths of this covariance and these cameras, in the same axes, where tracks are corrected."""
     view = estimate.perspective
     if view is None or not view.bends:
         return estimate
-    depth = depth_map(np.asarray(estimate.rotations), np.asarray(estimate.scales), covariance)
+    depth = depth_map(rotations, scales, covariance)
     return replace(estimate, perspective=replace(view, depth=depth))
 
 

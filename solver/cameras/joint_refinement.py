@@ -12,20 +12,15 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.solver.cameras.depth_rounds import settled, settled_again, with_depth_map
+from pliant.solver.cameras.covariance_learning import LearningData, learn_covariance
+from pliant.solver.cameras.depth_rounds import settled, settled_again
 from pliant.solver.cameras.estimation import CameraEstimate, restarted
 from pliant.solver.cameras.learned import Learned, motion_of, moved_to, scene_at
 from pliant.solver.cameras.scale import WIDEST, rigid_scales
 from pliant.solver.model import full_mode_covariance
-from pliant.solver.model.early_stopping import described, learn_with_early_stopping
 from pliant.solver.model.marginal_likelihood import fit
 from pliant.solver.model.model_order import ModelOrder, select_model_order
-from pliant.solver.model.shape_covariance import (
-    MAX_MODES,
-    MIN_ITERATIONS,
-    ShapeCovariance,
-    learned,
-)
+from pliant.solver.model.shape_covariance import MAX_MODES, MIN_ITERATIONS, ShapeCovariance, learned
 from pliant.solver.model.so3 import angles_between, exponential
 from pliant.solver.monitor import enter
 from pliant.solver.records import Floats, read_only
@@ -75,7 +70,25 @@ def learn(
     normalized: Normalized | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> tuple[CameraEstimate, ShapeCovariance]:
-    """Return the cameras, refined if `turning`, and the shape covariance of all frames.
+    """Return the cameras of `refine_cameras` and the covariance of `learn_covariance`."""
+    estimate, data = refine_cameras(
+        estimate, shown, turning=turning, estimates_scales=estimates_scales, seed=seed, normalized=normalized,
+        should_stop=should_stop,
+    )  # fmt: skip
+    return learn_covariance(estimate, data, seed=seed, should_stop=should_stop)
+
+
+def refine_cameras(
+    estimate: CameraEstimate,
+    shown: NDArray[np.bool_],
+    *,
+    turning: bool,
+    estimates_scales: bool = False,
+    seed: int = 0,
+    normalized: Normalized | None = None,
+    should_stop: Callable[[], bool] | None = None,
+) -> tuple[CameraEstimate, LearningData]:
+    """Return the cameras, refined if `turning`, and what the shape covariance of all frames is learned from.
 
     Parameters
     ----------
@@ -154,24 +167,14 @@ def learn(
                 estimate, found, unscaled, sample = again(found)
         before = np.asarray(estimate.rotations)[used] if bends else before
         rotations, scales = found.rotations, found.scales
-    if found is not None and not np.isfinite(found.energy):  # stopped
-        covariance, modes = found.covariance, described(found.covariance)
-    else:
-        # Learn from scratch: modes learned along the way to these cameras overstate their likelihood.
-        projections = rotations[:, :2] * scales[:, None, None]
-        if spoiled and turning:
-            model_order = select_model_order(
-                sample, projections, spoiled=True, ordered=estimate.ordered, seed=seed, should_stop=should_stop
-            )
-        enter(should_stop, "covariance")
-        covariance, modes = learn_with_early_stopping(
-            sample, unscaled, projections, model_order, seed=seed, should_stop=should_stop
-        )
-    if len(used) < frames:
-        covariance = covariance.stretched(used, frames)
-    estimate = replace(estimate, reasons={**estimate.reasons, "modes": modes})
+    stopped = found.covariance if found is not None and not np.isfinite(found.energy) else None
+    projections = rotations[:, :2] * scales[:, None, None]
+    data = LearningData(
+        unscaled, sample, projections, used, model_order, spoiled and turning, stopped,
+        np.asarray(estimate.rotations), np.asarray(estimate.scales), turning,
+    )  # fmt: skip
     if not turning:
-        return with_depth_map(estimate, covariance), covariance
+        return estimate, data
     turns = Rotation.from_matrix(rotations @ before.transpose(0, 2, 1)).as_rotvec()
     whole = exponential(_between(used, turns, frames)) @ estimate.rotations
     if why is not None:
@@ -181,8 +184,8 @@ def learn(
         scales = np.exp(logs - logs.mean())
         read_only(scales)
         estimate = replace(estimate, scales=scales)
-    estimate = with_depth_map(replace(estimate, rotations=whole), covariance)
-    return _with_rotation_reason(estimate, whole, at_first), _seen_from(covariance, whole[0])
+    data = replace(data, rotations=whole, scales=np.asarray(estimate.scales))
+    return _with_rotation_reason(estimate, whole, at_first), data
 
 
 def _of_corrected(estimate: CameraEstimate, scales: Floats, used: NDArray[np.intp]) -> tuple[Floats, Floats]:
@@ -354,15 +357,6 @@ def _coupled(gram: Floats, found: Learned, *, with_scales: bool, should_stop: Ca
 def _between(used: NDArray[np.intp], turns: Floats, frames: int) -> Floats:
     """Return turns of all frames, interpolated between those of the frames used."""
     return np.stack([np.interp(np.arange(frames), used, axis) for axis in turns.T], axis=1)
-
-
-def _seen_from(covariance: ShapeCovariance, first: Floats) -> ShapeCovariance:
-    """Return the covariance in the axes of the first camera."""
-    return replace(
-        covariance,
-        mean_covariance=first @ covariance.mean_covariance @ first.T,
-        axis_covariance=first @ covariance.axis_covariance @ first.T,
-    )
 
 
 def _with_rotation_reason(estimate: CameraEstimate, rotations: Floats, before: Floats) -> CameraEstimate:

@@ -48,14 +48,14 @@ class Level:
         return replace(self, down=self.down.astype(kind), up=self.up.astype(kind), mean=self.mean.astype(kind))
 
 
-def build_levels(laplacian: Matrix) -> tuple[Level, ...]:
-    """Return the levels below the points of a Laplacian A, shape `(P, P)`."""
+def build_levels(laplacian: Matrix, *, seed: int = 0) -> tuple[Level, ...]:
+    """Return the levels below the points of a Laplacian A, shape `(P, P)`; `seed` is that of the choice of centres."""
     graph = _joined(abs(laplacian) + abs(laplacian.T))
     whole: Matrix = sparse.csr_array(sparse.eye_array(laplacian.shape[0], format="csr"))
     scale = np.ones(laplacian.shape[0])
     levels: list[Level] = []
     while graph.shape[0] > COARSEST:
-        joined = _aggregates(graph)
+        joined = _aggregates(graph, seed)
         if joined.shape[1] > 0.7 * joined.shape[0]:  # only isolated points remain
             break
         smooth = _smoothed(graph, joined)
@@ -77,11 +77,11 @@ def build_levels(laplacian: Matrix) -> tuple[Level, ...]:
     return tuple(levels)
 
 
-def _aggregates(graph: Matrix) -> Matrix:
+def _aggregates(graph: Matrix, seed: int) -> Matrix:
     """Return the centre of each point as a 0/1 matrix, shape `(P, centres)`."""
     size = graph.shape[0]
     near = _joined(graph @ graph + graph)
-    centre = _independent(near)
+    centre = _independent(near, seed)
     owner = np.full(size, -1)
     owner[centre] = np.arange(len(centre))
     for _ in range(2):  # neighbours of centres first, then the remaining points through a neighbour's centre
@@ -91,10 +91,10 @@ def _aggregates(graph: Matrix) -> Matrix:
     return sparse.csr_array((np.ones(size), (np.arange(size), owner)), shape=(size, int(owner.max()) + 1))
 
 
-def _independent(graph: Matrix) -> NDArray[np.intp]:
+def _independent(graph: Matrix, seed: int) -> NDArray[np.intp]:
     """Return the indices of a maximal independent set of the graph."""
     size = graph.shape[0]
-    rank = np.random.default_rng(0).permutation(size)
+    rank = np.random.default_rng(seed).permutation(size)
     open_, chosen = np.ones(size, dtype=bool), np.zeros(size, dtype=bool)
     while open_.any():
         mine = np.where(open_, rank, -1)

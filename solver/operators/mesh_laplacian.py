@@ -57,7 +57,9 @@ class Laplacian:
         )
 
 
-def build_laplacian(mesh: Mesh | None, kind: str, reference: Floats | None = None) -> Laplacian | None:
+def build_laplacian(
+    mesh: Mesh | None, kind: str, reference: Floats | None = None, *, seed: int = 0
+) -> Laplacian | None:
     """Return the Laplacian of the given kind, or None if no point has a neighbour.
 
     Parameters
@@ -67,6 +69,8 @@ def build_laplacian(mesh: Mesh | None, kind: str, reference: Floats | None = Non
         `auto` is `grid8` on a grid, else `uniform`.
     reference : array, shape (P, 3), optional
         A typical shape, any unit; required for `cotangent` only.
+    seed : int
+        Of the coarser levels, which speed up the minimisation.
 
     Raises
     ------
@@ -88,7 +92,7 @@ def build_laplacian(mesh: Mesh | None, kind: str, reference: Floats | None = Non
         matrix, name = _mesh_matrix(mesh, np.ones(len(mesh.edges))), "uniform"
     if matrix.nnz == 0:
         return None
-    return Laplacian(matrix, name, sparse.csr_array(matrix.T), mesh.grid, build_levels(matrix))
+    return Laplacian(matrix, name, sparse.csr_array(matrix.T), mesh.grid, build_levels(matrix, seed=seed))
 
 
 def _grid_matrix(grid: Ints, num_points: int) -> Matrix:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.cameras.planar_ambiguity import is_planar
-from pliant.solver.energy.hyperparameters import MIN_NOISE_STD
+from pliant.solver.energy.hyperparameters import noise_std
 from pliant.solver.evaluation.trust import assess
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.records import Floats, Solution, read_only
@@ -55,10 +55,9 @@ def assessed(
     confidence = np.asarray(confidence, dtype=np.float64)
     if covariance is not None:
         projections = np.asarray(estimate.scales)[:, None, None] * np.asarray(estimate.rotations)[:, :2]
-        noise = max(covariance.noise_variance**0.5, MIN_NOISE_STD)
         pinhole = Pinhole.of(solution.camera, solution.shapes, unit)
         posterior = unit * position_std(
-            covariance, projections, confidence, noise_std=noise, pinhole=pinhole, seed=seed
+            covariance, projections, confidence, noise_std=noise_std(covariance), pinhole=pinhole, seed=seed
         )
         posterior = bounded_by_neighbours(posterior, solution.shapes, confidence)
         learning = unit * learning_std(

@@ -16,6 +16,7 @@ from pliant.solver.energy.objective import residuals
 from pliant.solver.energy.problem import Problem, Weights
 from pliant.solver.shapes.irls import init, no_higher, step
 from pliant.solver.shapes.state import State
+from pliant.solver.tracks.noise import weighted_median
 
 STIFFNESS_PER_OUTLIER_SHARE = 0.5
 """λ1 of the stiff fit divided by the share of outliers. With 10 % outliers on faces and animals, λ1 from .01 to .1 gives
@@ -72,7 +73,8 @@ def reject_outliers(
             break
     left = residuals(problem, before.shapes, before.translations)
     length = np.hypot(left[:, 0], left[:, 1])
-    typical = float(np.median(length[problem.confidence > 0])) / 1.1774
+    seen = problem.confidence > 0
+    typical = weighted_median(length[seen], problem.confidence[seen]) / 1.1774
     kept = np.where(length <= max(MIN_OUTLIER_DISTANCE, MIN_REJECTED_STDS * typical), problem.confidence, 0).astype(
         problem.confidence.dtype
     )

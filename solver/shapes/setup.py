@@ -81,7 +81,7 @@ def with_bending(
 def _laplacian(normalized: Normalized, mesh: Mesh | None, settings: Settings) -> Laplacian | None:
     if settings.method in ("pseudo_inverse", "temporal"):
         return None
-    return build_laplacian(mesh, settings.laplacian, _reference(normalized))
+    return build_laplacian(mesh, settings.laplacian, _reference(normalized), seed=settings.seed)
 
 
 def _reference(normalized: Normalized) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pliant.solver.errors import InvalidInput
 from pliant.solver.records import MIN_POINTS, Floats
 from pliant.solver.threads import SMALLEST, over_ranges
+from pliant.solver.tracks.noise import weighted_median
 from pliant.solver.tracks.normalization import Normalized
 
 MAX_SAMPLE_POINTS = 600
@@ -84,7 +85,7 @@ class Completed:
     """Columns of the basis, translation included; 0 if nothing was filled."""
 
     outliers: float
-    """Share of the visible entries of the sample that was replaced as outliers."""
+    """Share of the visible entries of the sample, weighted by confidence, that was replaced as outliers."""
 
     filling: Filling | None = None
     """The factor that replaced hidden entries and outliers; None if none were replaced."""
@@ -178,7 +179,7 @@ def fit_basis(
         basis, coefficients, spread, scale = alternate(points, kept, basis, sweeps=ALTERNATIONS)
         if not hidden and not gross(points, weight, predict(basis, coefficients), scale).any():
             return basis, spread, scale
-        error = _typical(_lengths(points - predict(basis, coefficients)), held & (weight > 0))
+        error = _typical(_lengths(points - predict(basis, coefficients)), np.where(held, weight, 0.0))
         if error < 0.98 * best_error or rank <= given:
             best_error, best_rank, best = error, rank, basis
         elif rank > 2 * best_rank:
@@ -200,7 +201,7 @@ def alternate(points: Floats, weight: Floats, basis: Floats, *, sweeps: int) -> 
     scale = MIN_RESIDUAL_SCALE
     for _ in range(sweeps):
         lengths = _lengths(points - predict(basis, coefficients))
-        scale = max(_typical(lengths, weight > 0), MIN_RESIDUAL_SCALE)
+        scale = max(_typical(lengths, weight), MIN_RESIDUAL_SCALE)
         robust = weight / (1 + (lengths / (3 * scale)) ** 2)
         extended = np.concatenate([coefficients, np.ones((len(coefficients), 1))], axis=1)
         normal = extended.T @ (robust[..., None] * extended)
@@ -240,7 +241,7 @@ def coefficients_of(
         coefficients = _solved(normal, pulled @ columns.reshape(-1, size))
         if sweep + 1 < sweeps:
             lengths = _lengths(points - predict(basis, coefficients))
-            typical = max(_typical(lengths, weight > 0), MIN_RESIDUAL_SCALE)
+            typical = max(_typical(lengths, weight), MIN_RESIDUAL_SCALE)
             robust = weight / (1 + (lengths / (3 * typical)) ** 2)
     if not with_moment:
         return coefficients, np.eye(size)
@@ -267,7 +268,7 @@ def predict(basis: Floats, coefficients: Floats) -> Floats:
 
 
 def fill(points: Floats, weight: Floats, basis: Floats, spread: Floats, scale: float) -> tuple[Floats, float]:
-    """Return points with hidden entries predicted and outliers replaced, and the share of visible entries replaced.
+    """Return points with hidden entries predicted and outliers replaced, and the share of the visible entries' confidence replaced.
 
     An entry with confidence 0 < c < 1 becomes c times itself plus 1 − c times its prediction: the EM completion of an
     observation whose noise variance is larger by 1/c.
@@ -277,7 +278,7 @@ def fill(points: Floats, weight: Floats, basis: Floats, spread: Floats, scale: f
     wrong = gross(points, weight, predicted, scale)
     trust = np.where(wrong, 0.0, weight)[..., None]
     filled = np.where(trust == 1, points, predicted + trust * (points - predicted))
-    return filled, float(wrong.sum() / max((weight > 0).sum(), 1))
+    return filled, float(weight[wrong].sum() / max(weight.sum(), np.finfo(float).tiny))
 
 
 def gross(points: Floats, weight: Floats, predicted: Floats, scale: float) -> NDArray[np.bool_]:
@@ -338,7 +339,7 @@ def _widen(basis: Floats, points: Floats, weight: Floats, start: Floats, rank: i
     else:
         coefficients, _ = coefficients_of(points, weight, basis, None, 1.0, sweeps=2, with_moment=False)
         left = points - predict(basis, coefficients)
-        scale = max(_typical(_lengths(left), weight > 0), MIN_RESIDUAL_SCALE)
+        scale = max(_typical(_lengths(left), weight), MIN_RESIDUAL_SCALE)
         left *= (weight / (1 + (_lengths(left) / (3 * scale)) ** 2))[..., None]
         old, shift = basis[:, :, :-1], basis[:, :, -1]
     stacked = (left - left.mean(axis=1, keepdims=True)).transpose(0, 2, 1).reshape(2 * frames, -1)
@@ -372,9 +373,10 @@ def _lengths(difference: Floats) -> Floats:
     return np.asarray(np.sqrt(difference[..., 0] ** 2 + difference[..., 1] ** 2))
 
 
-def _typical(lengths: Floats, mask: NDArray[np.bool_]) -> float:
-    """Return the standard deviation per coordinate of an isotropic Gaussian with this median length."""
-    return float(np.median(lengths[mask]) / 1.1774) if mask.any() else 0.0
+def _typical(lengths: Floats, weight: Floats) -> float:
+    """Return the standard deviation per coordinate of an isotropic Gaussian with this median length, weighted by confidence."""
+    mask = weight > 0
+    return weighted_median(lengths[mask], weight[mask]) / 1.1774 if mask.any() else 0.0
 
 
 def _leading(matrix: Floats, count: int) -> Floats:

@@ -127,4 +127,5 @@ def as_they_came(solution: Solution, order: NDArray[np.intp]) -> Solution:
         residuals=moved(solution.residuals),
         weights=moved(solution.weights),
         shapes_std=None if solution.shapes_std is None else moved(solution.shapes_std),
+        inlier_probability=None if solution.inlier_probability is None else moved(solution.inlier_probability),
     )

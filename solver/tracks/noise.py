@@ -5,6 +5,7 @@ from __future__ import annotations
 from math import comb
 
 import numpy as np
+from numpy.typing import NDArray
 from pliant.solver.records import Floats
 
 MIN_EIGENVALUE_RATIO = 1e-9
@@ -51,3 +52,12 @@ def white_noise(gram: Floats) -> float:
     values = np.linalg.eigvalsh(gram)
     median = float(values[len(values) // 2])
     return median if median > MIN_EIGENVALUE_RATIO * float(values[-1]) else roughness(gram)
+
+
+def weighted_median(values: NDArray[np.floating], weights: NDArray[np.floating]) -> float:
+    """Return the least value with at least half of the weight at or below it; the usual median for equal weights."""
+    if (weights == weights[0]).all():
+        return float(np.median(values))
+    order = np.argsort(values, kind="stable")
+    below = np.cumsum(weights[order])
+    return float(values[order[int(np.searchsorted(below, 0.5 * below[-1]))]])

@@ -54,6 +54,17 @@ def test_sequences_count_equally_however_often_they_were_solved(bench) -> None:
     assert "no solve" in tables.exceptions(often)
 
 
+def test_the_committed_solves_keep_the_rule_of_the_verdict() -> None:
+    """A true error above .15 is never good, and one below .03 never do_not_use."""
+    file = Path(__file__).parents[2] / "benchmarks" / "results" / "trust.jsonl"
+    solves = [json.loads(line) for line in file.read_text().splitlines()]
+    known = [solve for solve in solves if solve["true"] is not None and np.isfinite(solve["true"])]
+    assert len(known) > 60
+    for solve in known:
+        assert solve["true"] <= 0.15 or solve["verdict"] != "good", (solve["sequence"], solve["kind"])
+        assert solve["true"] >= 0.03 or solve["verdict"] != "do_not_use", (solve["sequence"], solve["kind"])
+
+
 def rolled_sheet(folder: Path) -> None:
     """A sheet rolled onto cylinders, 12 views of a pinhole camera, as a recorded sequence."""
     across, down = np.meshgrid(np.linspace(-1, 1, 7), np.linspace(-0.7, 0.7, 6))

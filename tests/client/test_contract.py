@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+import re
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -90,7 +91,10 @@ def test_submit_wait_shapes_is_one_line(client: Client) -> None:
 def test_a_result_holds_arrays_report_and_job(client: Client, tmp_path: Path) -> None:
     updates: list[Job] = []
     sent: list[tuple[int, int]] = []
-    job = client.submit(moving_points(), options=FAST, name="one", on_upload=lambda *now: sent.append(now))
+    points = moving_points()
+    points[2, 3] = np.nan
+    hidden = np.isnan(points).any(axis=2)
+    job = client.submit(points, options=FAST, name="one", on_upload=lambda *now: sent.append(now))
     result = job.wait(timeout=60, folder=tmp_path / "kept", on_progress=updates.append)
     np.testing.assert_allclose(
         result.rotations @ result.rotations.transpose(0, 2, 1), np.tile(np.eye(3), (6, 1, 1)), atol=1e-9
@@ -101,6 +105,12 @@ def test_a_result_holds_arrays_report_and_job(client: Client, tmp_path: Path) ->
     assert sent[-1][0] == sent[-1][1] > 0
     assert result.job.status is Status.SUCCEEDED
     assert len(client.log(result.job.id).splitlines()) >= 2
+    probability, weights = result.inlier_probability, result.arrays["weights"]
+    assert probability is not None
+    assert probability.shape == weights.shape == (6, 16)
+    np.testing.assert_array_equal(np.isnan(probability), hidden)
+    assert ((probability >= 0) & (probability <= 1) | hidden).all()
+    assert (weights[hidden] == 0).all()
     assert result.save_glb(tmp_path / "deep" / "it.glb").read_bytes()[:4] == b"glTF"
     assert {path.name for path in (tmp_path / "kept").iterdir()} == {"shapes.npz", "report.json", "shapes.glb"}
     everything = result.download(tmp_path / "all")
@@ -160,7 +170,9 @@ def test_jobs_are_listed_newest_first_over_pages_and_by_status(client: Client) -
 
 def test_a_finished_job_can_be_deleted_but_not_cancelled(client: Client) -> None:
     job = client.submit(moving_points(), options=FAST)
-    job.wait(timeout=60)
+    result = job.wait(timeout=60)
+    assert job.status is Status.SUCCEEDED, "the record is that of the end, without another request"
+    assert re.fullmatch(rf"<(Async)?Result of job {job.id}: 6 frames × 16 points, [\w, ]+>", repr(result))
     with pytest.raises(NotAllowedNow):
         job.cancel()
     assert job.refresh().status is Status.SUCCEEDED
@@ -346,4 +358,4 @@ def test_a_job_that_failed_is_failed_after_the_wait(kind: str) -> None:
         with pytest.raises(JobFailed):
             job.wait(timeout=60)
         assert job.status is Status.FAILED
-        assert kind == "async" or repr(job) == f"<RemoteJob {job.id} failed>"
+        assert repr(job) == f"<{'Async' if kind == 'async' else ''}RemoteJob {job.id} failed>"

@@ -22,13 +22,16 @@ def test_deviations_and_verdict_come_from_the_files_and_the_record(tmp_path: Pat
         verdict="good",
     )  # fmt: skip
     deviations = np.arange(6, dtype=np.float32).reshape(2, 3)
-    for name, arrays in (("new", {"shapes_std": deviations}), ("old", {})):
+    for name, arrays in (("new", {"shapes_std": deviations, "inlier_probability": deviations / 5}), ("old", {})):
         (tmp_path / name).mkdir()
         np.savez(tmp_path / name / "shapes.npz", shapes=np.zeros((2, 3, 3)), **arrays)
     new, old = Reconstruction(job, tmp_path / "new"), Reconstruction(job, tmp_path / "old")
     assert new.shapes_std is not None
     np.testing.assert_array_equal(new.shapes_std, deviations)
     assert old.shapes_std is None
+    assert new.inlier_probability is not None
+    np.testing.assert_array_equal(new.inlier_probability, deviations / 5)
+    assert old.inlier_probability is None
     assert new.verdict == "good"
     for result, camera in ((new, {"focal": 900.0, "field_of_view": 70.8}), (old, {"focal": None})):
         (result.folder / "report.json").write_text(json.dumps({"camera": {"model": "perspective", **camera}}))

@@ -55,7 +55,7 @@ def test_there_are_no_accessibility_findings_and_no_overflow(
         pytest.skip("axe-core is not installed; say `make page`")
     page.emulate_media(color_scheme=scheme, reduced_motion="reduce")  # type: ignore[arg-type]
     page.set_viewport_size({"width": width, "height": 844})
-    for address, landmark in (("", "Point tracks in"), (f"#job={finished}", "a finished face"), ("docs", "Pliant 0")):
+    for address, landmark in (("", "A film in"), (f"#job={finished}", "a finished face"), ("docs", "Pliant 0")):
         page.goto(f"{url}/{address}")
         page.get_by_role("heading", name=landmark).wait_for()
         if "#" in address:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 from pliant.solver import Outcome, Settings, Step, Tracks, gallery, solve
+from pliant.solver.descent import Descent, expected_iterations, steps_left
 from pliant.solver.monitor import Monitor
-from pliant.solver.stages import Stage, settling
+from pliant.solver.stages import Stage, planned, unseen_frames
 
 
 def small(*, noisy: bool = False) -> Tracks:
@@ -103,7 +107,9 @@ def test_stages_that_do_not_run_leave_the_plan_and_others_join_it() -> None:
     assert steps[-1].fraction == pytest.approx(0.45 * 2 / 105)
     monitor.enter("nothing of that name")
     monitor.enter("shapes")  # scales are left out
-    monitor.report(Step("reweight", 0.5))
+    monitor.report(Step("initialise", 0.0, objective=1.0))
+    for objective in (0.5, 0.25, 0.125):  # half of the usual six
+        monitor.report(Step("reweight", 0.0, objective=objective))
     assert steps[-1].fraction == pytest.approx((0.9 + 0.5 * 2) / 3.9)  # 0.9 of 2 s were done when it ended early
     monitor.expect([Stage("scales", 5.0, 10)], before="trust")
     monitor.enter("scales", units=20)  # twice as long as planned
@@ -127,16 +133,79 @@ def test_slow_units_are_reported_however_little_they_add() -> None:
     assert len(steps) == 5
 
 
-def test_settling_follows_the_decrease_of_the_objective() -> None:
-    objectives = list(1 + 0.5 ** np.arange(20))
-    shares = [settling(objectives[: count + 1], tolerance=1e-4, most=100) for count in range(15)]
-    assert shares[0] == 0.0
-    assert (np.diff(shares[2:]) > 0).all()
-    ends = next(n for n in range(1, 20) if (objectives[n - 1] - objectives[n]) / objectives[n - 1] <= 1e-4)
-    assert settling(objectives[: ends + 1], tolerance=1e-4, most=100) == 1.0
-    for count in range(3, ends):
-        assert shares[count] == pytest.approx(count / ends, abs=0.12)
-    assert settling(objectives[:4], tolerance=1e-4, most=3) == 1.0
+def descended(objectives: list[float], *, unseen: float = 0.0, iterations: int = 3, most: int = 100) -> Descent:
+    descent = Descent(unseen, tolerance=1e-4, most=most)
+    descent.begin(objectives[0], 0.0)
+    for objective in objectives[1:]:
+        descent.current = iterations
+        descent.reweighted(objective)
+    return descent
+
+
+def test_reweightings_that_are_left_follow_the_decrease_of_the_objective() -> None:
+    objectives = list(1 + 0.5 ** np.arange(25))
+    ends = next(n for n in range(1, 25) if (objectives[n - 1] - objectives[n]) / objectives[n - 1] <= 1e-4)
+    for count in range(8, ends):
+        left = descended(objectives[: count + 1]).reweightings_left()
+        assert (ends - count) / 2 <= left <= 2 * (ends - count)
+    assert descended(objectives[: ends + 1]).reweightings_left() == 0
+    assert descended(objectives[: ends + 1]).share() == 1
+    assert descended(objectives[:4], most=3).reweightings_left() == 0
+    assert steps_left(1e-5, 1e-3, 8, tolerance=1e-4) == 0
+    assert steps_left(1e-3, None, 1, tolerance=1e-4) > 1
+    power = [1 / step**2 for step in range(1, 200)]
+    assert 34 < steps_left(power[49], power[48], 50, tolerance=1e-4) < 51, "between geometric, 34, and a power, 50"
+
+
+def test_points_hidden_for_long_make_more_and_longer_reweightings() -> None:
+    visible = np.ones((20, 2))
+    visible[3:6, 0] = visible[10:12, 0] = 0
+    visible[:, 1] = [1, 0] * 10
+    assert unseen_frames(visible) == 2.0  # three frames in a row, and one
+    assert expected_iterations(0) < expected_iterations(10) < expected_iterations(1000) == 60
+    seen, hidden = descended([1.0, 0.5]), descended([1.0, 0.5], unseen=20.0, iterations=20)
+    assert hidden.reweightings_left() > 1.5 * seen.reweightings_left()
+    assert hidden.iterations_ahead() > 2 * seen.iterations_ahead()
+    for each in (seen, hidden):
+        each.current = 58
+        assert each.iterations_ahead() >= 58, "the reweighting under way already has more"
+    size = {"gaussian": True, "known_cameras": False, "sheet": False}
+    seconds = [
+        {stage.name: stage.seconds for stage in planned(40, 1000, unseen=each, **size)}["shapes"]
+        for each in (0.0, 20.0)
+    ]
+    assert seconds[1] > 10 * seconds[0]
+
+
+def test_corrections_for_perspective_are_expected_and_counted_down() -> None:
+    descent = Descent()
+    descent.begin(1.0, 0.0)
+    before = descent.reweightings_left()
+    descent.expect_corrections(4)
+    assert descent.reweightings_left() > before + 4
+    descent.reweighted(0.5)
+    descent.reweighted(0.5)
+    left = [descent.reweightings_left()]
+    for ahead in (3, 2, 1, 0):
+        descent.expect_corrections(ahead)
+        descent.reweighted(0.5)
+        descent.reweighted(0.5)
+        left.append(descent.reweightings_left())
+    assert left == sorted(left, reverse=True)
+    assert left[-1] == 0
+
+
+def test_units_that_take_ever_longer_and_preparation_count_by_their_time() -> None:
+    def filled(stage: Stage, units: int) -> float:
+        steps: list[Step] = []
+        monitor = Monitor(steps.append, plan=[stage])
+        for _ in range(units):
+            monitor()
+        monitor.report(Step("cameras", 0.0))
+        return steps[-1].fraction
+
+    assert filled(Stage("completion", 1.0, 6, growth=2.0), 5) == pytest.approx(31 / 127)
+    assert filled(Stage("surface", 1.0, 60, setup=40), 20) == pytest.approx(0.9 * 0.6)
 
 
 def test_a_stop_is_remembered() -> None:
@@ -149,7 +218,7 @@ def test_a_stop_is_remembered() -> None:
 def test_a_step_that_raises_the_objective_is_rejected_and_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     from dataclasses import replace
 
-    from pliant.solver import reconstruct
+    from pliant.solver.reconstruction import shapes
 
     taken: list[float] = []
 
@@ -157,7 +226,7 @@ def test_a_step_that_raises_the_objective_is_rejected_and_reported(monkeypatch: 
         taken.append(state.objective)
         return replace(state, shapes=state.shapes + 1, objective=2 * state.objective, reweighting=state.reweighting + 1)
 
-    monkeypatch.setattr(reconstruct, "step", worse)
+    monkeypatch.setattr(shapes, "step", worse)
     found = solve(small(), settings=Settings(prior="smooth", refine_rotations=False))
     assert found.outcome is Outcome.REJECTED
     assert found.trace.objective[-1] == taken[0]
@@ -166,7 +235,7 @@ def test_a_step_that_raises_the_objective_is_rejected_and_reported(monkeypatch: 
 def timed(plan: list[Stage]) -> tuple[Monitor, list[Step], list[float]]:
     steps: list[Step] = []
     now = [0.0]
-    return Monitor(steps.append, plan=plan, clock=lambda: now[0]), steps, now
+    return Monitor(steps.append, plan=plan, clock=lambda: now[0], work=lambda: now[0]), steps, now
 
 
 def test_a_slow_machine_multiplies_the_planned_time_that_is_left() -> None:
@@ -184,20 +253,82 @@ def test_a_slow_machine_multiplies_the_planned_time_that_is_left() -> None:
     assert steps[-1].seconds_left == 0.0
 
 
+def test_the_latest_load_of_the_machine_converts_work_into_time() -> None:
+    steps: list[Step] = []
+    now, work = [0.0], [0.0]
+    plan = [Stage("multistart", 100.0, 100)]
+    monitor = Monitor(steps.append, plan=plan, clock=lambda: now[0], work=lambda: work[0])
+    left = []
+    for slow in [1] * 10 + [4] * 10:  # others come to use the cores
+        work[0] += 5.0
+        now[0] += 5.0 * slow
+        monitor()
+        assert steps[-1].seconds_left is not None
+        left.append(steps[-1].seconds_left)
+    assert left[9] == pytest.approx(5 * 90, rel=0.2)
+    assert left[19] == pytest.approx(4 * 5 * 80, rel=0.2)
+
+
 def test_shapes_slower_than_planned_are_extrapolated_by_themselves() -> None:
     monitor, steps, now = timed([Stage("multistart", 10.0, 10), Stage("shapes", 1.0, 100), Stage("trust", 1.0, 10)])
     for unit in range(10):
         now[0] = unit + 1.0
         monitor()
-    monitor.report(Step("initialise", 0.0))
-    now[0] = 20.0
-    monitor()
-    first = steps[-1].seconds_left
-    assert first is not None
-    assert 20 < first < 30, "the first reweighting alone has taken ten seconds"
-    monitor.report(Step("reweight", 0.5))
-    assert steps[-1].seconds_left == pytest.approx(10 + 1, rel=0.1)
-    now[0] = 30.0
+    monitor.report(Step("initialise", 0.0, objective=1.0))
+    for unit in range(5):
+        now[0] = 12.0 + 2 * unit
+        monitor()
+    now[0] = 21.0
+    monitor.report(Step("reweight", 0.0, objective=0.5))
+    left = steps[-1].seconds_left
+    assert left is not None
+    assert 30 < left < 70, "the first of about six reweightings has taken eleven seconds"
+    for objective in (0.1, 0.05, 0.04999999):
+        now[0] += 10
+        for _ in range(5):
+            monitor()
+        monitor.report(Step("reweight", 0.0, objective=objective))
     monitor.enter("trust")
+    now[0] += 0.1
     monitor()
-    assert steps[-1].seconds_left == pytest.approx(1, rel=0.3), "slow shapes do not slow the rest down"
+    assert steps[-1].seconds_left == pytest.approx(0.9, rel=0.3), "slow shapes do not slow the rest down"
+
+
+def places(tracks: Tracks, settings: Settings) -> dict[str, int]:
+    """The number of the first question that each place in the source asks, while nothing stops."""
+    first: dict[str, int] = {}
+    asked = 0
+
+    def never() -> bool:
+        nonlocal asked
+        asked += 1
+        caller = sys._getframe(2)  # the place that calls the monitor, which calls this
+        first.setdefault(f"{Path(caller.f_code.co_filename).name}:{caller.f_lineno}", asked)
+        return False
+
+    solve(tracks, settings=settings, should_stop=never)
+    return first
+
+
+CASES = {
+    "default": (gallery.face(3, 6, degrees=60).tracks, Settings()),
+    "outliers": (small(noisy=True), Settings(order="any", camera="orthographic")),
+    "perspective": (gallery.face(3, 6, degrees=60).tracks, Settings(camera="perspective", focal=900.0, prior="smooth")),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", ["default", pytest.param("outliers", marks=pytest.mark.long), "perspective"])
+def test_a_stop_at_every_place_that_asks_is_reported(case: str) -> None:
+    tracks, settings = CASES[case]
+    asking = places(tracks, settings)
+    assert len(asking) > 5, "the monitor is asked in many places"
+    for number in asking.values():
+        stopped_at(tracks, settings, number)
+
+
+@pytest.mark.slow
+def test_a_stop_at_every_single_question_of_a_small_solve_is_reported() -> None:
+    tracks, settings = gallery.face(3, 6, degrees=60).tracks, Settings(prior="smooth", refine_rotations=False)
+    for number in range(1, questions(tracks, settings) + 1):
+        stopped_at(tracks, settings, number)

@@ -91,6 +91,11 @@ def test_a_reference_movie_is_refused(tmp_path: Path) -> None:
 def test_sound_alone_is_refused(tmp_path: Path) -> None:
     path = films.write_film(tmp_path / "film.mp4", PICTURES)
     assert refused(films.patched(path, b"hdlr", 12, b"soun")) == "no_picture"
+    with pytest.raises(FilmError) as caught:
+        open_film(path)
+    assert str(caught.value).endswith(
+        "got film.mp4, which holds sound but no picture. Pass a film with a picture track."
+    )
 
 
 def test_thousands_of_streams_are_refused(tmp_path: Path) -> None:

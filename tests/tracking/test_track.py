@@ -158,13 +158,17 @@ def test_pictures_are_not_read_again_after_a_stop(turning: tuple[Path, RenderedF
         track_film(path, region=film.region(8), region_frame=8, on_step=on_step, should_stop=last.is_set)
 
 
-def test_without_a_region_everything_is_tracked_with_a_warning(turning: tuple[Path, RenderedFilm]) -> None:
-    path, _ = turning
-    tracked = track_film(path, frames=":8", grid_step=6)
+def test_without_a_region_everything_in_a_busy_film_is_tracked_with_a_warning(tmp_path: Path) -> None:
+    behind, before = (films.textured_pictures(8, (96, 72), seed=seed) for seed in (0, 7))
+    for number, (picture, thing) in enumerate(zip(behind, before, strict=True)):
+        picture[20 + number : 50 + number, 30:70] = thing[20:50, 30:70]  # moves down, the background to the right
+    tracked = track_film(films.write_film(tmp_path / "film.mkv", behind), grid_step=6)
     assert 8 // 3 <= tracked.template < 8 - 8 // 3
     assert np.ptp(tracked.tracks[tracked.template], axis=0).min() > 50
-    assert any("Draw around the thing" in note for note in tracked.warnings)
-    assert any("Only 8 frames" in note for note in tracked.warnings)
+    assert tracked.warnings[:2] == (
+        "No region was given, so everything in the picture is tracked, background included. Draw around the thing.",
+        "Only 8 frames are tracked. Film two seconds or more, while the thing turns.",
+    )
 
 
 def test_a_selection_keeps_the_films_frame_numbers(turning: tuple[Path, RenderedFilm]) -> None:
@@ -184,21 +188,25 @@ def test_only_the_templates_shot_is_tracked(tmp_path: Path) -> None:
     tracked = track_film(path, region=polygon, region_frame=14)
     assert tracked.film.cuts == (10,)
     np.testing.assert_array_equal(tracked.film.frame_indices, np.arange(10, 20))
-    assert any("has a cut (at frame 10)" in note for note in tracked.warnings)
+    expected = "The film has a cut (at frame 10). Only frames 10 to 19 are tracked. Film the thing in one take."
+    assert tracked.warnings == (expected,)
     assert tracked.visibility.mean() > 0.9
 
 
 def test_a_still_film_gets_a_warning(tmp_path: Path) -> None:
     path = films.write_film(tmp_path / "film.mkv", films.textured_pictures(1, (96, 72)) * 12)
     tracked = track_film(path, region=[(20, 20), (70, 20), (70, 55), (20, 55)])
-    assert any("Nothing moves" in note for note in tracked.warnings)
+    assert tracked.warnings == (
+        "Nothing moves in this film, so it holds no information about depth. Turn the thing by 30° or more to both sides, "
+        "or walk around it.",
+    )
 
 
 def test_a_film_of_three_frames_is_tracked_and_one_of_two_refused(tmp_path: Path) -> None:
     pictures = films.textured_pictures(3, (96, 72))
     tracked = track_film(films.write_film(tmp_path / "three.mkv", pictures))
     assert tracked.tracks.shape[0] == 3
-    assert any("Only 3 frames" in note for note in tracked.warnings)
+    assert "Only 3 frames are tracked. Film two seconds or more, while the thing turns." in tracked.warnings
     with pytest.raises(FilmError, match="at least 3 frames, got 2") as caught:
         track_film(films.write_film(tmp_path / "two.mkv", pictures[:2]))
     assert caught.value.code == "too_few_frames"
@@ -216,9 +224,13 @@ def test_a_region_without_texture_is_refused(tmp_path: Path) -> None:
         picture[10:60, 10:60] = 120
     mask = np.zeros((72, 96), bool)
     mask[18:52, 18:52] = True
-    with pytest.raises(FilmError, match="film a surface with a pattern") as caught:
+    with pytest.raises(FilmError) as caught:
         track_film(films.write_film(tmp_path / "film.mkv", pictures), region=mask)
-    assert (caught.value.code, caught.value.field) == ("no_texture", "region")
+    assert caught.value.code == "no_texture"
+    assert str(caught.value) == (
+        "region: expected texture for at least 16 points in the template, got 0 (texture in 0% of the region). Draw a larger region, "
+        "use a smaller grid_step, or film a surface with a pattern, in focus and in good light."
+    )
 
 
 def test_unrelated_frames_are_rejected(tmp_path: Path) -> None:
@@ -245,7 +257,7 @@ def test_uneven_times_and_a_broken_tail_get_warnings(tmp_path: Path) -> None:
     pictures = films.textured_pictures(24, (96, 72))
     path = films.with_uneven_times(films.write_film(tmp_path / "film.mp4", pictures), first=12)
     tracked = track_film(path, region=np.ones((72, 96), bool))
-    assert any("time between frames varies" in note for note in tracked.warnings)
+    assert "The time between frames varies; frame_times holds the true times." in tracked.warnings
     path = films.write_film(tmp_path / "film.avi", pictures)
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     tracked = track_film(path, region=np.ones((72, 96), bool))
@@ -279,6 +291,15 @@ def test_frames_outside_the_film_are_refused(turning: tuple[Path, RenderedFilm],
     assert (caught.value.code, caught.value.field) == ("no_such_frame", field)
 
 
+def test_a_portrait_film_is_tracked_upright(tmp_path: Path) -> None:
+    path = films.turned_by_90(films.write_film(tmp_path / "film.mp4", films.textured_pictures(6, (96, 72))))
+    tracked = track_film(path, region=[(18, 20), (54, 20), (54, 76), (18, 76)])
+    assert (tracked.image_size, tracked.template_image.shape) == ((72, 96), (96, 72, 3))
+    assert tracked.warnings == ("Only 6 frames are tracked. Film two seconds or more, while the thing turns.",)
+    step = np.diff(tracked.tracks, axis=0)[tracked.visibility[1:] & tracked.visibility[:-1]]
+    np.testing.assert_allclose(np.abs(np.median(step, axis=0)), [0, 1], atol=0.2)  # to the right as recorded
+
+
 @pytest.mark.slow
 def test_a_4k_film_is_reduced_for_tracking(tmp_path: Path) -> None:
     small = films.textured_pictures(5, (192, 108))
@@ -286,6 +307,7 @@ def test_a_4k_film_is_reduced_for_tracking(tmp_path: Path) -> None:
     path = films.write_film(tmp_path / "film.mp4", pictures)
     tracked = track_film(path, region=[(800, 500), (3000, 500), (3000, 1700), (800, 1700)])
     assert tracked.image_size == (3840, 2160)
+    assert tracked.warnings == ("Only 5 frames are tracked. Film two seconds or more, while the thing turns.",)
     step = np.diff(tracked.tracks, axis=0)[tracked.visibility[1:] & tracked.visibility[:-1]]
     np.testing.assert_allclose(np.median(step, axis=0), [20, 0], atol=1)
     assert 1000 < tracked.tracks.shape[1] < 6000

@@ -83,7 +83,7 @@ def _npz(result: Result, file: IO[bytes], on_progress: OnProgress) -> dict[str, 
     solution, camera = result.solution, result.solution.camera
     chosen = result.inputs.selection
     sources = {} if chosen is None else {"source_frames": chosen.frames, "source_points": chosen.points}
-    spread = {} if solution.shapes_std is None else {"shapes_std": solution.shapes_std.astype(np.float32)}
+    posterior = {"shapes_std": solution.shapes_std, "inlier_probability": solution.inlier_probability}
     np.savez(
         file,
         allow_pickle=False,
@@ -98,7 +98,7 @@ def _npz(result: Result, file: IO[bytes], on_progress: OnProgress) -> dict[str, 
         faces=result.faces,
         residuals=solution.residuals.astype(np.float32),
         weights=solution.weights.astype(np.float32),
-        **spread,
+        **{name: array.astype(np.float32) for name, array in posterior.items() if array is not None},
         trace_objective=solution.trace.objective,
         trace_residual=solution.trace.residual,
         trace_iterations=solution.trace.iterations,

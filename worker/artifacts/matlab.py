@@ -24,7 +24,7 @@ def fits(num_frames: int, num_points: int) -> bool:
 def write_mat(result: Result, file: IO[bytes]) -> None:
     """Write the arrays of `shapes.npz` under the same names; indices in `faces` count from 1."""
     solution, camera = result.solution, result.solution.camera
-    spread = {} if solution.shapes_std is None else {"shapes_std": solution.shapes_std.astype(np.float32)}
+    posterior = {"shapes_std": solution.shapes_std, "inlier_probability": solution.inlier_probability}
     scipy.io.savemat(
         file,  # type: ignore[arg-type]  # documented: "str or file-like object"
         {
@@ -38,7 +38,7 @@ def write_mat(result: Result, file: IO[bytes]) -> None:
             "faces": result.faces + 1,
             "residuals": solution.residuals.astype(np.float32),
             "weights": solution.weights.astype(np.float32),
-            **spread,
+            **{name: array.astype(np.float32) for name, array in posterior.items() if array is not None},
             "trace_objective": solution.trace.objective,
             "trace_residual": solution.trace.residual,
             "trace_iterations": solution.trace.iterations,

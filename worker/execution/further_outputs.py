@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from pliant.schemas.job import Job, Progress
 from pliant.solver import Camera, Choices, Outcome, Solution, Trace
 from pliant.worker.artifacts import kinds_for
@@ -20,7 +21,7 @@ from pliant.worker.films.tracker import Tracked
 from pliant.worker.formats import Inputs, load_inputs
 from pliant.worker.formats.errors import damaged
 from pliant.worker.formats.reading.arrays import read_file
-from pliant.worker.formats.records import Limits
+from pliant.worker.formats.records import Arrays, Limits
 
 SHARES = {"loading": (0.0, 0.1), "exporting": (0.1, 1.0)}
 _OURS = Limits(max_bytes=1 << 36)
@@ -125,8 +126,13 @@ def read_solution(path: Path, *, y_up: bool) -> Solution:
             low_rank_weight=unknown, laplacian="", unit=unknown, noise=unknown,
         ),
         seconds={},
-        shapes_std=np.asarray(arrays["shapes_std"], dtype=np.float64) if "shapes_std" in arrays else None,
+        shapes_std=_optional(arrays, "shapes_std"),
+        inlier_probability=_optional(arrays, "inlier_probability"),
     )  # fmt: skip
+
+
+def _optional(arrays: Arrays, name: str) -> NDArray[np.float64] | None:
+    return np.asarray(arrays[name], dtype=np.float64) if name in arrays else None
 
 
 def _inputs(file: Path, job: Job) -> Inputs:

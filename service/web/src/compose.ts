@@ -57,7 +57,13 @@ export class Compose {
     this.key = null;
     const stem = this.slots.main?.name.replace(/\.[^.]*$/, "").slice(0, 200) ?? "";
     if (this.label.value === this.filledIn) this.label.value = this.filledIn = stem;
+    this.offerExamples();
     if (!this.sending) this.inspection.changed();
+  }
+
+  /** Examples are for those who have no files yet; what the files were read as takes their place. */
+  private offerExamples(): void {
+    this.examples.hidden = this.kept !== null || this.slots.main !== null;
   }
 
   /** Load options and examples. */
@@ -100,7 +106,8 @@ export class Compose {
     this.inspection.stop();
     this.clear();
     this.keeping.hidden = job === null;
-    this.slots.element.hidden = this.examples.hidden = this.inspection.element.hidden = job !== null;
+    this.slots.element.hidden = this.inspection.element.hidden = job !== null;
+    this.offerExamples();
     if (job === null) this.keeping.replaceChildren();
     else {
       const other = button("Use other files", () => this.keep(null), { class: "link" });

@@ -30,6 +30,8 @@ export class JobList {
   private jobs: Job[] = [];
   private next: string | null = null;
   private selected: string | null = null;
+  /** The selected job that the list was scrolled to. */
+  private revealed: string | null = null;
 
   constructor() {
     const summary = h("summary", {}, h("h2", { id: "jobs-title" }, "Jobs"));
@@ -109,6 +111,15 @@ export class JobList {
     this.show();
   }
 
+  /** Scroll the list to the selected job, once for each selection; the page itself stays where it is. */
+  private reveal(): void {
+    const row = this.selected === null ? undefined : this.rows.get(this.selected);
+    if (row === undefined || this.revealed === this.selected) return;
+    this.revealed = this.selected;
+    const [list, item] = [this.items.getBoundingClientRect(), row.element.getBoundingClientRect()];
+    this.items.scrollTop += Math.max(0, item.bottom - list.bottom) + Math.min(0, item.top - list.top);
+  }
+
   private show(): void {
     this.followRunning();
     this.empty.hidden = this.jobs.length > 0;
@@ -124,6 +135,7 @@ export class JobList {
       this.write(row, job);
       if (this.items.children[index] !== row.element) this.items.insertBefore(row.element, this.items.children[index] ?? null);
     });
+    this.reveal();
   }
 
   private row(id: string): Row {

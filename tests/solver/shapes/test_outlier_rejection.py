@@ -53,7 +53,7 @@ def test_starting_again_without_the_outliers_does_not_lose_accuracy(monkeypatch:
         tracks = gallery.corrupt(MADE, outliers=0.1, seed=seed).tracks
         again.append(metrics.e3d_frame(solve(tracks).shapes, MADE.shapes))
         with monkeypatch.context() as patch:
-            patch.setattr("pliant.solver.reconstruct.MIN_POINTS", 10_000)  # too few points would be left
+            patch.setattr("pliant.solver.reconstruction.start.MIN_POINTS", 10_000)  # too few points would be left
             found = solve(tracks)
         assert (found.weights == 0).mean() == pytest.approx(0.1, abs=0.03)
         once.append(metrics.e3d_frame(found.shapes, MADE.shapes))

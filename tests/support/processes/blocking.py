@@ -15,6 +15,9 @@ class Blocking:
     def __init__(self, target: Any, runner: asyncio.Runner, wrapped: tuple[type, ...]) -> None:
         self._target, self._runner, self._wrapped = target, runner, wrapped
 
+    def __repr__(self) -> str:
+        return repr(self._target)
+
     def __getattr__(self, name: str) -> Any:
         value = getattr(self._target, name)
         return partial(self._call, value) if inspect.ismethod(value) else self._handed(value)

@@ -68,6 +68,7 @@ def make_result(
             laplacian="grid8", unit=30.0, noise=float("nan"), reasons={"basis_size": "Two shapes explain it."}, warnings=("Look.",),
         ),
         seconds={"cameras": 0.5},
+        inlier_probability=np.where(visible > 0, 0.9, np.nan),
     )  # fmt: skip
     spread = np.linspace(0.5, 2.0, frames * points).reshape(frames, points) if std else None
     turned = Rotation.from_rotvec(np.linspace(0, 0.8, frames)[:, None] * [0, 1, 0]).as_matrix()

@@ -100,6 +100,9 @@ def test_npz_holds_the_solution_bit_for_bit(tmp_path: Path) -> None:
         assert solution.shapes_std is not None
         np.testing.assert_array_equal(got["shapes_std"], solution.shapes_std.astype(np.float32))
         assert got["shapes_std"].dtype == np.float32
+        assert solution.inlier_probability is not None
+        np.testing.assert_array_equal(got["inlier_probability"], solution.inlier_probability.astype(np.float32))
+        assert got["inlier_probability"].dtype == np.float32
         np.testing.assert_array_equal(got["trace_objective"], solution.trace.objective)
         np.testing.assert_array_equal(got["trace_residual"], solution.trace.residual)
         np.testing.assert_array_equal(got["trace_iterations"], solution.trace.iterations)

@@ -188,6 +188,24 @@ def test_text_with_the_suffix_npz_is_rejected(tmp_path: Path) -> None:
     refused("unknown_format", lambda: read_inputs(tracks=tmp_path / "tracks.npz", options=Options()))
 
 
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"%PDF-1.7\n" + bytes(600), "a PDF document"),
+        (b"%PDF-1.7\n% all text\n", "a PDF document"),
+        (b"\xd0\xcf\x11\xe0" + bytes(600), "an Office document (xls, doc)"),
+        (b"<!doctype html><p>Sign in</p>", "a web page or XML"),
+        (b"MZebra stripes\nare no tracks", "text that begins 'MZebra stripes'"),
+        (b" \n\n", "blank text"),
+        (bytes([1, 2, 3, 0]) * 9, "a file of an unknown kind, which begins with the bytes 01 02 03 00 01 02 03 00"),
+    ],
+)
+def test_a_file_of_another_kind_is_named_in_words(tmp_path: Path, content: bytes, words: str) -> None:
+    (tmp_path / "tracks").write_bytes(content)
+    error = refused("unknown_format", lambda: read_inputs(tracks=tmp_path / "tracks", options=Options()))
+    assert error.got == words
+
+
 def test_an_empty_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "tracks.npz").write_bytes(b"")
     refused("empty_file", lambda: read_inputs(tracks=tmp_path / "tracks.npz", options=Options()))

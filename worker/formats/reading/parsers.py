@@ -46,6 +46,12 @@ PARSERS = {
 }
 MATLAB_5, HDF5 = b"MATLAB 5.0", b"\x89HDF\r\n\x1a\n"
 PICTURES = {b"\x89PNG\r\n": "png", b"\xff\xd8\xff": "jpeg", b"BM": "bmp", b"II*\0": "tiff", b"MM\0*": "tiff"}
+DOCUMENTS = {
+    b"%PDF": "a PDF document", b"PK\x03\x04": "a zip archive", b"\xd0\xcf\x11\xe0": "an Office document (xls, doc)",
+    b"\x1f\x8b": "a gzip archive", b"7z\xbc\xaf": "a 7z archive", b"Rar!": "a RAR archive", b"\xfd7zXZ": "an xz archive",
+    b"ID3": "a sound recording (mp3)", b"\0asm": "a program", b"\x7fELF": "a program", b"MZ": "a program",
+    b"SQLite format 3": "an SQLite database",
+}  # fmt: skip
 PICKLE = tuple(bytes([0x80, version]) for version in range(2, 6))
 
 
@@ -90,9 +96,21 @@ def unknown_format(field: str, head: bytes) -> InvalidInput:
     mesh = "npz, npy, OBJ, PLY, glTF, GLB or a PNG mask"
     kinds = mesh if field == "mesh" else "npz, npy, MATLAB .mat, CSV, or DeepLabCut, SLEAP and MediaPipe exports"
     return InvalidInput(
-            "unknown_format", field=field, expected=f"{kinds}, recognised by content", got=f"a file that starts with {head[:16]!r}",
+            "unknown_format", field=field, expected=f"{kinds}, recognised by content", got=_in_words(head),
         hint="Convert it, e.g. numpy.savez('tracks.npz', tracks=points, visibility=visible).",
     )  # fmt: skip
+
+
+def _in_words(head: bytes) -> str:
+    """Return what a file of an unknown format is, as far as its first bytes show."""
+    if _is_text(head) and not head.startswith(b"%PDF"):
+        start = head.lstrip(b"\xef\xbb\xbf \t\r\n")
+        if start.startswith(b"<"):
+            return "a web page or XML"
+        return f"text that begins {start.decode('utf-8', 'replace').splitlines()[0][:40]!r}" if start else "blank text"
+    pictures = {start: f"a picture ({name})" for start, name in PICTURES.items()}
+    unknown = f"a file of an unknown kind, which begins with the bytes {head[:8].hex(' ')}"
+    return next((name for start, name in (pictures | DOCUMENTS).items() if head.startswith(start)), unknown)
 
 
 def _refuse_pictures(head: bytes) -> None:

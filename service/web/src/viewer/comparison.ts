@@ -27,6 +27,8 @@ export class Comparison {
   readonly summary = h("p", { class: "hint", role: "status" });
   companion: Companion | null = null;
 
+  private readonly own = h("span", { class: "view-name" }, "this job");
+
   constructor(private readonly parts: Compared) {}
 
   /** The choice of a job; the jobs are fetched now, and again when the list is opened. */
@@ -52,12 +54,14 @@ export class Comparison {
       this.companion?.dispose();
       this.companion = null;
       timeline.compare(null);
+      this.own.remove();
       say(this.summary, "");
       if (this.offerDifference(false)) paint(null);
       if (other === null) return;
       const companion = await Companion.open(other, signal);
       this.companion = companion;
       companion.element.append(h("span", { class: "view-name" }, other.title));
+      panes.querySelector(".view:not(.film)")?.append(this.own);
       panes.append(companion.element);
       timeline.compare(companion.preview, other.title);
       const values = await errorDifference(preview, companion.preview, signal);

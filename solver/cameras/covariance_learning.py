@@ -1,0 +1,101 @@
+"""The shape covariance of a sequence whose cameras are final."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from pliant.solver.cameras.depth_rounds import with_depth_map
+from pliant.solver.cameras.estimation import CameraEstimate
+from pliant.solver.model.early_stopping import described, learn_with_early_stopping
+from pliant.solver.model.model_order import ModelOrder, select_model_order
+from pliant.solver.model.shape_covariance import ShapeCovariance
+from pliant.solver.monitor import enter
+from pliant.solver.records import Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LearningData:
+    """What the shape covariance is learned from, once the cameras are final."""
+
+    gram: Floats
+    """Gram matrix of the frames used, divided by the scales of the start, shape `(2F', 2F')`."""
+
+    sample: Floats
+    """Sampled points, divided by the same scales, shape `(F', S, 2)`."""
+
+    projections: Floats
+    """Cameras of the frames used, relative to the same scales, shape `(F', 2, 3)`."""
+
+    used: NDArray[np.intp]
+    """Indices of the frames used."""
+
+    model_order: ModelOrder
+
+    selects_again: bool
+    """Whether the model order is selected again with these cameras."""
+
+    stopped: ShapeCovariance | None
+    """Covariance of a refinement that was stopped, to be taken as it is; None where one is to be learned."""
+
+    rotations: Floats
+    """Cameras of all frames in the axes of `projections`, shape `(F, 3, 3)`."""
+
+    scales: Floats
+    """Their scales, shape `(F,)`."""
+
+    turned: bool
+    """Whether the world axes of the estimate are those of its first camera."""
+
+
+def learn_covariance(
+    estimate: CameraEstimate, data: LearningData, *, seed: int = 0, should_stop: Callable[[], bool] | None = None
+) -> tuple[CameraEstimate, ShapeCovariance]:
+    """Return the shape covariance of all frames for fixed cameras, and the estimate with the depths that follow from it.
+
+    Parameters
+    ----------
+    estimate : CameraEstimate
+        The cameras, from `refine_cameras`.
+    data : LearningData
+        From the same call.
+    seed : int
+        Seed of the split of the points where some are held out.
+    should_stop : callable, optional
+        Called between rounds of EM; once it returns True, the best covariance so far is returned.
+    """
+    if data.stopped is not None:
+        covariance, modes = data.stopped, described(data.stopped)
+    else:
+        # Learn from scratch: modes learned along the way to these cameras overstate their likelihood.
+        model_order = data.model_order
+        if data.selects_again:
+            model_order = select_model_order(
+                data.sample,
+                data.projections,
+                spoiled=True,
+                ordered=estimate.ordered,
+                seed=seed,
+                should_stop=should_stop,
+            )
+        enter(should_stop, "covariance")
+        covariance, modes = learn_with_early_stopping(
+            data.sample, data.gram, data.projections, model_order, seed=seed, should_stop=should_stop
+        )
+    if len(data.used) < len(estimate.rotations):
+        covariance = covariance.stretched(data.used, len(estimate.rotations))
+    estimate = with_depth_map(
+        replace(estimate, reasons={**estimate.reasons, "modes": modes}), covariance, data.rotations, data.scales
+    )
+    return estimate, _seen_from(covariance, data.rotations[0]) if data.turned else covariance
+
+
+def _seen_from(covariance: ShapeCovariance, first: Floats) -> ShapeCovariance:
+    """Return the covariance in the axes of the first camera."""
+    return replace(
+        covariance,
+        mean_covariance=first @ covariance.mean_covariance @ first.T,
+        axis_covariance=first @ covariance.axis_covariance @ first.T,
+    )

@@ -1,0 +1,141 @@
+"""What all stages of a reconstruction start from: checked tracks in normalized units, the lens, and how to monitor a stage."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from pliant.solver.cameras.lens import given_lens
+from pliant.solver.cameras.perspective import Perspective
+from pliant.solver.descent import Descent
+from pliant.solver.errors import InvalidInput
+from pliant.solver.monitor import Monitor
+from pliant.solver.records import KnownCamera, Mesh, Step, Tracks
+from pliant.solver.settings import Settings
+from pliant.solver.stages import ITERATION_SECONDS, planned, unseen_frames
+from pliant.solver.tracks.normalization import Normalized, normalize
+
+OnStep = Callable[[Step], None]
+ShouldStop = Callable[[], bool]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observations:
+    """Tracks and what is given about their cameras."""
+
+    tracks: Tracks
+    """As given."""
+
+    normalized: Normalized
+    """The tracks in normalized units, with rejected observations hidden."""
+
+    settings: Settings
+    """With `order` `film` or `any`."""
+
+    lens: Perspective | None
+    """What is given about perspective; None for orthographic camera models."""
+
+    known: KnownCamera | None
+    """Given cameras; None where they are estimated."""
+
+    @property
+    def turning(self) -> bool:
+        """Whether rotations are estimated and refined."""
+        return self.known is None and self.settings.refine_rotations
+
+    def without(self, rejected: NDArray[np.bool_]) -> Observations:
+        """Return the same observations with those where `rejected`, shape `(F, P)`, hidden.
+
+        Raises
+        ------
+        InvalidInput
+            The shape differs from that of the tracks, or nothing visible is left.
+        """
+        if rejected.shape != self.tracks.visible.shape:
+            raise InvalidInput(
+                "wrong_shape", field="rejected", expected=f"{self.tracks.visible.shape}, as the visibility", got=f"{rejected.shape}",
+                hint="Mark observations by frame and point.",
+            )  # fmt: skip
+        kept = Tracks.from_arrays(self.tracks.points, np.where(rejected, 0.0, self.tracks.visible))
+        normalized = normalize(kept)
+        return replace(self, normalized=normalized, lens=given_lens(self.tracks, normalized, self.settings, self.known))
+
+    def of(self, tracks: Tracks) -> Observations:
+        """Return other tracks of the same frames, in the unit and about the centroids of these.
+
+        Raises
+        ------
+        InvalidInput
+            The number of frames differs.
+        """
+        if tracks is self.tracks:
+            return self
+        if tracks.num_frames != self.tracks.num_frames:
+            raise InvalidInput(
+                "camera_mismatch", field="cameras", expected=f"cameras of {tracks.num_frames} frames, as the tracks",
+                got=f"{self.tracks.num_frames}", hint="Estimate the cameras from tracks of the same frames.",
+            )  # fmt: skip
+        return replace(self, tracks=tracks, normalized=in_units_of(self.normalized, tracks))
+
+
+def in_units_of(normalized: Normalized, tracks: Tracks) -> Normalized:
+    """Return tracks in the unit and about the centroids of others."""
+    points = (tracks.points - normalized.centroid[:, None]) / normalized.unit
+    return replace(normalized, points=np.where(tracks.visible[..., None] > 0, points, 0.0), visible=tracks.visible)
+
+
+def observe(tracks: Tracks, known: KnownCamera | None, settings: Settings) -> Observations:
+    """Return the tracks in normalized units, with their lens; `settings.order` is `film` or `any`.
+
+    Raises
+    ------
+    InvalidInput
+        The tracks show nothing, or contradict the lens.
+    """
+    normalized = normalize(tracks)
+    return Observations(tracks, normalized, settings, given_lens(tracks, normalized, settings, known), known)
+
+
+def check_fit(tracks: Tracks, mesh: Mesh | None, cameras: KnownCamera | None) -> None:
+    """Check that mesh and given cameras fit the tracks.
+
+    Raises
+    ------
+    InvalidInput
+        Codes mesh_mismatch and camera_mismatch.
+    """
+    if mesh is not None and mesh.num_points != tracks.num_points:
+        raise InvalidInput(
+            "mesh_mismatch", field="mesh", expected=f"{tracks.num_points} vertices, one for each point of the tracks",
+            got=f"{mesh.num_points}", hint="Vertex i of the mesh must be point i of the tracks.",
+        )  # fmt: skip
+    if cameras is not None and len(cameras.rotations) != tracks.num_frames:
+        raise InvalidInput(
+            "camera_mismatch", field="rotations", expected=f"{tracks.num_frames} rotations, one for each frame of the tracks",
+            got=f"{len(cameras.rotations)}", hint="Give one camera a frame, in the order of the frames.",
+        )  # fmt: skip
+
+
+def monitored(
+    tracks: Tracks,
+    known: KnownCamera | None,
+    settings: Settings,
+    on_step: OnStep | None,
+    should_stop: ShouldStop | None,
+    *,
+    sheet: bool = False,
+    only: Collection[str] = (),
+) -> Monitor:
+    """Return the monitor of a solve, or of the stages named by `only`."""
+    unseen = 0.0 if tracks.all_visible else unseen_frames(tracks.visible)
+    plan = planned(
+        tracks.num_frames, tracks.num_points, gaussian=settings.gaussian, known_cameras=known is not None,
+        sheet=sheet, unseen=unseen,
+    )  # fmt: skip
+    return Monitor(
+        on_step, should_stop, plan=[stage for stage in plan if not only or stage.name in only],
+        descent=Descent(unseen, settings.tolerance, settings.max_reweightings),
+        seconds_per_iteration=ITERATION_SECONDS[settings.gaussian] * tracks.num_frames * tracks.num_points,
+    )  # fmt: skip

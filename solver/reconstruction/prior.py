@@ -1,0 +1,153 @@
+"""Second stage: the prior of the shapes, learned from the tracks and their cameras."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from pliant.solver.cameras.covariance_learning import learn_covariance
+from pliant.solver.cameras.depth_rounds import with_depth_map
+from pliant.solver.cameras.estimation import CameraEstimate
+from pliant.solver.energy.hyperparameters import noise_std
+from pliant.solver.errors import InvalidInput
+from pliant.solver.model.shape_covariance import ShapeCovariance
+from pliant.solver.monitor import Monitor
+from pliant.solver.reconstruction.cameras import Cameras, estimate_cameras
+from pliant.solver.reconstruction.observations import OnStep, ShouldStop, monitored
+from pliant.solver.records import Floats, KnownCamera, Step, Tracks
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Prior:
+    """A Gaussian over the path of a point through all frames: x_p ~ N(0, 1 1ᵀ ⊗ A₀ + C ⊗ A₁).
+
+    A₀ (3×3) is the covariance of a point's mean position, A₁ (3×3, trace 3) that of its deformation over the axes, and
+    C = L Lᵀ + τ T over the frames, with modes L (F×k) and a random walk T. World axes, the tracks' unit, about each frame's centroid.
+    """
+
+    unit: float
+    """The tracks' unit per normalized unit."""
+
+    reason: str
+    """A sentence about the modes."""
+
+    stopped: bool
+    """Whether a stop was requested; the prior is then the best so far."""
+
+    normalized: ShapeCovariance
+    """Internal: the covariance in normalized units."""
+
+    estimate: CameraEstimate
+    """Internal: the cameras that it was learned with."""
+
+    def __repr__(self) -> str:
+        frames, modes = self.normalized.modes.shape
+        return f"<Prior of {frames} frames: {modes} modes, noise {self.noise_std:.3g}>"
+
+    @property
+    def mean_covariance(self) -> Floats:
+        """A₀, shape `(3, 3)`, the tracks' unit squared."""
+        return np.asarray(self.normalized.mean_covariance * self.unit**2)
+
+    @property
+    def axis_covariance(self) -> Floats:
+        """A₁, shape `(3, 3)`, trace 3, dimensionless."""
+        return np.array(self.normalized.axis_covariance)
+
+    @property
+    def modes(self) -> Floats:
+        """L, shape `(F, k)`, the tracks' unit: standard deviation of the deformation that each mode explains, by frame."""
+        return np.asarray(self.normalized.modes * self.unit)
+
+    @property
+    def walk_variance(self) -> float:
+        """τ, the tracks' unit squared."""
+        return float(self.normalized.walk_variance * self.unit**2)
+
+    @property
+    def covariance(self) -> Floats:
+        """C, shape `(F, F)`, the tracks' unit squared."""
+        return np.asarray(self.normalized.over_frames() * self.unit**2)
+
+    @property
+    def noise_std(self) -> float:
+        """σ, standard deviation of an image coordinate that the shapes are solved with, the tracks' unit."""
+        return noise_std(self.normalized) * self.unit
+
+
+def learn_prior(
+    tracks: Tracks,
+    cameras: Cameras,
+    *,
+    seed: int | None = None,
+    on_step: OnStep | None = None,
+    should_stop: ShouldStop | None = None,
+) -> Prior:
+    """Learn the Gaussian prior of the shapes by expectation maximisation: the second stage of `solve`.
+
+    Parameters
+    ----------
+    tracks : Tracks
+        F frames of P points.
+    cameras : Cameras
+        Of these tracks; they are not changed. For given cameras call `estimate_cameras(tracks, known)`.
+    seed : int, optional
+        Of the split of the points where some are held out; None takes that of the cameras' settings.
+    on_step : callable, optional
+        Called after units of work.
+    should_stop : callable, optional
+        Called between units of work; once it returns True, the best prior so far is returned.
+
+    Raises
+    ------
+    InvalidInput
+        The cameras are not those of these tracks.
+    """
+    given = cameras.observations.tracks
+    if given is not tracks and not (
+        np.array_equal(given.points, tracks.points) and np.array_equal(given.visible, tracks.visible)
+    ):
+        raise InvalidInput(
+            "camera_mismatch", field="cameras", expected="cameras estimated from these tracks", got="those of other tracks",
+            hint="Call estimate_cameras with these tracks, or give rotations as a KnownCamera.",
+        )  # fmt: skip
+    if cameras.data is None:
+        cameras = _with_learning_data(tracks, cameras, should_stop)
+    observations = cameras.observations
+    monitor = monitored(
+        tracks, observations.known, observations.settings, on_step, should_stop, only=("model_order", "covariance")
+    )
+    found = prior_of(cameras, monitor, seed=observations.settings.seed if seed is None else seed)
+    monitor.report(Step("finish", 1.0))
+    return found
+
+
+def _with_learning_data(tracks: Tracks, cameras: Cameras, should_stop: ShouldStop | None) -> Cameras:
+    """Return the same cameras with what the prior is learned from, which estimates for other priors lack."""
+    settings = replace(
+        cameras.observations.settings, method="robust", preset="auto", prior="gaussian", focal=None, field_of_view=None
+    )
+    camera = cameras.camera
+    centre = None if camera.focal is None else (float(camera.principal_point[0]), float(camera.principal_point[1]))
+    known = KnownCamera(camera.rotations, camera.scales, camera.focal, centre)
+    return estimate_cameras(tracks, known, settings=settings, rejected=cameras.rejected, should_stop=should_stop)
+
+
+def prior_of(cameras: Cameras, monitor: Monitor, *, seed: int) -> Prior:
+    """Return the prior that belongs to the cameras, which have their learning data."""
+    assert cameras.data is not None
+    estimate, covariance = learn_covariance(cameras.estimate, cameras.data, seed=seed, should_stop=monitor)
+    unit = cameras.observations.normalized.unit
+    return Prior(unit, estimate.reasons["modes"], monitor.stopped, covariance, estimate)
+
+
+def estimate_with(cameras: Cameras, prior: Prior) -> CameraEstimate:
+    """Return the cameras with the depths that follow from the prior, for the correction of perspective."""
+    if prior.estimate.rotations is cameras.estimate.rotations:
+        return prior.estimate
+    reasons = {**cameras.estimate.reasons, "modes": prior.reason}
+    rotations, scales = np.asarray(cameras.estimate.rotations), np.asarray(cameras.estimate.scales)
+    if np.array_equal(rotations, prior.estimate.rotations) and np.array_equal(scales, prior.estimate.scales):
+        return replace(prior.estimate, reasons=reasons, warnings=cameras.warnings)  # with completed tracks
+    estimate = replace(cameras.estimate, reasons=reasons)
+    return with_depth_map(estimate, prior.normalized, rotations, scales)

@@ -1,0 +1,216 @@
+"""Third stage: the shapes, by iteratively reweighted least squares."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import numpy as np
+from pliant.solver.cameras.camera_choice import with_camera_choice
+from pliant.solver.energy.problem import Problem
+from pliant.solver.errors import InvalidInput
+from pliant.solver.monitor import Monitor, enter
+from pliant.solver.reconstruction.cameras import Cameras
+from pliant.solver.reconstruction.observations import OnStep, ShouldStop, in_units_of, monitored
+from pliant.solver.reconstruction.prior import Prior
+from pliant.solver.reconstruction.solution import finish
+from pliant.solver.reconstruction.start import Start, prepared, with_outlier_reason, with_outliers_rejected
+from pliant.solver.records import Floats, Mesh, Outcome, Solution, Step, Tracks
+from pliant.solver.settings import Settings
+from pliant.solver.shapes.assessment import assessed
+from pliant.solver.shapes.inliers import with_inlier_probability
+from pliant.solver.shapes.irls import init, no_higher, step, terminate
+from pliant.solver.shapes.perspective_shapes import corrected_again, seen_in_perspective
+from pliant.solver.shapes.setup import build_problem
+from pliant.solver.shapes.sparsely_observed import WELL_OBSERVED_SHARE, place_the_rest
+from pliant.solver.shapes.state import State
+from pliant.solver.tracks.noise import OUTLIER_SHARE
+
+DEPTH_ROUNDS, DEPTH_SETTLED = 4, 1e-4
+"""Maximum number of corrections of the tracks by the depths of the shapes, and the RMS change of the corrected
+tracks, normalized units, below which they end."""
+
+
+def solve_shapes(
+    tracks: Tracks,
+    cameras: Cameras,
+    prior: Prior | None = None,
+    mesh: Mesh | None = None,
+    *,
+    settings: Settings | None = None,
+    start: Solution | Floats | None = None,
+    on_step: OnStep | None = None,
+    should_stop: ShouldStop | None = None,
+) -> Solution:
+    """Solve for the shape of every frame: the last stage of `solve`.
+
+    Gross outliers are rejected, unless the cameras were estimated with rejected observations, which are left out here as well.
+
+    Parameters
+    ----------
+    tracks : Tracks
+        Of the cameras' frames; the points may be others than those that the cameras were estimated from.
+    cameras : Cameras
+        From `estimate_cameras`.
+    prior : Prior, optional
+        From `learn_prior`; None: smoothness in time, or the prior of `settings` if that is not `gaussian`.
+    mesh : Mesh, optional
+        Which points are neighbours.
+    settings : Settings, optional
+        Method, loss, weights; None takes those of the cameras.
+    start : Solution or ndarray, shape (F, P, 3), optional
+        Shapes to start from, world axes, the tracks' unit; None starts from least squares. The energy is the same either way.
+    on_step : callable, optional
+        Called after every unit of work.
+    should_stop : callable, optional
+        Called between units of work; once it returns True, the solve ends with `Outcome.STOPPED` and the last shapes.
+
+    Raises
+    ------
+    InvalidInput
+        Mesh, cameras, prior or start do not fit the tracks.
+    InvalidSettings
+        The settings are those of another prior than the given one, or need a mesh.
+    NotFinite
+        The arithmetic overflowed.
+    """
+    began = time.perf_counter()
+    begun = prepared(tracks, cameras, prior, mesh, settings)
+    monitor = monitored(tracks, None, begun.settings, on_step, should_stop, only=("shapes", "trust"))
+    begun = with_outlier_reason(with_outliers_rejected(begun, monitor))
+    if start is not None:
+        begun = _warm(begun, np.asarray(start.shapes if isinstance(start, Solution) else start, dtype=np.float64))
+    return shapes_from(begun, monitor, seconds={"initialise": time.perf_counter() - began})
+
+
+def _warm(start: Start, shapes: Floats) -> Start:
+    """Return the start at given shapes.
+
+    Raises
+    ------
+    InvalidInput
+        They have another shape, or are not finite.
+    """
+    expected = (*start.observations.tracks.visible.shape, 3)
+    if shapes.shape != expected or not np.isfinite(shapes).all():
+        got = f"{shapes.shape}" if shapes.shape != expected else "values that are not finite"
+        raise InvalidInput(
+            "wrong_shape", field="start", expected=f"finite shapes {expected}", got=got, hint="Pass a solution of these tracks."
+        )  # fmt: skip
+    part = shapes if start.kept is None else shapes[:, start.kept]
+    problem = start.problem
+    coordinates = (part / start.flat.unit) @ np.linalg.inv(problem.axes).T
+    there = np.ascontiguousarray(coordinates.transpose(0, 2, 1), dtype=problem.points.dtype)
+    return replace(start, state=init(problem, there, start.state.translations))
+
+
+def shapes_from(start: Start, monitor: Monitor, *, seconds: dict[str, float]) -> Solution:
+    """Return the solution that a start leads to; `seconds` are those of the stages so far."""
+    monitor.report(_step_of("initialise", start.state, start))
+    began = time.perf_counter()
+    start, history, outcome = _minimised(start, monitor)
+    start, history[-1] = _with_the_rest(start, history[-1])
+    seconds = {**seconds, "shapes": time.perf_counter() - began}
+    began = time.perf_counter()
+    solution = _finished(start, history, outcome, monitor)
+    monitor.report(_step_of("finish", history[-1], start, fraction=1.0))
+    return replace(solution, seconds={**seconds, "finish": time.perf_counter() - began})
+
+
+def _minimised(start: Start, monitor: Monitor) -> tuple[Start, list[State], Outcome]:
+    """Return the start with its tracks corrected for perspective by the shapes found, the history, and how it ended."""
+    view = start.estimate.perspective
+    corrections = DEPTH_ROUNDS if view is not None and view.bends else 0
+    monitor.expect_corrections(corrections)
+    history, outcome = _loop(start, [start.state], monitor)
+    for ahead in reversed(range(corrections)):
+        if outcome is Outcome.STOPPED:
+            break
+        monitor.expect_corrections(ahead)
+        problem, flat, changed = corrected_again(
+            start.problem, history[-1], start.observations.normalized, start.flat, start.estimate, start.kept
+        )
+        start = replace(start, problem=problem, flat=flat)
+        corrected = init(problem, history[-1].shapes, history[-1].translations)
+        history.append(replace(corrected, reweighting=history[-1].reweighting))
+        history, outcome = _loop(start, history, monitor)
+        if changed < DEPTH_SETTLED:
+            break
+    return start, history, outcome
+
+
+def _loop(start: Start, history: list[State], monitor: Monitor) -> tuple[list[State], Outcome]:
+    """Step until `terminate` returns an outcome. Only the newest state keeps its arrays."""
+    settings = start.settings
+    if settings.method == "pseudo_inverse":
+        return history, Outcome.CONVERGED
+    while True:
+        if monitor():
+            return history, Outcome.STOPPED
+        before = history[-1]
+        computed = step(start.problem, before, tolerance=settings.tolerance, should_stop=monitor)
+        after = no_higher(before, computed)
+        history[-1] = before.summary()
+        history.append(after)
+        monitor.report(_step_of("reweight", after, start))
+        outcome = terminate(before, computed, tolerance=settings.tolerance, max_reweightings=settings.max_reweightings)
+        if outcome is not None:
+            return history, outcome
+
+
+def _with_the_rest(start: Start, state: State) -> tuple[Start, State]:
+    """Return problem, choices and state of all points, given those of the well-observed points."""
+    part, covariance = start.part, start.covariance
+    if part is None or covariance is None:
+        return start, state
+    whole, _ = build_problem(start.flat, start.estimate, start.mesh, start.settings, covariance)
+    confidence = whole.confidence.copy()
+    confidence[:, part.kept] = start.problem.confidence
+    whole = replace(whole, confidence=confidence)
+    sparse, never = 1 - len(part.kept) / confidence.shape[1], float((confidence == 0).all(axis=0).mean())
+    whole, state = place_the_rest(part, whole, covariance, state, spoiled=start.outliers > OUTLIER_SHARE)
+    reason = (
+        f"{sparse:.1%} of the points were seen in fewer than {WELL_OBSERVED_SHARE:.0%} of the frames ({never:.1%} in none): "
+        "placed on the surface, then moved to their observations."
+    )
+    choices = replace(start.choices, reasons={**start.choices.reasons, "sparsely_observed": reason})
+    return replace(start, problem=whole, choices=choices), state
+
+
+def _finished(start: Start, history: list[State], outcome: Outcome, monitor: Monitor) -> Solution:
+    """Return the solution in the tracks' unit, with its standard deviations, probabilities and verdict."""
+    observations, estimate, problem = start.observations, start.estimate, start.problem
+    tracks, normalized = observations.tracks, observations.normalized
+    if normalized.visible is not tracks.visible:  # outliers are reported, not hidden
+        normalized = in_units_of(normalized, tracks)
+        problem = replace(problem, points=_rows(normalized.points, problem))
+    outcome = Outcome.STOPPED if monitor() else outcome
+    choices = with_camera_choice(
+        start.choices, estimate.perspective, start.settings, unit=normalized.unit, given=observations.known is not None
+    )
+    solution = finish(problem, history, outcome, normalized=normalized, estimate=estimate, choices=choices)
+    if estimate.perspective is not None:
+        solution = seen_in_perspective(solution, tracks, estimate.perspective, normalized.unit, start.kept)
+    enter(monitor, "trust")
+    confidence = np.asarray(problem.confidence, dtype=np.float64)
+    solution = with_inlier_probability(solution, tracks, confidence, loss=problem.loss)
+    solution = assessed(
+        solution, confidence, estimate, start.covariance, normalized.unit,
+        turning=observations.turning, seed=start.settings.seed, should_stop=monitor,
+    )  # fmt: skip
+    return replace(solution, outcome=Outcome.STOPPED) if monitor.stopped else solution
+
+
+def _rows(points: Floats, problem: Problem) -> Floats:
+    return np.ascontiguousarray(points.transpose(0, 2, 1), dtype=problem.points.dtype)
+
+
+def _step_of(stage: str, state: State, start: Start, *, fraction: float = 0.0) -> Step:
+    return Step(
+        stage,
+        fraction,
+        reweighting=state.reweighting,
+        max_reweightings=start.settings.max_reweightings,
+        objective=state.objective,
+        residual=start.flat.unit * state.residual,
+    )

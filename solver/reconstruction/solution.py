@@ -1,0 +1,46 @@
+"""A solution in the tracks' unit from the last state of a minimisation."""
+
+from __future__ import annotations
+
+import numpy as np
+from pliant.solver.cameras.estimation import CameraEstimate
+from pliant.solver.energy.objective import residuals
+from pliant.solver.energy.problem import Problem
+from pliant.solver.energy.robust_loss import largest_weight
+from pliant.solver.records import Camera, Choices, Floats, Outcome, Solution, Trace, read_only
+from pliant.solver.shapes.state import State
+from pliant.solver.tracks.normalization import Normalized
+
+
+def finish(
+    problem: Problem,
+    history: list[State],
+    outcome: Outcome,
+    *,
+    normalized: Normalized,
+    estimate: CameraEstimate,
+    choices: Choices,
+) -> Solution:
+    """Turn the last state into a Solution in the tracks' unit, with orthographic cameras."""
+    state, unit = history[-1], normalized.unit
+    left = residuals(problem, state.shapes, state.translations).astype(np.float64)
+    seen = normalized.visible > 0
+    length = np.where(seen, np.hypot(left[:, 0], left[:, 1]), 0.0)
+    top = largest_weight(problem.loss, problem.weights.robust_scale)
+    trust = np.where(seen, state.omega.mean(axis=1, dtype=np.float64) / top, 0.0)
+    shapes = (state.shapes.transpose(0, 2, 1).astype(np.float64) @ problem.axes.T) * unit
+    camera = Camera(
+        np.array(estimate.rotations, dtype=np.float64),
+        np.array(estimate.scales, dtype=np.float64),
+        normalized.centroid + unit * state.translations,
+    )
+    trace = Trace(
+        np.array([s.objective for s in history]),
+        unit * np.array([s.residual for s in history]),
+        np.array([s.iterations for s in history], dtype=np.int32),
+    )
+    residual = unit * length
+    arrays: list[Floats] = [shapes, camera.rotations, camera.scales, camera.translations, residual, trust]
+    for array in arrays:
+        read_only(array)
+    return Solution(shapes, camera, residual, np.clip(trust, 0.0, 1.0), trace, outcome, choices, {})

@@ -1,0 +1,204 @@
+"""The start of the shapes: the problem, least-squares shapes, and the rejection of gross outliers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from pliant.solver.cameras.estimation import CameraEstimate
+from pliant.solver.cameras.perspective import orthographic
+from pliant.solver.energy.problem import Problem
+from pliant.solver.errors import InvalidInput, InvalidSettings
+from pliant.solver.model.shape_covariance import ShapeCovariance
+from pliant.solver.monitor import Monitor
+from pliant.solver.reconstruction.cameras import Cameras
+from pliant.solver.reconstruction.observations import Observations, OnStep, ShouldStop, check_fit, monitored
+from pliant.solver.reconstruction.prior import Prior, estimate_with
+from pliant.solver.records import MIN_POINTS, Choices, Floats, Mesh, Step, Tracks
+from pliant.solver.settings import Settings
+from pliant.solver.shapes.initialization import pseudo_inverse, uniform_solution
+from pliant.solver.shapes.irls import init
+from pliant.solver.shapes.outlier_rejection import reject_outliers
+from pliant.solver.shapes.setup import build_problem, with_bending
+from pliant.solver.shapes.sparsely_observed import WellObserved, well_observed
+from pliant.solver.shapes.state import State
+from pliant.solver.tracks.completion import seen_again
+from pliant.solver.tracks.noise import OUTLIER_SHARE
+from pliant.solver.tracks.normalization import Normalized
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Start:
+    """Start of the minimisation."""
+
+    observations: Observations
+    mesh: Mesh | None
+    settings: Settings
+
+    flat: Normalized
+    """The tracks corrected for perspective; the tracks themselves for orthographic cameras."""
+
+    estimate: CameraEstimate
+    covariance: ShapeCovariance | None
+
+    outliers: float
+    """Share of gross outliers among the visible observations, as it was estimated before any was rejected."""
+
+    part: WellObserved | None
+    """The well-observed points, to which the problem is restricted; None for all points."""
+
+    problem: Problem
+    choices: Choices
+    state: State
+
+    @property
+    def kept(self) -> NDArray[np.intp] | None:
+        """Points of the problem; None for all."""
+        return None if self.part is None else self.part.kept
+
+    def confidence(self) -> Floats:
+        """Return the confidence of the tracks without rejected observations, shape `(F, P)`."""
+        visible = np.array(self.observations.normalized.visible)
+        points = slice(None) if self.part is None else self.part.kept
+        visible[:, points] = np.where(self.problem.confidence > 0, visible[:, points], 0.0)
+        return visible
+
+    def rejected(self) -> NDArray[np.bool_]:
+        """Return the observations to leave out of another estimate of the cameras, shape `(F, P)`.
+
+        None are where too few points would remain.
+        """
+        kept = self.confidence()
+        found = (self.observations.tracks.visible > 0) & (kept == 0)
+        return np.asarray(found if seen_again(kept) >= MIN_POINTS else np.zeros_like(found))
+
+
+def find_outliers(
+    tracks: Tracks,
+    cameras: Cameras,
+    prior: Prior,
+    mesh: Mesh | None = None,
+    *,
+    settings: Settings | None = None,
+    on_step: OnStep | None = None,
+    should_stop: ShouldStop | None = None,
+) -> NDArray[np.bool_]:
+    """Find the observations that are gross outliers, by a fit whose prior is too stiff to follow them.
+
+    `solve` estimates cameras and prior again without them: an outlier that is not recognised biases the completion of hidden entries and
+    everything after it.
+
+    Parameters
+    ----------
+    tracks, cameras, prior, mesh, settings
+        As for `solve_shapes`.
+    on_step : callable, optional
+        Called after units of work.
+    should_stop : callable, optional
+        Called between units of work; once it returns True, nothing is rejected.
+
+    Returns
+    -------
+    ndarray of bool, shape (F, P)
+        All False where the share of outliers that the cameras were estimated with, `cameras.outliers`, is 0.5 % or less.
+    """
+    start = prepared(tracks, cameras, prior, mesh, settings)
+    monitor = monitored(tracks, None, start.settings, on_step, should_stop, only=("shapes",))
+    found = with_outliers_rejected(start, monitor).rejected()
+    monitor.report(Step("finish", 1.0))
+    return found
+
+
+def prepared(
+    tracks: Tracks, cameras: Cameras, prior: Prior | None, mesh: Mesh | None, settings: Settings | None
+) -> Start:
+    """Return the start of the minimisation, with nothing rejected.
+
+    Raises
+    ------
+    InvalidInput
+        Mesh or cameras do not fit the tracks.
+    InvalidSettings
+        A learned prior beside settings of another one.
+    """
+    check_fit(tracks, mesh, None)
+    observations = cameras.observations.of(tracks)
+    settings = observations.settings if settings is None else settings
+    if prior is None:
+        estimate, covariance = cameras.estimate, None
+        settings = replace(settings, prior="smooth", order="film") if settings.gaussian else settings
+    elif settings.gaussian:
+        estimate, covariance = estimate_with(cameras, prior), prior.normalized
+    else:
+        raise InvalidSettings(
+            "invalid_option", field="settings.prior", expected="gaussian, with method robust and preset auto, beside a learned prior",
+            got=f"prior {settings.prior}, method {settings.method}, preset {settings.preset}",
+            hint="Pass prior=None for the priors that are not learned.",
+        )  # fmt: skip
+    if len(estimate.rotations) != tracks.num_frames or (
+        covariance is not None and len(covariance.modes) != tracks.num_frames
+    ):
+        raise InvalidInput(
+            "camera_mismatch", field="prior", expected=f"a prior of {tracks.num_frames} frames, as the tracks",
+            got=f"{0 if covariance is None else len(covariance.modes)}", hint="Learn the prior from tracks of the same frames.",
+        )  # fmt: skip
+    flat = orthographic(observations.normalized, estimate.perspective)
+    return _begun(observations, mesh, settings, flat, estimate, covariance, cameras.outliers)
+
+
+def _begun(
+    observations: Observations,
+    mesh: Mesh | None,
+    settings: Settings,
+    flat: Normalized,
+    estimate: CameraEstimate,
+    covariance: ShapeCovariance | None,
+    outliers: float,
+) -> Start:
+    part = None if covariance is None or settings.temporal_weight == 0 else well_observed(flat, mesh)
+    if part is None:
+        problem, choices = build_problem(flat, estimate, mesh, settings, covariance)
+    else:
+        problem, choices = build_problem(part.normalized, estimate, part.mesh, settings, covariance)
+    state = _initial(problem, estimate, settings)
+    return Start(
+        observations, mesh, settings, flat, estimate, covariance, outliers, part,
+        *with_bending(problem, choices, state, settings),
+    )  # fmt: skip
+
+
+def _initial(problem: Problem, estimate: CameraEstimate, settings: Settings) -> State:
+    translations = np.array(estimate.translations, dtype=np.float64)
+    if settings.method == "pseudo_inverse":
+        return init(problem, pseudo_inverse(problem, translations), translations)
+    return init(problem, uniform_solution(problem, translations), translations)
+
+
+def with_outliers_rejected(start: Start, monitor: Monitor) -> Start:
+    """Return the start without gross outliers, where there are any and the prior resists them.
+
+    Nothing is rejected twice: not with cameras that were estimated without rejected observations.
+    """
+    problem = start.problem
+    resists = problem.quadratic is not None and problem.weights.temporal > 0
+    if start.outliers <= OUTLIER_SHARE or not resists or _hides_some(start.observations):
+        return start
+    kept, state = reject_outliers(problem, start.state, start.outliers, should_stop=monitor)
+    return replace(start, problem=kept, state=state)
+
+
+def _hides_some(observations: Observations) -> bool:
+    return observations.normalized.visible is not observations.tracks.visible
+
+
+def with_outlier_reason(start: Start) -> Start:
+    """Return the start with a sentence about the share of rejected observations, where outliers were looked for."""
+    outliers = start.outliers
+    if outliers <= OUTLIER_SHARE or start.problem.quadratic is None or not start.problem.weights.temporal > 0:
+        return start
+    share = 1 - np.count_nonzero(start.confidence()) / np.count_nonzero(start.observations.tracks.visible)
+    reason = (
+        f"{share:.1%} of what was seen is left out as gross outliers; {outliers:.1%} looked like it before the fit."
+    )
+    return replace(start, choices=replace(start.choices, reasons={**start.choices.reasons, "outliers": reason}))

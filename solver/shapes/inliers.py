@@ -1,0 +1,88 @@
+"""Posterior probability that an observation is an inlier.
+
+An observation is either an inlier, whose residual r in the image has the density of the solver's loss, or an outlier, uniform over
+the area A that the tracks cover about their frames' centroids. With a share α of outliers,
+
+    P(inlier | r) = (1 − α) p(r) / ((1 − α) p(r) + α / A).
+
+For an observation of confidence v the density is p(r) = v² / (2 s²) exp(−√2 v (|r_x| + |r_y|) / s) with the loss `l1`, whose smoothed
+absolute value is the negative logarithm of a Laplace density of standard deviation s, and p(r) = v / (2π s²) exp(−v |r|² / 2s²) with
+the other losses. s is the standard deviation of the noise that the solve used (`Choices.noise`), or that of the residuals if that is
+larger because the model does not fit: their median length, weighted by confidence, over √(2 ln 2). α = (n + 1) / (N + 2) for n of N visible
+observations rejected, the mean under a uniform prior (Laplace's rule of succession).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from pliant.solver.records import Floats, Solution, Tracks, read_only
+from pliant.solver.tracks.noise import weighted_median
+from scipy.special import expit
+
+MEDIAN_LENGTH = float(np.sqrt(2 * np.log(2)))
+"""Median length of a vector with two standard normal coordinates."""
+
+
+def with_inlier_probability(solution: Solution, tracks: Tracks, confidence: Floats, *, loss: str) -> Solution:
+    """Return the solution with the probability of every observation.
+
+    Parameters
+    ----------
+    solution : Solution
+        With its final cameras.
+    tracks : Tracks
+        All observations.
+    confidence : ndarray, shape (F, P)
+        Of the observations that were used; 0 where rejected.
+    loss : {"l1", "l2", "huber"}
+        Of the data term.
+    """
+    left = tracks.points - solution.camera.project(solution.shapes)
+    seen = tracks.visible > 0
+    rejected = seen & (confidence == 0)
+    extent = np.ptp((tracks.points - solution.camera.translations[:, None])[seen], axis=0)
+    probability = inlier_probability(
+        left, np.where(seen, tracks.visible, 0.0), rejected, noise_std=solution.choices.noise, extent=extent, loss=loss
+    )
+    read_only(probability)
+    return replace(solution, inlier_probability=probability)
+
+
+def inlier_probability(
+    left: Floats, confidence: Floats, rejected: np.ndarray, *, noise_std: float, extent: Floats, loss: str
+) -> Floats:
+    """Return the probability of every observation, shape `(F, P)`: 0 where rejected, NaN where hidden.
+
+    Parameters
+    ----------
+    left : ndarray, shape (F, P, 2)
+        Residuals.
+    confidence : ndarray, shape (F, P)
+        v; 0 where hidden.
+    rejected : ndarray of bool, shape (F, P)
+        Visible observations that were not used.
+    noise_std : float
+        Standard deviation of an image coordinate, the unit of the residuals.
+    extent : ndarray, shape (2,)
+        Width and height of the area that outliers lie in, the same unit.
+    loss : {"l1", "l2", "huber"}
+        Density of the inliers.
+    """
+    seen, found = confidence > 0, np.full(confidence.shape, np.nan)
+    used = seen & ~rejected
+    found[rejected] = 0.0
+    if not used.any():
+        return found
+    residual, weight = left[used], confidence[used]
+    typical = weighted_median(np.hypot(residual[:, 0], residual[:, 1]), weight) / MEDIAN_LENGTH
+    scale = max(noise_std, typical, float(np.finfo(float).tiny) ** 0.25)
+    if loss == "l1":
+        logs = 2 * np.log(weight) - np.log(2) - np.sqrt(2) * weight * np.abs(residual / scale).sum(axis=1)
+    else:
+        logs = np.log(weight / (2 * np.pi)) - weight * np.square(residual / scale).sum(axis=1) / 2
+    area = float(np.prod(np.asarray(extent) / scale + 1))  # in units of s²; an extent of 0 has the size of the noise
+    odds = (seen.sum() - rejected.sum() + 1) / (rejected.sum() + 1)
+    found[used] = expit(logs + np.log(area) + np.log(odds))
+    return found

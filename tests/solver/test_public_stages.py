@@ -1,0 +1,225 @@
+"""The stages of a reconstruction, one by one: their composition is `solve`, and each can be repeated with other inputs."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pliant.solver import (
+    Cameras,
+    InvalidInput,
+    InvalidSettings,
+    KnownCamera,
+    Outcome,
+    Prior,
+    Settings,
+    Solution,
+    Step,
+    Tracks,
+    estimate_cameras,
+    find_outliers,
+    gallery,
+    learn_prior,
+    solve,
+    solve_shapes,
+)
+from pliant.solver.evaluation import metrics
+
+MADE = gallery.face(8, 40, degrees=60, mesh="triangles")
+KNOWN = KnownCamera.from_arrays(MADE.rotations, MADE.scales)
+SPOILED = gallery.corrupt(MADE, outliers=0.04, seed=1).tracks
+
+
+@pytest.fixture(scope="module")
+def cameras() -> Cameras:
+    return estimate_cameras(MADE.tracks, KNOWN)
+
+
+@pytest.fixture(scope="module")
+def prior(cameras: Cameras) -> Prior:
+    return learn_prior(MADE.tracks, cameras)
+
+
+@pytest.fixture(scope="module")
+def solution(cameras: Cameras, prior: Prior) -> Solution:
+    return solve_shapes(MADE.tracks, cameras, prior, MADE.mesh)
+
+
+def assert_same(one: Solution, other: Solution) -> None:
+    for name in ("shapes", "residuals", "weights", "inlier_probability"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+    np.testing.assert_array_equal(one.camera.rotations, other.camera.rotations)
+    np.testing.assert_array_equal(one.trace.objective, other.trace.objective)
+    assert one.outcome is other.outcome
+    assert {**one.choices.reasons, "order": ""} == {**other.choices.reasons, "order": ""}
+
+
+def composed(tracks: Tracks, known: KnownCamera | None, settings: Settings) -> Solution:
+    cameras = estimate_cameras(tracks, known, settings=settings)
+    if not settings.gaussian:
+        return solve_shapes(tracks, cameras, mesh=MADE.mesh)
+    prior = learn_prior(tracks, cameras)
+    rejected = find_outliers(tracks, cameras, prior, MADE.mesh)
+    if rejected.any():
+        cameras = estimate_cameras(tracks, known, settings=settings, rejected=rejected, previous=cameras)
+        prior = learn_prior(tracks, cameras)
+    return solve_shapes(tracks, cameras, prior, MADE.mesh)
+
+
+@pytest.mark.parametrize(
+    ("known", "settings"),
+    [
+        (KNOWN, Settings(order="film")),
+        (None, Settings(prior="smooth", refine_rotations=False)),
+        pytest.param(KNOWN, Settings(order="film", focal=900.0), marks=pytest.mark.slow),
+        pytest.param(None, Settings(order="film"), marks=[pytest.mark.slow, pytest.mark.long]),
+    ],
+    ids=["known", "smooth", "perspective", "default"],
+)
+def test_solve_is_the_composition_of_its_stages(known: KnownCamera | None, settings: Settings) -> None:
+    whole = solve(SPOILED, MADE.mesh, cameras=known, settings=settings)
+    assert_same(composed(SPOILED, known, settings), whole)
+    if settings.gaussian:
+        assert (whole.weights == 0).any(), "outliers were rejected on the way"
+
+
+def test_cameras_project_and_the_prior_states_its_covariance(cameras: Cameras, prior: Prior) -> None:
+    assert cameras.project(MADE.shapes).shape == MADE.tracks.points.shape
+    left = cameras.project(MADE.shapes) - MADE.tracks.points
+    assert np.abs(left - left.mean(axis=1, keepdims=True)).max() < 1e-6 * prior.unit
+    assert prior.modes.shape[0] == 8
+    walk = prior.covariance - prior.modes @ prior.modes.T
+    np.testing.assert_allclose(np.diag(walk, 1)[0], walk[0, 1])
+    assert np.linalg.eigvalsh(prior.covariance)[0] > -1e-9 * prior.unit**2
+    assert np.trace(prior.axis_covariance) == pytest.approx(3)
+    spread = np.square(MADE.shapes).sum(axis=2).mean()
+    assert 0.3 * spread < np.trace(prior.mean_covariance) + 3 * np.diag(prior.covariance).mean() < 3 * spread
+    assert prior.walk_variance > 0
+
+
+def test_what_is_printed_is_short(cameras: Cameras, prior: Prior, solution: Solution) -> None:
+    assert repr(cameras) == "<Cameras of 8 frames, orthographic>"
+    assert repr(prior).startswith("<Prior of 8 frames: ")
+    assert repr(solution).startswith(f"<Solution of 8 frames × {MADE.tracks.num_points} points, converged")
+    assert all(len(repr(each)) < 90 for each in (cameras, prior, solution))
+
+
+def test_one_noise_is_used_and_reported(prior: Prior, solution: Solution) -> None:
+    """With the loss `l1` the weight of the prior is σ/√8 in normalized units (`energy.hyperparameters`)."""
+    choices = solution.choices
+    assert choices.noise == prior.noise_std
+    assert choices.temporal_weight * 8**0.5 * choices.unit == pytest.approx(choices.noise, rel=1e-12)
+
+
+def test_a_start_at_the_solution_ends_there_at_once(cameras: Cameras, prior: Prior, solution: Solution) -> None:
+    again = solve_shapes(MADE.tracks, cameras, prior, MADE.mesh, start=solution)
+    assert len(again.trace.objective) <= 3 < len(solution.trace.objective)
+    assert again.trace.objective[-1] <= solution.trace.objective[-1] * (1 + 1e-9)
+    assert metrics.e3d_frame(again.shapes, solution.shapes) < 1e-3
+    np.testing.assert_allclose(again.choices.spatial_weight, solution.choices.spatial_weight)
+
+
+def test_a_start_elsewhere_has_the_same_energy_and_ends_at_the_same_shapes(
+    cameras: Cameras, prior: Prior, solution: Solution
+) -> None:
+    given = solution.shapes + 0.05 * solution.choices.unit * np.random.default_rng(0).normal(size=solution.shapes.shape)
+    tight = Settings(tolerance=1e-6, max_reweightings=200)
+    away = solve_shapes(MADE.tracks, cameras, prior, MADE.mesh, start=given, settings=tight)
+    here = solve_shapes(MADE.tracks, cameras, prior, MADE.mesh, settings=tight)
+    assert away.trace.objective[0] > here.trace.objective[-1]
+    assert away.trace.objective[-1] == pytest.approx(here.trace.objective[-1], rel=1e-2)
+    assert metrics.e3d_frame(away.shapes, here.shapes) < 0.02
+
+
+def test_shapes_of_other_points_follow_from_cameras_and_prior_of_some(solution: Solution) -> None:
+    some = Tracks.from_arrays(MADE.tracks.points[:, ::2])
+    cameras = estimate_cameras(some, KNOWN)
+    found = solve_shapes(MADE.tracks, cameras, learn_prior(some, cameras), MADE.mesh)
+    assert found.shapes.shape == MADE.shapes.shape
+    assert metrics.e3d_frame(found.shapes, MADE.shapes) < 1.5 * metrics.e3d_frame(solution.shapes, MADE.shapes) + 0.01
+
+
+def test_a_prior_is_learned_from_cameras_of_any_settings() -> None:
+    cameras = estimate_cameras(MADE.tracks, KNOWN, settings=Settings(prior="smooth"))
+    smooth = solve_shapes(MADE.tracks, cameras, mesh=MADE.mesh)
+    learned = solve_shapes(MADE.tracks, cameras, learn_prior(MADE.tracks, cameras), MADE.mesh, settings=Settings())
+    assert smooth.shapes_std is None
+    assert learned.shapes_std is not None
+    assert metrics.e3d_frame(learned.shapes, MADE.shapes) < metrics.e3d_frame(smooth.shapes, MADE.shapes)
+    plain = solve_shapes(MADE.tracks, cameras, None, MADE.mesh, settings=Settings())
+    assert plain.choices.reasons["weights"] == smooth.choices.reasons["weights"], "without a prior it is the smooth one"
+
+
+def test_every_stage_reports_its_steps_and_its_end(cameras: Cameras, prior: Prior) -> None:
+    for run in (
+        lambda on_step: estimate_cameras(MADE.tracks, KNOWN, on_step=on_step),
+        lambda on_step: learn_prior(MADE.tracks, cameras, on_step=on_step),
+        lambda on_step: find_outliers(MADE.tracks, cameras, prior, on_step=on_step),
+        lambda on_step: solve_shapes(MADE.tracks, cameras, prior, on_step=on_step),
+    ):
+        steps: list[Step] = []
+        run(steps.append)
+        fractions = [step.fraction for step in steps]
+        assert fractions == sorted(fractions)
+        assert fractions[-1] == 1
+        assert len(fractions) > 1 or run.__code__.co_names[0] == "find_outliers"
+
+
+def test_every_stage_stops(cameras: Cameras, prior: Prior) -> None:
+    early = estimate_cameras(SPOILED, should_stop=lambda: True)
+    assert early.stopped
+    assert np.isfinite(early.camera.rotations).all()
+    assert not cameras.stopped
+    stopped = learn_prior(MADE.tracks, cameras, should_stop=lambda: True)
+    assert stopped.stopped
+    assert np.isfinite(stopped.covariance).all()
+    noisy = estimate_cameras(SPOILED, KNOWN)
+    assert not find_outliers(SPOILED, noisy, learn_prior(SPOILED, noisy), should_stop=lambda: True).any()
+    found = solve_shapes(MADE.tracks, cameras, prior, should_stop=lambda: True)
+    assert found.outcome is Outcome.STOPPED
+    assert np.isfinite(found.shapes).all()
+
+
+@pytest.mark.slow
+def test_the_seed_reaches_every_random_choice(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each generator that a solve makes has the seed of the settings."""
+    made, original = set(), np.random.default_rng
+
+    def seeded(seed: object = None) -> np.random.Generator:
+        made.add((Path(sys._getframe(1).f_code.co_filename).stem, seed))
+        return original(seed)  # type: ignore[arg-type]
+
+    few = Tracks.from_arrays(MADE.tracks.points[:, :14])
+    many = gallery.face(4, 150, degrees=60)
+    visible = original(0).random(many.tracks.visible.shape) > 0.2
+    monkeypatch.setattr(np.random, "default_rng", seeded)
+    settings = Settings(seed=7, max_reweightings=2)
+    solve(few, cameras=KNOWN, settings=settings)
+    solve(
+        Tracks.from_arrays(many.tracks.points, visible), many.mesh,
+        cameras=KnownCamera.from_arrays(many.rotations, many.scales), settings=settings,
+    )  # fmt: skip
+    assert {seed for _, seed in made} == {7}
+    assert {name for name, _ in made} == {"completion", "model_order", "early_stopping", "uncertainty", "aggregation"}
+
+
+def test_inputs_that_do_not_belong_together_are_refused(cameras: Cameras, prior: Prior, solution: Solution) -> None:
+    tracks = MADE.tracks
+    fewer = Tracks.from_arrays(tracks.points[:6])
+    short = estimate_cameras(fewer, KnownCamera.from_arrays(MADE.rotations[:6], MADE.scales[:6]))
+    for field, call in (
+        ("cameras", lambda: learn_prior(SPOILED, cameras)),
+        ("cameras", lambda: solve_shapes(fewer, cameras, prior)),
+        ("prior", lambda: solve_shapes(tracks, cameras, learn_prior(fewer, short))),
+        ("start", lambda: solve_shapes(tracks, cameras, prior, start=solution.shapes[:, :5])),
+        ("start", lambda: solve_shapes(tracks, cameras, prior, start=solution.shapes * np.nan)),
+        ("rejected", lambda: estimate_cameras(tracks, KNOWN, rejected=np.zeros((8, 3), dtype=bool))),
+        ("rotations", lambda: estimate_cameras(fewer, KNOWN)),
+    ):
+        with pytest.raises(InvalidInput) as caught:
+            call()
+        assert caught.value.field == field
+    with pytest.raises(InvalidSettings, match="beside a learned prior"):
+        solve_shapes(tracks, cameras, prior, settings=Settings(prior="smooth"))
