@@ -89,21 +89,24 @@ class Appearance:
     def _refined(self, image: Floats, points: Floats, affine: Floats, usable: Bools, block: slice) -> Floats:
         """Return the refined places of the points of one block."""
         template, offsets = self.patches[block], _offsets(affine)
-        back = np.linalg.inv(np.where(usable[:, None, None], affine, np.eye(2, dtype=np.float32)))
+        back = np.linalg.inv(np.where(usable[:, None, None], affine, np.eye(2, dtype=np.float32))).astype(np.float32)
         slopes = [
             self.slopes[0, block] * back[:, 0, axis, None] + self.slopes[1, block] * back[:, 1, axis, None]
             for axis in (0, 1)
         ]
         hold = np.float32(2 * (self.noise + 1.0) / FLOW_VARIANCE)
         normal = [[_dot(first, second) for second in slopes] for first in slopes]
-        inverse = np.linalg.inv(np.moveaxis(np.array(normal), 2, 0) + hold * np.eye(2, dtype=np.float32))
+        inverse = np.linalg.inv(np.moveaxis(np.array(normal), 2, 0) + hold * np.eye(2, dtype=np.float32)).astype(
+            np.float32
+        )
         strength = _dot(template, template) + np.float32(self.noise + 1.0)
         moved, before = points.copy(), np.zeros(len(points), np.float32)
         alike = before
         for step in range(REFINEMENTS + 1):
             patches = _centred(_cut(image, moved[:, None] + offsets))
             product = _dot(patches, template)
-            alike = product / np.sqrt(strength * (_dot(patches, patches) + np.float32(self.noise + 1.0)))
+            norms = strength * (_dot(patches, patches) + np.float32(self.noise + 1.0))
+            alike = np.asarray(product / np.sqrt(norms), dtype=np.float32)
             if step == 0:
                 before = alike
             if step < REFINEMENTS:

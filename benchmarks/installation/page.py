@@ -1,6 +1,7 @@
 """The page on a real service: time from `pliant up` to the first playing mesh, and the pictures in docs/images.
 
     python -m benchmarks.installation.page                      # times, as JSON
+    python -m benchmarks.installation.page --film               # from a film dropped onto the page to its playing mesh
     python -m benchmarks.installation.page --pictures docs/images
 
 Needs a Chromium, the built page (`make page`) and, for pictures, Pillow.
@@ -9,6 +10,7 @@ Needs a Chromium, the built page (`make page`) and, for pictures, Pillow.
 from __future__ import annotations
 
 import argparse
+import base64
 import io
 import json
 import os
@@ -20,7 +22,9 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
+import httpx
 from playwright.sync_api import Page
 from pliant.client import Client
 from pliant.solver.gallery import face
@@ -83,6 +87,48 @@ def first_mesh() -> dict[str, float]:
     }
 
 
+DROP = """([name, data]) => {
+  const given = new DataTransfer();
+  given.items.add(new File([Uint8Array.from(atob(data), (c) => c.charCodeAt(0))], name));
+  document.body.dispatchEvent(new DragEvent("drop", { dataTransfer: given, bubbles: true, cancelable: true }));
+}"""
+
+
+def dropped_film() -> dict[str, Any]:
+    """Seconds from dropping the example film onto the page until its first frame shows, its tracks are done, and its mesh plays."""
+    with service() as url, Browsing() as browser:
+        example = next(one for one in httpx.get(f"{url}/v1/examples").json()["examples"] if one["region_polygon"])
+        film = httpx.get(f"{url}{example['files'][0]['url']}", timeout=120).content  # made when first asked for
+        page = browser.new_page(viewport={"width": 1280, "height": 900})
+        page.goto(url)
+        page.get_by_text("Drop a film here").wait_for()
+        began = time.perf_counter()
+        page.evaluate(DROP, [example["files"][0]["file"], base64.b64encode(film).decode()])
+        page.get_by_role("img", name="First frame of the film").wait_for()
+        shown = time.perf_counter() - began
+        page.get_by_role("button", name="Reconstruct").click()
+        stages = _stages(url, began)
+        page.locator(".view canvas").wait_for(timeout=300_000)
+        while frame(page) == 0:
+            time.sleep(0.02)
+        plays = time.perf_counter() - began
+    return {"first_frame_seconds": shown, "stages": stages, "mesh_plays_seconds": plays, "cores": os.cpu_count() or 0}
+
+
+def _stages(url: str, began: float) -> dict[str, float]:
+    """Follow the only job to its end; return seconds from `began` to when each stage was first seen."""
+    found: dict[str, float] = {}
+    status = "queued"
+    while status in ("queued", "running"):
+        time.sleep(0.1)
+        for job in httpx.get(f"{url}/v1/jobs", timeout=60).json()["jobs"]:
+            status = job["status"]
+            stage = (job["progress"] or {}).get("stage") if status == "running" else status
+            found.setdefault(str(stage), time.perf_counter() - began)
+    assert status == "succeeded", status
+    return found
+
+
 def talking_face(url: str) -> str:
     """Have a face reconstructed; return the job's id. Clean tracks, so the closed form in time does: it takes seconds."""
     sequence = face(40, 5000, degrees=50)
@@ -141,8 +187,11 @@ def save(png: bytes, path: Path) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--pictures", type=Path, metavar="DIR")
+    parser.add_argument("--film", action="store_true", help="drop the example film")
     given = parser.parse_args()
-    if given.pictures is None:
+    if given.film:
+        print(json.dumps(dropped_film(), indent=2))
+    elif given.pictures is None:
         print(json.dumps(first_mesh(), indent=2))
     else:
         pictures(given.pictures)

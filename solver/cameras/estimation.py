@@ -91,6 +91,12 @@ class CameraEstimate:
     warnings: tuple[str, ...] = ()
     """Reasons to distrust the result."""
 
+    candidates: tuple[Floats, ...] = ()
+    """Rotations of all candidates of the multistart, to be compared at a typical depth where the tracks do not determine it."""
+
+    depth_is_typical: bool = False
+    """Whether the extent of depth rests on its prior and not on the tracks (`cameras.bas_relief`)."""
+
 
 def estimate_cameras(
     normalized: Normalized,
@@ -147,11 +153,13 @@ def estimate_cameras(
     report(Step("cameras", 0.8 * PROGRESS_SHARE))
     rotations, refined = _everywhere(own.rotations, best, used, settings)
     hypotheses: tuple[tuple[int, Floats], ...] = ()
+    candidates: tuple[Floats, ...] = ()
     if settings.refine_rotations and is_planar(gram):
         rotations, sheet = resolve_pose_signs(gram, rotations, ordered=ordered, should_stop=should_stop)
         refined = f"{refined} {sheet}"
     elif settings.refine_rotations:
         hypotheses = _hypotheses(upgrades, ran, part, used)
+        candidates = tuple(_everywhere(own.rotations, each, used, settings)[0] for each in ran)
     read_only(rotations)
     read_only(scales)
     report(Step("cameras", PROGRESS_SHARE))
@@ -159,6 +167,7 @@ def estimate_cameras(
     return CameraEstimate(
         rotations, scales, completed.translations, best.basis_size, completed.gram, completed.sample,
         hypotheses, completed.outliers, completed.rank, completed.filling, None, ordered, reasons, _warnings(rotations),
+        candidates=candidates,
     )  # fmt: skip
 
 

@@ -88,6 +88,7 @@ def assess(
     shapes_std: Floats | None,
     planar: bool = False,
     modes: int = 0,
+    depth_is_typical: bool = False,
 ) -> Trust:
     """Return the verdict on a result.
 
@@ -109,12 +110,18 @@ def assess(
         The tracks are those of a sheet, so that its pose signs are weakly determined.
     modes : int
         Modes of deformation of the prior.
+    depth_is_typical : bool
+        The extent of depth rests on a prior and not on the tracks.
     """
     centred = shapes - shapes.mean(axis=1, keepdims=True)
     size = max(float(np.sqrt(np.square(centred).sum(axis=2).mean())), np.finfo(float).tiny)
     seen = visible > 0
     expected = None if shapes_std is None else float(np.sqrt(np.square(shapes_std).mean())) / size
-    interval = (INTERVAL[0] * expected, INTERVAL[1] * expected) if expected is not None and not planar else None
+    interval = (
+        (INTERVAL[0] * expected, INTERVAL[1] * expected)
+        if expected is not None and not (planar or depth_is_typical)
+        else None
+    )
     relative = (residuals / scales[:, None])[seen]
     residual = float(np.median(relative)) / size if relative.size else np.inf
     turn = turned(rotations)
@@ -133,6 +140,9 @@ def assess(
         found.append(
             (Verdict.WITH_CARE, "The tracks are those of a thin sheet, whose bending this motion hardly shows.")
         )
+    if depth_is_typical:
+        sentence = "The tracks hardly show how deep the object is; its depth is one that is usual for its width. Let it turn further."
+        found.append((Verdict.WITH_CARE, sentence))
     signs = sorted((sign for sign in found if sign[0] is not Verdict.GOOD), key=lambda sign: -_RANK[sign[0]])
     verdict = signs[0][0] if signs else Verdict.GOOD
     return Trust(verdict, tuple(sentence for _, sentence in signs), expected, interval, turn, residual, hidden)

@@ -153,7 +153,8 @@ def cameras_of(
         corrupted_plane = estimate.outliers > OUTLIER_SHARE and is_planar(estimate.gram)
         estimate, data = refine_cameras(
             estimate, shown, turning=observations.turning and not corrupted_plane,
-            estimates_scales=settings.estimates_scales, seed=settings.seed, normalized=normalized, should_stop=monitor,
+            estimates_scales=settings.estimates_scales, seed=settings.seed, normalized=normalized,
+            y_up=settings.y_up, should_stop=monitor,
         )  # fmt: skip
     elif observations.lens is not None:
         estimate = settled(

@@ -75,5 +75,6 @@ def assessed(
         shapes_std=std,
         planar=is_planar(estimate.gram),
         modes=modes,
+        depth_is_typical=estimate.depth_is_typical,
     )
     return replace(solution, shapes_std=std, trust=trust)

@@ -319,7 +319,9 @@ CASES = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", ["default", pytest.param("outliers", marks=pytest.mark.long), "perspective"])
+@pytest.mark.parametrize(
+    "case", ["default", *(pytest.param(each, marks=pytest.mark.long) for each in ("outliers", "perspective"))]
+)
 def test_a_stop_at_every_place_that_asks_is_reported(case: str) -> None:
     tracks, settings = CASES[case]
     asking = places(tracks, settings)
@@ -330,6 +332,9 @@ def test_a_stop_at_every_place_that_asks_is_reported(case: str) -> None:
 
 @pytest.mark.slow
 def test_a_stop_at_every_single_question_of_a_small_solve_is_reported() -> None:
-    tracks, settings = gallery.face(3, 6, degrees=60).tracks, Settings(prior="smooth", refine_rotations=False)
+    tracks, settings = (
+        gallery.face(3, 6, degrees=60).tracks,
+        Settings(prior="smooth", refine_rotations=False, max_reweightings=3),
+    )
     for number in range(1, questions(tracks, settings) + 1):
         stopped_at(tracks, settings, number)

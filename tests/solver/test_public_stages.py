@@ -73,7 +73,7 @@ def composed(tracks: Tracks, known: KnownCamera | None, settings: Settings) -> S
     [
         (KNOWN, Settings(order="film")),
         (None, Settings(prior="smooth", refine_rotations=False)),
-        pytest.param(KNOWN, Settings(order="film", focal=900.0), marks=pytest.mark.slow),
+        pytest.param(KNOWN, Settings(order="film", focal=900.0), marks=[pytest.mark.slow, pytest.mark.long]),
         pytest.param(None, Settings(order="film"), marks=[pytest.mark.slow, pytest.mark.long]),
     ],
     ids=["known", "smooth", "perspective", "default"],

@@ -53,6 +53,7 @@ def test_a_result_without_reasons_against_it_is_good() -> None:
         ({"shapes_std": np.full((FRAMES, POINTS), 0.9)}, Verdict.DO_NOT_USE, "may be as large as the object itself"),
         ({"visible": np.eye(FRAMES, POINTS) + np.eye(FRAMES, POINTS, 12)}, Verdict.DO_NOT_USE, "are not seen"),
         ({"planar": True}, Verdict.WITH_CARE, "thin sheet"),
+        ({"depth_is_typical": True}, Verdict.WITH_CARE, "Let it turn further"),
         ({"modes": 7}, Verdict.WITH_CARE, "7 modes of deformation in 12 frames"),
     ],
 )

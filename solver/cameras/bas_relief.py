@@ -1,0 +1,145 @@
+"""How deep the object is, where the cameras hardly turn: one step along the bas-relief family, with a prior on the extent of depth.
+
+A deep object that hardly turns and a flat one that turns more look alike (the bas-relief ambiguity; Belhumeur, Kriegman and Yuille
+1999). Let d be the mean optical axis in world axes. Depth along d times λ and rotations off d divided by λ change the images only in
+the second order of the angles. Where these are a few degrees the likelihood hardly changes with λ, and the prior on camera motion, which
+rewards a smaller variance of the motion without end (`model.camera_motion_prior`), prefers no rotation and unlimited depth. Refinement
+creeps along this curved valley; here λ alone is changed, to where
+
+    E(λ) + weight · (3/2 log((2 + x) / 3) − 1/2 log x),    x = a λ² / (b r²)
+
+is least. E is the negative log likelihood without the prior on camera motion, a the variance of the positions along d, and b that across.
+The penalty is the negative log density of log x for x with an F distribution of 1 and 2 degrees of freedom, the ratio of a variance along
+one axis to one along two. It has no unit and grows as 2 log λ and log 1/λ. Where the object turns by tens of degrees, E decides and
+λ is 1 to within a fraction of a percent.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from pliant.solver.cameras.learned import Learned, motion_of, scene_at
+from pliant.solver.cameras.perspective import mirrored
+from pliant.solver.model.marginal_likelihood import CAMERA_PRIOR_WEIGHT, energy
+from pliant.solver.model.so3 import exponential
+from pliant.solver.records import Floats
+from scipy.optimize import minimize_scalar
+
+VISIBLE_DEPTH = (1 / 2 - 4 / 9) ** 0.5 / 0.5
+"""r, standard deviation of depth over that of x or y: .47 for the half of a sphere that faces the camera, in points evenly spread over
+the picture (z² has the mean 1/2, z 2/3, x² 1/4)."""
+
+MAX_STRETCH = 30.0
+"""Bound on λ and 1/λ."""
+
+DECIDED = 1.25
+"""λ or 1/λ below which the depth counts as decided by the tracks."""
+
+MAX_ANGLE = np.radians(60.0)
+"""Angle from d, rad, that no frame may exceed after the step: bas-relief is an approximation for small angles."""
+
+
+def settled_depth(gram: Floats, found: Learned) -> tuple[Learned, float]:
+    """Return cameras and covariance at the most probable λ, and λ.
+
+    Parameters
+    ----------
+    gram : array, shape (2F, 2F)
+        Of the tracks that `found` belongs to.
+    found : Learned
+        Cameras, orthographic up to scale, and covariance.
+    """
+    toward, rolls, tilts = _decomposed(found.rotations)
+    largest = float(np.linalg.norm(tilts, axis=1).max())
+    least = np.log(max(1 / MAX_STRETCH, largest / MAX_ANGLE))
+    if least >= 0:
+        return found, 1.0
+    spread = _spread(found)
+    depth = float(toward @ spread @ toward)
+    expected = VISIBLE_DEPTH**2 * (float(np.trace(spread)) - depth) / 2
+
+    def cost(log_stretch: float) -> float:
+        moved = _stretched(found, float(np.exp(log_stretch)), toward, rolls, tilts)
+        scene = replace(
+            scene_at(gram, moved.rotations, with_scales=True, ordered=moved.covariance.ordered), prior_weight=0.0
+        )
+        return energy(scene, motion_of(scene, moved))[0] + CAMERA_PRIOR_WEIGHT * extent_penalty(
+            depth / expected * float(np.exp(2 * log_stretch))
+        )
+
+    # Several starts: far from its minimum the likelihood is flat.
+    grid = np.linspace(least, np.log(MAX_STRETCH), 25)
+    costs = [cost(float(each)) for each in grid]
+    best = int(np.argmin(costs))
+    bounds = (grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)])
+    step = minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": 1e-4})
+    at = min((0.0, float(grid[best]), float(step.x)), key=cost)
+    moved = _stretched(found, float(np.exp(at)), toward, rolls, tilts)
+    scene = scene_at(gram, moved.rotations, with_scales=True, ordered=moved.covariance.ordered)
+    return replace(moved, energy=energy(scene, motion_of(scene, moved))[0]), float(np.exp(at))
+
+
+def facing(found: Learned, sample: Floats, *, y_up: bool) -> Learned:
+    """Return cameras and covariance or their mirror images, whichever bulge toward the camera, as half a sphere that one sees does.
+
+    Parameters
+    ----------
+    found : Learned
+        Cameras, orthographic up to scale, and covariance.
+    sample : array, shape (F, S, 2)
+        Tracks of some points that they belong to, centred.
+    y_up : bool
+        Whether y points up in the images, and z therefore toward the camera.
+    """
+    frames = len(sample)
+    rows = (found.rotations[:, :2] * found.scales[:, None, None]).reshape(2 * frames, 3)
+    rigid = np.linalg.pinv(rows) @ sample.transpose(0, 2, 1).reshape(2 * frames, -1)
+    toward = _decomposed(found.rotations)[0]
+    depth = (toward @ rigid) * (-1 if y_up else 1)
+    width = rigid - np.outer(toward, toward @ rigid)
+    radius = (width**2).sum(axis=0)
+    if depth @ (radius - radius.mean()) >= 0:
+        return found
+    rotations, covariance = mirrored(found.rotations, found.covariance)
+    return replace(found, rotations=rotations, covariance=covariance)
+
+
+def extent_penalty(ratio: float) -> float:
+    """Return the negative log density of log x at x = `ratio` > 0, 0 at its least."""
+    return 1.5 * float(np.log((2 + ratio) / 3)) - 0.5 * float(np.log(ratio))
+
+
+def _decomposed(rotations: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return d (3,), rotations (F, 3, 3) about the optical axis, and the rotation vectors (F, 3) before them, orthogonal to d."""
+    axes = rotations[:, 2]
+    mean = axes.sum(axis=0)
+    toward = mean / max(float(np.linalg.norm(mean)), np.finfo(float).tiny)
+    cross = np.cross(axes, toward)
+    sine = np.linalg.norm(cross, axis=1)
+    angles = np.arctan2(sine, axes @ toward)
+    tilts = cross * (angles / np.maximum(sine, np.finfo(float).tiny))[:, None]
+    return toward, rotations @ exponential(-tilts), tilts
+
+
+def _stretched(found: Learned, stretch: float, toward: Floats, rolls: Floats, tilts: Floats) -> Learned:
+    """Return cameras and covariance with depth along d times λ and tilts divided by it."""
+    along = np.eye(3) + (stretch - 1) * np.outer(toward, toward)
+    covariance = found.covariance
+    deformation = along @ covariance.axis_covariance @ along.T
+    size = float(np.trace(deformation)) / 3
+    changed = replace(
+        covariance,
+        mean_covariance=along @ covariance.mean_covariance @ along.T,
+        axis_covariance=deformation / size,
+        modes=covariance.modes * size**0.5,
+        walk_variance=covariance.walk_variance * size,
+    )
+    return replace(found, rotations=rolls @ exponential(tilts / stretch), covariance=changed)
+
+
+def _spread(found: Learned) -> Floats:
+    """Return the variance of the positions over points, mean over frames, shape `(3, 3)`."""
+    covariance = found.covariance
+    moving = float((covariance.modes**2).sum()) / len(covariance.modes) + covariance.walk_variance
+    return np.asarray(covariance.mean_covariance + moving * covariance.axis_covariance)

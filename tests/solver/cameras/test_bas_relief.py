@@ -1,0 +1,141 @@
+"""The step along the bas-relief family: its geometry, what decides it, and heads that turn by 2° and by 30°."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pliant.solver import gallery, solve
+from pliant.solver.cameras import bas_relief, joint_refinement
+from pliant.solver.cameras.bas_relief import VISIBLE_DEPTH, extent_penalty, facing, settled_depth
+from pliant.solver.cameras.learned import Learned
+from pliant.solver.cameras.perspective import MIRROR
+from pliant.solver.model.shape_covariance import ShapeCovariance
+from pliant.solver.model.so3 import exponential
+from scipy.optimize import minimize_scalar
+from scipy.spatial.transform import Rotation
+
+FRAMES = 24
+
+
+def found(degrees: float, depth: float) -> tuple[np.ndarray, Learned]:
+    """Tracks' Gram matrix and the cameras and covariance that it has, for an object with extents 1, 1 and `depth`."""
+    time = np.linspace(0, 2 * np.pi, FRAMES)
+    tilts = np.radians(degrees / 2) * np.stack([np.sin(time), np.cos(2 * time), 0 * time], axis=1)
+    rolls = exponential(np.stack([0 * time, 0 * time, 0.4 * np.sin(time)], axis=1))
+    covariance = ShapeCovariance(
+        np.diag([1.0, 1.0, depth**2]), np.eye(3), 0.05 * np.cos(np.outer(time, [1, 2])), 1e-4, 1e-4, 0.0
+    )
+    rotations = rolls @ exponential(tilts)
+    return covariance.of_image(rotations[:, :2]), Learned(rotations, np.ones(FRAMES), covariance, 0.0)
+
+
+def test_the_expected_depth_is_that_of_half_a_sphere() -> None:
+    side = np.linspace(-1, 1, 401)
+    x, y = (each.ravel() for each in np.meshgrid(side, side))
+    inside = x**2 + y**2 < 1
+    assert np.sqrt(1 - x[inside] ** 2 - y[inside] ** 2).std() / x[inside].std() == pytest.approx(
+        VISIBLE_DEPTH, rel=2e-3
+    )
+
+
+def test_the_penalty_is_least_at_the_expected_ratio_and_steeper_for_deep_objects() -> None:
+    least = minimize_scalar(lambda log: extent_penalty(np.exp(log)), bounds=(-3, 3), method="bounded")
+    assert least.x == pytest.approx(0, abs=1e-4)
+    assert extent_penalty(1.0) == 0
+    assert extent_penalty(4e8) - extent_penalty(1e8) == pytest.approx(2 * np.log(2), rel=1e-6)
+    assert extent_penalty(1e-8) - extent_penalty(4e-8) == pytest.approx(np.log(2), rel=1e-6)
+
+
+def test_rotations_are_rolls_after_tilts() -> None:
+    _, given = found(8, 0.5)
+    toward, rolls, tilts = bas_relief._decomposed(given.rotations)
+    np.testing.assert_allclose(rolls @ exponential(tilts), given.rotations, atol=1e-12)
+    np.testing.assert_allclose(rolls @ toward, np.tile([0, 0, 1], (FRAMES, 1)), atol=1e-12)
+    np.testing.assert_allclose(tilts @ toward, 0, atol=1e-12)
+
+
+def test_images_change_in_the_second_order_of_the_angles_only() -> None:
+    def change(degrees: float) -> float:
+        gram, given = found(degrees, 0.5)
+        moved = bas_relief._stretched(given, 0.5, *bas_relief._decomposed(given.rotations))
+        assert given.covariance.axis_covariance.trace() == pytest.approx(3)
+        assert moved.covariance.axis_covariance.trace() == pytest.approx(3)
+        return float(np.abs(moved.covariance.of_image(moved.rotations[:, :2]) - gram).max())
+
+    assert change(2) / change(1) == pytest.approx(4, rel=0.1)
+    gram, given = found(10, 0.5)
+    same = bas_relief._stretched(given, 1.0, *bas_relief._decomposed(given.rotations))
+    np.testing.assert_allclose(same.covariance.of_image(same.rotations[:, :2]), gram, atol=1e-12)
+
+
+def test_depth_is_the_expected_one_without_rotation_and_the_tracks_own_with_it() -> None:
+    gram, deep = found(1, 4.0)
+    settled, stretch = settled_depth(gram, deep)
+    assert settled.covariance.mean_covariance[2, 2] ** 0.5 == pytest.approx(4.0 * stretch)
+    assert 4.0 * stretch == pytest.approx(VISIBLE_DEPTH, rel=0.3)
+    gram, turning = found(60, 1.5)
+    assert settled_depth(gram, turning)[1] == pytest.approx(1, abs=0.01)
+
+
+def test_without_a_weight_the_tracks_own_depth_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bas_relief, "CAMERA_PRIOR_WEIGHT", 0.0)
+    gram, given = found(10, 1.5)
+    assert settled_depth(gram, given)[1] == pytest.approx(1, abs=0.01)
+
+
+def test_views_from_all_around_are_left_alone() -> None:
+    rotations = Rotation.from_euler("y", np.linspace(0, 350, FRAMES)[:, None], degrees=True).as_matrix()
+    gram, given = found(10, 1.5)
+    around = Learned(rotations, given.scales, given.covariance, 0.0)
+    settled, stretch = settled_depth(gram, around)
+    assert stretch == 1
+    assert settled is around
+
+
+def depth_of(shapes: np.ndarray, rotations: np.ndarray) -> float:
+    """Standard deviation of depth over that of x and y, mean over frames."""
+    seen = shapes @ rotations.transpose(0, 2, 1)
+    return float((seen[..., 2].std(axis=1) / seen[..., :2].std(axis=(1, 2))).mean())
+
+
+@pytest.mark.slow
+def test_a_head_that_turns_by_2_degrees_is_as_deep_as_a_head() -> None:
+    head = gallery.face(20, 150, degrees=1, tilt=0.5)
+    tracks, _ = gallery.corrupt_tracks(head.tracks, noise=0.003, seed=0)
+    solution = solve(tracks, head.mesh)
+    found = depth_of(solution.shapes, solution.camera.rotations)
+    assert 0.5 < found / depth_of(head.shapes, head.rotations) < 2
+    assert "as of half a sphere" in solution.choices.reasons["depth_extent"]
+    assert solution.trust is not None
+    assert solution.trust.verdict != "good"
+    assert solution.trust.interval is None
+
+
+@pytest.mark.slow
+def test_a_head_that_turns_by_30_degrees_keeps_its_depth(monkeypatch: pytest.MonkeyPatch) -> None:
+    stretches = []
+
+    def settled(gram: np.ndarray, given: Learned) -> tuple[Learned, float]:
+        moved, stretch = settled_depth(gram, given)
+        stretches.append(stretch)
+        return moved, stretch
+
+    monkeypatch.setattr(joint_refinement, "settled_depth", settled)
+    head = gallery.face(20, 150, degrees=15)
+    tracks, _ = gallery.corrupt_tracks(head.tracks, noise=0.003, seed=0)
+    solution = solve(tracks, head.mesh)
+    assert stretches == [pytest.approx(1, abs=0.01)], "the candidates are not compared"
+    assert "depth_extent" not in solution.choices.reasons
+
+
+@pytest.mark.parametrize("y_up", [False, True])
+def test_of_two_mirror_images_the_one_that_bulges_toward_the_camera_is_taken(y_up: bool) -> None:
+    _, given = found(10, 0.5)
+    side = np.linspace(-1, 1, 9)
+    x, y = (each.ravel() for each in np.meshgrid(side, side))
+    bowl = np.stack([x, y, (-1 if y_up else 1) * (x**2 + y**2)])  # the rim lies behind the middle
+    bowl -= bowl.mean(axis=1, keepdims=True)
+    sample = (given.rotations[:, :2] @ bowl).transpose(0, 2, 1)
+    assert facing(given, sample, y_up=y_up) is given
+    hollow = facing(given, (given.rotations[:, :2] @ (np.array([[1], [1], [-1]]) * bowl)).transpose(0, 2, 1), y_up=y_up)
+    np.testing.assert_allclose(hollow.rotations, MIRROR @ given.rotations @ MIRROR)
