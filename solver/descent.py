@@ -2,8 +2,8 @@
 
 The number of reweightings is not known before. Three regularities predict it:
 
-- Where a point is hidden for ℓ frames, the equations link these frames in a chain, so that conjugate gradients need a number of iterations
-  proportional to ℓ, and reach their largest number for long chains. The errors that they leave make more reweightings necessary.
+- Where a point is hidden for ℓ frames, the equations link these frames in a chain: conjugate gradients need more iterations, and the errors
+  that they leave make more reweightings necessary.
 - The first reweightings, with large decreases of the objective, say nothing about the rest.
 - Afterwards the relative decrease falls slower than geometrically and faster than a power of the step; between the two lies the truth.
 """
@@ -13,13 +13,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-ITERATIONS_PER_UNSEEN_FRAME, FEWEST_ITERATIONS, MOST_ITERATIONS = 2.5, 5.0, 60.0
+ITERATIONS_PER_UNSEEN_FRAME, FEWEST_ITERATIONS, MOST_ITERATIONS = 0.5, 5.0, 60.0
 """Iterations of conjugate gradients in a reweighting per frame of `unseen_frames`, and where nothing is hidden; at most 60 are done.
-Measured on spheres of 24 to 60 frames, of which a point is hidden for 10 to 26 frames in a row: 30 to 61."""
+Measured on spheres of 24 to 60 frames, of which a point is hidden for 10 to 26 frames in a row: 6 to 12."""
 
-USUAL, PER_ITERATION = 6.0, 0.25
-"""Reweightings where all is seen (5 to 7), and how many more each iteration goes with where points are hidden (11 for 12 iterations, 13 for
-31, 20 for 61)."""
+USUAL, PER_UNSEEN_FRAME, MOST_USUAL = 6.0, 0.6, 20.0
+"""Reweightings where all is seen (5 to 7), how many more for each of `unseen_frames`, and the largest number that is expected. Measured on
+the same spheres: 11 to 20, with given cameras 31."""
 
 USUAL_AGAIN = 4.0
 """Reweightings after a correction of the tracks for perspective, which starts near the end."""
@@ -40,9 +40,9 @@ def expected_iterations(unseen: float) -> float:
     return min(max(ITERATIONS_PER_UNSEEN_FRAME * unseen, FEWEST_ITERATIONS), MOST_ITERATIONS)
 
 
-def expected_reweightings(iterations: float, *, hidden: bool) -> float:
-    """Return the usual number of reweightings of so many iterations."""
-    return USUAL + PER_ITERATION * iterations if hidden else USUAL
+def expected_reweightings(unseen: float) -> float:
+    """Return the usual number of reweightings, for points hidden for `unseen` frames in a row."""
+    return min(USUAL + PER_UNSEEN_FRAME * unseen, MOST_USUAL)
 
 
 def steps_left(last: float, before: float | None, taken: int, *, tolerance: float) -> float:
@@ -136,9 +136,7 @@ class Descent:
             max(before - after, 0.0) / max(abs(before), 1e-300)
             for before, after in zip(self.objectives, self.objectives[1:], strict=False)
         ]
-        usual = (
-            USUAL_AGAIN if self.corrected else expected_reweightings(self.iterations_ahead(), hidden=self.unseen > 0)
-        )
+        usual = USUAL_AGAIN if self.corrected else expected_reweightings(self.unseen)
         if not decreases:
             return usual + further
         if decreases[-1] <= self.tolerance:
@@ -153,13 +151,11 @@ class Descent:
         return min(left, max(self.most - taken, 0)) + further
 
     def iterations_ahead(self) -> float:
-        """Return the expected number of iterations of a further reweighting: they grow at first where points are hidden."""
+        """Return the expected number of iterations of a further reweighting: they fall in the end where points are hidden."""
         expected = expected_iterations(self.unseen)
         if self.reweightings == 0:
             return max(expected, float(self.current))
-        known = max(self.last, self.current)
-        grown = known * (1 + 2 / self.reweightings)
-        return max(known, min(expected, grown))
+        return min(self.last, expected) if self.unseen > 0 else float(self.last)
 
     def share(self) -> float:
         """Return the completed part, by the number of reweightings."""

@@ -21,7 +21,7 @@ from pliant.solver.cameras.scale import WIDEST, rigid_scales
 from pliant.solver.model import full_mode_covariance
 from pliant.solver.model.marginal_likelihood import fit
 from pliant.solver.model.model_order import ModelOrder, select_model_order
-from pliant.solver.model.shape_covariance import MAX_MODES, MIN_ITERATIONS, ShapeCovariance, learned
+from pliant.solver.model.shape_covariance import MAX_MODES, ShapeCovariance, learned
 from pliant.solver.model.so3 import angles_between, exponential
 from pliant.solver.monitor import enter
 from pliant.solver.records import Floats, read_only
@@ -36,6 +36,10 @@ LEARNED_FRAMES = 360
 REFINEMENT_ROUNDS = 5
 """Refinements of rotations and covariance, each with a new L-BFGS memory. EM in between would undo part of the gain,
 since it keeps modes and random walk apart."""
+
+START_EM_ROUNDS = 90
+"""Maximum number of EM rounds of a run before a refinement; L-BFGS, which follows, gains more in the same time. Error of faces
+of 99 frames with 60, 90 and 150: .0146, .0132, .0138; of 10 frames: .0542, .0541, .0584."""
 
 ROTATION_ITERATIONS = 60
 """L-BFGS iterations per refinement of the rotations."""
@@ -237,7 +241,7 @@ def _learned_at(
         max_modes=model_order.max_modes,
         noisy_start=model_order.noisy_start,
         ordered=model_order.ordered,
-        iterations=MIN_ITERATIONS,  # L-BFGS, which follows, gains more in the same time
+        iterations=START_EM_ROUNDS,
         should_stop=should_stop,
     )
     return Learned(rotations, scales, covariance, np.inf)

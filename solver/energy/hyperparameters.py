@@ -19,7 +19,7 @@ from pliant.solver.energy.problem import Weights
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.operators.mesh_laplacian import Laplacian
 from pliant.solver.settings import Settings
-from pliant.solver.tracks.noise import magnified
+from pliant.solver.tracks.noise import magnified, weighted_median
 from pliant.solver.tracks.normalization import Normalized
 
 PAPER = Weights(temporal=1e-3, spatial=1.0, low_rank=0.0, robust_scale=1e-3, order=1, rank_floor=1e-4)
@@ -119,18 +119,21 @@ def roughness_of(normalized: Normalized) -> Roughness:
     """Return noise and jumps of the tracks.
 
     The noise is the standard deviation of white noise with the same median absolute third difference over frames.
-    Smooth motion contributes little to it, and a median is robust to outliers. Short sequences use lower differences.
+    Smooth motion contributes little to it, and a median is robust to outliers. Short sequences use lower differences. A difference
+    weighs as much as the least confidence among its observations.
     """
     order = min(3, len(normalized.points) - 1)
     differences = np.abs(np.diff(normalized.points, n=order, axis=0))
-    whole = np.ones(differences.shape[:2], dtype=bool)
+    weight = np.ones(differences.shape[:2])
     for start in range(order + 1):
-        whole &= normalized.visible[start : start + len(differences)] > 0
+        weight = np.minimum(weight, normalized.visible[start : start + len(differences)])
+    whole = weight > 0
     if not whole.any():
         return Roughness(0.0, 0.0)
-    seen = differences[whole]
-    typical = 1.4826 * float(np.median(seen))
-    return Roughness(typical / magnified(order), float((seen.max(axis=1) > max(JUMP_RATIO * typical, MIN_JUMP)).mean()))
+    seen, weight = differences[whole], weight[whole]
+    typical = 1.4826 * weighted_median(seen.ravel(), np.repeat(weight, 2))
+    jumps = seen.max(axis=1) > max(JUMP_RATIO * typical, MIN_JUMP)
+    return Roughness(typical / magnified(order), float(weight[jumps].sum() / weight.sum()))
 
 
 def noise_std(covariance: ShapeCovariance) -> float:

@@ -38,7 +38,7 @@ MAX_NOISE_STD = 1e-3
 """Noise standard deviation, normalized units, above which the basis would fit noise and is not used: at .01 it raises
 the error of faces from .044 to .28."""
 
-MAX_STEPS, MAX_FRAME_STEPS, MAX_BASIS_FRAMES = 1200, 120_000, 160
+MAX_STEPS, MAX_FRAME_STEPS, MAX_BASIS_FRAMES = 2400, 240_000, 160
 """Maximum L-BFGS iterations, maximum product of iterations and frames, and maximum number of frames: bounds on the
 time."""
 

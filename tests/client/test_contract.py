@@ -100,6 +100,8 @@ def test_a_result_holds_arrays_report_and_job(client: Client, tmp_path: Path) ->
         result.rotations @ result.rotations.transpose(0, 2, 1), np.tile(np.eye(3), (6, 1, 1)), atol=1e-9
     )
     assert result.report["outcome"] in ("converged", "max_reweightings")
+    assert job.record.interpretation.estimate is not None
+    assert result.report["interpretation"]["estimate"] == job.record.interpretation.estimate.model_dump(mode="json")
     assert result.job.name == "one"
     assert updates[-1].status is Status.SUCCEEDED
     assert sent[-1][0] == sent[-1][1] > 0
@@ -134,6 +136,8 @@ def test_inspecting_returns_the_interpretation_without_creating_a_job(client: Cl
     interpretation = client.inspect(points, mesh="none", rotations=np.tile(np.eye(3), (6, 1, 1)))
     assert [job.id for job in client.list()] == before
     assert (interpretation.num_frames, interpretation.num_points, interpretation.has_rotations) == (6, 16, True)
+    assert interpretation.estimate is not None
+    assert interpretation.estimate.memory_bytes > 0
     assert interpretation.hidden_fraction == pytest.approx(1 / (6 * 16))
     job = client.submit(points, mesh="none", rotations=np.tile(np.eye(3), (6, 1, 1)))
     assert job.record.interpretation == interpretation

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from pliant.solver import InvalidInput, KnownCamera, Mesh, Settings, Tracks, solve
+from pliant.solver import InvalidInput, KnownCamera, Mesh, Outcome, Settings, Solution, Tracks, solve
 from pliant.solver.cameras.planar_ambiguity import poses
 from pliant.solver.cameras.scale import rigid_scales
 from pliant.solver.model.marginal_likelihood import LOWER, root_of
+from pliant.solver.model.so3 import exponential
 
 SEEDS = (2, 3, 6, 10, 12, 13, 17, 18, 19, 21, 22, 23)
 """Refused sequences, sequences whose cameras are given, and two whose cameras are estimated, which takes ten times as long."""
@@ -61,6 +62,89 @@ def test_small_sequences_give_finite_shapes_or_an_input_error(seed: int) -> None
         return
     for array in (found.shapes, found.residuals, found.weights, found.camera.scales, found.camera.translations):
         assert np.isfinite(array).all()
+
+
+def odd_points(kind: str, frames: int, points: int) -> np.ndarray:
+    """Tracks (F, P, 2) with something missing that a solver may take for granted; NaN is hidden."""
+    random = np.random.default_rng([frames, points])
+    shapes = random.normal(size=(points, 3)) + 0.1 * random.normal(size=(frames, points, 3))
+    turned = exponential(np.linspace(0, 1, frames)[:, None] * (0.0, 1.0, 0.0))
+    image = 100 + 20 * np.einsum("fij,fpj->fpi", turned[:, :2], shapes)
+    if kind == "duplicated frames":
+        image[1] = image[0]
+        image[-1] = image[-2]
+    elif kind == "duplicated points":
+        image[:, 1::2] = image[:, ::2][:, : image[:, 1::2].shape[1]]
+    elif kind == "constant":
+        image[:] = image[0]
+    elif kind == "one moving point":
+        image[:] = image[0]
+        image[:, 2] += 5.0 * np.arange(frames)[:, None]
+    elif kind == "one place but one":
+        image[:] = 100.0
+        image[:, 0] = 100 + np.arange(frames)[:, None]
+    elif kind == "hidden":
+        image[random.random(image.shape) < 0.15] = np.nan
+    elif kind == "a point seen once":
+        image[1:, 0] = np.nan
+    return image
+
+
+ODD = (
+    "duplicated frames", "duplicated points", "constant", "one moving point", "one place but one", "hidden", "a point seen once",
+)  # fmt: skip
+
+
+def assert_finite(found: Solution, visible: np.ndarray) -> None:
+    camera = found.camera
+    for array in (
+        found.shapes, found.residuals, found.weights, found.trace.objective, found.trace.residual,
+        camera.rotations, camera.scales, camera.translations, camera.project(found.shapes),
+    ):  # fmt: skip
+        assert np.isfinite(array).all()
+    if found.shapes_std is not None:
+        assert np.isfinite(found.shapes_std).all()
+    assert found.inlier_probability is not None
+    assert ((found.inlier_probability >= 0) & (found.inlier_probability <= 1) == visible).all()
+    assert np.isnan(found.inlier_probability[~visible]).all()
+    assert found.trust is not None
+    assert found.outcome is not Outcome.STOPPED
+
+
+def finite_or_refused(image: np.ndarray, cameras: KnownCamera | None, settings: Settings) -> None:
+    count = image.shape[1]
+    mesh = Mesh.from_faces([[index, index + 1, index + 2] for index in range(count - 2)], count)
+    refused, found = "", None
+    try:
+        found = solve(Tracks.from_arrays(image), mesh, cameras=cameras, settings=settings)
+    except InvalidInput as error:
+        refused = error.code
+    if found is None:
+        assert refused in {"too_little_seen", "nothing_visible", "no_extent"}
+    else:
+        assert_finite(found, np.isfinite(image).all(axis=2))
+
+
+@pytest.mark.parametrize("kind", ODD)
+@pytest.mark.parametrize(("frames", "points"), [(3, 4), pytest.param(5, 8, marks=pytest.mark.slow)])
+def test_odd_tracks_of_known_cameras_give_finite_results_or_an_input_error(kind: str, frames: int, points: int) -> None:
+    rotations = exponential(np.linspace(0, 1, frames)[:, None] * (0.0, 1.0, 0.0))
+    for settings in (Settings(order="film"), Settings(prior="smooth"), Settings(method="temporal")):
+        finite_or_refused(odd_points(kind, frames, points), KnownCamera.from_arrays(rotations), settings)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "constant",
+        "hidden",
+        *(pytest.param(each, marks=pytest.mark.long) for each in ODD if each not in ("constant", "hidden")),
+    ],
+)
+def test_odd_tracks_give_finite_results_or_an_input_error(kind: str) -> None:
+    finite_or_refused(odd_points(kind, 3, 5), None, Settings())
+    finite_or_refused(odd_points(kind, 4, 6), None, Settings(prior="smooth"))
 
 
 def test_a_covariance_without_extent_along_an_axis_still_has_a_root() -> None:

@@ -81,7 +81,7 @@ def read_inputs(
         given_frames=understood.points.shape[0], given_points=understood.points.shape[1],
         num_left_out=len(chosen.left_out), left_out_points=chosen.left_out[:LISTED].tolist(),
         notes=[*understood.notes, *chosen.notes, *truth_notes],
-        estimate=estimated(checked.num_frames, checked.num_points, options),
+        estimate=estimated(checked.num_frames, checked.num_points, options, has_rotations=cameras is not None),
         **({} if film is None else _stated(film, chosen.selection)),
     )  # fmt: skip
     texture = None if film is None or film.texture is None else film.texture.at_points(chosen.selection.points)

@@ -1,40 +1,75 @@
-"""Confidence between 0 and 1 weighs an observation in the completed tracks and their Gram matrix."""
+"""Fractional confidence is a weight: half of it twice is one of it once, and very little of it is none."""
 
 from __future__ import annotations
 
 import numpy as np
-from pliant.solver import Tracks, gallery
-from pliant.solver.tracks.completion import complete
+import pytest
+from pliant.solver import KnownCamera, Settings, Tracks, gallery, solve
+from pliant.solver.evaluation import metrics
+from pliant.solver.tracks.completion import coefficients_of, complete
+from pliant.solver.tracks.noise import weighted_median
 from pliant.solver.tracks.normalization import normalize
 
-
-def gram(points: np.ndarray, confidence: np.ndarray | None = None) -> np.ndarray:
-    """The Gram matrix in the tracks' unit, so that those of differently weighted tracks compare."""
-    normalized = normalize(Tracks.from_arrays(points, confidence))
-    return np.asarray(complete(normalized).gram * normalized.unit**2)
-
-
-def noisy() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    random = np.random.default_rng(0)
-    clean = np.array(gallery.face(12, 80, degrees=60).tracks.points)
-    poor = random.random(clean.shape[:2]) < 0.2
-    size = 0.05 * np.std(clean)
-    return clean, clean + size * poor[..., None] * random.normal(size=clean.shape), poor
+MADE = gallery.face(10, 60, degrees=60)
+RNG = np.random.default_rng(5)
+POINTS = np.array(MADE.tracks.points)
+WRONG = RNG.random(POINTS.shape[:2]) < 0.05
+SPOILED = np.where(WRONG[..., None], POINTS + 150.0, POINTS)
+LITTLE, NOTHING = np.where(WRONG, 1e-6, 1.0), np.where(WRONG, 0.0, 1.0)
 
 
-def test_observations_of_little_confidence_count_little() -> None:
-    clean, points, poor = noisy()
-    truth = gram(clean)
-    trusted = np.abs(gram(points) - truth).max()
-    doubted = np.abs(gram(points, np.where(poor, 0.05, 1.0)) - truth).max()
-    half = np.abs(gram(points, np.where(poor, 0.5, 1.0)) - truth).max()
-    assert doubted < 0.7 * trusted
-    assert doubted < half < trusted
-
-
-def test_only_the_ratios_of_confidences_count() -> None:
-    _, points, poor = noisy()
-    np.testing.assert_allclose(
-        gram(points, np.where(poor, 0.1, 0.4)), gram(points, np.where(poor, 0.25, 1.0)), rtol=1e-9, atol=1e-9
+def test_a_point_given_twice_with_shared_confidence_is_a_point_given_once() -> None:
+    share = RNG.uniform(0.1, 0.9, POINTS.shape[:2])
+    once = normalize(Tracks.from_arrays(POINTS))
+    twice = normalize(
+        Tracks.from_arrays(np.concatenate([POINTS, POINTS], axis=1), np.concatenate([share, 1 - share], axis=1))
     )
-    np.testing.assert_allclose(gram(points, np.full(poor.shape, 0.3)), gram(points), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(twice.centroid, once.centroid, rtol=1e-12)
+    assert twice.unit == pytest.approx(once.unit, rel=1e-12)
+
+
+def test_a_frame_given_twice_with_shared_confidence_is_a_frame_given_once() -> None:
+    basis, points = RNG.normal(size=(10, 2, 4)), normalize(MADE.tracks).points
+    weight, spread = RNG.uniform(0.2, 1.0, points.shape[:2]), np.diag([3.0, 2.0, 1.0])
+    once, _ = coefficients_of(points, weight, basis, spread, 0.1, sweeps=1)
+    part = RNG.uniform(0.1, 0.9, weight.shape)
+    twice, _ = coefficients_of(
+        np.concatenate([points, points]), np.concatenate([part * weight, (1 - part) * weight]),
+        np.concatenate([basis, basis]), spread, 0.1, sweeps=1,
+    )  # fmt: skip
+    np.testing.assert_allclose(twice, once, rtol=2e-6, atol=1e-6)  # the ridge is relative to the mean frame
+
+
+def test_a_value_of_weight_n_counts_n_times_in_the_median() -> None:
+    values, counts = RNG.normal(size=31), RNG.integers(1, 5, size=31)
+    repeated = np.sort(np.repeat(values, counts))
+    assert weighted_median(values, counts.astype(float)) == repeated[(len(repeated) - 1) // 2]
+    assert weighted_median(values, np.full(31, 0.3)) == np.median(values)
+
+
+def test_only_the_ratios_of_confidences_count_in_the_completion() -> None:
+    weight = RNG.uniform(0.3, 1.0, POINTS.shape[:2])
+    weight[0, 0] = 1.0
+    full, half = (complete(normalize(Tracks.from_arrays(SPOILED, weight * factor))) for factor in (1.0, 0.5))
+    np.testing.assert_allclose(half.gram, full.gram, rtol=1e-9, atol=1e-9)
+    assert half.outliers == pytest.approx(full.outliers)
+
+
+def test_wrong_observations_of_little_confidence_are_as_good_as_hidden_in_the_completion() -> None:
+    little, hidden, trusted = (
+        complete(normalize(Tracks.from_arrays(SPOILED, visible))) for visible in (LITTLE, NOTHING, None)
+    )
+    assert trusted.outliers > 0.03
+    assert little.outliers < 1e-5
+    np.testing.assert_allclose(little.gram, hidden.gram, atol=3e-3 * np.abs(hidden.gram).max())
+
+
+@pytest.mark.parametrize("settings", [Settings(prior="smooth"), Settings(order="film")], ids=["smooth", "gaussian"])
+def test_wrong_observations_of_little_confidence_are_as_good_as_hidden_in_a_solve(settings: Settings) -> None:
+    cameras = KnownCamera.from_arrays(MADE.rotations, MADE.scales)
+    little, hidden = (
+        solve(Tracks.from_arrays(SPOILED, visible), MADE.mesh, cameras=cameras, settings=settings)
+        for visible in (LITTLE, NOTHING)
+    )
+    assert metrics.e3d_frame(little.shapes, hidden.shapes) < 0.01
+    assert "outliers" not in little.choices.reasons

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -72,6 +73,23 @@ def test_what_fits_is_what_the_estimate_says() -> None:
             < estimated(frames + 1, 1000, options).memory_bytes
         )
     assert largest_that_fits(LIBRARIES - 1, 50, 1000, Options()) == (0, 0)
+
+
+SECONDS = (
+    (10, 500, {}, 2.4), (100, 500, {}, 12.4), (20, 1_000, {}, 3.3), (30, 5_000, {}, 5.1), (80, 300, {}, 9.5), (10, 20_000, {}, 3.3),
+    (100, 500, {"prior": "smooth"}, 5.2), (30, 5_000, {"prior": "smooth"}, 2.1), (100, 500, {"has_rotations": True}, 4.4),
+    (30, 5_000, {"has_rotations": True}, 2.2),
+)  # fmt: skip
+"""Frames, points, what is not the default, and processor seconds that were measured."""
+
+
+@pytest.mark.parametrize(("frames", "points", "given", "seconds"), SECONDS)
+def test_the_time_is_within_a_factor_of_two_of_what_was_measured(
+    frames: int, points: int, given: dict[str, Any], seconds: float
+) -> None:
+    options = Options(**{name: value for name, value in given.items() if name == "prior"})
+    estimate = estimated(frames, points, options, has_rotations="has_rotations" in given)
+    assert seconds / 2 < estimate.seconds < 2 * seconds
 
 
 def interpretation(frames: int, points: int) -> Interpretation:
