@@ -282,7 +282,9 @@ def test_a_slow_receiver_delays_no_other_messages(
         quick = made(receiver.url)
         until(lambda: "Webhook delivered" in door.log(quick.id))
         assert len(slow.got) == PER_RECEIVER, "the others wait their turn"
-        until(lambda: webhook_sender.outbox.owed() == 2 * CONCURRENT)  # the log is written before the message is removed
+        until(
+            lambda: webhook_sender.outbox.owed() == 2 * CONCURRENT
+        )  # the log is written before the message is removed
         assert door.records.tallies()["webhooks:tried"] == PER_RECEIVER + 1, (
             "a message that was postponed was not tried"
         )
