@@ -39,7 +39,7 @@ since it keeps modes and random walk apart."""
 
 START_EM_ROUNDS = 90
 """Maximum number of EM rounds of a run before a refinement; L-BFGS, which follows, gains more in the same time. Error of faces
-of 99 frames with 60, 90 and 150: .0146, .0132, .0138; of 10 frames: .0542, .0541, .0584."""
+of 99 frames with 60, 90 and 150: .0146, .0132, .0138, differences that may be chance."""
 
 ROTATION_ITERATIONS = 60
 """L-BFGS iterations per refinement of the rotations."""
