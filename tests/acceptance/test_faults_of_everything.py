@@ -24,6 +24,9 @@ WANTED = (
     "cancel_exporting",
 )  # fmt: skip
 
+AGAIN = {"valkey_down", "api_uploading", "frozen", "cancel_loading"}
+"""Those that `tests/hosts` or a cancelled job in another state covers as well."""
+
 
 @pytest.fixture(scope="module", autouse=True)
 def root() -> Iterator[None]:
@@ -39,7 +42,9 @@ def instance(root: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[A
         yield instance
 
 
-@pytest.mark.parametrize("name", WANTED)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.long) if name in AGAIN else name for name in WANTED]
+)
 def test_nothing_is_lost_duplicated_half_written_or_left_over(instance: Any, name: str) -> None:
     listed = import_module("benchmarks.installation.faults").FAULTS
     _, inject = listed[name]

@@ -107,7 +107,7 @@ def killing(installation: Installation) -> Iterator[Callable[[str], None]]:
 
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="finds the service's process through /proc")
-@pytest.mark.parametrize("what", ["everything", "service"])
+@pytest.mark.parametrize("what", ["everything", pytest.param("service", marks=pytest.mark.long)])
 def test_the_client_survives_a_killed_service_while_waiting_and_downloading(
     installation: Installation, killing: Callable[[str], None], tmp_path: Path, what: str
 ) -> None:

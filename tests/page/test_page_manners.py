@@ -45,8 +45,14 @@ def test_an_example_is_run_with_the_keyboard_only(page: Page) -> None:
     assert differing_pixels(page, before, canvas.screenshot()) > 0.01
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("width", [1280, 390])
+@pytest.mark.parametrize(
+    ("width", "scheme"),
+    [
+        (1280, "light"),
+        (390, "dark"),
+        *(pytest.param(*other, marks=pytest.mark.long) for other in ((1280, "dark"), (390, "light"))),
+    ],
+)
 def test_there_are_no_accessibility_findings_and_no_overflow(
     page: Page, url: str, finished: str, scheme: str, width: int
 ) -> None:
