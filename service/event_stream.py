@@ -85,7 +85,9 @@ class Followers:
             known = await run_in_threadpool(jobs.events, id, after=after)
             last = after or "0-0"
             if not known and (await run_in_threadpool(jobs.get, id)).status.final:
-                return  # nothing follows the last event of a finished job
+                known = await run_in_threadpool(jobs.events, id, after=after)  # it may have ended between the two reads
+                if not known:
+                    return  # nothing follows the last event of a finished job
             while True:
                 for event in known:
                     last = event.id

@@ -1,8 +1,10 @@
 """Whether frames come in the order of a film, and an order of their own for photographs.
 
 If a point's image walks from frame to frame, its step has variance s² given the frame before; if frames are independent, its image has
-variance v about the mean, and two frames differ by 2v. The walk is the more probable of the two where s² < v: where the mean squared
-difference of neighbouring frames is less than half of that of any two frames.
+variance v about the mean, and two frames differ by 2v. The walk is the more probable of the two where s² < v: where the squared
+difference of neighbouring frames is less than half of that of any two frames. The difference of two frames is the mean over the points or
+their median, whichever shows a walk: gross outliers, which differ as much between neighbours as between any frames, decide a mean, and
+points that stand still a median.
 
 Photographs in no order are put in an order that follows from their content, so that nothing depends on the order that they came in: each
 frame is followed by the most similar one that is left.
@@ -10,6 +12,7 @@ frame is followed by the most similar one that is left.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -17,9 +20,14 @@ from numpy.typing import NDArray
 from pliant.solver.errors import InvalidSettings
 from pliant.solver.records import Camera, Floats, KnownCamera, Solution, Tracks, read_only
 from pliant.solver.settings import Settings
+from pliant.solver.tracks.noise import weighted_median
 
 WALK_SHARE = 0.5
-"""Mean squared difference of neighbouring frames over that of any two below which the walk is more probable; see above."""
+"""Squared difference of neighbouring frames over that of any two below which the walk is more probable; see above. Recorded films, with up
+to 20 % gross outliers, have at most .40, photographs and shuffled films at least .74."""
+
+MAX_PAIRS, MAX_POINTS = 200, 2000
+"""Maximum numbers of pairs of frames and of points that are compared; they bound time and memory."""
 
 MAX_UNORDERED_FRAMES = 360
 """Maximum number of photographs: all of them are learned from, since between photographs nothing can be interpolated
@@ -41,9 +49,9 @@ def resolved_order(tracks: Tracks, settings: Settings) -> tuple[Settings, str]:
         )  # fmt: skip
     if settings.order != "auto":
         return settings, f"Frames in {'the order of a film' if settings.order == 'film' else 'no order'}, as set."
-    share = step_share(differences(tracks))
+    share = step_share(tracks)
     found = (
-        f"neighbouring frames differ by {share:.2f} of what any two frames differ by, mean squares; the walk of a film is more probable "
+        f"neighbouring frames differ by {share:.2f} of what any two frames differ by, squared; the walk of a film is more probable "
         f"below {WALK_SHARE:g}"
     )
     if share < WALK_SHARE or not np.isfinite(share):
@@ -74,14 +82,42 @@ def differences(tracks: Tracks) -> Floats:
     return np.asarray(found)
 
 
-def step_share(between: Floats) -> float:
-    """Return the mean squared difference of neighbouring frames over that of any two; NaN where nothing moves or can be compared."""
-    steps = np.diag(between, 1)
-    pairs = between[np.triu_indices(len(between), 1)]
-    steps, pairs = steps[np.isfinite(steps)], pairs[np.isfinite(pairs)]
-    if len(steps) == 0 or not pairs.mean() > 0:
-        return float("nan")
-    return float(steps.mean() / pairs.mean())
+def step_share(tracks: Tracks) -> float:
+    """Return the squared difference of neighbouring frames over that of any two; NaN where nothing moves or can be compared.
+
+    Differences are averaged over pairs of frames. Of two frames it is the mean or the median over their common points, weighted by the
+    products of their confidences; the smaller of the two results is returned.
+    """
+    every = -(-tracks.num_points // MAX_POINTS)
+    points, weight = tracks.points[:, ::every], tracks.visible[:, ::every]
+    first, second = np.triu_indices(tracks.num_frames, 1)
+    some, steps = _spread(len(first)), _spread(tracks.num_frames - 1)
+    any_two = _typical(points, weight, zip(first[some], second[some], strict=True))
+    neighbours = _typical(points, weight, zip(steps, steps + 1, strict=True))
+    shares = [near / far for near, far in zip(neighbours, any_two, strict=True) if far > 0]
+    return min(shares, default=float("nan"))
+
+
+def _spread(count: int) -> NDArray[np.intp]:
+    """Return at most `MAX_PAIRS` of the numbers below count, evenly spread."""
+    return np.unique(np.linspace(0, count - 1, min(count, MAX_PAIRS)).round().astype(np.intp))
+
+
+def _typical(points: Floats, weight: Floats, pairs: Iterable[tuple[int, int]]) -> tuple[float, float]:
+    """Return mean and median over points of the squared difference, averaged over the pairs with points in common; NaN if none has.
+
+    The median motion of the points between two frames does not count.
+    """
+    found = []
+    for first, second in pairs:
+        trust = weight[first] * weight[second]
+        common = trust > 0
+        if common.any():
+            moved = points[first, common] - points[second, common]
+            squared = np.square(moved - np.median(moved, axis=0)).sum(axis=1)
+            found.append((np.average(squared, weights=trust[common]), weighted_median(squared, trust[common])))
+    mean, median = np.mean(found, axis=0) if found else (np.nan, np.nan)
+    return float(mean), float(median)
 
 
 def content_order(between: Floats) -> NDArray[np.intp]:

@@ -14,10 +14,12 @@ from collections.abc import Iterator
 from datetime import timedelta
 from itertools import pairwise
 from pathlib import Path
+from typing import cast
 
 import httpx
 import pytest
-from pliant.service.event_stream import WOKEN_AT_ONCE, _Watcher
+from pliant.service.event_stream import WOKEN_AT_ONCE, Followers, _Watcher, is_final
+from pliant.worker.jobs.service import Jobs
 from pliant.worker.records import Event, utc_now
 from pliant.worker.settings import Settings
 from serving import Running, Serve, claim, finish, form, submit, tracks, until
@@ -65,6 +67,30 @@ def test_between_followers_the_service_answers_others() -> None:
     seen = asyncio.run(turns())
     assert seen[-1] == 4 * WOKEN_AT_ONCE
     assert max(after - before for before, after in pairwise([0, *seen])) <= WOKEN_AT_ONCE
+
+
+def test_a_job_that_ends_between_two_reads_is_followed_to_its_end(running: Running, http: httpx.Client) -> None:
+    job = submit(http, name="ends")
+    seen = running.jobs.events(job.id)[-1].id
+
+    class Ending:
+        """Jobs of which this one ends after its events were read."""
+
+        records, get = running.jobs.records, staticmethod(running.jobs.get)
+
+        @staticmethod
+        def events(id: str, *, after: str) -> list[Event]:
+            found = running.jobs.events(id, after=after)
+            if not running.jobs.get(id).status.final:
+                finish(running, id, b"result")
+            return found
+
+    async def followed() -> list[Event | None]:
+        return [event async for event in Followers().follow(cast(Jobs, Ending()), job.id, after=seen)]
+
+    last = asyncio.run(followed())[-1]
+    assert last is not None
+    assert is_final(last)
 
 
 def test_a_client_that_disconnects_is_forgotten(restless: Running) -> None:

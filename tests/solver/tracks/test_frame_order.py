@@ -49,10 +49,32 @@ def test_a_film_and_shuffled_frames_are_told_apart() -> None:
     settings, why = resolved_order(shuffled(FACE.tracks), Settings())
     assert settings.order == "any"
     assert "no order" in why
-    assert step_share(differences(shuffled(FACE.tracks))) > 2 * step_share(differences(FACE.tracks))
+    assert step_share(shuffled(FACE.tracks)) > 2 * step_share(FACE.tracks)
     assert resolved_order(shuffled(FACE.tracks), Settings(prior="smooth"))[0].order == "film"
     still = Tracks.from_arrays(np.tile(FACE.tracks.points[:1], (4, 1, 1)))
     assert resolved_order(still, Settings())[0].order == "film"
+
+
+@pytest.mark.parametrize("share", [0.02, 0.1, 0.2])
+def test_gross_outliers_do_not_turn_a_film_into_photographs(share: float) -> None:
+    film = gallery.face(20, 200)
+    order = np.random.default_rng(1).permutation(20)
+    spoiled = gallery.corrupt(film, outliers=share, seed=0).tracks
+    assert resolved_order(spoiled, Settings())[0].order == "film"
+    assert resolved_order(shuffled(spoiled, order), Settings())[0].order == "any"
+
+
+def test_points_that_stand_still_do_not_count() -> None:
+    film = gallery.face(20, 60).tracks
+    still = np.tile(film.points[:1], (1, 3, 1)) + np.random.default_rng(0).normal(0, 0.2, (20, 3 * film.num_points, 2))
+    mixed = Tracks.from_arrays(np.concatenate([film.points, still], axis=1))
+    assert resolved_order(mixed, Settings())[0].order == "film"
+    assert resolved_order(shuffled(mixed, np.random.default_rng(1).permutation(20)), Settings())[0].order == "any"
+
+
+def test_the_order_is_not_known_where_no_two_frames_have_a_point_in_common() -> None:
+    apart = Tracks.from_arrays(np.random.default_rng(0).normal(size=(3, 9, 2)), np.kron(np.eye(3), np.ones(3)))
+    assert np.isnan(step_share(apart))
 
 
 def test_the_order_of_their_own_follows_from_the_content() -> None:
