@@ -110,11 +110,11 @@ def search(
     def judge(curvature: float) -> None:
         trial = trials[0.0]
         for _ in range(UPDATES):
-            depth = depth_map(rotations[used], scales[used], trial.covariance)
-            depths = depths_of(depth, some, curvature, start=trial.depths)
             try:
+                depth = depth_map(rotations[used], scales[used], trial.covariance)
+                depths = depths_of(depth, some, curvature, start=trial.depths)
                 covariance = _learn(some, depths, curvature, projections, model_order)
-            except np.linalg.LinAlgError:  # depths beyond any measure, to which no covariance can be learned
+            except np.linalg.LinAlgError:  # depths beyond any measure
                 trial = replace(trial, curvature=curvature, nll=UNLIKELY)
                 break
             trial = _Trial(curvature, covariance.nll + density(depths, curvature), depths, covariance)

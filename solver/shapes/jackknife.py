@@ -87,13 +87,16 @@ def learning_std(
     if sample.shape[1] <= FEWEST:
         return np.zeros(shapes.shape[:2])
     part_of = parts(sample)
-    everything = _shapes_from(sample, np.ones(len(part_of), dtype=bool), start, turning)
     without = []
-    for part in np.unique(part_of):
-        if should_stop is not None and should_stop():
-            return np.zeros(shapes.shape[:2])
-        if (part_of != part).sum() >= FEWEST:
-            without.append(_onto(_shapes_from(sample, part_of != part, start, turning), everything))
+    try:
+        everything = _shapes_from(sample, np.ones(len(part_of), dtype=bool), start, turning)
+        for part in np.unique(part_of):
+            if should_stop is not None and should_stop():
+                return np.zeros(shapes.shape[:2])
+            if (part_of != part).sum() >= FEWEST:
+                without.append(_onto(_shapes_from(sample, part_of != part, start, turning), everything))
+    except np.linalg.LinAlgError:  # a prior of unbounded depth, whose posterior alone is too wide for any trust
+        return np.zeros(shapes.shape[:2])
     if len(without) < 2:
         return np.zeros(shapes.shape[:2])
     squared = _mean_squared_change(np.stack(without), everything)

@@ -220,7 +220,8 @@ def _sample(weights: Floats, seed: int) -> NDArray[np.intp]:
 def _predicted(everything: Floats, weights: Floats, sample: NDArray[np.intp], exact: Floats) -> Floats:
     """Return variances `(F, P)`: those evaluated, and for the others the mean ratio to `everything` in their class."""
     kind = np.digitize(_gaps(weights), GAPS[1:])
-    ratio = exact / np.maximum(everything[:, sample], np.finfo(float).tiny)
+    rounding = np.finfo(float)
+    ratio = exact / np.maximum(everything[:, sample], np.maximum(rounding.eps * exact, rounding.tiny))
     sampled = kind[:, sample]
     factors = np.ones(len(GAPS))
     for each in range(len(GAPS)):
