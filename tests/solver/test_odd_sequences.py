@@ -11,7 +11,7 @@ from pliant.solver.model.marginal_likelihood import LOWER, root_of
 from pliant.solver.model.so3 import exponential
 
 SEEDS = (2, 3, 4, 6, 10, 12, 13, 17, 18, 19, 21, 22, 23, 45, 71, 91)
-"""Refused sequences, sequences whose cameras are given, and two whose cameras are estimated, which takes ten times as long."""
+"""Refused sequences, sequences whose cameras are given, and some whose cameras are estimated, which takes ten times as long."""
 
 MORE_SEEDS = tuple(set(range(24)) - set(SEEDS))
 """Sequences whose cameras are estimated."""
