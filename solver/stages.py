@@ -17,8 +17,9 @@ UNIT_SECONDS, FRAME_SECONDS = 7e-5, 1.3e-5
 """Seconds per unit of work, and per unit and frame, on one core: .2 ms at 10 frames, .46 at 30, .7 at 48, 1 at 74. The other times
 below are of the same core."""
 
-ITERATION_SECONDS = {True: 2.5e-7, False: 1e-7}
-"""Seconds per iteration of conjugate gradients, frame and point, with and without a learned prior; measured 2.1e-7 to 3e-7 and 1e-7."""
+ITERATION_SECONDS = {True: 1.2e-7, False: 1e-7}
+"""Seconds per iteration of conjugate gradients, frame and point, with and without a learned prior; measured 0.9e-7 to 1.1e-7 for 60 × 4,000,
+50 × 9,000 and 99 × 6,000."""
 
 SETUP_SECONDS = 0.1
 """Of the shapes."""
@@ -52,10 +53,10 @@ that are tried end at 40; and the growth of the time from one rank to the next."
 UNITS = {
     "multistart": (1600, 120, 1.3),
     "model_order": (1000, 360, 0.6),
-    "starts": (1365, 40, 0.8),
+    "starts": (1740, 40, 0.8),
     "perspective": (10, 360, 30.0),
-    "scales": (670, 120, 0.85),
-    "refinement": (1000, 360, 1.1),
+    "scales": (820, 120, 0.85),
+    "refinement": (1500, 360, 1.1),
     "covariance": (380, 360, 1.0),
     "trust": (6, 100, 130.0),
 }
@@ -65,7 +66,7 @@ Measured on sequences of 10 to 80 frames, clean and spoiled."""
 PACE_PRIOR = 0.5
 """Seconds of the plan that count as measured at the planned pace, so that the first units do not decide the pace alone."""
 
-REFINEMENT_UNITS = {True: 1660, False: 185}
+REFINEMENT_UNITS = {True: 2930, False: 185}
 """Units of the stage `refinement` where the covariance may couple the modes, and where the model order rules that out. The plan has a
 number between, until this is known."""
 
@@ -75,7 +76,7 @@ LOAD_SECONDS, LOAD_PRIOR = 20.0, 1.0
 OWN_PACE = 4.0
 """Weight of a stage's own pace, per completed share of it, beside that of all stages: its units take about the same time."""
 
-UNITS_PER_START = 273
+UNITS_PER_START = 348
 """Units that one starting point of the stage `starts` takes."""
 
 

@@ -172,7 +172,7 @@ def test_points_hidden_for_long_make_more_and_longer_reweightings() -> None:
     assert first.iterations_ahead() == 58, "the reweighting under way already has more"
     size = {"gaussian": True, "known_cameras": False, "sheet": False}
     seconds = [
-        {stage.name: stage.seconds for stage in planned(40, 1000, unseen=each, **size)}["shapes"]
+        {stage.name: stage.seconds for stage in planned(40, 10_000, unseen=each, **size)}["shapes"]
         for each in (0.0, 20.0)
     ]
     assert seconds[1] > 4 * seconds[0]
