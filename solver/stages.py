@@ -18,8 +18,8 @@ UNIT_SECONDS, FRAME_SECONDS = 7e-5, 1.3e-5
 below are of the same core."""
 
 ITERATION_SECONDS = {True: 1.2e-7, False: 1e-7}
-"""Seconds per iteration of conjugate gradients, frame and point, with and without a learned prior; measured 0.9e-7 to 1.1e-7 for 60 × 4,000,
-50 × 9,000 and 99 × 6,000."""
+"""Seconds per iteration of conjugate gradients, frame and point, with and without a learned prior; measured 0.9e-7 to 1.1e-7
+for 60 × 4,000, 50 × 9,000 and 99 × 6,000."""
 
 SETUP_SECONDS = 0.1
 """Of the shapes."""
