@@ -95,8 +95,10 @@ def learning_std(
                 return np.zeros(shapes.shape[:2])
             if (part_of != part).sum() >= FEWEST:
                 without.append(_onto(_shapes_from(sample, part_of != part, start, turning), everything))
-    except np.linalg.LinAlgError:  # a prior of unbounded depth, whose posterior alone is too wide for any trust
-        return np.zeros(shapes.shape[:2])
+    except (
+        np.linalg.LinAlgError
+    ):  # depth without bounds: nothing is known, so every position is as uncertain as the object is large
+        return np.asarray(np.linalg.norm(centred(shapes), axis=2))
     if len(without) < 2:
         return np.zeros(shapes.shape[:2])
     squared = _mean_squared_change(np.stack(without), everything)

@@ -76,6 +76,13 @@ def test_hardly_any_points_or_a_request_to_stop_give_zero() -> None:
     assert (learning_std(estimate, covariance, shapes, turning=True, should_stop=lambda: True) == 0).all()
 
 
+def test_a_depth_without_bounds_makes_every_position_as_uncertain_as_the_object_is_large() -> None:
+    estimate, covariance, shapes = seen(20)
+    unbounded = replace(covariance, mean_covariance=np.full((3, 3), 1e30))
+    found = learning_std(estimate, unbounded, shapes, turning=False)
+    np.testing.assert_allclose(found, np.linalg.norm(shapes - shapes.mean(axis=1, keepdims=True), axis=2))
+
+
 def test_parts_are_compact_and_hold_every_point() -> None:
     rng = np.random.default_rng(0)
     corners = np.array([[x, y] for x in (-5.0, 5.0) for y in (-5.0, 0.0, 5.0)])

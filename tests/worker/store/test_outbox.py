@@ -280,7 +280,7 @@ def test_a_slow_receiver_delays_no_other_messages(
         webhook_sender.start()
         until(lambda: len(slow.got) == PER_RECEIVER)
         quick = made(receiver.url)
-        until(lambda: "Webhook delivered" in door.log(quick.id))
+        until(lambda: "Webhook delivered" in door.log(quick.id), seconds=5)
         assert len(slow.got) == PER_RECEIVER, "the others wait their turn"
         until(
             lambda: webhook_sender.outbox.owed() == 2 * CONCURRENT
