@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.cameras.bas_relief import DECIDED, facing, settled_depth
-from pliant.solver.cameras.covariance_learning import LearningData, learn_covariance
+from pliant.solver.cameras.covariance_learning import LearningData
 from pliant.solver.cameras.depth_rounds import settled, settled_again
 from pliant.solver.cameras.estimation import CameraEstimate, restarted
 from pliant.solver.cameras.learned import Learned, motion_of, moved_to, scene_at
@@ -21,7 +21,7 @@ from pliant.solver.cameras.scale import WIDEST, rigid_scales
 from pliant.solver.model import full_mode_covariance
 from pliant.solver.model.marginal_likelihood import fit
 from pliant.solver.model.model_order import ModelOrder, select_model_order
-from pliant.solver.model.shape_covariance import MAX_MODES, ShapeCovariance, learned
+from pliant.solver.model.shape_covariance import MAX_MODES, learned
 from pliant.solver.model.so3 import angles_between, exponential
 from pliant.solver.monitor import enter
 from pliant.solver.records import Floats, read_only
@@ -66,25 +66,6 @@ frames gains .058, none up to .04."""
 
 MIN_SCALE_STD = 0.01
 """Standard deviation of log s below which scales stay 1."""
-
-
-def learn(
-    estimate: CameraEstimate,
-    shown: NDArray[np.bool_],
-    *,
-    turning: bool,
-    estimates_scales: bool = False,
-    seed: int = 0,
-    normalized: Normalized | None = None,
-    y_up: bool = False,
-    should_stop: Callable[[], bool] | None = None,
-) -> tuple[CameraEstimate, ShapeCovariance]:
-    """Return the cameras of `refine_cameras` and the covariance of `learn_covariance`."""
-    estimate, data = refine_cameras(
-        estimate, shown, turning=turning, estimates_scales=estimates_scales, seed=seed, normalized=normalized,
-        y_up=y_up, should_stop=should_stop,
-    )  # fmt: skip
-    return learn_covariance(estimate, data, seed=seed, should_stop=should_stop)
 
 
 def refine_cameras(

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from learning import learn
 from pliant.solver import Settings, gallery
 from pliant.solver.cameras import joint_refinement
 from pliant.solver.cameras.estimation import MAX_START_DEPTH_VARIANCE, CameraEstimate, estimate_cameras, restarted
-from pliant.solver.cameras.joint_refinement import learn
 from pliant.solver.cameras.multistart import depth
 from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.shape_covariance import MAX_MODES

@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from learning import learn
 from pliant.solver import KnownCamera, Settings, gallery, solve
 from pliant.solver.cameras.estimation import CameraEstimate
-from pliant.solver.cameras.joint_refinement import informative_frames, learn
+from pliant.solver.cameras.joint_refinement import informative_frames
 from pliant.solver.evaluation import metrics
 from pliant.solver.model.random_walk import random_walk
 from pliant.solver.model.shape_covariance import (

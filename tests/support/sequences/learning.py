@@ -1,0 +1,17 @@
+"""Cameras and covariance in one call, as a solve learns them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from pliant.solver.cameras.covariance_learning import learn_covariance
+from pliant.solver.cameras.estimation import CameraEstimate
+from pliant.solver.cameras.joint_refinement import refine_cameras
+from pliant.solver.model.shape_covariance import ShapeCovariance
+
+
+def learn(estimate: CameraEstimate, shown: np.ndarray, **more: Any) -> tuple[CameraEstimate, ShapeCovariance]:
+    """Return the cameras of `refine_cameras` and the covariance of `learn_covariance`."""
+    refined, data = refine_cameras(estimate, shown, **more)
+    return learn_covariance(refined, data, should_stop=more.get("should_stop"))
