@@ -17,8 +17,8 @@ from pliant.solver.cameras.focal_length import refined_with_focal
 from pliant.solver.cameras.learned import Learned
 from pliant.solver.cameras.multistart import CANDIDATES
 from pliant.solver.cameras.perspective import MIRROR, Perspective, centred, columns, corrected, depth_map, depths_of
+from pliant.solver.model.expectation_maximisation import annealed
 from pliant.solver.model.model_order import ModelOrder
-from pliant.solver.model.shape_covariance import annealed
 from pliant.solver.model.so3 import nearest
 from pliant.solver.records import Floats
 

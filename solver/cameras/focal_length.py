@@ -30,9 +30,10 @@ from pliant.solver.cameras.perspective import (
     depth_map,
     depths_of,
 )
+from pliant.solver.model.expectation_maximisation import annealed
 from pliant.solver.model.marginal_likelihood import CAMERA_PRIOR_WEIGHT, UNLIKELY, Motion, energy_with_inverse
 from pliant.solver.model.model_order import ModelOrder
-from pliant.solver.model.shape_covariance import ShapeCovariance, annealed
+from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.records import Floats
 from scipy.optimize import minimize
 

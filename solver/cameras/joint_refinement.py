@@ -19,9 +19,9 @@ from pliant.solver.cameras.estimation import CameraEstimate, restarted
 from pliant.solver.cameras.learned import Learned, motion_of, moved_to, scene_at
 from pliant.solver.cameras.scale import WIDEST, rigid_scales
 from pliant.solver.model import full_mode_covariance
+from pliant.solver.model.expectation_maximisation import MAX_MODES, learned
 from pliant.solver.model.marginal_likelihood import fit
 from pliant.solver.model.model_order import ModelOrder, select_model_order
-from pliant.solver.model.shape_covariance import MAX_MODES, learned
 from pliant.solver.model.so3 import angles_between, exponential
 from pliant.solver.monitor import enter
 from pliant.solver.records import Floats, read_only

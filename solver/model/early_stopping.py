@@ -16,16 +16,16 @@ from dataclasses import replace
 from itertools import islice
 
 import numpy as np
-from pliant.solver.model.model_order import MIN_JUDGED_POINTS, MIN_NLL_GAIN, ModelOrder, held_out_nll
-from pliant.solver.model.shape_covariance import (
+from pliant.solver.model.expectation_maximisation import (
     ANNEALING_START,
     MAX_MODES,
     WALK_VARIANCE_FLOOR,
-    ShapeCovariance,
     learned,
     rounds,
     scratch,
 )
+from pliant.solver.model.model_order import MIN_JUDGED_POINTS, MIN_NLL_GAIN, ModelOrder, held_out_nll
+from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.records import Floats
 from pliant.solver.tracks.completion import MAX_SAMPLE_POINTS
 
@@ -61,7 +61,7 @@ def learn_with_early_stopping(
     sample : array, shape (F, S, 2)
         Some points of centred, complete tracks, normalized units; held out only if they are all points and fewer than 2F.
     gram, projections
-        As for `pliant.solver.model.shape_covariance.learned`.
+        As for `pliant.solver.model.expectation_maximisation.learned`.
     model_order : Support
         Maximum number of modes, and the starting noise.
     seed : int

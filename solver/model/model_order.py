@@ -14,9 +14,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from pliant.solver.model.expectation_maximisation import MAX_MODES, annealed
 from pliant.solver.model.image_density import negative_log_likelihoods
 from pliant.solver.model.marginal_likelihood import NOISE_STD_FLOOR
-from pliant.solver.model.shape_covariance import MAX_MODES, ShapeCovariance, annealed
+from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.records import Floats
 from pliant.solver.tracks.completion import ranks
 from pliant.solver.tracks.noise import typical_roughness

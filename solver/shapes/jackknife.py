@@ -25,8 +25,9 @@ from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.cameras.learned import Learned, motion_of, moved_to, scene_at
 from pliant.solver.cameras.perspective import centred, columns, depth_map
 from pliant.solver.evaluation.alignment import procrustes
+from pliant.solver.model.expectation_maximisation import improve
 from pliant.solver.model.marginal_likelihood import fit
-from pliant.solver.model.shape_covariance import ShapeCovariance, improve
+from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.records import Floats
 from scipy.spatial import cKDTree
 

@@ -10,8 +10,8 @@ from pliant.solver.cameras.depth_alternation import aligned, alternated, factori
 from pliant.solver.cameras.learned import Learned
 from pliant.solver.cameras.perspective import MIRROR, Perspective, centred, columns
 from pliant.solver.evaluation.metrics import e3d_frame_scaled
+from pliant.solver.model.expectation_maximisation import annealed
 from pliant.solver.model.model_order import ModelOrder
-from pliant.solver.model.shape_covariance import annealed
 from pliant.solver.model.so3 import angles_between, exponential
 
 PICTURE = (1280.0, 720.0)

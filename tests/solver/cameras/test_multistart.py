@@ -9,8 +9,8 @@ from pliant.solver import Settings, gallery
 from pliant.solver.cameras import joint_refinement
 from pliant.solver.cameras.estimation import MAX_START_DEPTH_VARIANCE, CameraEstimate, estimate_cameras, restarted
 from pliant.solver.cameras.multistart import depth
+from pliant.solver.model.expectation_maximisation import MAX_MODES
 from pliant.solver.model.model_order import ModelOrder
-from pliant.solver.model.shape_covariance import MAX_MODES
 from pliant.solver.model.so3 import angles_between, exponential, nearest
 from pliant.solver.tracks.normalization import normalize
 

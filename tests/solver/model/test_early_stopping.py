@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from pliant.solver.model import early_stopping
 from pliant.solver.model.early_stopping import learn_with_early_stopping
+from pliant.solver.model.expectation_maximisation import learned
 from pliant.solver.model.model_order import MIN_JUDGED_POINTS, ModelOrder, held_out_nll
 from pliant.solver.model.random_walk import random_walk
-from pliant.solver.model.shape_covariance import ShapeCovariance, learned
+from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import exponential
 
 FRAMES = 40

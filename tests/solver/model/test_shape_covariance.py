@@ -11,19 +11,19 @@ from pliant.solver import KnownCamera, Settings, gallery, solve
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.cameras.joint_refinement import informative_frames
 from pliant.solver.evaluation import metrics
-from pliant.solver.model.random_walk import random_walk
-from pliant.solver.model.shape_covariance import (
+from pliant.solver.model.expectation_maximisation import (
     MAX_DENSE_FRAMES,
     MAX_ITERATIONS,
     MEAN_MODE_STD,
     WALK_VARIANCE_FLOOR,
-    ShapeCovariance,
     annealed,
     begin,
     freed,
     improve,
     learned,
 )
+from pliant.solver.model.random_walk import random_walk
+from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import exponential
 
 FRAMES = 14

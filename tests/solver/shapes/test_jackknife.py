@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.cameras.perspective import centred, columns
-from pliant.solver.model.shape_covariance import ShapeCovariance, annealed
+from pliant.solver.model.expectation_maximisation import annealed
+from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.shapes.jackknife import FEWEST, PARTS, learning_std, parts
 from scipy.spatial.transform import Rotation
 

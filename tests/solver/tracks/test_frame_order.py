@@ -9,8 +9,8 @@ import pytest
 from pliant.solver import InvalidSettings, KnownCamera, Settings, Tracks, gallery, solve
 from pliant.solver.evaluation.metrics import e3d_frame
 from pliant.solver.model import full_mode_covariance
+from pliant.solver.model.expectation_maximisation import annealed
 from pliant.solver.model.marginal_likelihood import Motion, Scene, energy, start
-from pliant.solver.model.shape_covariance import annealed
 from pliant.solver.model.so3 import exponential
 from pliant.solver.tracks.frame_order import (
     MAX_UNORDERED_FRAMES,

@@ -7,9 +7,9 @@ import pytest
 from pliant.solver import KnownCamera, Settings, gallery, solve
 from pliant.solver.cameras.multistart import scaled_prior_weight
 from pliant.solver.evaluation import metrics
+from pliant.solver.model.expectation_maximisation import ANNEALING_START, START_NOISE_VARIANCE, begin, improve, learned
 from pliant.solver.model.marginal_likelihood import CAMERA_PRIOR_WEIGHT
 from pliant.solver.model.model_order import MIN_JUDGED_POINTS, ModelOrder, select_model_order
-from pliant.solver.model.shape_covariance import ANNEALING_START, START_NOISE_VARIANCE, begin, improve, learned
 from pliant.solver.model.so3 import exponential
 from pliant.solver.tracks.noise import roughness, typical_roughness, white_noise
 
