@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.solver.cameras.factorization import upgrade
+from pliant.solver.cameras.factorization import upgrades
 from pliant.solver.cameras.focal_length import refined_with_focal
 from pliant.solver.cameras.learned import Learned
 from pliant.solver.cameras.multistart import CANDIDATES
@@ -100,10 +100,10 @@ def factorized_again(
 
     limit = min(len(gram) // 3, view.sample.shape[1] // 3)
     best, lowest = None, energy(part)
-    for size in CANDIDATES:
-        if size > limit or (should_stop is not None and should_stop()):
+    for each in upgrades(gram, [size for size in CANDIDATES if size <= limit]):
+        if should_stop is not None and should_stop():
             break
-        rotations = aligned(upgrade(gram, size).rotations, found.rotations, used)
+        rotations = aligned(each.rotations, found.rotations, used)
         reached = energy(replace(part, rotations=rotations[some]))
         if reached < lowest:
             best, lowest = rotations, reached

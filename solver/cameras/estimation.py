@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from pliant.solver.cameras.factorization import Upgrade, upgrade
+from pliant.solver.cameras.factorization import Upgrade, upgrades
 from pliant.solver.cameras.multistart import (
     CANDIDATES,
     Candidate,
@@ -129,16 +129,16 @@ def estimate_cameras(
     gram = completed.gram / np.outer(np.repeat(scales, 2), np.repeat(scales, 2))
     used = frames_used(len(scales))
     part = gram_of(gram, used)
-    upgrades: list[Upgrade] = []
+    factorized: list[Upgrade] = []
     entries: list[Candidate] = []
-    for size in _sizes(completed, settings):
+    for each in upgrades(gram, _sizes(completed, settings)):
         if entries and should_stop is not None and should_stop():
             break
-        upgrades.append(upgrade(gram, size))
+        factorized.append(each)
         entries.append(
             with_fixed_rotations(
                 part,
-                _thinned(upgrades[-1], used),
+                _thinned(each, used),
                 np.ones(len(part) // 2),
                 with_scales=False,
                 ordered=ordered,
@@ -149,7 +149,7 @@ def estimate_cameras(
     best, ran = min(entries, key=lambda candidate: candidate.energy), entries
     if settings.refine_rotations:
         best, ran = run_multistart(part, entries, ordered=ordered, should_stop=should_stop)
-    own = next(each for each in upgrades if each.basis_size == best.basis_size)
+    own = next(each for each in factorized if each.basis_size == best.basis_size)
     report(Step("cameras", 0.8 * PROGRESS_SHARE))
     rotations, refined = _everywhere(own.rotations, best, used, settings)
     hypotheses: tuple[tuple[int, Floats], ...] = ()
@@ -158,7 +158,7 @@ def estimate_cameras(
         rotations, sheet = resolve_pose_signs(gram, rotations, ordered=ordered, should_stop=should_stop)
         refined = f"{refined} {sheet}"
     elif settings.refine_rotations:
-        hypotheses = _hypotheses(upgrades, ran, part, used)
+        hypotheses = _hypotheses(factorized, ran, part, used)
         candidates = tuple(_everywhere(own.rotations, each, used, settings)[0] for each in ran)
     read_only(rotations)
     read_only(scales)
@@ -185,14 +185,14 @@ def restarted(estimate: CameraEstimate, size: int, rotations: Floats) -> CameraE
 
 
 def _hypotheses(
-    upgrades: list[Upgrade], ran: list[Candidate], gram: Floats, used: slice
+    factorized: list[Upgrade], ran: list[Candidate], gram: Floats, used: slice
 ) -> tuple[tuple[int, Floats], ...]:
     """Return K and rotations of factorizations that reached nearly the lowest energy in the first round and are not too deep."""
     lowest = min(candidate.energy for candidate in ran)
     near = {each.basis_size for each in ran if not each.smooth_start and each.energy <= lowest + MAX_HYPOTHESIS_GAP}
     return tuple(
         (each.basis_size, each.rotations)
-        for each in upgrades
+        for each in factorized
         if each.basis_size in near and depth(gram, each.rotations[used]) < MAX_START_DEPTH_VARIANCE
     )
 

@@ -12,6 +12,7 @@ is the metric upgrade of Tomasi and Kanade. The factor G is then refined on the 
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,7 +60,17 @@ def upgrade(gram: Floats, basis_size: int) -> Upgrade:
     basis_size : int
         K, with 3K ≤ 2F.
     """
-    factor = leading_factor(gram, 3 * basis_size)
+    return next(upgrades(gram, (basis_size,)))
+
+
+def upgrades(gram: Floats, basis_sizes: Iterable[int]) -> Iterator[Upgrade]:
+    """Yield the same for every K, from one eigendecomposition."""
+    values, vectors = np.linalg.eigh(gram)
+    for basis_size in basis_sizes:
+        yield _upgraded(_leading(values, vectors, 3 * basis_size), basis_size)
+
+
+def _upgraded(factor: Floats, basis_size: int) -> Upgrade:
     if basis_size == 1:  # Q is unique: columns of equal length keep the trace term from shrinking a small rotation
         factor = factor / np.maximum(np.sqrt((factor**2).mean(axis=(0, 1))), 1e-6)
     corrective = refine_factor(factor, least_trace_factor(factor, 0.0 if basis_size == 1 else TRACE_WEIGHT))
@@ -72,11 +83,15 @@ def upgrade(gram: Floats, basis_size: int) -> Upgrade:
 
 def leading_factor(gram: Floats, rank: int) -> Floats:
     """Return Π with Π Πᵀ ≈ gram and rank at most `rank`, shape `(F, 2, rank)`, mean row length 1."""
-    values, vectors = np.linalg.eigh(gram)
-    rank = min(rank, len(gram))
+    return _leading(*np.linalg.eigh(gram), rank)
+
+
+def _leading(values: Floats, vectors: Floats, rank: int) -> Floats:
+    size = len(values)
+    rank = min(rank, size)
     positive = np.maximum(values[::-1][:rank], 1e-14 * max(float(values[-1]), np.finfo(float).tiny))
-    factor = (vectors[:, ::-1][:, :rank] * np.sqrt(positive)).reshape(len(gram) // 2, 2, rank)
-    return np.asarray(factor / np.sqrt((factor**2).sum() / len(gram)))
+    factor = (vectors[:, ::-1][:, :rank] * np.sqrt(positive)).reshape(size // 2, 2, rank)
+    return np.asarray(factor / np.sqrt((factor**2).sum() / size))
 
 
 def least_trace_factor(factor: Floats, trace_weight: float = TRACE_WEIGHT) -> Floats:
