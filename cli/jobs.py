@@ -18,12 +18,14 @@ from pliant.cli.session import (
     JobId,
     Json,
     Mesh,
+    Name,
     OptionPairs,
     Region,
     Rotations,
     Session,
     Timeout,
     Url,
+    name_of,
     parse_options,
 )  # fmt: skip
 from pliant.cli.show import err, out, print_json, show_job, show_jobs, show_options
@@ -50,7 +52,7 @@ def submit(
     rotations: Rotations = None,
     region: Region = None,
     option: OptionPairs = None,
-    name: Annotated[str, typer.Option("--name", "-n", help="Your own label.")] = "",
+    name: Name = "",
     priority: Annotated[
         Literal["high", "normal", "low"], typer.Option("--priority", help="Order among your own waiting jobs.")
     ] = "normal",
@@ -109,7 +111,7 @@ def submit(
                 ground_truth=ground_truth,
                 rotations=rotations,
                 options=options,
-                name=name,
+                name=name_of(name, tracks),
                 job_id=job_id,
                 idempotency_key=key,
                 webhook=webhook,

@@ -15,10 +15,12 @@ from pliant.cli.session import (
     GroundTruth,
     Json,
     Mesh,
+    Name,
     OptionPairs,
     Region,
     Rotations,
     Tracks,
+    name_of,
     parse_options,
 )
 from pliant.cli.show import err, metrics_table, out, print_json, understood, verdict_lines
@@ -42,6 +44,7 @@ def solve(
     rotations: Rotations = None,
     region: Region = None,
     option: OptionPairs = None,
+    name: Name = "",
     threads: Threads = None,
     force: Force = False,
     as_json: Json = False,
@@ -68,7 +71,9 @@ def solve(
     if is_film(tracks, region):
         refuse_parts_of_tracks(mesh=mesh, ground_truth=ground_truth, rotations=rotations)
         given = parse_options(option)
-        done = solve_film(tracks, output, region=region, options=given, threads=threads, as_json=as_json)
+        done = solve_film(
+            tracks, output, region=region, options=given, name=name_of(name, tracks), threads=threads, as_json=as_json
+        )
         show_finished(done, output, as_json=as_json)
         return
     options = checked_options(parse_options(option))
@@ -79,7 +84,7 @@ def solve(
     if not as_json:
         show_understood(inputs.interpretation)
     with progress_bar(line_every=LINE_EVERY) as bar, threads_limited(threads):
-        done = reconstruct(inputs, options, output, on_progress=bar.on_step, should_stop=None)
+        done = reconstruct(inputs, options, output, name=name_of(name, tracks), on_progress=bar.on_step)
     show_finished(done, output, as_json=as_json)
 
 

@@ -15,6 +15,7 @@ from pliant.service.multipart import File, Form, FormRules
 from pliant.service.problems import Refusal, from_validation, wrong_input
 from pliant.service.settings import ServiceSettings
 from pliant.worker.artifacts import kinds_for
+from pliant.worker.artifacts.names import one_line
 from pliant.worker.errors import Conflict, UnknownUpload
 from pliant.worker.films.sources import FilmBounds, FilmSource, is_source, open_source, save_source
 from pliant.worker.films.tracker import check_film, described, film_options
@@ -328,7 +329,7 @@ def _priority(text: str) -> Priority:
 
 def _name(text: str) -> str:
     """Return the user's label with runs of blanks and control characters replaced by single spaces."""
-    name = " ".join("".join(sign if sign.isprintable() else " " for sign in text).split())
+    name = one_line(text)
     if len(name) > LONGEST_NAME:
         expected = f"at most {LONGEST_NAME} characters"
         code = ProblemCode.NAME_TOO_LONG

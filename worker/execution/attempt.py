@@ -268,13 +268,14 @@ def _reconstruct(
     options = stored.job.options
     if not is_source(inputs):
         return (reconstruct or pipeline.reconstruct)(
-            load_inputs(inputs), options, results, on_progress=attempt.report, should_stop=attempt.should_stop
-        )
+            load_inputs(inputs), options, results, name=stored.job.name, on_progress=attempt.report,
+            should_stop=attempt.should_stop,
+        )  # fmt: skip
     settings, scratch = attempt.jobs.settings, inputs.with_name("film")
     source = open_source(inputs, inputs.with_name("source"))
     scratch.mkdir()
     return reconstruct_film(
-        source, options, results, scratch=scratch, threads=settings.threads_per_job, bounds=FilmBounds.of(settings),
+        source, options, results, scratch=scratch, name=stored.job.name, threads=settings.threads_per_job, bounds=FilmBounds.of(settings),
         on_progress=attempt.report, should_stop=attempt.should_stop,
     )  # fmt: skip
 

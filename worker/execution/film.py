@@ -36,6 +36,7 @@ def reconstruct_film(
     directory: Path,
     *,
     scratch: Path,
+    name: str = "",
     threads: int = 1,
     bounds: FilmBounds = FilmBounds(),  # noqa: B008 - frozen
     on_progress: Callable[[Progress], None] | None = None,
@@ -53,6 +54,8 @@ def reconstruct_film(
         Where to write the files; created if missing.
     scratch : Path
         An empty folder for the film process.
+    name : str
+        As in `reconstruct`.
     threads : int
         Threads for optical flow.
     bounds : FilmBounds
@@ -86,7 +89,7 @@ def reconstruct_film(
         spent = {"track": time.perf_counter() - began}
         directory.mkdir(parents=True, exist_ok=True)
         artifacts = [_moved(scratch / name, directory) for name in FILES if (scratch / name).exists()]
-        finished = solve_and_write(inputs, options, directory, reporter=reporter, halt=halt, spent=spent)
+        finished = solve_and_write(inputs, options, directory, reporter=reporter, halt=halt, name=name, spent=spent)
     return replace(
         finished,
         artifacts=(*artifacts, *finished.artifacts),

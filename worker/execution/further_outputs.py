@@ -70,7 +70,7 @@ def write_further(
     if solution.shapes.shape[:2] != (inputs.tracks.num_frames, inputs.tracks.num_points):
         raise damaged("inputs", "tracks and shapes of different sizes")
     directory.mkdir(parents=True, exist_ok=True)
-    result = Result(inputs, solution, options)
+    result = Result(inputs, solution, options, job.name)
     kinds = [kind for kind in kinds_for(options, textured=result.texture is not None) if kind.output is not None]
 
     def exported(done: float) -> None:

@@ -77,6 +77,7 @@ def reconstruct(
     options: Options,
     directory: Path,
     *,
+    name: str = "",
     on_progress: Callable[[Progress], None] | None = None,
     should_stop: Callable[[], bool] | None = None,
     solver: Callable[..., Solution] | None = None,
@@ -91,6 +92,8 @@ def reconstruct(
         How to solve and which files to write.
     directory : Path
         Where to write the files; created if missing.
+    name : str
+        Name of the job, which the object in the files has.
     on_progress : callable, optional
         Called frequently; throttle if needed.
     should_stop : callable, optional
@@ -112,7 +115,7 @@ def reconstruct(
     reporter = Reporter(on_progress if on_progress is not None else silent)
     halt = Halt(should_stop, options.time_limit)
     with reporter.ticking():
-        return solve_and_write(inputs, options, directory, reporter=reporter, halt=halt, solver=solver)
+        return solve_and_write(inputs, options, directory, name=name, reporter=reporter, halt=halt, solver=solver)
 
 
 def solve_and_write(
@@ -122,6 +125,7 @@ def solve_and_write(
     *,
     reporter: Reporter,
     halt: Halt,
+    name: str = "",
     spent: Mapping[str, float] | None = None,
     solver: Callable[..., Solution] | None = None,
 ) -> Finished:
@@ -135,6 +139,8 @@ def solve_and_write(
         Receives the parts `loading`, `solving` and `exporting`.
     halt : Halt
         The stop condition.
+    name : str
+        As in `reconstruct`.
     spent : mapping, optional
         Seconds of earlier parts, for the report.
     solver : callable, optional
@@ -159,13 +165,13 @@ def solve_and_write(
     solved = time.perf_counter()
     metrics = _metrics(inputs, solution)
     seconds = {**(spent or {}), "solve": solved - began, "metrics": time.perf_counter() - solved}
-    report = build_report(inputs, solution, options, metrics=metrics, seconds=seconds)
+    report = build_report(inputs, solution, options, metrics=metrics, seconds=seconds, name=name)
 
     def exported(done: float) -> None:
         reporter.part("exporting", done)
         halt.check()
 
-    artifacts = write_artifacts(inputs, solution, options, report, directory, on_progress=exported)
+    artifacts = write_artifacts(inputs, solution, options, report, directory, name=name, on_progress=exported)
     exported(1.0)
     trust = solution.trust
     return Finished(
