@@ -15,11 +15,11 @@ from pliant.service.multipart import File, Form, FormRules
 from pliant.service.problems import Refusal, from_validation, wrong_input
 from pliant.service.settings import ServiceSettings
 from pliant.worker.artifacts import kinds_for
-from pliant.worker.artifacts.names import one_line
 from pliant.worker.errors import Conflict, UnknownUpload
 from pliant.worker.films.sources import FilmBounds, FilmSource, is_source, open_source, save_source
 from pliant.worker.films.tracker import check_film, described, film_options
 from pliant.worker.formats import Limits, store_inputs
+from pliant.worker.formats.point_names import one_line
 from pliant.worker.formats.tracks.film_tracks import tracks_options
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.jobs.submission import Submission

@@ -119,6 +119,18 @@ def test_a_result_holds_arrays_report_and_job(client: Client, tmp_path: Path) ->
     assert set(everything) == {artifact.name for artifact in result.job.artifacts}
 
 
+def test_a_result_has_the_names_of_its_points_and_of_its_object(client: Client, tmp_path: Path) -> None:
+    heads = [f"{part}_{axis}" for part in ("Nose", "chin", "brow", "tip") for axis in "xy"]
+    rows = np.random.default_rng(0).uniform(0, 100, (1, 8)) + np.arange(5)[:, None]
+    text = "\n".join(",".join(map(str, row)) for row in [heads, *rows.tolist()])
+    (tmp_path / "pose.csv").write_text(text)
+    result = client.submit(tmp_path / "pose.csv", mesh="none", options=FAST, name="a pose").wait(timeout=60)
+    assert result.point_names == ("Nose", "chin", "brow", "tip")
+    assert result.report["name"] == "a pose"
+    assert '"name":"a pose"' in result.save_glb(tmp_path / "it.glb").read_bytes().decode("utf-8", "replace")
+    assert client.submit(moving_points(), options=FAST).wait(timeout=60).point_names is None
+
+
 def test_rejected_requests_raise_typed_errors_with_the_services_message(client: Client) -> None:
     with pytest.raises(InvalidRequest) as caught:
         client.submit(np.ones((2, 9, 2)), name="too-short")

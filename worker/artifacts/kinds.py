@@ -85,10 +85,12 @@ def _npz(result: Result, file: IO[bytes], on_progress: OnProgress) -> dict[str, 
     chosen = result.inputs.selection
     sources = {} if chosen is None else {"source_frames": chosen.frames, "source_points": chosen.points}
     posterior = {"shapes_std": solution.shapes_std, "inlier_probability": solution.inlier_probability}
+    names = result.inputs.point_names
     np.savez(
         file,
         allow_pickle=False,
         **sources,
+        **({} if names is None else {"point_names": np.array(names)}),
         shapes=solution.shapes,
         rotations=camera.rotations,
         scales=camera.scales,
@@ -162,6 +164,7 @@ def _preview(result: Result, file: IO[bytes]) -> None:
         y_axis=inputs.interpretation.y_axis,
         fps=result.options.fps,
         image_size=result.options.image_size,
+        point_names=inputs.point_names,
     )
 
 

@@ -5,16 +5,13 @@ from __future__ import annotations
 import re
 import unicodedata
 
+from pliant.worker.formats.point_names import one_line
+
 DEFAULT = "shape"
 """Name of an object whose job has none, or none that a format can write."""
 
 LONGEST = 200
 """Characters of a name."""
-
-
-def one_line(text: str) -> str:
-    """Return a text on one line: what cannot be printed counts as space, and spaces are single."""
-    return " ".join("".join(sign if sign.isprintable() else " " for sign in text).split())
 
 
 def object_name(text: str) -> str:

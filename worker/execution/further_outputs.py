@@ -29,6 +29,7 @@ _NEEDED = frozenset(
     ("shapes", "rotations", "scales", "translations", "focal", "focal_std", "principal_point", "residuals", "weights",
      "trace_objective", "trace_residual", "trace_iterations")
 )  # fmt: skip
+_OPTIONAL = frozenset(("shapes_std", "inlier_probability"))
 
 
 def write_further(
@@ -104,7 +105,7 @@ def read_solution(path: Path, *, y_up: bool) -> Solution:
     InvalidInput
         Code damaged_file, when it is not a result of ours or was damaged.
     """
-    arrays = read_file(path, field="result", limits=_OURS)
+    arrays = read_file(path, field="result", limits=_OURS, wanted=_NEEDED | _OPTIONAL)
     missing = sorted(_NEEDED - set(arrays))
     if missing:
         raise damaged("result", f"a shapes.npz without {', '.join(missing)}")

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import csv
 import io
 import json
+import struct
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import alembic3d
+import numpy as np
 import plyfile
 import pytest
+import scipy.io
 import trimesh
 from khronos import assert_valid
 from pliant.schemas.options import Options
 from pliant.worker.artifacts import build_report, write_artifacts
 from pliant.worker.artifacts.names import LONGEST
 from pliant.worker.execution import pipeline
+from pliant.worker.execution.further_outputs import read_solution
 from pxr import Usd
 from results import make_result
 
@@ -70,6 +76,32 @@ def test_every_file_carries_the_name_of_the_job(tmp_path: Path, name: str) -> No
     assert [line for line in text.splitlines() if line.startswith("o ")] == [f"o {obj}"]
     mesh = trimesh.load(io.BytesIO(text.encode()), file_type="obj", process=False, split_object=True)
     assert list(getattr(mesh, "geometry", {obj: None})) == [obj]
+
+
+def test_point_names_are_in_the_arrays_the_table_and_the_preview(tmp_path: Path) -> None:
+    inputs, solution, options = make_result(outputs="mat,csv", truth=True)
+    names = tuple(f"Teil {number} ü" for number in range(30))
+    inputs = replace(inputs, point_names=names)
+    write_artifacts(inputs, solution, options, {}, tmp_path)
+    with np.load(tmp_path / "shapes.npz", allow_pickle=False) as held:
+        assert tuple(held["point_names"].tolist()) == names
+    cells = scipy.io.loadmat(tmp_path / "shapes.mat")["point_names"]
+    assert cells.shape == (30, 1)
+    assert tuple(cell[0] for cell in cells[:, 0]) == names
+    with (tmp_path / "metrics_points.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0])[:2] == ["point", "name"]
+    assert tuple(row["name"] for row in rows) == names
+    content = (tmp_path / "preview.bin").read_bytes()
+    place = json.loads(content[16 : 16 + struct.unpack("<I", content[12:16])[0]])["sections"]["names"]
+    assert tuple(content[place["offset"] :][: place["bytes"]].decode().split("\n")) == names
+    assert read_solution(tmp_path / "shapes.npz", y_up=False).shapes.shape == solution.shapes.shape
+
+    write_artifacts(replace(inputs, point_names=None), solution, options, {}, tmp_path)
+    with np.load(tmp_path / "shapes.npz") as held:
+        assert "point_names" not in held
+    assert "point_names" not in scipy.io.loadmat(tmp_path / "shapes.mat")
+    assert "name" not in (tmp_path / "metrics_points.csv").read_text().splitlines()[0].split(",")
 
 
 def test_a_texture_hangs_below_the_name(tmp_path: Path) -> None:
