@@ -150,7 +150,7 @@ class ProblemCode(StrEnum):
      "The link's expiry date has passed.",
      "Ask the sender of the link for a new one.")
     BEYOND_SHARE = ("beyond_share", 403, "Beyond the share link",
-     "A request with the token of a share link named another job, or something other than the job's record, events and files.",
+     "A request with the token of a share link named another job, or something other than the job's record, events, files and expiry.",
      "Use a token of the service for anything else.")
     INSUFFICIENT_SCOPE = ("insufficient_scope", 403, "Insufficient scope",
      "The token is valid but lacks the scope that the route needs; `expected` names it.",
