@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 from pliant.cli.films import is_film
 from pliant.cli.ids import find_job
-from pliant.cli.paths import output_folder
+from pliant.cli.paths import output_folder, tracks_or_film
 from pliant.cli.session import (
     HOME,
     LINE_EVERY,
@@ -98,6 +98,7 @@ def submit(
         batch.show(as_json=as_json)
         raise typer.Exit(batch.exit_code)
     tracks = chosen[0]
+    tracks_or_film(tracks)
     if output is not None:
         output_folder(output, force=force)
     film = is_film(tracks, region)

@@ -58,7 +58,7 @@ LONGEST_NAME = 200
 LINE_EVERY = 30.0
 """Without a terminal, waiting commands print a line this often, seconds."""
 
-Force = Annotated[bool, typer.Option("--force", help="Replace existing files in the output folder.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
 
 HOME = "http://127.0.0.1:8000"
 

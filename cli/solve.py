@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from pliant.cli.films import inspect_film, is_film, refuse_parts_of_tracks, solve_film
-from pliant.cli.paths import input_file, output_folder
+from pliant.cli.paths import input_file, output_folder, tracks_or_film
 from pliant.cli.session import (
     LINE_EVERY,
     Force,
@@ -51,7 +51,7 @@ def solve(
 ) -> None:
     """Reconstruct tracks or a film in this process, without a service: the same code, the same files."""
     ctx.obj.json = as_json
-    check_inputs(None if tracks.is_dir() else tracks, ground_truth, rotations)
+    check_inputs(tracks, ground_truth, rotations)
     input_file(region, "region")
     missing = not output.exists()
     output_folder(output, force=force)
@@ -103,7 +103,7 @@ def inspect(
 ) -> None:
     """Show how a track file is read, or what a film holds and what tracking it would take, without solving."""
     ctx.obj.json = as_json
-    check_inputs(None if file.is_dir() else file, ground_truth, rotations)
+    check_inputs(file, ground_truth, rotations)
     input_file(region, "region")
     options = parse_options(option)
     if url == "" and is_film(file, region):
@@ -132,9 +132,10 @@ def inspect(
         show_understood(interpretation)
 
 
-def check_inputs(tracks: Path | None, ground_truth: Path | None, rotations: Path | None) -> None:
+def check_inputs(tracks: Path, ground_truth: Path | None, rotations: Path | None) -> None:
     """Check the paths of the inputs; a mesh may be a word, so its reader checks it."""
-    for path, name in ((tracks, "tracks"), (ground_truth, "ground_truth"), (rotations, "rotations")):
+    tracks_or_film(tracks)
+    for path, name in ((ground_truth, "ground_truth"), (rotations, "rotations")):
         input_file(path, name)
 
 

@@ -48,6 +48,6 @@ async def authorize_share(scope: Scope, token: str, records: Records) -> Respons
     return None
 
 
-def _refused(code: ProblemCode, detail: str, **members: str) -> Response:
+def _refused(code: ProblemCode, detail: str, *, got: str | None = None) -> Response:
     challenge = 'Bearer realm="pliant", error="invalid_token"'
-    return answer(code, detail=detail, headers={"WWW-Authenticate": challenge}, field="Authorization", **members)
+    return answer(code, detail=detail, headers={"WWW-Authenticate": challenge}, field="Authorization", got=got)

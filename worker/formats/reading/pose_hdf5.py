@@ -122,7 +122,7 @@ def _levels(group: h5py.Group, field: str, limits: Limits) -> list[tuple[str, ..
 def _pickled_heads(group: h5py.Group) -> list[tuple[str, ...]]:
     """Return the names of each column of a table in pandas' table form; empty where they cannot be told."""
     held = group.attrs.get("non_index_axes")
-    strings = strings_of(bytes(held)) if isinstance(held, bytes | np.bytes_ | np.void) else []
+    strings = strings_of(held) if isinstance(held, bytes) else []
     ends = [index for index, string in enumerate(strings) if string == "likelihood"]
     levels = (ends[0] + 1) // 3 if ends else 0
     if levels < 3 or (ends[0] + 1) % 3 or len(strings) < (count := 3 * levels * len(ends)):
@@ -137,12 +137,13 @@ def strings_of(pickle: bytes) -> list[str]:
     last: str | None = None
     try:
         for opcode, argument, _ in genops(pickle):
+            place = argument if isinstance(argument, int) else len(memo)
             if opcode.name in ("MEMOIZE", "PUT", "BINPUT", "LONG_BINPUT"):
-                memo[len(memo) if argument is None else int(argument)] = last
+                memo[place] = last
                 continue
             last = argument if isinstance(argument, str) and opcode.name in STRINGS else None
             if opcode.name in ("GET", "BINGET", "LONG_BINGET"):
-                last = memo.get(int(argument))
+                last = memo.get(place)
             if last is not None:
                 found.append(last)
     except (ValueError, OverflowError):  # cut off, or no pickle
