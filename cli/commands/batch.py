@@ -154,10 +154,12 @@ class Batch:
         if as_json:
             print_json([{"file": str(row.file), **_outcome(row)} for row in self.rows])
             return
-        from rich.table import Table
+        from rich.table import Column, Table
         from rich.text import Text
 
-        table = Table("file", "job", "status", "verdict", "seconds", "")
+        longest = max((len(row.job.id) for row in self.rows if row.job is not None), default=0)
+        job_column = Column("job", no_wrap=True, min_width=longest)  # ids are for copying, also from narrow terminals
+        table = Table("file", job_column, "status", "verdict", "seconds", "")
         for row in self.rows:
             job = row.job
             status = "refused" if job is None else str(job.status)
