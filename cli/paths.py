@@ -70,6 +70,28 @@ def output_file(path: Path | None, option: str, *, force: bool) -> None:
         raise BadArgument(f"{option}: {path} exists already. Choose another name, or replace it with --force.")
 
 
+def made_folder(folder: Path, option: str) -> None:
+    """Create a folder, unless it exists, and check that it is writable.
+
+    Raises
+    ------
+    BadArgument
+        The path is a file or below one, or the folder cannot be created or written.
+    """
+    from pliant.client.errors import BadArgument
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise BadArgument(f"{option}: expected a folder, got the file {folder}. Choose another folder.") from None
+    except NotADirectoryError:
+        raise BadArgument(f"{option}: {folder} is below a file. Choose another folder.") from None
+    except OSError as fault:
+        raise BadArgument(f"{option}: cannot create {folder}: {fault.strerror}. Choose another folder.") from None
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise BadArgument(f"{option}: the folder {folder} is not writable. Choose another folder.")
+
+
 def output_folder(folder: Path, *, force: bool, files: Iterable[str] = RESULT_FILES) -> None:
     """Create the folder of the results and check that it can take them.
 
@@ -89,16 +111,7 @@ def output_folder(folder: Path, *, force: bool, files: Iterable[str] = RESULT_FI
     """
     from pliant.client.errors import BadArgument
 
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except FileExistsError:
-        raise BadArgument(f"--output: expected a folder, got the file {folder}. Choose another folder.") from None
-    except NotADirectoryError:
-        raise BadArgument(f"--output: {folder} is below a file. Choose another folder.") from None
-    except OSError as fault:
-        raise BadArgument(f"--output: cannot create {folder}: {fault.strerror}. Choose another folder.") from None
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise BadArgument(f"--output: the folder {folder} is not writable. Choose another folder.")
+    made_folder(folder, "--output")
     existing = [name for name in files if (folder / name).exists()]
     if existing and not force:
         raise BadArgument(

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 from pliant.cli.extras import require_server
+from pliant.cli.paths import made_folder
 from pliant.cli.session import Json
 from pliant.cli.show import err, out, print_json
 
@@ -81,6 +82,7 @@ def up(
     host = service.host if host is None else host
     port = taken(host, service.port if port is None else port)
     url = address(host, port)
+    made_folder(settings.data, "--data")
     with ExitStack() as held:
         children: list[Child] = []
         if settings.redis_url is None:
@@ -112,6 +114,7 @@ def work(ctx: typer.Context, data: Data = None, workers: Workers = None, as_json
     from pliant.worker.processes.supervisor import Supervisor, worker_children
 
     settings = chosen(data, workers)
+    made_folder(settings.data, "--data")
 
     def announce() -> None:
         if as_json:
