@@ -18,8 +18,9 @@ from pliant.solver.linear import block_tridiagonal
 from pliant.solver.linear.conjugate_gradient import conjugate_gradient
 from pliant.solver.linear.preconditioner import build_preconditioner
 from pliant.solver.operators.normal_equations import Operator
-from pliant.solver.records import Floats, Outcome
+from pliant.solver.records import Floats
 from pliant.solver.shapes.state import State
+from pliant.solver.solution import Outcome
 from pliant.solver.threads import SMALLEST, over_ranges
 
 INNER_REDUCTION = 0.1

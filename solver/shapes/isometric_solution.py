@@ -13,8 +13,9 @@ import numpy as np
 from pliant.solver.evaluation.alignment import procrustes
 from pliant.solver.evaluation.trust import Trust, Verdict, turned
 from pliant.solver.isometry.surface import IsometricSurface, IsometricVerdict
-from pliant.solver.records import Camera, Choices, Floats, Outcome, Solution, Trace, Tracks, read_only
+from pliant.solver.records import Camera, Choices, Floats, Tracks, read_only
 from pliant.solver.settings import Settings
+from pliant.solver.solution import Outcome, Solution, Trace
 
 ROUNDS = 5
 """Alternations between mean shape and rotations; each starts from the last, and the third changes angles by less than 1e-3 already."""

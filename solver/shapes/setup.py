@@ -8,10 +8,11 @@ import numpy as np
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.energy.hyperparameters import bending_weight, choose_weights, without_effect
 from pliant.solver.energy.problem import Problem
+from pliant.solver.mesh import Mesh
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.operators.finite_differences import difference_bands
 from pliant.solver.operators.mesh_laplacian import Laplacian, build_laplacian
-from pliant.solver.records import Choices, Mesh
+from pliant.solver.records import Choices
 from pliant.solver.settings import Settings
 from pliant.solver.shapes.irls import init
 from pliant.solver.shapes.state import State
