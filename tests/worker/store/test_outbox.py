@@ -22,6 +22,7 @@ from pathlib import Path
 import pytest
 from pliant.schemas.job import Interpretation, Job, Status
 from pliant.schemas.options import Options
+from pliant.worker.jobs.retry import retry
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.jobs.submission import Submission
 from pliant.worker.records import Webhook
@@ -345,7 +346,7 @@ def test_a_retried_job_sends_its_webhook_and_one_without_does_not(
     inputs_file: Path,
     interpretation: Interpretation,
 ) -> None:
-    again = door.retry(made(receiver.url).id)
+    again = retry(door, made(receiver.url).id)
     door.cancel(again.id)
     plain = door.submit(inputs_file, Submission(options=Options()), interpretation=interpretation)
     assert door.cancel(plain.id).status is Status.CANCELLED
