@@ -38,7 +38,7 @@ READING = (
     "layout", "rows", "y_axis", "coordinates", "coordinate_order", "visibility", "frames", "stride", "max_points", "min_seen",
 )  # fmt: skip
 """Options that say how tracks are read: kept inputs have been read already."""
-LONGEST_NAME = 200
+LONGEST_JOB_NAME = 200
 """Characters of the user's label."""
 
 
@@ -329,8 +329,8 @@ def _priority(text: str) -> Priority:
 def _name(text: str) -> str:
     """Return the user's label with runs of blanks and control characters replaced by single spaces."""
     name = " ".join("".join(sign if sign.isprintable() else " " for sign in text).split())
-    if len(name) > LONGEST_NAME:
-        expected = f"at most {LONGEST_NAME} characters"
+    if len(name) > LONGEST_JOB_NAME:
+        expected = f"at most {LONGEST_JOB_NAME} characters"
         code = ProblemCode.NAME_TOO_LONG
         raise wrong_input(code, field="name", expected=expected, got=str(len(name)), hint="Shorten it.")
     return name

@@ -30,7 +30,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 from pliant.solver.errors import InvalidInput
-from pliant.solver.evaluation.alignment import MIRROR, Aligned, Kind, align, procrustes
+from pliant.solver.evaluation.alignment import Aligned, Kind, align, procrustes
+from pliant.solver.model.so3 import MIRROR
 from pliant.solver.records import Camera, Floats, Tracks
 from pliant.solver.solution import Solution
 

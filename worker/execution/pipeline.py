@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -167,6 +167,12 @@ def solve_and_write(
 
     artifacts = write_artifacts(inputs, solution, options, report, directory, on_progress=exported)
     exported(1.0)
+    return _finished(solution, metrics, artifacts, camera_sentence=report["camera"]["sentence"])
+
+
+def _finished(
+    solution: Solution, metrics: dict[str, float], artifacts: Iterable[Artifact], *, camera_sentence: str
+) -> Finished:
     trust = solution.trust
     return Finished(
         metrics=metrics,
@@ -175,7 +181,7 @@ def solve_and_write(
         verdict=None if trust is None else trust.verdict.value,
         verdict_reasons=() if trust is None else trust.reasons,
         trust_sentence=None if trust is None else trust.sentence,
-        camera_sentence=report["camera"]["sentence"],
+        camera_sentence=camera_sentence,
         warnings=tuple(solution.choices.warnings),
         artifacts=tuple(artifacts),
     )
