@@ -108,4 +108,4 @@ format: $(STAMP)
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf $(VENV) .cache build dist *.egg-info service/web/dist service/web/dist.next service/web/node_modules
+	rm -rf $(VENV) .venv-3.* .cache build dist *.egg-info service/web/dist service/web/dist.next service/web/node_modules

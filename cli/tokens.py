@@ -56,7 +56,9 @@ def create(
     source: Annotated[
         Path | None,
         typer.Option(
-            "--from", help="File with the token itself, made by a deployment; known ones stay.", metavar="FILE"
+            "--from",
+            help="File with a token to register, in place of a new one. Does nothing if it is registered.",
+            metavar="FILE",
         ),
     ] = None,
     data: Data = None,

@@ -42,7 +42,7 @@ def track(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Track the surface that a film shows. Needs OpenCV: pip install 'pliant[film]'."""
+    """Track the surface that a film shows. Needs OpenCV, which the extra `film` installs."""
     ctx.obj.json = as_json
     from pliant.tracking import track_film
 
