@@ -14,7 +14,7 @@ from pliant.solver import Camera, Choices, Outcome, Solution, Trace
 from pliant.worker.artifacts import kinds_for
 from pliant.worker.artifacts.result import Result
 from pliant.worker.artifacts.write import write_kinds, write_report
-from pliant.worker.execution.pipeline import Finished, Halt, silent
+from pliant.worker.execution.pipeline import Halt, silent
 from pliant.worker.execution.progress import Reporter
 from pliant.worker.films.inputs import read_tracked
 from pliant.worker.films.tracker import Tracked
@@ -23,6 +23,7 @@ from pliant.worker.formats.canonical import OWN_FILES
 from pliant.worker.formats.errors import damaged
 from pliant.worker.formats.reading.arrays import read_file
 from pliant.worker.formats.records import Arrays
+from pliant.worker.jobs.finished import Finished
 
 SHARES = {"loading": (0.0, 0.1), "exporting": (0.1, 1.0)}
 _NEEDED = frozenset(

@@ -20,6 +20,7 @@ from pliant.worker.errors import (
     UnknownJob,
 )
 from pliant.worker.jobs import lifecycle
+from pliant.worker.jobs.finished import Finished
 from pliant.worker.jobs.retry import retry
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.jobs.submission import Submission
@@ -45,9 +46,12 @@ def finish(jobs: Jobs, id: str, file: Path) -> Stored:
     return jobs.records.update(
         id,
         lambda stored: lifecycle.succeed(
-            stored, attempt_id=attempt_id, prefix=prefix, artifacts=[artifact], metrics={"reprojection_median": 0.5},
-            outcome="converged", sentence="Converged.", warnings=[], now=NOW, retention=60,
-            verdict="with_care", verdict_reasons=["The camera turned by 9° only."], trust_sentence="Expected error about 4 %.",
+            stored,
+            Finished(
+                metrics={"reprojection_median": 0.5}, outcome="converged", sentence="Converged.", warnings=(), artifacts=(artifact,),
+                verdict="with_care", verdict_reasons=("The camera turned by 9° only.",), trust_sentence="Expected error about 4 %.",
+            ),
+            attempt_id=attempt_id, prefix=prefix, now=NOW, retention=60,
         ),
     )  # fmt: skip
 
