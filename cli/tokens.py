@@ -89,7 +89,11 @@ def create(
         return
     if as_json:
         print_json({**shown(token), "token": text})
-        return
+    else:
+        _show_once(token, text)
+
+
+def _show_once(token: Token, text: str) -> None:
     print(text)
     until = "never expires" if token.expires_at is None else f"expires {token.expires_at:%Y-%m-%d %H:%M} UTC"
     err().print(

@@ -105,14 +105,9 @@ def accept(
         networks=jobs.settings.webhook_networks,
     )
     submission = Submission(
-        options=options,
-        name=name,
-        id=id,
-        idempotency_key=idempotency_key,
-        fingerprint=fingerprint,
-        webhook=webhook,
+        options=options, name=name, id=id, idempotency_key=idempotency_key, fingerprint=fingerprint, webhook=webhook,
         priority=_priority(form.texts.get("priority", "")),
-    )
+    )  # fmt: skip
     known = jobs.known(submission)
     if known is not None:
         return known, False

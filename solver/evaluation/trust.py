@@ -123,20 +123,27 @@ def assess(
     residual = float(np.median(relative)) / size if relative.size else np.inf
     turn = turned(rotations)
     hidden = 1.0 - float(seen.mean())
+    unseen = f"{hidden:.0%} of the positions are not seen and drawn from their surroundings."
     found = [
         _sign(residual, LOOSE, LOST, f"The shapes miss the tracks by {_percent(residual)} of the object's size."),
         _sign(-turn, -NARROW, -STILL, f"The camera turned by {turn:.0f}° only; depth needs {NARROW:.0f}° or more."),
-        _sign(
-            hidden,
-            HIDDEN_SHARE,
-            UNSEEN_SHARE,
-            f"{hidden:.0%} of the positions are not seen and drawn from their surroundings.",
-        ),
+        _sign(hidden, HIDDEN_SHARE, UNSEEN_SHARE, unseen),
     ]
     if interval is not None:
         found.append(_sign(interval[1], POOR, BAD, f"The error may be as large as {_at_most(interval[1])}."))
-    if modes > FLEXIBLE * len(shapes):
-        sentence = f"{modes} modes of deformation in {len(shapes)} frames: the motion hardly determines depth. Use more frames."
+    found += _doubts(modes, len(shapes), planar=planar, depth_is_typical=depth_is_typical)
+    signs = sorted((sign for sign in found if sign[0] is not Verdict.GOOD), key=lambda sign: -_SEVERITY[sign[0]])
+    verdict = signs[0][0] if signs else Verdict.GOOD
+    return Trust(verdict, tuple(sentence for _, sentence in signs), expected, interval, turn, residual, hidden)
+
+
+def _doubts(modes: int, frames: int, *, planar: bool, depth_is_typical: bool) -> list[tuple[Verdict, str]]:
+    """Return the reasons to doubt the model itself, which the standard deviations do not include."""
+    found: list[tuple[Verdict, str]] = []
+    if modes > FLEXIBLE * frames:
+        sentence = (
+            f"{modes} modes of deformation in {frames} frames: the motion hardly determines depth. Use more frames."
+        )
         found.append((Verdict.WITH_CARE, sentence))
     if planar:
         found.append(
@@ -145,9 +152,7 @@ def assess(
     if depth_is_typical:
         sentence = "The tracks hardly show how deep the object is; its depth is one that is usual for its width. Let it turn further."
         found.append((Verdict.WITH_CARE, sentence))
-    signs = sorted((sign for sign in found if sign[0] is not Verdict.GOOD), key=lambda sign: -_SEVERITY[sign[0]])
-    verdict = signs[0][0] if signs else Verdict.GOOD
-    return Trust(verdict, tuple(sentence for _, sentence in signs), expected, interval, turn, residual, hidden)
+    return found
 
 
 def turned(rotations: Floats) -> float:

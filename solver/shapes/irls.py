@@ -159,16 +159,10 @@ def _evaluated(
         raise NotFinite(f"the energy became {value} after {reweighting} reweightings")
     seen = problem.confidence > 0
     return State(
-        shapes=shapes,
-        translations=translations,
-        omega=fresh,
-        rank=rank_term(shapes, weights.low_rank, weights.rank_floor),
-        objective=value,
-        residual=float(np.sqrt(np.median(squared if seen.all() else squared[seen]))),
-        reweighting=reweighting,
-        iterations=0,
-        reduction=INNER_REDUCTION,
-    )
+        shapes=shapes, translations=translations, omega=fresh, rank=rank_term(shapes, weights.low_rank, weights.rank_floor),
+        objective=value, residual=float(np.sqrt(np.median(squared if seen.all() else squared[seen]))),
+        reweighting=reweighting, iterations=0, reduction=INNER_REDUCTION,
+    )  # fmt: skip
 
 
 def _mean(left: Array, weights: Array) -> Floats:

@@ -50,18 +50,11 @@ def build_problem(
         quadratic=quadratic,
     )
     choices = Choices(
-        basis_size=estimate.basis_size,
-        temporal_weight=weights.temporal,
-        spatial_weight=weights.spatial,
-        robust_scale=weights.robust_scale,
-        temporal_order=weights.order,
-        low_rank_weight=weights.low_rank,
-        laplacian=laplacian.name if laplacian is not None else "none",
-        unit=normalized.unit,
-        noise=noise * normalized.unit,
-        reasons={**estimate.reasons, **reasons},
-        warnings=(*estimate.warnings, *without_effect(settings)),
-    )
+        basis_size=estimate.basis_size, temporal_weight=weights.temporal, spatial_weight=weights.spatial,
+        robust_scale=weights.robust_scale, temporal_order=weights.order, low_rank_weight=weights.low_rank,
+        laplacian=laplacian.name if laplacian is not None else "none", unit=normalized.unit, noise=noise * normalized.unit,
+        reasons={**estimate.reasons, **reasons}, warnings=(*estimate.warnings, *without_effect(settings)),
+    )  # fmt: skip
     return problem, choices
 
 
