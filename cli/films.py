@@ -10,8 +10,8 @@ from pliant.cli.session import LINE_EVERY
 from pliant.cli.show import out
 
 if TYPE_CHECKING:
-    from pliant.worker.execution.pipeline import Finished
     from pliant.worker.films.tracker import FilmFacts
+    from pliant.worker.jobs.finished import Finished
 
 
 def is_film(path: Path, region: Path | None) -> bool:

@@ -126,7 +126,6 @@ def submit(
                 if not as_json:
                     err().print(f"Job {job.id}", highlight=False)
                 done = job.wait(on_progress=bar.on_progress, load=False, timeout=timeout)
-                job.record = done.job
                 if output is not None:
                     done.download(output, on_download=bar.on_download)
         show_job(job.record, as_json=as_json)

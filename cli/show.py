@@ -13,7 +13,7 @@ from rich.text import Text
 if TYPE_CHECKING:
     from pliant.cli.exits import Exit
     from pliant.schemas.job import Interpretation, Job
-    from pliant.worker.execution.pipeline import Finished
+    from pliant.worker.jobs.finished import Finished
 
 COLOURS = {
     "queued": "cyan", "running": "blue", "cancelling": "yellow", "succeeded": "green", "failed": "red", "cancelled": "yellow",

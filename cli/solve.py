@@ -27,7 +27,7 @@ from pliant.cli.show import err, metrics_table, out, print_json, understood, ver
 
 if TYPE_CHECKING:
     from pliant.schemas.job import Interpretation
-    from pliant.worker.execution.pipeline import Finished
+    from pliant.worker.jobs.finished import Finished
 
 Threads = Annotated[
     int | None,

@@ -44,7 +44,7 @@ def track(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Track the surface that a film shows. Needs OpenCV: pip install 'pliant[film]'."""
+    """Track the surface that a film shows. Needs OpenCV, which the extra `film` installs."""
     ctx.obj.json = as_json
     input_file(region, "--region")
     output_file(output, "--output", force=force)

@@ -91,20 +91,19 @@ def up(
             children.append(valkey_child(valkey))
         children += [*worker_children(settings), service_child(settings, host, port, url, auth=auth or service.auth)]
 
-        def announce() -> None:
-            if as_json:
-                print_json({"url": url, "data": str(settings.data.absolute()), "workers": settings.workers})
-                sys.stdout.flush()
-                return
-            screen = out()
-            screen.print(f"[bold green]Pliant is ready[/]  {url}")
-            screen.print(
-                f"[dim]data in {settings.data.absolute()}, {settings.workers} worker(s); Ctrl-C stops everything[/]"
-            )
-
-        Supervisor(children).run(on_started=announce)
+        Supervisor(children).run(on_started=lambda: _announce(url, settings, as_json=as_json))
     if not as_json:
         err().print("Stopped.")
+
+
+def _announce(url: str, settings: Settings, *, as_json: bool) -> None:
+    if as_json:
+        print_json({"url": url, "data": str(settings.data.absolute()), "workers": settings.workers})
+        sys.stdout.flush()
+        return
+    screen = out()
+    screen.print(f"[bold green]Pliant is ready[/]  {url}")
+    screen.print(f"[dim]data in {settings.data.absolute()}, {settings.workers} worker(s); Ctrl-C stops everything[/]")
 
 
 def work(ctx: typer.Context, data: Data = None, workers: Workers = None, as_json: Json = False) -> None:

@@ -39,7 +39,7 @@ READING = (
     "layout", "rows", "y_axis", "coordinates", "coordinate_order", "visibility", "frames", "stride", "max_points", "min_seen",
 )  # fmt: skip
 """Options that say how tracks are read: kept inputs have been read already."""
-LONGEST_NAME = 200
+LONGEST_JOB_NAME = 200
 """Characters of the user's label."""
 
 
@@ -106,14 +106,9 @@ def accept(
         networks=jobs.settings.webhook_networks,
     )
     submission = Submission(
-        options=options,
-        name=name,
-        id=id,
-        idempotency_key=idempotency_key,
-        fingerprint=fingerprint,
-        webhook=webhook,
+        options=options, name=name, id=id, idempotency_key=idempotency_key, fingerprint=fingerprint, webhook=webhook,
         priority=_priority(form.texts.get("priority", "")),
-    )
+    )  # fmt: skip
     known = jobs.known(submission)
     if known is not None:
         return known, False
@@ -330,8 +325,8 @@ def _priority(text: str) -> Priority:
 def _name(text: str) -> str:
     """Return the user's label with runs of blanks and control characters replaced by single spaces."""
     name = one_line(text)
-    if len(name) > LONGEST_NAME:
-        expected = f"at most {LONGEST_NAME} characters"
+    if len(name) > LONGEST_JOB_NAME:
+        expected = f"at most {LONGEST_JOB_NAME} characters"
         code = ProblemCode.NAME_TOO_LONG
         raise wrong_input(code, field="name", expected=expected, got=str(len(name)), hint="Shorten it.")
     return name

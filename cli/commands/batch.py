@@ -76,7 +76,7 @@ class Batch:
     """Further parameters of `Client.submit`."""
     options: dict[str, Any]
     key: str
-    """Told apart from other batches of the same files by it."""
+    """Distinguishes the batch from others of the same files."""
     priority: str
     timeout: float | None
     output: Path | None
@@ -107,7 +107,7 @@ class Batch:
         twice = next((each for each in names if names.count(each) > 1), None)
         if twice is not None:
             raise BadArgument(
-                f"--output: several files are named {twice}, and would share a folder. Submit them apart."
+                f"--output: several files are named {twice}, and would share a folder. Submit them separately."
             )
         for each in names:
             if not force and (self.output / each / "report.json").exists():

@@ -12,7 +12,7 @@ from pliant.cli.show import show_job, show_jobs, verdict_lines
 from pliant.cli.solve import show_finished
 from pliant.schemas.job import Interpretation, Job, Status
 from pliant.schemas.options import Options
-from pliant.worker.execution.pipeline import Finished
+from pliant.worker.jobs.finished import Finished
 
 REASON = "The camera turned by 9° only; depth needs 20° or more."
 TRUST = "Expected error about 4 % of the object's size; depth rests on 9° of turn."

@@ -267,7 +267,7 @@ def test_cancelling_ends_the_wait_and_a_retry_is_a_new_job(kind: str, asked: dic
 def test_large_inputs_are_uploaded_first_with_the_same_result(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
     points, key = moving_points(6, 4000), secrets.token_hex()
     carried = client.submit(points, options=FAST, idempotency_key=key)
-    monkeypatch.setattr("pliant.client.multipart.LARGE", 100_000)
+    monkeypatch.setattr("pliant.client.multipart.RESUMABLE_BYTES", 100_000)
     monkeypatch.setattr("pliant.client.multipart.SMALL", 1000)
     updates: list[tuple[int, int]] = []
     ahead = client.submit(points, options=FAST, idempotency_key=key, on_upload=lambda *now: updates.append(now))

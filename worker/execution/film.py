@@ -12,12 +12,13 @@ from pliant.schemas.job import Artifact, Progress
 from pliant.schemas.options import Options
 from pliant.worker.artifacts import described, kinds_for
 from pliant.worker.errors import Interrupted
-from pliant.worker.execution.pipeline import Finished, Halt, silent, solve_and_write
+from pliant.worker.execution.pipeline import Halt, silent, solve_and_write
 from pliant.worker.execution.progress import FILM_SHARES, Reporter
 from pliant.worker.films import frame_strip
 from pliant.worker.films.inputs import read_tracked
 from pliant.worker.films.sources import FilmBounds, FilmSource
 from pliant.worker.films.tracker import track_film
+from pliant.worker.jobs.finished import Finished
 
 FILES = {
     "tracks.npz": (

@@ -17,7 +17,8 @@ from pliant.worker.formats.records import Arrays, GroundTruth, Inputs, Limits, S
 from pliant.worker.formats.texture import Texture
 
 VERSION = 1
-_OURS = Limits(max_bytes=1 << 36)
+OWN_FILES = Limits(max_bytes=1 << 36)
+"""Limits of files that this package wrote: they were checked when they were made."""
 
 
 def save_inputs(inputs: Inputs, path: Path) -> None:
@@ -61,7 +62,7 @@ def load_inputs(path: Path) -> Inputs:
     InvalidInput
         Code damaged_file: `save_inputs` did not write this file, or it was damaged.
     """
-    arrays = read_file(path, field="inputs", limits=_OURS)
+    arrays = read_file(path, field="inputs", limits=OWN_FILES)
     missing = {"version", "points", "visible", "interpretation"} - set(arrays)
     if missing or int(arrays["version"]) != VERSION:
         raise damaged(
