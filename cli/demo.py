@@ -55,6 +55,14 @@ DEGREES, DISTANCE = 30.0, 5.0
 GOOD: Mapping[str, float] = {"e3d_frame_scaled": 0.08, "track_median": 0.7, "track_p95": 3.0}
 """Errors above which the demonstration counts as failed: relative 3-D error, pixels, pixels."""
 
+MEANINGS: Mapping[str, str] = {
+    "e3d_frame_scaled": "3-D error, share of the object's size: e3d_frame after one scale, which a film does not show",
+    "track_median": "error of the tracks in pixels, median",
+    "track_p95": "error of the tracks in pixels, 95 % are below",
+    "visibility_precision": "share of the points called visible that are",
+    "visibility_recall": "share of the visible points called visible",
+}
+
 STOPS_WITHIN = 60.0
 
 
@@ -149,12 +157,12 @@ def report(
     from rich.text import Text
 
     table = Table(title=job.trust_sentence or job.sentence, title_justify="left")
-    for heading in ("metric", "value", "good below"):
-        table.add_column(heading, justify="left" if heading == "metric" else "right")
+    for heading in ("metric", "value", "good below", "meaning"):
+        table.add_column(heading, justify="left" if heading in ("metric", "meaning") else "right")
     for name, value in metrics.items():
         bound = GOOD.get(name)
         colour = "" if bound is None else "green" if value <= bound else "red"
-        table.add_row(name, Text(f"{value:.4g}", colour), "" if bound is None else f"{bound:g}")
+        table.add_row(name, Text(f"{value:.4g}", colour), "" if bound is None else f"{bound:g}", MEANINGS[name])
     screen = out()
     screen.print(table)
     for warning in job.warnings:
