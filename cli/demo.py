@@ -19,7 +19,7 @@ from pliant.cli.exits import Exit
 from pliant.cli.extras import require_server
 from pliant.cli.paths import output_folder
 from pliant.cli.session import LINE_EVERY, Json, Session
-from pliant.cli.show import err, out, print_json
+from pliant.cli.show import err, out, print_json, verdict_lines
 
 if TYPE_CHECKING:
     from pliant.schemas.job import Job
@@ -156,7 +156,7 @@ def report(
     from rich.table import Table
     from rich.text import Text
 
-    table = Table(title=job.trust_sentence or job.sentence, title_justify="left")
+    table = Table()
     for heading in ("metric", "value", "good below", "meaning"):
         table.add_column(heading, justify="left" if heading in ("metric", "meaning") else "right")
     for name, value in metrics.items():
@@ -171,6 +171,8 @@ def report(
         err().print("[bold red]The errors are too large.[/] Please report this with the output of `pliant doctor`.")
     for path in paths.values():
         screen.print(f"  {path}  {path.stat().st_size / 1e6:.2f} MB", markup=False)
+    for line in verdict_lines(job):
+        screen.print(line)
     glb = paths.get("shapes.glb")
     screen.print(f"Open {glb} in Blender or any glTF viewer: it plays." if glb is not None else "", markup=False)
     if url is None:

@@ -85,8 +85,10 @@ def test_the_demonstration_states_what_its_figures_mean(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "200")
-    report(job(), dict.fromkeys(MEANINGS, 0.04), {}, good=True, url=None, as_json=False)
+    judged = job(verdict="with_care", verdict_reasons=[REASON], trust_sentence=TRUST)
+    report(judged, dict.fromkeys(MEANINGS, 0.04), {}, good=True, url=None, as_json=False)
     rows = capsys.readouterr().out.splitlines()
+    assert [row for row in rows if row in LAST] == LAST
     for name, meaning in MEANINGS.items():
         (row,) = [line for line in rows if name in line.split()]
         assert meaning in row
