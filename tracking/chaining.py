@@ -15,6 +15,7 @@ import numpy as np
 from pliant.tracking.appearance import Appearance
 from pliant.tracking.errors import TrackingStopped
 from pliant.tracking.flow import Bools, Floats, Grey, Match, match
+from pliant.tracking.registration import Registration
 
 DELTAS = (1, 4, 16)
 """Frames back from t of the candidates beside the template itself: the set of MFT without its duplicates. On 177 frames of a
@@ -58,6 +59,7 @@ def chain(
     num_frames: int,
     template: int,
     appearance: Appearance,
+    registration: Registration,
     *,
     pool: ThreadPoolExecutor,
     on_frame: OnFrame,
@@ -73,6 +75,8 @@ def chain(
         F, and the index of the template.
     appearance
         The points `(P, 2)` and what the template shows around them.
+    registration
+        The same points, and what the template shows between them.
     pool
         Threads for the flows of one frame.
     on_frame
@@ -98,7 +102,7 @@ def chain(
         for t in range(template + direction, end, direction):
             if should_stop():
                 raise TrackingStopped
-            recent[t] = _advance(read, t, direction, recent, template, appearance, pool)
+            recent[t] = _advance(read, t, direction, recent, template, appearance, registration, pool)
             _store(result, t, recent[t])
             recent = {s: state for s, state in recent.items() if s == template or abs(t - s) < max(DELTAS)}
             on_frame(t, recent[t].points, recent[t].visible)
@@ -112,6 +116,7 @@ def _advance(
     recent: dict[int, _State],
     template: int,
     appearance: Appearance,
+    registration: Registration,
     pool: ThreadPoolExecutor,
 ) -> _State:
     """Find the points in frame t from the states of the frames between the template and t."""
@@ -129,7 +134,7 @@ def _advance(
     best = np.lexsort((variance, ~visible), axis=0)[0]
     every = np.arange(len(best))
     points = np.stack([m.points for m in matches])[best, every]
-    points = appearance.refine(frame, points, visible[best, every], pool=pool)
+    points = registration.refine(frame, points, visible[best, every])
     seen = appearance.agrees(frame, points, visible[best, every], pool=pool)
     return _State(points, seen, variance[best, every])
 
