@@ -42,16 +42,17 @@ class Chain:
     """Shape `(F, P)`."""
 
     variance: Floats
-    """Square pixels, shape `(F, P)`."""
+    """Of the places, square pixels, shape `(F, P)`, see `Registration.refine`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _State:
-    """What is known of the points in one frame: a frame's row of `Chain`."""
+    """What is known of the points in one frame: a frame's row of `Chain`, and the variance of the flows that lead there."""
 
     points: Floats
     visible: Bools
     variance: Floats
+    along: Floats
 
 
 def chain(
@@ -90,7 +91,8 @@ def chain(
         `should_stop` returned True.
     """
     count = len(appearance.points)
-    first = _State(appearance.points, np.ones(count, dtype=bool), np.zeros(count, dtype=np.float32))
+    none = np.zeros(count, dtype=np.float32)
+    first = _State(appearance.points, np.ones(count, dtype=bool), none, none)
     result = Chain(
         np.zeros((num_frames, count, 2), np.float32),
         np.zeros((num_frames, count), bool),
@@ -130,13 +132,13 @@ def _advance(
     # Slow turning and bending steepen the long flow from the template everywhere; there a gradient is no sign of an edge.
     lost = [m.lost if s == template else m.lost | m.boundary for s, m in zip(sources, matches, strict=True)]
     visible = np.stack([state.visible & ~gone for state, gone in zip(states, lost, strict=True)])
-    variance = np.stack([state.variance + m.gap + STEP_VARIANCE for state, m in zip(states, matches, strict=True)])
-    best = np.lexsort((variance, ~visible), axis=0)[0]
+    along = np.stack([state.along + m.gap + STEP_VARIANCE for state, m in zip(states, matches, strict=True)])
+    best = np.lexsort((along, ~visible), axis=0)[0]
     every = np.arange(len(best))
     points = np.stack([m.points for m in matches])[best, every]
-    points = registration.refine(frame, points, visible[best, every])
+    points, variance = registration.refine(frame, points, along[best, every], visible[best, every])
     seen = appearance.agrees(frame, points, visible[best, every], pool=pool)
-    return _State(points, seen, variance[best, every])
+    return _State(points, seen, variance, along[best, every])
 
 
 def _match_nearby(first: Grey, second: Grey, points: Floats, near: Floats, visible: Bools) -> Match:

@@ -40,6 +40,10 @@ STEPS, ITERATIONS = 4, 25
 LONGEST_STEP, FARTHEST = 1.0, 2.0
 """Pixels that a point moves at most in one step, and from the end of the flow in all; beyond that its flow is believed."""
 
+LEAST_SLOPE, ROUNDING = 0.25, 1e-4
+"""Mean squared slope that counts at least, (grey levels / pixel)², half a grey level a pixel, which is the rounding of 8-bit film; and the
+least variance, square pixels."""
+
 HOLD = 0.1
 """Precision of the flow's places where nothing else is known, 1/px²: a deviation of 3 px."""
 
@@ -110,20 +114,49 @@ class Registration:
             points, corners, between, products, pattern, _bending(grid, len(points)), window, values, step, noise
         )
 
-    def refine(self, frame: Grey, points: Floats, visible: Bools) -> Floats:
-        """Move visible points `(P, 2)` from the end of the flow to where a frame matches the template; the others stay."""
+    def refine(self, frame: Grey, points: Floats, variance: Floats, visible: Bools) -> tuple[Floats, Floats]:
+        """Move visible points from the end of the flow to where a frame matches the template.
+
+        Parameters
+        ----------
+        frame : array, shape (H, W)
+            Grey levels.
+        points, variance : array, shapes (P, 2) and (P,)
+            Where flow leads, and its variance in square pixels.
+        visible : array of bool, shape (P,)
+            Which points the frame shows. The others keep place and variance, as do those too far from a match.
+
+        Returns
+        -------
+        points, variance
+            Of the matches: the variance is that of the shift which would explain the remaining difference of brightness, the mean squared
+            residual around a point over the mean squared slope in the direction of least slope.
+        """
         shown = visible[self.corners].all(axis=1)
         used = np.zeros(len(points), dtype=bool)
         used[self.corners[shown]] = True
         if not used.any():
-            return points
+            return points, variance
         around = _Surroundings.of(self, np.repeat(shown, len(self.template) // len(shown)).astype(np.float32))
         picture, moved = _slopes(frame), points.astype(np.float32)
         for _ in range(STEPS):
             step = self._step(around, picture, moved, points)
             moved = moved + np.clip(step, -LONGEST_STEP, LONGEST_STEP).astype(np.float32)
         believed = used & (((moved - points) ** 2).sum(axis=1) < FARTHEST**2)
-        return np.where(believed[:, None], moved, points)
+        left = self._variance(around, picture, moved)
+        return np.where(believed[:, None], moved, points), np.where(believed, left, variance)
+
+    def _variance(self, around: _Surroundings, picture: Floats, points: Floats) -> Floats:
+        """Return the variance of all points, square pixels."""
+        values = _sampled(picture, self.between @ points)
+        residual, contrast = around.residual(values[:, 0])
+        across, down = (values[:, 1:] / contrast[:, None]).T
+        parts = [across * across, across * down, down * down, residual * residual]
+        xx, xy, yy, left = (self.between.T @ around.mean(part) for part in parts)
+        least = (xx + yy) / 2 - np.sqrt(((xx - yy) / 2) ** 2 + xy**2)
+        shown = self.between.T @ around.shown
+        variance = np.maximum(left, 0) / np.maximum(least, LEAST_SLOPE * shown + 1e-6) + ROUNDING
+        return np.asarray(variance, dtype=np.float32)
 
     def _step(self, around: _Surroundings, picture: Floats, moved: Floats, flowed: Floats) -> Floats:
         """Return the step of all points, shape `(P, 2)`."""
@@ -211,6 +244,10 @@ class _Surroundings:
         count = window.mean(shown) + np.float32(1e-6)
         centred = (registration.template - window.mean(registration.template * shown) / count) * shown
         return cls(window, shown, count, centred, window.mean(centred * centred) / count + noise, noise)
+
+    def mean(self, values: Floats) -> Floats:
+        """Return means over the shown places around every shown one, 0 elsewhere."""
+        return self.shown * self.window.mean(values * self.shown) / self.count
 
     def residual(self, values: Floats) -> tuple[Floats, Floats]:
         """Return a frame's values `(S,)` less the template, brightness and contrast adapted, and the contrast."""

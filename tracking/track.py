@@ -225,7 +225,9 @@ def _assemble(
     indices, times = found.indices[rows], found.times[rows]
     visible = chained.visible[:, kept]
     tracks = _in_film(chained.points[:, kept], found.scale)
-    confidence = np.where(visible, 1 / (1 + chained.variance[:, kept]), 0).astype(np.float32)
+    variance = chained.variance[:, kept]
+    usual = np.median(variance[visible])
+    confidence = np.where(visible, usual / np.maximum(variance, usual), 0).astype(np.float32)
     template = plan.template - plan.start
     picked = np.unique(np.linspace(0, len(indices) - 1, THUMBNAILS).round().astype(np.int64))
     image, thumbnails = _pictures(run, indices, template, picked)
