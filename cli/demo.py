@@ -19,7 +19,7 @@ from pliant.cli.exits import Exit
 from pliant.cli.extras import require_server
 from pliant.cli.paths import output_folder
 from pliant.cli.session import LINE_EVERY, Json, Session
-from pliant.cli.show import err, out, print_json
+from pliant.cli.show import err, out, print_json, verdict_lines
 
 if TYPE_CHECKING:
     from pliant.schemas.job import Job
@@ -54,6 +54,14 @@ DEGREES, DISTANCE = 30.0, 5.0
 
 GOOD: Mapping[str, float] = {"e3d_frame_scaled": 0.08, "track_median": 0.7, "track_p95": 3.0}
 """Errors above which the demonstration counts as failed: relative 3-D error, pixels, pixels."""
+
+MEANINGS: Mapping[str, str] = {
+    "e3d_frame_scaled": "3-D error, share of the object's size: e3d_frame after one scale, which a film does not show",
+    "track_median": "error of the tracks in pixels, median",
+    "track_p95": "error of the tracks in pixels, 95 % are below",
+    "visibility_precision": "share of the points called visible that are",
+    "visibility_recall": "share of the visible points called visible",
+}
 
 STOPS_WITHIN = 60.0
 
@@ -148,13 +156,13 @@ def report(
     from rich.table import Table
     from rich.text import Text
 
-    table = Table(title=job.trust_sentence or job.sentence, title_justify="left")
-    for heading in ("metric", "value", "good below"):
-        table.add_column(heading, justify="left" if heading == "metric" else "right")
+    table = Table()
+    for heading in ("metric", "value", "good below", "meaning"):
+        table.add_column(heading, justify="left" if heading in ("metric", "meaning") else "right")
     for name, value in metrics.items():
         bound = GOOD.get(name)
         colour = "" if bound is None else "green" if value <= bound else "red"
-        table.add_row(name, Text(f"{value:.4g}", colour), "" if bound is None else f"{bound:g}")
+        table.add_row(name, Text(f"{value:.4g}", colour), "" if bound is None else f"{bound:g}", MEANINGS[name])
     screen = out()
     screen.print(table)
     for warning in job.warnings:
@@ -163,6 +171,8 @@ def report(
         err().print("[bold red]The errors are too large.[/] Please report this with the output of `pliant doctor`.")
     for path in paths.values():
         screen.print(f"  {path}  {path.stat().st_size / 1e6:.2f} MB", markup=False)
+    for line in verdict_lines(job):
+        screen.print(line)
     glb = paths.get("shapes.glb")
     screen.print(f"Open {glb} in Blender or any glTF viewer: it plays." if glb is not None else "", markup=False)
     if url is None:
@@ -172,15 +182,13 @@ def report(
 
 
 @contextmanager
-def running(folder: Path, *, threads: int | None = None) -> Iterator[str]:
+def running(folder: Path) -> Iterator[str]:
     """Run `pliant up` on a free port with its data in a folder, yield its address, and stop it afterwards.
 
     Parameters
     ----------
     folder : Path
         Created if missing; holds the data and the log.
-    threads : int, optional
-        Threads of the numerical libraries in one job.
 
     Raises
     ------
@@ -190,33 +198,16 @@ def running(folder: Path, *, threads: int | None = None) -> Iterator[str]:
     from pliant.client.errors import Unreachable
 
     log = folder / "service.log"
-    command = [
-        sys.executable,
-        "-m",
-        "pliant.cli",
-        "up",
-        "--port",
-        "0",
-        "--data",
-        str(folder.absolute() / "data"),
-        "--json",
-    ]
+    data = str(folder.absolute() / "data")
+    command = [sys.executable, "-m", "pliant.cli", "up", "--port", "0", "--data", data, "--json"]
     elsewhere = ("PLIANT_REDIS_URL", "PLIANT_BLOB_URL", "PLIANT_HOST", "PLIANT_AUTH", "PLIANT_TOKEN")
     environment = {name: value for name, value in os.environ.items() if name not in elsewhere}
-    if threads is not None:
-        environment["PLIANT_THREADS"] = str(threads)
     folder.mkdir(parents=True, exist_ok=True)
     # Started in its own folder, for a `.env` of the current one describes another installation.
     with log.open("wb") as errors:
         process = subprocess.Popen(  # noqa: S603 - our own program
-            command,
-            stdout=subprocess.PIPE,
-            stderr=errors,
-            env=environment,
-            cwd=folder,
-            start_new_session=True,
-            text=True,
-        )
+            command, stdout=subprocess.PIPE, stderr=errors, env=environment, cwd=folder, start_new_session=True, text=True
+        )  # fmt: skip
         try:
             assert process.stdout is not None
             url = announced(process.stdout)

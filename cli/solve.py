@@ -4,28 +4,30 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from pliant.cli.films import inspect_film, is_film, refuse_parts_of_tracks, solve_film
-from pliant.cli.paths import input_file, output_folder
+from pliant.cli.paths import input_file, results_folder, tracks_or_film
 from pliant.cli.session import (
     LINE_EVERY,
     Force,
     GroundTruth,
     Json,
     Mesh,
+    Name,
     OptionPairs,
     Region,
     Rotations,
     Tracks,
+    name_of,
     parse_options,
 )
 from pliant.cli.show import err, metrics_table, out, print_json, understood, verdict_lines
 
 if TYPE_CHECKING:
     from pliant.schemas.job import Interpretation
-    from pliant.worker.execution.pipeline import Finished
+    from pliant.worker.jobs.finished import Finished
 
 Threads = Annotated[
     int | None,
@@ -42,22 +44,42 @@ def solve(
     rotations: Rotations = None,
     region: Region = None,
     option: OptionPairs = None,
+    name: Name = "",
     threads: Threads = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Reconstruct tracks or a film in this process, without a service: the same code, the same files."""
     ctx.obj.json = as_json
-    check_inputs(None if tracks.is_dir() else tracks, ground_truth, rotations)
+    check_inputs(tracks, ground_truth, rotations)
     input_file(region, "region")
-    missing = not output.exists()
-    output_folder(output, force=force)
-    if missing:  # made again when there are results: inputs that are refused leave no folder behind
-        output.rmdir()
     from pliant.worker.settings import NUMERICAL_THREADS
 
     # Read by the numerical libraries when they are imported, below; the solver has its own threads.
     os.environ.update(dict.fromkeys(NUMERICAL_THREADS, "1"))
+    with results_folder(output, force=force):
+        options, name = parse_options(option), name_of(name, tracks)
+        if is_film(tracks, region):
+            refuse_parts_of_tracks(mesh=mesh, ground_truth=ground_truth, rotations=rotations)
+            done = solve_film(
+                tracks, output, region=region, options=options, name=name, threads=threads, as_json=as_json
+            )
+        else:
+            parts = {"tracks": tracks, "mesh": file_or_word(mesh), "ground_truth": ground_truth, "rotations": rotations}
+            done = solve_tracks(parts, output, options=options, name=name, threads=threads, as_json=as_json)
+    show_finished(done, output, as_json=as_json)
+
+
+def solve_tracks(
+    parts: dict[str, Any], output: Path, *, options: dict[str, Any], name: str, threads: int | None, as_json: bool
+) -> Finished:
+    """Read and reconstruct tracks; `parts` are the inputs by their names in `read_inputs`.
+
+    Raises
+    ------
+    InvalidInput
+        An input or an option cannot be used.
+    """
     from pliant.client.multipart import checked_options
     from pliant.client.progress import progress_bar
     from pliant.solver import threads_limited
@@ -65,22 +87,13 @@ def solve(
     from pliant.worker.formats import read_inputs
     from pliant.worker.formats.tracks.film_tracks import tracks_options
 
-    if is_film(tracks, region):
-        refuse_parts_of_tracks(mesh=mesh, ground_truth=ground_truth, rotations=rotations)
-        given = parse_options(option)
-        done = solve_film(tracks, output, region=region, options=given, threads=threads, as_json=as_json)
-        show_finished(done, output, as_json=as_json)
-        return
-    options = checked_options(parse_options(option))
-    inputs = read_inputs(
-        tracks=tracks, mesh=file_or_word(mesh), ground_truth=ground_truth, rotations=rotations, options=options
-    )
-    options = tracks_options(options, inputs.interpretation)
+    checked = checked_options(options)
+    inputs = read_inputs(**parts, options=checked)
+    checked = tracks_options(checked, inputs.interpretation)
     if not as_json:
         show_understood(inputs.interpretation)
     with progress_bar(line_every=LINE_EVERY) as bar, threads_limited(threads):
-        done = reconstruct(inputs, options, output, on_progress=bar.on_step, should_stop=None)
-    show_finished(done, output, as_json=as_json)
+        return reconstruct(inputs, checked, output, name=name, on_progress=bar.on_step)
 
 
 def inspect(
@@ -98,7 +111,7 @@ def inspect(
 ) -> None:
     """Show how a track file is read, or what a film holds and what tracking it would take, without solving."""
     ctx.obj.json = as_json
-    check_inputs(None if file.is_dir() else file, ground_truth, rotations)
+    check_inputs(file, ground_truth, rotations)
     input_file(region, "region")
     options = parse_options(option)
     if url == "" and is_film(file, region):
@@ -127,9 +140,10 @@ def inspect(
         show_understood(interpretation)
 
 
-def check_inputs(tracks: Path | None, ground_truth: Path | None, rotations: Path | None) -> None:
+def check_inputs(tracks: Path, ground_truth: Path | None, rotations: Path | None) -> None:
     """Check the paths of the inputs; a mesh may be a word, so its reader checks it."""
-    for path, name in ((tracks, "tracks"), (ground_truth, "ground_truth"), (rotations, "rotations")):
+    tracks_or_film(tracks)
+    for path, name in ((ground_truth, "ground_truth"), (rotations, "rotations")):
         input_file(path, name)
 
 

@@ -40,6 +40,10 @@ STEPS, ITERATIONS = 4, 25
 LONGEST_STEP, FARTHEST = 1.0, 2.0
 """Pixels that a point moves at most in one step, and from the end of the flow in all; beyond that its flow is believed."""
 
+UNLIKE = 0.36
+"""Share of the template's contrast around a point that the frame leaves unexplained, from which on it shows something else, or the same
+too much changed, and the flow is believed: a correlation of .8."""
+
 LEAST_SLOPE, ROUNDING = 0.25, 1e-4
 """Mean squared slope that counts at least, (grey levels / pixel)², half a grey level a pixel, which is the rounding of 8-bit film; and the
 least variance, square pixels."""
@@ -143,11 +147,12 @@ class Registration:
             step = self._step(around, picture, moved, points)
             moved = moved + np.clip(step, -LONGEST_STEP, LONGEST_STEP).astype(np.float32)
         believed = used & (((moved - points) ** 2).sum(axis=1) < FARTHEST**2)
-        left = self._variance(around, picture, moved)
+        left, unlike = self._remaining(around, picture, moved)
+        believed &= unlike < UNLIKE
         return np.where(believed[:, None], moved, points), np.where(believed, left, variance)
 
-    def _variance(self, around: _Surroundings, picture: Floats, points: Floats) -> Floats:
-        """Return the variance of all points, square pixels."""
+    def _remaining(self, around: _Surroundings, picture: Floats, points: Floats) -> tuple[Floats, Floats]:
+        """Return the variance of all points, square pixels, and the share of the template's contrast that the frame does not explain."""
         values = _sampled(picture, self.between @ points)
         residual, contrast = around.residual(values[:, 0])
         across, down = (values[:, 1:] / contrast[:, None]).T
@@ -156,7 +161,8 @@ class Registration:
         least = (xx + yy) / 2 - np.sqrt(((xx - yy) / 2) ** 2 + xy**2)
         shown = self.between.T @ around.shown
         variance = np.maximum(left, 0) / np.maximum(least, LEAST_SLOPE * shown + 1e-6) + ROUNDING
-        return np.asarray(variance, dtype=np.float32)
+        unlike = np.maximum(left, 0) / np.maximum(self.between.T @ around.power, 1e-6)
+        return np.asarray(variance, dtype=np.float32), np.asarray(unlike, dtype=np.float32)
 
     def _step(self, around: _Surroundings, picture: Floats, moved: Floats, flowed: Floats) -> Floats:
         """Return the step of all points, shape `(P, 2)`."""

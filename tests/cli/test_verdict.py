@@ -7,11 +7,13 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
+from pliant.cli.commands.batch import Batch, Row
+from pliant.cli.demo import MEANINGS, report
 from pliant.cli.show import show_job, show_jobs, verdict_lines
 from pliant.cli.solve import show_finished
 from pliant.schemas.job import Interpretation, Job, Status
 from pliant.schemas.options import Options
-from pliant.worker.execution.pipeline import Finished
+from pliant.worker.jobs.finished import Finished
 
 REASON = "The camera turned by 9° only; depth needs 20° or more."
 TRUST = "Expected error about 4 % of the object's size; depth rests on 9° of turn."
@@ -77,3 +79,31 @@ def test_the_list_of_jobs_has_the_verdict(capsys: pytest.CaptureFixture[str]) ->
     assert "verdict" in heading
     assert "Do not use" in bad
     assert old.split()[:2] == ["job", "succeeded"]
+
+
+def test_the_demonstration_states_what_its_figures_mean(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    judged = job(verdict="with_care", verdict_reasons=[REASON], trust_sentence=TRUST)
+    report(judged, dict.fromkeys(MEANINGS, 0.04), {}, good=True, url=None, as_json=False)
+    rows = capsys.readouterr().out.splitlines()
+    assert [row for row in rows if row in LAST] == LAST
+    for name, meaning in MEANINGS.items():
+        (row,) = [line for line in rows if name in line.split()]
+        assert meaning in row
+        assert "0.04" in row
+
+
+@pytest.mark.parametrize("columns", ["40", "80", "200"])
+def test_ids_are_whole_on_a_narrow_terminal(
+    columns: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", columns)
+    known = job(id="e2efed37cfcf5352891c", name="a name that is long", verdict="with_care")
+    show_jobs([known], as_json=False)
+    assert known.id in capsys.readouterr().out
+    batch = Batch(files=[], shared={}, options={}, key="", priority="normal", timeout=None, output=None, wait=True)
+    batch.rows = [Row(Path("a file with a long name.npz"), known)]
+    batch.show(as_json=False)
+    assert known.id in capsys.readouterr().out

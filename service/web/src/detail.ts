@@ -1,6 +1,6 @@
 // One job: where it stands, what it was understood as, and what came of it.
 
-import { Refusal, artifactPath, cancelJob, deleteJob, getReport, isShared, listJobs, retryJob } from "./api";
+import { Refusal, artifactPath, cancelJob, deleteJob, getReport, isShared, isSingle, listJobs, retryJob } from "./api";
 import { Afterwards } from "./afterwards";
 import { Countdown } from "./countdown";
 import { Curves } from "./curves";
@@ -136,7 +136,7 @@ export class Detail {
     say(this.heading, title(job));
     say(this.status, STATUS_WORDS[job.status]);
     this.status.dataset["status"] = job.status;
-    say(this.when, `${isFinal(job.status) ? "" : "sent "}${ago(job.created_at)}${job.expires_at ? `, kept until ${new Date(job.expires_at).toLocaleDateString()}` : ""}`);
+    say(this.when, `${isFinal(job.status) ? "" : "sent "}${ago(job.created_at)}${job.expires_at && !isShared() ? `, kept until ${new Date(job.expires_at).toLocaleDateString()}` : ""}`);
     this.countdown.show(job);
     this.tab.show(job);
     this.live.show(job);
@@ -267,7 +267,7 @@ export class Detail {
       preview: artifactPath(job.id, PREVIEW),
       film: path(FILM),
       usdz: path(USDZ),
-      ...(isShared() ? {} : { others }),
+      ...(isSingle() ? {} : { others }),
     };
   }
 }
