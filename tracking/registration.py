@@ -25,8 +25,8 @@ WINDOW = 13.0
 """Side of the window in which brightness and contrast are free, pixels: 9 and 25 change the errors on a rendered face by less than 10 %."""
 
 BENDING = 0.06
-"""Standard deviation of the motion's second differences over the distance of neighbouring points. On a rendered face .04 and .1 have a
-median error up to 15 % larger; the double has half as much error again where there is little texture."""
+"""Standard deviation of the motion's second differences over the distance of neighbouring points. On a rendered face, one registration
+from the end of the flow has a median error of .69 px with .012, .16 with .05, .19 with .1 and .26 with .2."""
 
 EDGE = 2.0
 """Standard deviations beyond which a second difference counts less and less, so that the motion may have creases (Cauchy)."""
