@@ -24,19 +24,8 @@ quarter to a half of the wrongly visible points and hides 2 to 3 % of the right 
 PATCH_OFFSETS = np.stack(np.meshgrid(*[np.arange(-6, 7, 2, dtype=np.float32)] * 2), axis=-1).reshape(-1, 2)
 """Sample places of a patch in pixels around its point: 7 × 7, two pixels apart."""
 
-
-REFINEMENTS = 4
-"""Steps of Lucas and Kanade from the end of the flow; each is at most half a pixel."""
-
-SAME_PATCH = 0.8
-"""Least correlation with the template at which a refined place is believed: below, the patch shows something else or has changed, and
-its best match is no longer the point."""
-
 POINTS_AT_ONCE = 512
-"""Points refined together: their patches (100 KB an array) stay in a core's cache."""
-
-FLOW_VARIANCE = 0.25
-"""Prior variance of the flow's error, square pixels: half a pixel, what DIS is off on rendered films of 480 pixels."""
+"""Points compared together: their patches (100 KB an array) stay in a core's cache."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,9 +41,6 @@ class Appearance:
     patches: Floats
     """Grey levels with their mean removed, shape `(P, 49)`."""
 
-    slopes: Floats
-    """Derivatives of the grey levels with respect to x and y, shape `(2, P, 49)`."""
-
     noise: float
     """Variance of the template's noise, square grey levels."""
 
@@ -63,58 +49,7 @@ class Appearance:
         """Cut the patches out of a template."""
         image, places = _smooth(template), points[:, None] + PATCH_OFFSETS
         patches = _cut(image, places)
-        slopes = np.stack(
-            [
-                _cut(np.asarray(cv2.Sobel(image, cv2.CV_32F, *axis, scale=1 / 8), dtype=np.float32), places)
-                for axis in ((1, 0), (0, 1))
-            ]
-        )
-        return cls(points, neighbours, _centred(patches), slopes, noise_variance(template))
-
-    def refine(self, frame: Grey, points: Floats, visible: Bools, *, pool: ThreadPoolExecutor | None = None) -> Floats:
-        """Move visible points to where a frame matches the template's patches best; returns points `(P, 2)`.
-
-        Flow is smooth over its patches and rounds its errors off; a patch that follows the tracks' local affine map finds the point
-        itself. Each step is the maximum a posteriori of the shift, the flow's place being the prior (Lucas and Kanade 1981, with
-        the template's slopes as in Baker and Matthews 2004; brightness may change by a factor and an offset). The result does not
-        depend on the pool.
-        """
-        image, affine = _smooth(frame), self._affine(points, visible)
-        determinant = affine[:, 0, 0] * affine[:, 1, 1] - affine[:, 0, 1] * affine[:, 1, 0]
-        usable = visible & (np.abs(determinant) > 0.1)
-        return _by_blocks(
-            lambda block: self._refined(image, points[block], affine[block], usable[block], block), len(points), pool
-        )
-
-    def _refined(self, image: Floats, points: Floats, affine: Floats, usable: Bools, block: slice) -> Floats:
-        """Return the refined places of the points of one block."""
-        template, offsets = self.patches[block], _offsets(affine)
-        back = np.linalg.inv(np.where(usable[:, None, None], affine, np.eye(2, dtype=np.float32))).astype(np.float32)
-        slopes = [
-            self.slopes[0, block] * back[:, 0, axis, None] + self.slopes[1, block] * back[:, 1, axis, None]
-            for axis in (0, 1)
-        ]
-        hold = np.float32(2 * (self.noise + 1.0) / FLOW_VARIANCE)
-        normal = [[_dot(first, second) for second in slopes] for first in slopes]
-        inverse = np.linalg.inv(np.moveaxis(np.array(normal), 2, 0) + hold * np.eye(2, dtype=np.float32)).astype(
-            np.float32
-        )
-        strength = _dot(template, template) + np.float32(self.noise + 1.0)
-        moved, before = points.copy(), np.zeros(len(points), np.float32)
-        alike = before
-        for step in range(REFINEMENTS + 1):
-            patches = _centred(_cut(image, moved[:, None] + offsets))
-            product = _dot(patches, template)
-            norms = strength * (_dot(patches, patches) + np.float32(self.noise + 1.0))
-            alike = np.asarray(product / np.sqrt(norms), dtype=np.float32)
-            if step == 0:
-                before = alike
-            if step < REFINEMENTS:
-                residual = patches / np.clip(product / strength, 0.5, 2.0)[:, None] - template
-                pull = np.stack([_dot(slope, residual) for slope in slopes], axis=1) + hold * (moved - points)
-                moved -= np.clip((inverse @ pull[:, :, None])[:, :, 0], -0.5, 0.5)
-        better = usable & (alike >= np.maximum(before, SAME_PATCH)) & (((moved - points) ** 2).sum(axis=1) < 1)
-        return np.asarray(np.where(better[:, None], moved, points), dtype=np.float32)
+        return cls(points, neighbours, _centred(patches), noise_variance(template))
 
     def agrees(self, frame: Grey, points: Floats, visible: Bools, *, pool: ThreadPoolExecutor | None = None) -> Bools:
         """Compare a frame with the template at tracked points; return which of the visible ones stay so, shape `(P,)`.

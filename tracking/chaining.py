@@ -15,6 +15,7 @@ import numpy as np
 from pliant.tracking.appearance import Appearance
 from pliant.tracking.errors import TrackingStopped
 from pliant.tracking.flow import Bools, Floats, Grey, Match, match
+from pliant.tracking.registration import Registration
 
 DELTAS = (1, 4, 16)
 """Frames back from t of the candidates beside the template itself: the set of MFT without its duplicates. On 177 frames of a
@@ -41,16 +42,17 @@ class Chain:
     """Shape `(F, P)`."""
 
     variance: Floats
-    """Square pixels, shape `(F, P)`."""
+    """Of the places, square pixels, shape `(F, P)`, see `Registration.refine`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _State:
-    """What is known of the points in one frame: a frame's row of `Chain`."""
+    """What is known of the points in one frame: a frame's row of `Chain`, and the variance of the flows that lead there."""
 
     points: Floats
     visible: Bools
     variance: Floats
+    along: Floats
 
 
 def chain(
@@ -58,6 +60,7 @@ def chain(
     num_frames: int,
     template: int,
     appearance: Appearance,
+    registration: Registration,
     *,
     pool: ThreadPoolExecutor,
     on_frame: OnFrame,
@@ -73,6 +76,8 @@ def chain(
         F, and the index of the template.
     appearance
         The points `(P, 2)` and what the template shows around them.
+    registration
+        The same points, and what the template shows between them.
     pool
         Threads for the flows of one frame.
     on_frame
@@ -86,7 +91,8 @@ def chain(
         `should_stop` returned True.
     """
     count = len(appearance.points)
-    first = _State(appearance.points, np.ones(count, dtype=bool), np.zeros(count, dtype=np.float32))
+    none = np.zeros(count, dtype=np.float32)
+    first = _State(appearance.points, np.ones(count, dtype=bool), none, none)
     result = Chain(
         np.zeros((num_frames, count, 2), np.float32),
         np.zeros((num_frames, count), bool),
@@ -98,7 +104,7 @@ def chain(
         for t in range(template + direction, end, direction):
             if should_stop():
                 raise TrackingStopped
-            recent[t] = _advance(read, t, direction, recent, template, appearance, pool)
+            recent[t] = _advance(read, t, direction, recent, template, appearance, registration, pool)
             _store(result, t, recent[t])
             recent = {s: state for s, state in recent.items() if s == template or abs(t - s) < max(DELTAS)}
             on_frame(t, recent[t].points, recent[t].visible)
@@ -112,6 +118,7 @@ def _advance(
     recent: dict[int, _State],
     template: int,
     appearance: Appearance,
+    registration: Registration,
     pool: ThreadPoolExecutor,
 ) -> _State:
     """Find the points in frame t from the states of the frames between the template and t."""
@@ -125,13 +132,13 @@ def _advance(
     # Slow turning and bending steepen the long flow from the template everywhere; there a gradient is no sign of an edge.
     lost = [m.lost if s == template else m.lost | m.boundary for s, m in zip(sources, matches, strict=True)]
     visible = np.stack([state.visible & ~gone for state, gone in zip(states, lost, strict=True)])
-    variance = np.stack([state.variance + m.gap + STEP_VARIANCE for state, m in zip(states, matches, strict=True)])
-    best = np.lexsort((variance, ~visible), axis=0)[0]
+    along = np.stack([state.along + m.gap + STEP_VARIANCE for state, m in zip(states, matches, strict=True)])
+    best = np.lexsort((along, ~visible), axis=0)[0]
     every = np.arange(len(best))
     points = np.stack([m.points for m in matches])[best, every]
-    points = appearance.refine(frame, points, visible[best, every], pool=pool)
+    points, variance = registration.refine(frame, points, along[best, every], visible[best, every])
     seen = appearance.agrees(frame, points, visible[best, every], pool=pool)
-    return _State(points, seen, variance[best, every])
+    return _State(points, seen, variance, along[best, every])
 
 
 def _match_nearby(first: Grey, second: Grey, points: Floats, near: Floats, visible: Bools) -> Match:

@@ -85,7 +85,7 @@ class TrackedFilm:
     """Shape `(F, P)`."""
 
     confidence: NDArray[np.float32]
-    """1 / (1 + σ²) with σ² the track's variance in square pixels of the tracker's frames; 0 where hidden, shape `(F, P)`."""
+    """At most 1: the film's median variance over that of the observation; 0 where hidden, shape `(F, P)`."""
 
     grid: NDArray[np.int32]
     """Point of every grid cell, −1 for holes, shape `(rows, columns)`."""

@@ -22,6 +22,7 @@ from pliant.tracking.flow import Bools, Floats, opencv_serial
 from pliant.tracking.frame_store import FrameStore
 from pliant.tracking.records import FilmInfo, Followed, OnStep, TrackedFilm, TrackingStep
 from pliant.tracking.region import Region, read_region, transport
+from pliant.tracking.registration import Registration
 from pliant.tracking.seeding import default_step, keep, neighbours, place, quads
 from pliant.tracking.survey import Survey, sharpest, survey
 
@@ -183,6 +184,7 @@ def _track(run: _Run, found: Survey, plan: _Plan, step: float | None, *, whole: 
             hint="Draw a larger region, use a smaller grid_step, or film a surface with a pattern, in focus and in good light.",
         )  # fmt: skip
     appearance = Appearance.of(template, seeds.points, neighbours(seeds.grid, len(seeds.points)))
+    registration = Registration.of(template, seeds.points, seeds.grid, noise=appearance.noise)
     length = plan.stop - plan.start
     done = 1
 
@@ -194,7 +196,7 @@ def _track(run: _Run, found: Survey, plan: _Plan, step: float | None, *, whole: 
         run.on_step(TrackingStep("track", done, length, followed))
 
     chained = chain(
-        lambda row: run.store.read(plan.start + row), length, plan.template - plan.start, appearance,
+        lambda row: run.store.read(plan.start + row), length, plan.template - plan.start, appearance, registration,
         pool=run.pool, on_frame=on_frame, should_stop=run.should_stop,
     )  # fmt: skip
     kept_grid, kept = keep(seeds.grid, chained.visible.mean(axis=0) >= LEAST_SEEN)
@@ -223,7 +225,9 @@ def _assemble(
     indices, times = found.indices[rows], found.times[rows]
     visible = chained.visible[:, kept]
     tracks = _in_film(chained.points[:, kept], found.scale)
-    confidence = np.where(visible, 1 / (1 + chained.variance[:, kept]), 0).astype(np.float32)
+    variance = chained.variance[:, kept]
+    usual = np.median(variance[visible])
+    confidence = np.where(visible, usual / np.maximum(variance, usual), 0).astype(np.float32)
     template = plan.template - plan.start
     picked = np.unique(np.linspace(0, len(indices) - 1, THUMBNAILS).round().astype(np.int64))
     image, thumbnails = _pictures(run, indices, template, picked)

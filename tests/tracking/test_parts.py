@@ -18,9 +18,11 @@ from pliant.tracking.decoding.pictures import natural
 from pliant.tracking.flow import match, opencv_serial, sample
 from pliant.tracking.frame_store import CACHED, FrameStore
 from pliant.tracking.region import read_region
+from pliant.tracking.registration import Registration
 from pliant.tracking.rendering import render_film
 from pliant.tracking.seeding import keep, neighbours, place, quads
 from pliant.tracking.survey import find_cuts, sharpest, tracking_scale
+from scipy import sparse
 
 
 def grey(count: int = 2, step: int = 2) -> list[np.ndarray]:
@@ -197,20 +199,62 @@ def test_rendered_films_are_written_in_known_containers_only(tmp_path: Path) -> 
     assert caught.value.code == "unwritable_film"
 
 
-def test_refinement_finds_the_point_that_the_flow_missed() -> None:
+def registered() -> tuple[Registration, np.ndarray, np.ndarray, np.ndarray]:
+    """A template's grid, a frame that shows it turned in another light, true places there, and the end of a flow."""
     wide = cv2.cvtColor(films.textured_pictures(1, (96, 72))[0], cv2.COLOR_RGB2GRAY)
     turn = cv2.getRotationMatrix2D((48, 36), 6, 1.05)
     frame = np.asarray(cv2.warpAffine(wide, turn, (96, 72), flags=cv2.INTER_CUBIC), np.uint8)
-    frame = np.clip(0.8 * frame + 20.0, 0, 255).astype(np.uint8)  # the light changes, too
+    frame = np.clip(0.8 * frame + 20.0, 0, 255).astype(np.uint8)
     seeds, _ = place(wide, np.pad(np.ones((40, 64), bool), 16), step=4)
-    appearance = Appearance.of(wide, seeds.points, neighbours(seeds.grid, len(seeds.points)))
     true = seeds.points @ turn[:, :2].T.astype(np.float32) + turn[:, 2].astype(np.float32)
     flowed = true + np.random.default_rng(0).normal(0, 0.3, true.shape).astype(np.float32)
-    visible = np.ones(len(true), bool)
-    refined = appearance.refine(frame, flowed, visible)
-    before, after = (np.median(np.linalg.norm(found - true, axis=1)) for found in (flowed, refined))
-    assert after < 0.4 * before
-    np.testing.assert_array_equal(appearance.refine(frame, flowed, ~visible), flowed)
+    return Registration.of(wide, seeds.points, seeds.grid, noise=noise_variance(wide)), frame, true, flowed
+
+
+def test_registration_finds_the_point_that_the_flow_missed() -> None:
+    registration, frame, true, flowed = registered()
+    visible, before = np.ones(len(true), bool), np.full(len(true), 0.5, np.float32)
+    found, variance = registration.refine(frame, flowed, before, visible)
+    error, missed = (np.linalg.norm(points - true, axis=1) for points in (found, flowed))
+    assert np.median(error) < 0.25 * np.median(missed)
+    np.testing.assert_allclose(np.sqrt((error**2).mean()), np.sqrt(np.median(variance)), rtol=0.7)
+    hidden, same = registration.refine(frame, flowed, before, ~visible)
+    np.testing.assert_array_equal(hidden, flowed)
+    np.testing.assert_array_equal(same, before)
+
+
+def test_registration_leaves_alone_what_shows_something_else() -> None:
+    registration, _, true, flowed = registered()
     other = cv2.cvtColor(films.textured_pictures(1, (96, 72), seed=5)[0], cv2.COLOR_RGB2GRAY)
-    kept = (appearance.refine(other, flowed, visible) == flowed).all(axis=1)
-    assert kept.mean() > 0.95, "what shows something else is left where it was"
+    visible, before = np.ones(len(true), bool), np.full(len(true), 0.5, np.float32)
+    found, variance = registration.refine(other, flowed, before, visible)
+    assert (found == flowed).all(axis=1).mean() > 0.95
+    assert (variance == before).mean() > 0.95
+
+
+def test_registration_of_a_frame_with_itself_moves_nothing() -> None:
+    wide = cv2.cvtColor(films.textured_pictures(1, (96, 72))[0], cv2.COLOR_RGB2GRAY)
+    seeds, _ = place(wide, np.pad(np.ones((40, 64), bool), 16), step=4)
+    registration = Registration.of(wide, seeds.points, seeds.grid, noise=noise_variance(wide))
+    everywhere = np.ones(len(seeds.points), bool)
+    found, variance = registration.refine(wide, seeds.points, np.ones(len(seeds.points), np.float32), everywhere)
+    np.testing.assert_allclose(found, seeds.points, atol=1e-3)
+    assert variance.max() < 0.01
+
+
+def test_a_cell_moves_bilinearly_and_a_plane_does_not_bend() -> None:
+    registration, *_ = registered()
+    corner = registration.points[registration.corners]
+    places = registration.between @ registration.points
+    inside = places.reshape(len(corner), -1, 2)
+    np.testing.assert_allclose(inside.mean(axis=1), corner.mean(axis=1), rtol=1e-5)
+    assert (inside.min(axis=1) > corner.min(axis=1)).all()
+    assert (inside.max(axis=1) < corner.max(axis=1)).all()
+    affine = registration.points @ np.array([[1.1, 0.3], [-0.2, 0.9]], np.float32) + 5
+    np.testing.assert_allclose(registration.bending @ affine, 0, atol=1e-4)
+    assert np.abs(registration.bending @ registration.points**2).max() > 1
+    columns, pointers = registration.pattern
+    weights = np.random.default_rng(0).random(len(registration.template)).astype(np.float32)
+    sums = sparse.csr_array((registration.products @ weights, columns, pointers)).toarray()
+    dense = registration.between.toarray()
+    np.testing.assert_allclose(sums, dense.T @ (weights[:, None] * dense), atol=1e-4)
