@@ -29,6 +29,7 @@ from pliant.solver.model.random_walk import (
     WalkPosterior,
     coloured,
     random_walk,
+    random_walk_at,
     walk_bands,
     whitened,
     whitener,
@@ -108,6 +109,12 @@ class ShapeCovariance:
         """Return C, shape `(F, F)`."""
         covariance: Floats = self.modes @ self.modes.T + self.walk_variance * random_walk(len(self.modes), self.ordered)
         return covariance
+
+    def over_frames_at(self, used: NDArray[np.intp]) -> Floats:
+        """Return C restricted to the frames used, shape `(F', F')`."""
+        modes = self.modes[used]
+        walk = random_walk_at(used, len(self.modes), self.ordered)
+        return np.asarray(modes @ modes.T + self.walk_variance * walk)
 
     def of_image(self, projections: Floats) -> Floats:
         """Return V = ΠΣΠᵀ + σ²I, shape `(2F, 2F)`; `projections` (F, 2, 3) are s_f times the first two rows of R_f."""
