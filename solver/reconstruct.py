@@ -89,7 +89,7 @@ def _solved(
     cameras, prior = _learned(observations, monitor)
     monitor.report(Step("cameras", 0.0, max_reweightings=settings.max_reweightings))
     learning, began = time.perf_counter() - began, time.perf_counter()
-    start = with_outliers_rejected(prepared(tracks, cameras, prior, mesh, settings), monitor)
+    start = with_outliers_rejected(prepared(tracks, cameras, prior, mesh, settings, should_stop=monitor), monitor)
     if start.rejected().any() and not monitor():
         again = time.perf_counter()
         start = _started_again(start, cameras, monitor)
@@ -123,4 +123,4 @@ def _started_again(start: Start, before: Cameras, monitor: Monitor) -> Start:
     """
     observations = start.observations
     cameras, prior = _learned(observations, monitor, start.rejected(), before)
-    return prepared(observations.tracks, cameras, prior, start.mesh, start.settings)
+    return prepared(observations.tracks, cameras, prior, start.mesh, start.settings, should_stop=monitor)

@@ -188,11 +188,13 @@ def _finished(start: Start, history: list[State], outcome: Outcome, monitor: Mon
     choices = with_camera_choice(
         start.choices, estimate.perspective, start.settings, unit=normalized.unit, given=observations.known is not None
     )
+    monitor()
     solution = finish(problem, history, outcome, normalized=normalized, estimate=estimate, choices=choices)
     if estimate.perspective is not None:
         solution = seen_in_perspective(solution, tracks, estimate.perspective, normalized.unit, start.kept)
     enter(monitor, "trust")
     confidence = np.asarray(problem.confidence, dtype=np.float64)
+    monitor()
     solution = with_inlier_probability(solution, tracks, confidence, loss=problem.loss)
     solution = assessed(
         solution, confidence, estimate, start.covariance, normalized.unit,

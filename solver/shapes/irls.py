@@ -59,13 +59,18 @@ def step(
     operator = operator_at(problem, state)
     target = problem.points - state.translations[:, :, None].astype(problem.points.dtype)
     gradient = operator.gradient(state.shapes, target)
+    tick = should_stop if should_stop is not None else bool
+    tick()
     inner = operator.rounded(inner_precision(operator, reduction))
+    precondition = build_preconditioner(inner)
+    tick()
     solved = conjugate_gradient(
-        inner.apply, (-gradient).astype(inner.weights.dtype), precondition=build_preconditioner(inner),
+        inner.apply, np.negative(gradient).astype(inner.weights.dtype, copy=False), precondition=precondition,
         reduction=reduction, max_iterations=max_inner, negligible=NEGLIGIBLE * tolerance * abs(state.objective),
         should_stop=should_stop,
     )  # fmt: skip
     shapes = np.add(state.shapes, solved.x, out=gradient)
+    tick()
     after = _evaluated(problem, shapes, state.translations, state.omega, reweighting=state.reweighting + 1)
     gained = state.objective - after.objective
     unforeseen = abs(gained - solved.decrease) / gained if gained > 0 else INNER_REDUCTION
