@@ -166,7 +166,7 @@ def _with_the_rest(start: Start, state: State) -> tuple[Start, State]:
     whole, _ = build_problem(start.flat, start.estimate, start.mesh, start.settings, covariance)
     confidence = whole.confidence.copy()
     confidence[:, part.kept] = start.problem.confidence
-    whole = replace(whole, confidence=confidence)
+    whole = replace(whole, confidence=confidence, moving=start.problem.moving)
     sparse, never = 1 - len(part.kept) / confidence.shape[1], float((confidence == 0).all(axis=0).mean())
     whole, state = place_the_rest(part, whole, covariance, state, spoiled=start.outliers > OUTLIER_SHARE)
     reason = (

@@ -117,9 +117,12 @@ def prepared(
     mesh: Mesh | None,
     settings: Settings | None,
     *,
+    moving: bool = True,
     should_stop: ShouldStop | None = None,
 ) -> Start:
     """Return the start of the minimisation, with nothing rejected; once `should_stop` returns True, shapes that are less converged.
+
+    `moving` as in `Problem`.
 
     Raises
     ------
@@ -150,7 +153,7 @@ def prepared(
             got=f"{0 if covariance is None else len(covariance.modes)}", hint="Learn the prior from tracks of the same frames.",
         )  # fmt: skip
     flat = orthographic(observations.normalized, estimate.perspective)
-    return _begun(observations, mesh, settings, flat, estimate, covariance, cameras.outliers, should_stop)
+    return _begun(observations, mesh, settings, flat, estimate, covariance, cameras.outliers, moving, should_stop)
 
 
 def _begun(
@@ -161,6 +164,7 @@ def _begun(
     estimate: CameraEstimate,
     covariance: ShapeCovariance | None,
     outliers: float,
+    moving: bool,
     should_stop: ShouldStop | None,
 ) -> Start:
     tick = should_stop if should_stop is not None else bool
@@ -170,6 +174,7 @@ def _begun(
         problem, choices = build_problem(flat, estimate, mesh, settings, covariance)
     else:
         problem, choices = build_problem(part.normalized, estimate, part.mesh, settings, covariance)
+    problem = replace(problem, moving=moving)
     tick()
     state = _initial(problem, estimate, settings, should_stop)
     tick()

@@ -129,7 +129,7 @@ def no_higher(before: State, after: State) -> State:
 def _evaluated(
     problem: Problem, shapes: Array, translations: Floats, omega: Array | None, *, reweighting: int
 ) -> State:
-    """Centre every frame's shape, in place, and return the state there.
+    """Centre every frame's shape, in place, and return the state there; without `problem.moving` translations and centres stay.
 
     The translation compensates the shift: the data term and AX are unchanged (rows of A sum to 0), and ‖HX‖ and the rank
     penalty cannot increase. With weights ω, the translations are first fitted to the residuals.
@@ -144,13 +144,14 @@ def _evaluated(
             if not np.isfinite(np.vdot(shapes[frame], shapes[frame])):
                 continue
             left = residuals_of(problem, shapes, translations, frame)
-            if omega is not None:
+            if omega is not None and problem.moving:
                 shift = _mean(left, omega[frame])
                 left -= shift[:, None].astype(kind)
                 translations[frame] += shift
-            middle = shapes[frame].mean(axis=1, dtype=np.float64)
-            shapes[frame] -= middle[:, None].astype(kind)
-            translations[frame] += problem.projections[frame].astype(np.float64) @ middle
+            if problem.moving:
+                middle = shapes[frame].mean(axis=1, dtype=np.float64)
+                shapes[frame] -= middle[:, None].astype(kind)
+                translations[frame] += problem.projections[frame].astype(np.float64) @ middle
             losses[frame] = loss_of(problem, left, frame)
             fresh[frame] = weights_of(problem, left, frame)
             np.einsum("cp,cp->p", left, left, out=squared[frame])
