@@ -73,11 +73,14 @@ test-slow: $(STAMP) $(PAGE)
 test-long: $(STAMP) $(PAGE)
 	$(PYTEST) -m long $(TESTS)
 
-# Every interpreter of 3.11 to 3.14 on this machine, each in an environment of its own.
+# Every interpreter of 3.11 to 3.14 on this machine, pyenv's too, each in an environment of its own. One that does not start is left out.
 matrix:
 	@for version in 3.11 3.12 3.13 3.14; do \
-	  if command -v python$$version >/dev/null; then \
-	    echo "== Python $$version"; $(MAKE) --no-print-directory test PYTHON=python$$version VENV=.venv-$$version || exit 1; \
+	  found=; \
+	  for python in python$$version "$$HOME"/.pyenv/versions/$$version.*/bin/python; do \
+	    if "$$python" -c '' 2>/dev/null; then found=$$python; break; fi; done; \
+	  if [ -n "$$found" ]; then \
+	    echo "== Python $$version"; $(MAKE) --no-print-directory test PYTHON="$$found" VENV=.venv-$$version || exit 1; \
 	  else echo "== Python $$version is not on this machine"; fi; done
 
 coverage: $(STAMP)
@@ -108,4 +111,4 @@ format: $(STAMP)
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf $(VENV) .cache build dist *.egg-info service/web/dist service/web/dist.next service/web/node_modules
+	rm -rf $(VENV) .venv-3.* .cache build dist *.egg-info service/web/dist service/web/dist.next service/web/node_modules

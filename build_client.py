@@ -20,6 +20,7 @@ HEADER = "# Generated from client/_async/{} by `make client`. Edit that file ins
 
 NAMES = {
     "AsyncClient": "Client",
+    "AsyncConnection": "Connection",
     "AsyncRemoteJob": "RemoteJob",
     "AsyncResult": "Result",
     "AsyncBaseTransport": "BaseTransport",
@@ -35,7 +36,7 @@ NAMES = {
 """Names of the asynchronous source, and what they become; beside those that unasync knows."""
 
 PATTERNS = (
-    (r"\bAsync(Client|RemoteJob|Result|BaseTransport)\b", r"\1"),
+    (r"\bAsync(Client|Connection|RemoteJob|Result|BaseTransport)\b", r"\1"),
     (r"\bawait \((await [^()]+\([^()]*\))\)", r"\1"),
     (r"\bawait ", ""),
     (r"\bGenerator\[(\w+), None\]", r"Generator[\1, None, None]"),

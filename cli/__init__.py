@@ -24,7 +24,7 @@ from pliant.cli.up import up, work
 app = typer.Typer(
     name="pliant",
     cls=Guarded,
-    help="Reconstruct a moving 3-D mesh from dense 2-D point tracks of a deforming surface.",
+    help="Reconstruct a moving 3-D mesh from a film of a deforming surface, or from dense 2-D point tracks.",
     no_args_is_help=True,
     pretty_exceptions_show_locals=False,
 )

@@ -172,15 +172,13 @@ def report(
 
 
 @contextmanager
-def running(folder: Path, *, threads: int | None = None) -> Iterator[str]:
+def running(folder: Path) -> Iterator[str]:
     """Run `pliant up` on a free port with its data in a folder, yield its address, and stop it afterwards.
 
     Parameters
     ----------
     folder : Path
         Created if missing; holds the data and the log.
-    threads : int, optional
-        Threads of the numerical libraries in one job.
 
     Raises
     ------
@@ -190,33 +188,16 @@ def running(folder: Path, *, threads: int | None = None) -> Iterator[str]:
     from pliant.client.errors import Unreachable
 
     log = folder / "service.log"
-    command = [
-        sys.executable,
-        "-m",
-        "pliant.cli",
-        "up",
-        "--port",
-        "0",
-        "--data",
-        str(folder.absolute() / "data"),
-        "--json",
-    ]
+    data = str(folder.absolute() / "data")
+    command = [sys.executable, "-m", "pliant.cli", "up", "--port", "0", "--data", data, "--json"]
     elsewhere = ("PLIANT_REDIS_URL", "PLIANT_BLOB_URL", "PLIANT_HOST", "PLIANT_AUTH", "PLIANT_TOKEN")
     environment = {name: value for name, value in os.environ.items() if name not in elsewhere}
-    if threads is not None:
-        environment["PLIANT_THREADS"] = str(threads)
     folder.mkdir(parents=True, exist_ok=True)
     # Started in its own folder, for a `.env` of the current one describes another installation.
     with log.open("wb") as errors:
         process = subprocess.Popen(  # noqa: S603 - our own program
-            command,
-            stdout=subprocess.PIPE,
-            stderr=errors,
-            env=environment,
-            cwd=folder,
-            start_new_session=True,
-            text=True,
-        )
+            command, stdout=subprocess.PIPE, stderr=errors, env=environment, cwd=folder, start_new_session=True, text=True
+        )  # fmt: skip
         try:
             assert process.stdout is not None
             url = announced(process.stdout)

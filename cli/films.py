@@ -10,8 +10,8 @@ from pliant.cli.session import LINE_EVERY
 from pliant.cli.show import out
 
 if TYPE_CHECKING:
-    from pliant.worker.execution.pipeline import Finished
     from pliant.worker.films.tracker import FilmFacts
+    from pliant.worker.jobs.finished import Finished
 
 
 def is_film(path: Path, region: Path | None) -> bool:
@@ -88,8 +88,8 @@ def film_rows(facts: FilmFacts) -> list[tuple[str, str]]:
 
 
 def solve_film(
-    film: Path, output: Path, *, region: Path | None, options: dict[str, Any], threads: int | None, as_json: bool
-) -> Finished:
+    film: Path, output: Path, *, region: Path | None, options: dict[str, Any], name: str, threads: int | None, as_json: bool
+) -> Finished:  # fmt: skip
     """Track and reconstruct a film; `tracks.npz` and `contact_sheet.jpg` lie beside the other files.
 
     Raises
@@ -116,5 +116,6 @@ def solve_film(
         threads_limited(threads),
     ):
         return reconstruct_film(
-            source, checked, output, scratch=Path(scratch), threads=threads or usable_cores(), on_progress=bar.on_step
-        )
+            source, checked, output, scratch=Path(scratch), name=name, threads=threads or usable_cores(),
+            on_progress=bar.on_step,
+        )  # fmt: skip

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 from pliant.cli.films import is_film
 from pliant.cli.ids import find_job
-from pliant.cli.paths import output_folder
+from pliant.cli.paths import output_folder, tracks_or_film
 from pliant.cli.session import (
     HOME,
     LINE_EVERY,
@@ -18,12 +18,14 @@ from pliant.cli.session import (
     JobId,
     Json,
     Mesh,
+    Name,
     OptionPairs,
     Region,
     Rotations,
     Session,
     Timeout,
     Url,
+    name_of,
     parse_options,
 )  # fmt: skip
 from pliant.cli.show import err, out, print_json, show_job, show_jobs, show_options
@@ -50,7 +52,7 @@ def submit(
     rotations: Rotations = None,
     region: Region = None,
     option: OptionPairs = None,
-    name: Annotated[str, typer.Option("--name", "-n", help="Your own label.")] = "",
+    name: Name = "",
     priority: Annotated[
         Literal["high", "normal", "low"], typer.Option("--priority", help="Order among your own waiting jobs.")
     ] = "normal",
@@ -96,6 +98,7 @@ def submit(
         batch.show(as_json=as_json)
         raise typer.Exit(batch.exit_code)
     tracks = chosen[0]
+    tracks_or_film(tracks)
     if output is not None:
         output_folder(output, force=force)
     film = is_film(tracks, region)
@@ -109,7 +112,7 @@ def submit(
                 ground_truth=ground_truth,
                 rotations=rotations,
                 options=options,
-                name=name,
+                name=name_of(name, tracks),
                 job_id=job_id,
                 idempotency_key=key,
                 webhook=webhook,
@@ -123,7 +126,6 @@ def submit(
                 if not as_json:
                     err().print(f"Job {job.id}", highlight=False)
                 done = job.wait(on_progress=bar.on_progress, load=False, timeout=timeout)
-                job.record = done.job
                 if output is not None:
                     done.download(output, on_download=bar.on_download)
         show_job(job.record, as_json=as_json)

@@ -18,10 +18,78 @@ def input_file(path: Path | None, name: str) -> None:
     BadArgument
         It is missing, a folder, or not readable.
     """
+    from pliant.client.errors import BadArgument
     from pliant.client.multipart import existing_file
 
-    if path is not None:
-        existing_file(path, name)
+    if path is None:
+        return
+    if not path.expanduser().exists():
+        raise BadArgument(f"{name}: expected a file, got no file at {path}. Check the path.")
+    existing_file(path, name)
+
+
+def tracks_or_film(path: Path, name: str = "tracks") -> None:
+    """Check that a path is a file that can be read, or a folder with the pictures of a film.
+
+    Raises
+    ------
+    BadArgument
+        It is missing, not readable, or a folder without pictures.
+    """
+    from pliant.client.errors import BadArgument
+    from pliant.worker.films.sources import PICTURES
+
+    if not path.is_dir():
+        input_file(path, name)
+    elif not any(each.suffix.lower() in PICTURES for each in path.iterdir()):
+        raise BadArgument(
+            f"{name}: expected a file or a folder of pictures, got the folder {path}, which has no pictures. "
+            "Give the path of a file in it."
+        )
+
+
+def output_file(path: Path | None, option: str, *, force: bool) -> None:
+    """Check that a file can be written, before the work that it is written after.
+
+    Raises
+    ------
+    BadArgument
+        It is a folder, exists already, or its folder is missing or not writable.
+    """
+    from pliant.client.errors import BadArgument
+
+    if path is None:
+        return
+    if path.is_dir():
+        raise BadArgument(f"{option}: expected a file, got the folder {path}. Give a file in it.")
+    if not path.parent.is_dir():
+        raise BadArgument(f"{option}: there is no folder {path.parent}. Create it, or choose another.")
+    if not os.access(path.parent, os.W_OK | os.X_OK):
+        raise BadArgument(f"{option}: the folder {path.parent} is not writable. Choose another folder.")
+    if path.exists() and not force:
+        raise BadArgument(f"{option}: {path} exists already. Choose another name, or replace it with --force.")
+
+
+def made_folder(folder: Path, option: str) -> None:
+    """Create a folder, unless it exists, and check that it is writable.
+
+    Raises
+    ------
+    BadArgument
+        The path is a file or below one, or the folder cannot be created or written.
+    """
+    from pliant.client.errors import BadArgument
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise BadArgument(f"{option}: expected a folder, got the file {folder}. Choose another folder.") from None
+    except NotADirectoryError:
+        raise BadArgument(f"{option}: {folder} is below a file. Choose another folder.") from None
+    except OSError as fault:
+        raise BadArgument(f"{option}: cannot create {folder}: {fault.strerror}. Choose another folder.") from None
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise BadArgument(f"{option}: the folder {folder} is not writable. Choose another folder.")
 
 
 def output_folder(folder: Path, *, force: bool, files: Iterable[str] = RESULT_FILES) -> None:
@@ -43,16 +111,7 @@ def output_folder(folder: Path, *, force: bool, files: Iterable[str] = RESULT_FI
     """
     from pliant.client.errors import BadArgument
 
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except FileExistsError:
-        raise BadArgument(f"--output: expected a folder, got the file {folder}. Choose another folder.") from None
-    except NotADirectoryError:
-        raise BadArgument(f"--output: {folder} is below a file. Choose another folder.") from None
-    except OSError as fault:
-        raise BadArgument(f"--output: cannot create {folder}: {fault.strerror}. Choose another folder.") from None
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise BadArgument(f"--output: the folder {folder} is not writable. Choose another folder.")
+    made_folder(folder, "--output")
     existing = [name for name in files if (folder / name).exists()]
     if existing and not force:
         raise BadArgument(

@@ -47,10 +47,18 @@ GroundTruth = Annotated[
 ]
 Rotations = Annotated[Path | None, typer.Option("--rotations", "-r", help="Known cameras.", readable=False)]
 
+Name = Annotated[
+    str,
+    typer.Option("--name", "-n", help="Label of the job and name of the object in its files; by default the file's."),
+]
+
+LONGEST_NAME = 200
+"""Characters of a name that is taken from a file."""
+
 LINE_EVERY = 30.0
 """Without a terminal, waiting commands print a line this often, seconds."""
 
-Force = Annotated[bool, typer.Option("--force", help="Replace existing files in the output folder.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
 
 HOME = "http://127.0.0.1:8000"
 
@@ -73,6 +81,12 @@ class Session:
         self.json = as_json
         retries = Retry() if first_contact is None else Retry(first_contact=first_contact)
         return Client(url, transport=self.transport, retries=retries)
+
+
+def name_of(given: str, file: Path) -> str:
+    """Return the name of a job: the one given, or that of its file without the ending, as far as a service takes it."""
+    own = file.resolve().name if file.is_dir() else file.stem
+    return given or own.encode("utf-8", "replace").decode()[:LONGEST_NAME]
 
 
 def parse_options(pairs: list[str] | None) -> dict[str, Any]:

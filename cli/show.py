@@ -13,7 +13,7 @@ from rich.text import Text
 if TYPE_CHECKING:
     from pliant.cli.exits import Exit
     from pliant.schemas.job import Interpretation, Job
-    from pliant.worker.execution.pipeline import Finished
+    from pliant.worker.jobs.finished import Finished
 
 COLOURS = {
     "queued": "cyan", "running": "blue", "cancelling": "yellow", "succeeded": "green", "failed": "red", "cancelled": "yellow",
@@ -150,9 +150,12 @@ def show_jobs(jobs: Iterable[Job], *, as_json: bool) -> None:
         print_json([job.model_dump(mode="json") for job in jobs])
         return
     table = Table(box=None, pad_edge=False)
-    for heading in ("id", "status", "verdict", "progress", "created", "frames × points", "name"):
+    listed = list(jobs)
+    # Ids are for copying: on a narrow terminal, and in a pipe, the other columns give way.
+    table.add_column("id", no_wrap=True, min_width=max((len(job.id) for job in listed), default=0))
+    for heading in ("status", "verdict", "progress", "created", "frames × points", "name"):
         table.add_column(heading)
-    for job in jobs:
+    for job in listed:
         progress = "" if job.progress is None or job.status.final else f"{job.progress.fraction:.0%}"
         size = f"{job.interpretation.num_frames} × {job.interpretation.num_points}"
         created = f"{job.created_at.astimezone():%Y-%m-%d %H:%M:%S}"

@@ -8,24 +8,26 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from pliant.cli.films import inspect_film, is_film, refuse_parts_of_tracks, solve_film
-from pliant.cli.paths import input_file, output_folder
+from pliant.cli.paths import input_file, output_folder, tracks_or_film
 from pliant.cli.session import (
     LINE_EVERY,
     Force,
     GroundTruth,
     Json,
     Mesh,
+    Name,
     OptionPairs,
     Region,
     Rotations,
     Tracks,
+    name_of,
     parse_options,
 )
 from pliant.cli.show import err, metrics_table, out, print_json, understood, verdict_lines
 
 if TYPE_CHECKING:
     from pliant.schemas.job import Interpretation
-    from pliant.worker.execution.pipeline import Finished
+    from pliant.worker.jobs.finished import Finished
 
 Threads = Annotated[
     int | None,
@@ -42,13 +44,14 @@ def solve(
     rotations: Rotations = None,
     region: Region = None,
     option: OptionPairs = None,
+    name: Name = "",
     threads: Threads = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Reconstruct tracks or a film in this process, without a service: the same code, the same files."""
     ctx.obj.json = as_json
-    check_inputs(None if tracks.is_dir() else tracks, ground_truth, rotations)
+    check_inputs(tracks, ground_truth, rotations)
     input_file(region, "region")
     missing = not output.exists()
     output_folder(output, force=force)
@@ -68,7 +71,9 @@ def solve(
     if is_film(tracks, region):
         refuse_parts_of_tracks(mesh=mesh, ground_truth=ground_truth, rotations=rotations)
         given = parse_options(option)
-        done = solve_film(tracks, output, region=region, options=given, threads=threads, as_json=as_json)
+        done = solve_film(
+            tracks, output, region=region, options=given, name=name_of(name, tracks), threads=threads, as_json=as_json
+        )
         show_finished(done, output, as_json=as_json)
         return
     options = checked_options(parse_options(option))
@@ -79,7 +84,7 @@ def solve(
     if not as_json:
         show_understood(inputs.interpretation)
     with progress_bar(line_every=LINE_EVERY) as bar, threads_limited(threads):
-        done = reconstruct(inputs, options, output, on_progress=bar.on_step, should_stop=None)
+        done = reconstruct(inputs, options, output, name=name_of(name, tracks), on_progress=bar.on_step)
     show_finished(done, output, as_json=as_json)
 
 
@@ -98,7 +103,7 @@ def inspect(
 ) -> None:
     """Show how a track file is read, or what a film holds and what tracking it would take, without solving."""
     ctx.obj.json = as_json
-    check_inputs(None if file.is_dir() else file, ground_truth, rotations)
+    check_inputs(file, ground_truth, rotations)
     input_file(region, "region")
     options = parse_options(option)
     if url == "" and is_film(file, region):
@@ -127,9 +132,10 @@ def inspect(
         show_understood(interpretation)
 
 
-def check_inputs(tracks: Path | None, ground_truth: Path | None, rotations: Path | None) -> None:
+def check_inputs(tracks: Path, ground_truth: Path | None, rotations: Path | None) -> None:
     """Check the paths of the inputs; a mesh may be a word, so its reader checks it."""
-    for path, name in ((tracks, "tracks"), (ground_truth, "ground_truth"), (rotations, "rotations")):
+    tracks_or_film(tracks)
+    for path, name in ((ground_truth, "ground_truth"), (rotations, "rotations")):
         input_file(path, name)
 
 

@@ -56,7 +56,9 @@ def create(
     source: Annotated[
         Path | None,
         typer.Option(
-            "--from", help="File with the token itself, made by a deployment; known ones stay.", metavar="FILE"
+            "--from",
+            help="File with a token to register, in place of a new one. Does nothing if it is registered.",
+            metavar="FILE",
         ),
     ] = None,
     data: Data = None,
@@ -87,7 +89,11 @@ def create(
         return
     if as_json:
         print_json({**shown(token), "token": text})
-        return
+    else:
+        _show_once(token, text)
+
+
+def _show_once(token: Token, text: str) -> None:
     print(text)
     until = "never expires" if token.expires_at is None else f"expires {token.expires_at:%Y-%m-%d %H:%M} UTC"
     err().print(

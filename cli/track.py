@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from pliant.cli.session import Json
+from pliant.cli.paths import input_file, output_file
+from pliant.cli.session import Force, Json
 from pliant.cli.show import err, out, print_json
 
 if TYPE_CHECKING:
@@ -40,10 +41,14 @@ def track(
     preview: Annotated[
         Path | None, typer.Option("--preview", help="Picture to write: the tracks over some frames (JPEG).")
     ] = None,
+    force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Track the surface that a film shows. Needs OpenCV: pip install 'pliant[film]'."""
+    """Track the surface that a film shows. Needs OpenCV, which the extra `film` installs."""
     ctx.obj.json = as_json
+    input_file(region, "--region")
+    output_file(output, "--output", force=force)
+    output_file(preview, "--preview", force=force)
     from pliant.tracking import track_film
 
     with _bars() as on_step:

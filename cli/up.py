@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 from pliant.cli.extras import require_server
+from pliant.cli.paths import made_folder
 from pliant.cli.session import Json
 from pliant.cli.show import err, out, print_json
 
@@ -81,6 +82,7 @@ def up(
     host = service.host if host is None else host
     port = taken(host, service.port if port is None else port)
     url = address(host, port)
+    made_folder(settings.data, "--data")
     with ExitStack() as held:
         children: list[Child] = []
         if settings.redis_url is None:
@@ -89,20 +91,19 @@ def up(
             children.append(valkey_child(valkey))
         children += [*worker_children(settings), service_child(settings, host, port, url, auth=auth or service.auth)]
 
-        def announce() -> None:
-            if as_json:
-                print_json({"url": url, "data": str(settings.data.absolute()), "workers": settings.workers})
-                sys.stdout.flush()
-                return
-            screen = out()
-            screen.print(f"[bold green]Pliant is ready[/]  {url}")
-            screen.print(
-                f"[dim]data in {settings.data.absolute()}, {settings.workers} worker(s); Ctrl-C stops everything[/]"
-            )
-
-        Supervisor(children).run(on_started=announce)
+        Supervisor(children).run(on_started=lambda: _announce(url, settings, as_json=as_json))
     if not as_json:
         err().print("Stopped.")
+
+
+def _announce(url: str, settings: Settings, *, as_json: bool) -> None:
+    if as_json:
+        print_json({"url": url, "data": str(settings.data.absolute()), "workers": settings.workers})
+        sys.stdout.flush()
+        return
+    screen = out()
+    screen.print(f"[bold green]Pliant is ready[/]  {url}")
+    screen.print(f"[dim]data in {settings.data.absolute()}, {settings.workers} worker(s); Ctrl-C stops everything[/]")
 
 
 def work(ctx: typer.Context, data: Data = None, workers: Workers = None, as_json: Json = False) -> None:
@@ -112,6 +113,7 @@ def work(ctx: typer.Context, data: Data = None, workers: Workers = None, as_json
     from pliant.worker.processes.supervisor import Supervisor, worker_children
 
     settings = chosen(data, workers)
+    made_folder(settings.data, "--data")
 
     def announce() -> None:
         if as_json:

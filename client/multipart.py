@@ -78,7 +78,7 @@ class Remainder:
 PIECE = 1 << 18
 """Bytes of a raw body read at a time."""
 
-LARGE = 32 * 2**20
+RESUMABLE_BYTES = 32 * 2**20
 """Bytes of all files of a submission above which they are uploaded before the job."""
 
 SMALL = 2**20

@@ -75,6 +75,12 @@ class Reconstruction:
         return self.arrays.get("inlier_probability")
 
     @property
+    def point_names(self) -> tuple[str, ...] | None:
+        """Names of the points, P of them, as the tracks' file has them (DeepLabCut, SLEAP, MediaPipe, named columns); None without."""
+        names = self.arrays.get("point_names")
+        return None if names is None else tuple(names.tolist())
+
+    @property
     def verdict(self) -> str | None:
         """Whether the result can be used: `good`, `with_care` or `do_not_use`; None where it was not judged."""
         return self.job.verdict

@@ -17,7 +17,7 @@ import re
 import shutil
 import sys
 from collections.abc import Callable, Iterable, Iterator
-from itertools import pairwise
+from itertools import groupby, pairwise
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -81,16 +81,14 @@ def _settings_of(module: ModuleType, record: str) -> list[tuple[str, str, str]]:
 
 
 def errors() -> str:
-    """Return a section for every error code, grouped by the comments of the table."""
+    """Return a section for every error code, grouped by the sections of the table."""
     from pliant.schemas.problems import ProblemCode
 
     parts = []
-    for line in inspect.getsource(ProblemCode).splitlines():
-        if title := re.fullmatch(r" {4}# ([A-Z].*)", line):
-            parts.append(f"## {title[1]}")
-            parts += [ERROR_GROUPS[title[1]]] if title[1] in ERROR_GROUPS else []
-        elif entry := re.match(r" {4}([A-Z][A-Z0-9_]*) = \(", line):
-            parts.append(_error(ProblemCode[entry[1]]))
+    for section, codes in groupby(ProblemCode, key=lambda code: code.section):
+        parts.append(f"## {section}")
+        parts += [ERROR_GROUPS[section]] if section in ERROR_GROUPS else []
+        parts += [_error(code) for code in codes]
     return "\n\n".join(parts)
 
 

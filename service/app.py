@@ -36,6 +36,11 @@ from starlette.middleware import Middleware
 from starlette.middleware.cors import CORSMiddleware
 from starlette.requests import ClientDisconnect
 
+ROUTES = (
+    jobs, outputs, shares, inspection, uploads, artifacts, events, meta, metrics_route, examples, error_pages,
+)  # fmt: skip
+"""In the order of the API reference."""
+
 STATUS_OF: dict[type[Exception], int] = {
     InvalidInput: 422,
     errors.UnknownJob: 404,
@@ -81,31 +86,12 @@ def create_app(
     """
     metrics = Metrics()
     limits = limits or Limits(read_memory=jobs_of_all.settings.read_memory)
-
-    @asynccontextmanager
-    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        incoming = Incoming(jobs_of_all.settings.incoming)
-        incoming.open()
-        app.state.service = Service(
-            jobs=jobs_of_all,
-            settings=settings,
-            limits=limits,
-            incoming=incoming,
-            followers=Followers(),
-            metrics=metrics,
-            uploads=open_uploads(jobs_of_all.settings, jobs_of_all.blobs),
-            upload_locks=UploadLocks(),
-            parsing=ParserSlots(settings.parsers),
-        )
-        yield
-        incoming.close()
-
     app = FastAPI(
         title="Pliant",
         summary=openapi.SUMMARY,
         description=openapi.DESCRIPTION,
         version=version("pliant"),
-        lifespan=lifespan,
+        lifespan=lambda app: _parts(app, jobs_of_all, settings, limits=limits, metrics=metrics),
         openapi_tags=openapi.TAGS,
         servers=[{"url": "/", "description": "This service"}],
         middleware=middleware(settings, tokens, metrics, jobs_of_all.records),
@@ -113,23 +99,33 @@ def create_app(
         redoc_url=None,
     )
     problems.install(app, STATUS_OF, security_headers=SECURITY_HEADERS)
-    for each in (
-        jobs,
-        outputs,
-        shares,
-        inspection,
-        uploads,
-        artifacts,
-        events,
-        meta,
-        metrics_route,
-        examples,
-        error_pages,
-    ):
+    for each in ROUTES:
         app.include_router(each.router)
     mount_page(app)
     app.openapi = lambda: openapi.document(app)  # type: ignore[method-assign]
     return app
+
+
+@asynccontextmanager
+async def _parts(
+    app: FastAPI, jobs_of_all: Jobs, settings: ServiceSettings, *, limits: Limits, metrics: Metrics
+) -> AsyncIterator[None]:
+    """Make what the routes use when the application starts; close it at the end."""
+    incoming = Incoming(jobs_of_all.settings.incoming)
+    incoming.open()
+    app.state.service = Service(
+        jobs=jobs_of_all,
+        settings=settings,
+        limits=limits,
+        incoming=incoming,
+        followers=Followers(),
+        metrics=metrics,
+        uploads=open_uploads(jobs_of_all.settings, jobs_of_all.blobs),
+        upload_locks=UploadLocks(),
+        parsing=ParserSlots(settings.parsers),
+    )
+    yield
+    incoming.close()
 
 
 def middleware(settings: ServiceSettings, tokens: Tokens, metrics: Metrics, records: Records) -> list[Middleware]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import errno
 import logging
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 from fastapi import FastAPI, Request
@@ -187,51 +188,56 @@ def install(app: FastAPI, table: Mapping[type[Exception], int], *, security_head
     security_headers : mapping of str to str
         Headers of the answer to an unexpected exception, which is made outside all middleware.
     """
-
-    async def of_refusal(_: Request, error: Exception) -> Response:
-        assert isinstance(error, Refusal)
-        return ProblemResponse(
-            Problem.of(error.code, error.status, detail=error.detail, **error.members), headers=error.headers
-        )
-
-    async def of_ours(_: Request, error: Exception) -> Response:
-        status = next(table[base] for base in type(error).__mro__ if base in table)
-        if status >= 500:
-            _log.error("%s: %s", type(error).__name__, error, exc_info=error if status == 500 else None)
-        after = getattr(error, "retry_after", None)
-        headers = None if after is None else {"Retry-After": str(after)}
-        return ProblemResponse(from_error(error, status), headers=headers)
-
-    async def of_http(_: Request, error: Exception) -> Response:
-        assert isinstance(error, HTTPException)
-        usual = (ProblemCode.HTTP_ERROR, f"{error.detail}. See /docs.")
-        code, detail = _BY_STATUS.get(error.status_code, usual)
-        return answer(code, detail=detail, status=error.status_code, headers=error.headers)
-
-    async def of_validation(request: Request, error: Exception) -> Response:
-        assert isinstance(error, (RequestValidationError, ValidationError))
-        return await of_refusal(request, from_validation(error.errors()))
-
-    async def of_disk(request: Request, error: Exception) -> Response:
-        assert isinstance(error, OSError)
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
-            return await unforeseen(request, error)
-        _log.error("the data volume is full: %s", error)
-        detail = "The service's disk is full; nothing was kept. Try later, or ask the operator to free space."
-        return answer(ProblemCode.STORAGE_FULL, detail=detail)
-
-    async def unforeseen(request: Request, error: Exception) -> Response:
-        # Starlette raises it again after this answer, so the server's log has the traceback; the client never sees it.
-        _log.error("unexpected %s in %s %s", type(error).__name__, request.method, request.url.path)
-        code, detail = _BY_STATUS[500]
-        kept: dict[str, str] = request.scope.get("pliant.log", {})
-        own = {"X-Request-ID": kept["request_id"]} if "request_id" in kept else {}
-        return answer(code, detail=detail, headers={**security_headers, **own, "Cache-Control": "no-store"})
-
-    app.add_exception_handler(Refusal, of_refusal)
-    app.add_exception_handler(HTTPException, of_http)
-    app.add_exception_handler(RequestValidationError, of_validation)
-    app.add_exception_handler(OSError, of_disk)
-    app.add_exception_handler(Exception, unforeseen)
+    app.add_exception_handler(Refusal, _of_refusal)
+    app.add_exception_handler(HTTPException, _of_http)
+    app.add_exception_handler(RequestValidationError, _of_validation)
+    app.add_exception_handler(OSError, partial(_of_disk, security_headers=security_headers))
+    app.add_exception_handler(Exception, partial(_unforeseen, security_headers=security_headers))
     for kind in table:
-        app.add_exception_handler(kind, of_ours)
+        app.add_exception_handler(kind, partial(_of_ours, table=table))
+
+
+async def _of_refusal(_: Request, error: Exception) -> Response:
+    assert isinstance(error, Refusal)
+    return ProblemResponse(
+        Problem.of(error.code, error.status, detail=error.detail, **error.members), headers=error.headers
+    )
+
+
+async def _of_http(_: Request, error: Exception) -> Response:
+    assert isinstance(error, HTTPException)
+    usual = (ProblemCode.HTTP_ERROR, f"{error.detail}. See /docs.")
+    code, detail = _BY_STATUS.get(error.status_code, usual)
+    return answer(code, detail=detail, status=error.status_code, headers=error.headers)
+
+
+async def _of_validation(request: Request, error: Exception) -> Response:
+    assert isinstance(error, (RequestValidationError, ValidationError))
+    return await _of_refusal(request, from_validation(error.errors()))
+
+
+async def _of_ours(_: Request, error: Exception, table: Mapping[type[Exception], int]) -> Response:
+    status = next(table[base] for base in type(error).__mro__ if base in table)
+    if status >= 500:
+        _log.error("%s: %s", type(error).__name__, error, exc_info=error if status == 500 else None)
+    after = getattr(error, "retry_after", None)
+    headers = None if after is None else {"Retry-After": str(after)}
+    return ProblemResponse(from_error(error, status), headers=headers)
+
+
+async def _of_disk(request: Request, error: Exception, security_headers: Mapping[str, str]) -> Response:
+    assert isinstance(error, OSError)
+    if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+        return await _unforeseen(request, error, security_headers)
+    _log.error("the data volume is full: %s", error)
+    detail = "The service's disk is full; nothing was kept. Try later, or ask the operator to free space."
+    return answer(ProblemCode.STORAGE_FULL, detail=detail)
+
+
+async def _unforeseen(request: Request, error: Exception, security_headers: Mapping[str, str]) -> Response:
+    # Starlette raises it again after this answer, so the server's log has the traceback; the client never sees it.
+    _log.error("unexpected %s in %s %s", type(error).__name__, request.method, request.url.path)
+    code, detail = _BY_STATUS[500]
+    kept: dict[str, str] = request.scope.get("pliant.log", {})
+    own = {"X-Request-ID": kept["request_id"]} if "request_id" in kept else {}
+    return answer(code, detail=detail, headers={**security_headers, **own, "Cache-Control": "no-store"})

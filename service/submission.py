@@ -19,6 +19,7 @@ from pliant.worker.errors import Conflict, UnknownUpload
 from pliant.worker.films.sources import FilmBounds, FilmSource, is_source, open_source, save_source
 from pliant.worker.films.tracker import check_film, described, film_options
 from pliant.worker.formats import Limits, store_inputs
+from pliant.worker.formats.point_names import one_line
 from pliant.worker.formats.tracks.film_tracks import tracks_options
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.jobs.submission import Submission
@@ -38,7 +39,7 @@ READING = (
     "layout", "rows", "y_axis", "coordinates", "coordinate_order", "visibility", "frames", "stride", "max_points", "min_seen",
 )  # fmt: skip
 """Options that say how tracks are read: kept inputs have been read already."""
-LONGEST_NAME = 200
+LONGEST_JOB_NAME = 200
 """Characters of the user's label."""
 
 
@@ -105,14 +106,9 @@ def accept(
         networks=jobs.settings.webhook_networks,
     )
     submission = Submission(
-        options=options,
-        name=name,
-        id=id,
-        idempotency_key=idempotency_key,
-        fingerprint=fingerprint,
-        webhook=webhook,
+        options=options, name=name, id=id, idempotency_key=idempotency_key, fingerprint=fingerprint, webhook=webhook,
         priority=_priority(form.texts.get("priority", "")),
-    )
+    )  # fmt: skip
     known = jobs.known(submission)
     if known is not None:
         return known, False
@@ -328,9 +324,9 @@ def _priority(text: str) -> Priority:
 
 def _name(text: str) -> str:
     """Return the user's label with runs of blanks and control characters replaced by single spaces."""
-    name = " ".join("".join(sign if sign.isprintable() else " " for sign in text).split())
-    if len(name) > LONGEST_NAME:
-        expected = f"at most {LONGEST_NAME} characters"
+    name = one_line(text)
+    if len(name) > LONGEST_JOB_NAME:
+        expected = f"at most {LONGEST_JOB_NAME} characters"
         code = ProblemCode.NAME_TOO_LONG
         raise wrong_input(code, field="name", expected=expected, got=str(len(name)), hint="Shorten it.")
     return name

@@ -12,13 +12,15 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from pliant.solver.errors import InvalidInput, InvalidSettings, NotFinite, SolverError
+    from pliant.solver.mesh import Mesh
     from pliant.solver.reconstruct import solve
     from pliant.solver.reconstruction.cameras import Cameras, estimate_cameras
     from pliant.solver.reconstruction.prior import Prior, learn_prior
     from pliant.solver.reconstruction.shapes import solve_shapes
     from pliant.solver.reconstruction.start import find_outliers
-    from pliant.solver.records import Camera, Choices, KnownCamera, Mesh, Outcome, Solution, Step, Trace, Tracks
+    from pliant.solver.records import Camera, Choices, KnownCamera, Step, Tracks
     from pliant.solver.settings import Settings
+    from pliant.solver.solution import Outcome, Solution, Trace
     from pliant.solver.threads import threads_limited
 
 _HOMES = {
@@ -34,17 +36,9 @@ _HOMES = {
     "reconstruction.prior": ("Prior", "learn_prior"),
     "reconstruction.shapes": ("solve_shapes",),
     "reconstruction.start": ("find_outliers",),
-    "records": (
-        "Camera",
-        "Choices",
-        "KnownCamera",
-        "Mesh",
-        "Outcome",
-        "Solution",
-        "Step",
-        "Trace",
-        "Tracks",
-    ),
+    "mesh": ("Mesh",),
+    "records": ("Camera", "Choices", "KnownCamera", "Step", "Tracks"),
+    "solution": ("Outcome", "Solution", "Trace"),
     "settings": ("Settings",),
 }
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}

@@ -10,7 +10,13 @@ Not converging is not an error: see `pliant.solver.Outcome`.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from pliant.schemas.invalid import Invalid
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 
 class SolverError(Exception):
@@ -32,3 +38,13 @@ class InvalidInput(Invalid, SolverError):
 
 class InvalidSettings(InvalidInput):
     """A setting is out of its range, or two settings contradict each other."""
+
+
+def wrong_input(field: str, code: str, expected: str, got: str, hint: str) -> InvalidInput:
+    """Return the error of a wrong input; all parts are required, so they have an order instead of keywords."""
+    return InvalidInput(code, field=field, expected=expected, got=got, hint=hint)
+
+
+def shape_text(array: NDArray[np.generic]) -> str:
+    """Return the shape of an array as messages state it, e.g. ``(10, 3)``."""
+    return "(" + ", ".join(str(n) for n in array.shape) + ")"

@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.isometry.surface import IsometricVerdict
+from pliant.solver.mesh import Mesh
 from pliant.solver.monitor import Monitor
 from pliant.solver.reconstruction.blocks import needs_blocks, shapes_in_blocks
 from pliant.solver.reconstruction.cameras import Cameras, cameras_of
@@ -22,8 +23,9 @@ from pliant.solver.reconstruction.prior import Prior, prior_of
 from pliant.solver.reconstruction.shapes import shapes_from
 from pliant.solver.reconstruction.start import Start, prepared, with_outlier_reason, with_outliers_rejected
 from pliant.solver.reconstruction.surface import isometric_verdict, solution_of, tries_isometry, with_verdict
-from pliant.solver.records import KnownCamera, Mesh, Solution, Step, Tracks
+from pliant.solver.records import KnownCamera, Step, Tracks
 from pliant.solver.settings import Settings
+from pliant.solver.solution import Solution
 from pliant.solver.tracks.frame_order import as_they_came, content_order, differences, in_order, resolved_order
 
 

@@ -1,17 +1,13 @@
-"""Records of a solve, from Tracks to Solution. Their arrays are read-only."""
+"""Tracks and cameras, and what a solve reports of its steps and choices. Arrays are read-only."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from enum import StrEnum
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pliant.solver.errors import InvalidInput
-
-if TYPE_CHECKING:
-    from pliant.solver.evaluation.trust import Trust
+from pliant.solver.errors import shape_text, wrong_input
 
 MIN_FRAMES = 3
 MIN_POINTS = 4
@@ -54,23 +50,27 @@ class Tracks:
         """
         given = np.asarray(points)
         if given.dtype.kind not in "fiu":
-            raise _wrong("tracks", "wrong_type", "real numbers", f"dtype {given.dtype}", "Convert the array to float.")
+            raise wrong_input(
+                "tracks", "wrong_type", "real numbers", f"dtype {given.dtype}", "Convert the array to float."
+            )
         if given.ndim != 3 or given.shape[2] != 2:
-            raise _wrong(
-                "tracks", "wrong_shape", "(frames, points, 2)", _shape(given), "Transpose or reshape the array."
+            raise wrong_input(
+                "tracks", "wrong_shape", "(frames, points, 2)", shape_text(given), "Transpose or reshape the array."
             )
         frames, count, _ = given.shape
         if frames < MIN_FRAMES:
-            raise _wrong(
+            raise wrong_input(
                 "tracks", "too_few_frames", f"at least {MIN_FRAMES} frames", f"{frames}", "Track a longer clip."
             )
         if count < MIN_POINTS:
-            raise _wrong("tracks", "too_few_points", f"at least {MIN_POINTS} points", f"{count}", "Track more points.")
+            raise wrong_input(
+                "tracks", "too_few_points", f"at least {MIN_POINTS} points", f"{count}", "Track more points."
+            )
         positions = np.array(given, dtype=np.float64, order="C")  # results must not depend on the memory layout
         confidence = _confidence(visible, (frames, count))
         confidence[~np.isfinite(positions).all(axis=2)] = 0.0
         if not confidence.any():
-            raise _wrong(
+            raise wrong_input(
                 "tracks", "nothing_visible", "at least one finite, visible observation", "none",
                 "Check for NaN everywhere, or a visibility array that is inverted.",
             )  # fmt: skip
@@ -93,100 +93,6 @@ class Tracks:
     def all_visible(self) -> bool:
         """Whether every observation has confidence 1."""
         return bool((self.visible == 1).all())
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Mesh:
-    """Faces that connect the points. Vertex i is point i; the order is never changed."""
-
-    num_points: int
-    """P."""
-
-    faces: Ints
-    """Triangles `(T, 3)` or quads `(T, 4)`, counter-clockwise, indices into the points; T may be 0."""
-
-    grid: Ints | None = None
-    """Point index of every cell of a pixel grid, −1 for holes, shape `(rows, columns)`; None without a grid."""
-
-    @classmethod
-    def from_faces(cls, faces: ArrayLike, num_points: int) -> Mesh:
-        """Validate and copy faces.
-
-        Raises
-        ------
-        InvalidInput
-            Not an integer array of 3 or 4 columns, an index out of range, or a face that repeats a vertex.
-        """
-        given = np.asarray(faces)
-        if given.size == 0:
-            given = np.zeros((0, 3), dtype=np.int32)
-        if given.dtype.kind not in "iu":
-            raise _wrong("mesh.faces", "wrong_type", "integers", f"dtype {given.dtype}", "Convert the faces to int32.")
-        if given.ndim != 2 or given.shape[1] not in (3, 4):
-            raise _wrong(
-                "mesh.faces", "wrong_shape", "(faces, 3) or (faces, 4)", _shape(given),
-                "Give triangles or quads; split larger polygons first.",
-            )  # fmt: skip
-        if len(given) > 0 and (int(given.min()) < 0 or int(given.max()) >= num_points):
-            raise _wrong(
-                "mesh.faces", "index_out_of_range", f"indices from 0 to {num_points - 1} (the tracks have {num_points} points)",
-                f"indices from {given.min()} to {given.max()}", "Vertex i of the mesh must be point i of the tracks; indices start at 0.",
-            )  # fmt: skip
-        ordered = np.sort(given, axis=1)
-        if bool((ordered[:, 1:] == ordered[:, :-1]).any()):
-            bad = int(np.flatnonzero((ordered[:, 1:] == ordered[:, :-1]).any(axis=1))[0])
-            raise _wrong(
-                "mesh.faces", "degenerate_face", "distinct vertices in every face", f"face {bad} = {given[bad].tolist()}",
-                "Remove faces that repeat a vertex.",
-            )  # fmt: skip
-        kept = np.array(given, dtype=np.int32)
-        read_only(kept)
-        return cls(num_points, kept)
-
-    @classmethod
-    def from_grid(cls, grid: ArrayLike) -> Mesh:
-        """Return the mesh of quads between the cells of a pixel grid, which may have holes.
-
-        Parameters
-        ----------
-        grid : array_like of int, shape (rows, columns)
-            The point index of each cell, −1 where there is none; every point appears exactly once.
-
-        Raises
-        ------
-        InvalidInput
-            Not two-dimensional, or the indices are not each of 0 … P−1 exactly once.
-        """
-        given = np.asarray(grid)
-        if given.dtype.kind not in "iu" or given.ndim != 2:
-            raise _wrong(
-                "mesh.grid", "wrong_shape", "an integer array (rows, columns)", f"{given.dtype} {_shape(given)}",
-                "Give the point index of every cell, −1 for holes.",
-            )  # fmt: skip
-        present = given[given >= 0]
-        if present.size == 0 or not np.array_equal(np.sort(present), np.arange(present.size)):
-            raise _wrong(
-                "mesh.grid", "index_out_of_range", f"each index from 0 to {max(present.size - 1, 0)} exactly once",
-                "missing or repeated indices", "Number the grid's points without gaps; −1 marks a hole.",
-            )  # fmt: skip
-        cells = np.array(given, dtype=np.int32)
-        corners = np.stack([cells[:-1, :-1], cells[1:, :-1], cells[1:, 1:], cells[:-1, 1:]], axis=-1).reshape(-1, 4)
-        faces = np.ascontiguousarray(corners[(corners >= 0).all(axis=1)])
-        read_only(cells)
-        read_only(faces)
-        return cls(int(present.size), faces, cells)
-
-    @property
-    def edges(self) -> Ints:
-        """Undirected edges of the faces, each once with the lower index first, shape `(E, 2)`."""
-        if len(self.faces) == 0:
-            return np.zeros((0, 2), dtype=np.int32)
-        following = np.roll(self.faces, -1, axis=1)
-        low, high = np.minimum(self.faces, following), np.maximum(self.faces, following)
-        keys = np.unique(
-            low.astype(np.int64) * self.num_points + high
-        )  # unique of scalars is ten times as fast as unique of rows
-        return np.stack([keys // self.num_points, keys % self.num_points], axis=1).astype(self.faces.dtype)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -278,27 +184,27 @@ class KnownCamera:
             Wrong shape, not finite, rows not orthonormal to 1e-3, or a scale or focal length that is not positive.
         """
         if focal is not None and not (np.isfinite(focal) and focal > 0):
-            raise _wrong(
+            raise wrong_input(
                 "cameras.focal", "out_of_range", "a positive, finite length", str(focal), "Give it in the tracks' unit."
             )
         if principal_point is not None and not np.isfinite(principal_point).all():
-            raise _wrong(
+            raise wrong_input(
                 "cameras.principal_point", "not_finite", "two finite numbers", str(principal_point), "Give x and y."
             )
         given = np.asarray(rotations, dtype=np.float64)
         if given.ndim != 3 or given.shape[1:] not in ((2, 3), (3, 3)):
-            raise _wrong(
+            raise wrong_input(
                 "rotations",
                 "wrong_shape",
                 "(frames, 2, 3) or (frames, 3, 3)",
-                _shape(given),
+                shape_text(given),
                 "Give one rotation a frame.",
             )
         rows = given[:, :2]
         with np.errstate(over="ignore", invalid="ignore"):
             error = np.abs(rows @ rows.transpose(0, 2, 1) - np.eye(2)).max()
         if not error <= 1e-3:  # NaN is no rotation either
-            raise _wrong(
+            raise wrong_input(
                 "rotations", "not_a_rotation", "orthonormal rows", f"a deviation of {error:.3g}",
                 "Rows must have length 1 and be perpendicular; scales are given separately.",
             )  # fmt: skip
@@ -306,43 +212,8 @@ class KnownCamera:
         rows = left @ right
         complete = np.concatenate([rows, np.cross(rows[:, 0], rows[:, 1])[:, None]], axis=1)
         read_only(complete)
-        if scales is None:
-            return cls(complete, None, focal, principal_point)
-        factors = np.array(scales, dtype=np.float64)
-        if factors.shape != (len(given),) or not np.isfinite(factors).all() or not (factors > 0).all():
-            raise _wrong(
-                "scales", "wrong_shape", f"{len(given)} positive numbers", _shape(factors), "Give one scale a frame."
-            )
-        read_only(factors)
+        factors = None if scales is None else _positive_scales(scales, len(given))
         return cls(complete, factors, focal, principal_point)
-
-
-class Outcome(StrEnum):
-    """How a solve ended; `sentence` explains each member."""
-
-    CONVERGED = "converged"
-    MAX_REWEIGHTINGS = "max_reweightings"
-    REJECTED = "rejected"
-    STOPPED = "stopped"
-
-    @property
-    def sentence(self) -> str:
-        """What happened, and what to do next where there is something to do."""
-        return _SENTENCES[self]
-
-
-_SENTENCES = {
-    Outcome.CONVERGED: "Converged.",
-    Outcome.MAX_REWEIGHTINGS: (
-        "Stopped at the maximum number of reweightings before the objective converged. The result is usable; "
-        "raise max_reweightings or tolerance if it must converge."
-    ),
-    Outcome.REJECTED: (
-        "The last step increased the objective by more than the tolerance and was rejected; the shapes are those before it. "
-        "Try precision float64 or weaker weights if they are not good enough."
-    ),
-    Outcome.STOPPED: "Stopped on request; the shapes are those of the last finished step.",
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -369,20 +240,6 @@ class Step:
 
     seconds_left: float | None = None
     """Estimated time until the solve ends, from the plan and the pace so far."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Trace:
-    """Per-reweighting history, arrays of equal length; entry 0 is the initialisation."""
-
-    objective: Floats
-    """E, normalized units; never increases, except when the tracks are corrected again for perspective."""
-
-    residual: Floats
-    """Median visible reprojection residual, the tracks' unit."""
-
-    iterations: Ints
-    """Inner conjugate-gradient iterations spent."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -428,43 +285,14 @@ class Choices:
     """Focal lengths that were compared for an isometric surface, pixels, each with its isometric inconsistency I; empty if none were."""
 
 
-@dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Solution:
-    """Result of a solve."""
-
-    shapes: Floats
-    """Shape `(F, P, 3)`, world axes, the tracks' unit, centred per frame."""
-
-    camera: Camera
-    """Estimated or given cameras. Depth has one free sign for the whole sequence (the bas-relief mirror)."""
-
-    residuals: Floats
-    """Length of the reprojection residual, shape `(F, P)`, the tracks' unit; 0 where hidden."""
-
-    weights: Floats
-    """Final IRLS weight relative to its largest possible value, in [0, 1], shape `(F, P)`; 0 where hidden, small for outliers."""
-
-    trace: Trace
-    outcome: Outcome
-    choices: Choices
-    seconds: dict[str, float]
-    """Wall time per stage."""
-
-    shapes_std: Floats | None = None
-    """Posterior standard deviation of every position, shape `(F, P)`, the unit of the shapes; None where the prior has no posterior."""
-
-    trust: Trust | None = None
-    """Expected error, verdict and its reasons."""
-
-    inlier_probability: Floats | None = None
-    """Posterior probability that an observation is an inlier, shape `(F, P)`; 0 where rejected, NaN where hidden. With α the share of
-    outliers, A the area of the tracks, and p the density of the loss at the scale of the noise: (1 − α) p / ((1 − α) p + α / A); in full in
-    `pliant.solver.shapes.inliers`."""
-
-    def __repr__(self) -> str:
-        frames, points, _ = self.shapes.shape
-        verdict = "" if self.trust is None else f", {self.trust.verdict}"
-        return f"<Solution of {frames} frames × {points} points, {self.outcome}{verdict}>"
+def _positive_scales(scales: ArrayLike, frames: int) -> Floats:
+    factors = np.array(scales, dtype=np.float64)
+    if factors.shape != (frames,) or not np.isfinite(factors).all() or not (factors > 0).all():
+        raise wrong_input(
+            "scales", "wrong_shape", f"{frames} positive numbers", shape_text(factors), "Give one scale a frame."
+        )
+    read_only(factors)
+    return factors
 
 
 def _confidence(visible: ArrayLike | None, shape: tuple[int, int]) -> Floats:
@@ -472,25 +300,17 @@ def _confidence(visible: ArrayLike | None, shape: tuple[int, int]) -> Floats:
         return np.ones(shape)
     given = np.asarray(visible)
     if given.dtype.kind not in "bfiu":
-        raise _wrong(
+        raise wrong_input(
             "visibility", "wrong_type", "bool or numbers", f"dtype {given.dtype}", "Convert the array to bool."
         )
     if given.shape != shape:
-        raise _wrong(
-            "visibility", "wrong_shape", str(shape), _shape(given), "Visibility is (frames, points), as the tracks."
+        raise wrong_input(
+            "visibility", "wrong_shape", str(shape), shape_text(given), "Visibility is (frames, points), as the tracks."
         )
     confidence = np.array(given, dtype=np.float64, order="C")
     if not np.isfinite(confidence).all() or confidence.min() < 0 or confidence.max() > 1:
-        raise _wrong(
+        raise wrong_input(
             "visibility", "out_of_range", "values from 0 to 1", f"values from {confidence.min():.3g} to {confidence.max():.3g}",
             "Turn logits into probabilities first.",
         )  # fmt: skip
     return confidence
-
-
-def _shape(array: NDArray[np.generic]) -> str:
-    return "(" + ", ".join(str(n) for n in array.shape) + ")"
-
-
-def _wrong(name: str, code: str, expected: str, got: str, hint: str) -> InvalidInput:
-    return InvalidInput(code, field=name, expected=expected, got=got, hint=hint)

@@ -174,7 +174,7 @@ class Settings:
             raise _out_of_range("seed", "a whole number from 0 to 4294967295", self.seed)
 
 
-FARTHEST = 10.0
+MAX_CENTRE_DISTANCE = 10.0
 """Maximum distance of the principal point from the picture, in picture sizes: a crop may keep a tenth of a picture."""
 
 
@@ -213,10 +213,11 @@ def check_pinhole(settings: Settings) -> None:
     if not (len(centre) == 2 and all(math.isfinite(each) for each in centre)):
         raise _out_of_range("principal_point", "two finite numbers x, y in pixels, or None", centre)
     if size is not None and any(
-        not -FARTHEST * side <= each <= (1 + FARTHEST) * side for each, side in zip(centre, size, strict=True)
+        not -MAX_CENTRE_DISTANCE * side <= each <= (1 + MAX_CENTRE_DISTANCE) * side
+        for each, side in zip(centre, size, strict=True)
     ):
         raise _contradiction(
-            "principal_point", f"a point within {FARTHEST:.0f} pictures of size {size[0]:g}x{size[1]:g}", f"{centre}",
+            "principal_point", f"a point within {MAX_CENTRE_DISTANCE:.0f} pictures of size {size[0]:g}x{size[1]:g}", f"{centre}",
             "Give x, y in pixels from the picture's upper left corner.",
         )  # fmt: skip
 

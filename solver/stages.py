@@ -136,11 +136,10 @@ def learning(frames: int, *, gaussian: bool, known_cameras: bool) -> tuple[Stage
     return tuple(stage_of(name, frames) for name in names)
 
 
-def stage_of(name: str, frames: int, *, units: int | None = None) -> Stage:
-    """Return a stage of `UNITS` for so many frames; `units` where their number is known."""
-    count, most_frames, cost = UNITS[name]
-    used = count if units is None else units
-    return Stage(name, used * cost * (UNIT_SECONDS + FRAME_SECONDS * min(frames, most_frames)), used)
+def stage_of(name: str, frames: int) -> Stage:
+    """Return a stage of `UNITS` for so many frames."""
+    units, most_frames, cost = UNITS[name]
+    return Stage(name, units * cost * (UNIT_SECONDS + FRAME_SECONDS * min(frames, most_frames)), units)
 
 
 @dataclass(slots=True)

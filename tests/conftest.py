@@ -30,8 +30,10 @@ def service_url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """Address of a running service; its jobs compute with one thread, so that their arrays can be compared bit for bit."""
     from pliant.cli.demo import running
 
-    with running(tmp_path_factory.mktemp("service"), threads=1) as url:
-        yield url
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PLIANT_THREADS", "1")
+        with running(tmp_path_factory.mktemp("service")) as url:
+            yield url
 
 
 @pytest.fixture(scope="session")

@@ -115,6 +115,19 @@ def test_every_command_is_generated_with_its_parameters(generate: ModuleType) ->
     assert "| `--ground-truth, -g` |" in text
 
 
+def test_no_help_has_words_in_brackets() -> None:
+    """The terminal takes them for markup and leaves them out."""
+    import typer
+
+    commands, texts = [typer.main.get_command(app)], []
+    while commands:
+        command = commands.pop()
+        commands += getattr(command, "commands", {}).values()
+        texts += [command.help, *(getattr(parameter, "help", None) for parameter in command.params)]
+    assert len(texts) > 150
+    assert [text for text in texts if text and re.search(r"\[[a-z]", text)] == []
+
+
 def test_every_option_is_generated_with_its_default(generate: ModuleType) -> None:
     text = generate.options()
     assert re.findall(r"^### (\w+)$", text, re.MULTILINE) == list(Options.model_fields)

@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 from pliant.tracking.decoding.film import Film
 from pliant.tracking.survey import Survey
 
-SHORT = 10
+FEW_FRAMES = 10
 """Frames below which a film rarely holds enough motion for a shape."""
 
-STILL = 0.01
+STILL_SHARE = 0.01
 """Motion below this share of the region's size counts as none: about the noise of the tracks on a region of 50 pixels."""
 
 UNEVEN = 1.5
@@ -34,7 +34,7 @@ def warnings_before(film: Film, found: Survey, start: int, stop: int, *, whole: 
         notes.append(
             f"The film states {film.stated_frames} frames but ends after {found.indices[-1] + 1}; its end is damaged or missing."
         )
-    if stop - start < SHORT:
+    if stop - start < FEW_FRAMES:
         notes.append(f"Only {stop - start} frames are tracked. Film two seconds or more, while the thing turns.")
     steps = np.diff(found.times[start:stop])
     if film.container in ("mp4", "matroska", "avi", "gif") and steps.max() > UNEVEN * np.median(steps):
@@ -52,7 +52,7 @@ def warnings_of(tracks: NDArray[np.float32], visible: NDArray[np.bool_], templat
     notes = []
     size = float(np.hypot(*np.ptp(tracks[template], axis=0)))
     moved = np.where(visible, np.linalg.norm(tracks - tracks[template], axis=2), 0).max(axis=0)
-    if np.median(moved) < STILL * size:
+    if np.median(moved) < STILL_SHARE * size:
         notes.append(
             "Nothing moves in this film, so it holds no information about depth. Turn the thing by 30° or more to both sides, "
             "or walk around it."

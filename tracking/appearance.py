@@ -21,18 +21,18 @@ LOST_NEIGHBOURS = 2
 two motions. On rendered films with an occluder this removes a
 quarter to a half of the wrongly visible points and hides 2 to 3 % of the right ones."""
 
-PATCH = np.stack(np.meshgrid(*[np.arange(-6, 7, 2, dtype=np.float32)] * 2), axis=-1).reshape(-1, 2)
+PATCH_OFFSETS = np.stack(np.meshgrid(*[np.arange(-6, 7, 2, dtype=np.float32)] * 2), axis=-1).reshape(-1, 2)
 """Sample places of a patch in pixels around its point: 7 × 7, two pixels apart."""
 
 
 REFINEMENTS = 4
 """Steps of Lucas and Kanade from the end of the flow; each is at most half a pixel."""
 
-ALIKE = 0.8
+SAME_PATCH = 0.8
 """Least correlation with the template at which a refined place is believed: below, the patch shows something else or has changed, and
 its best match is no longer the point."""
 
-BLOCK = 512
+POINTS_AT_ONCE = 512
 """Points refined together: their patches (100 KB an array) stay in a core's cache."""
 
 FLOW_VARIANCE = 0.25
@@ -61,7 +61,7 @@ class Appearance:
     @classmethod
     def of(cls, template: Grey, points: Floats, neighbours: NDArray[np.int64]) -> Appearance:
         """Cut the patches out of a template."""
-        image, places = _smooth(template), points[:, None] + PATCH
+        image, places = _smooth(template), points[:, None] + PATCH_OFFSETS
         patches = _cut(image, places)
         slopes = np.stack(
             [
@@ -113,7 +113,7 @@ class Appearance:
                 residual = patches / np.clip(product / strength, 0.5, 2.0)[:, None] - template
                 pull = np.stack([_dot(slope, residual) for slope in slopes], axis=1) + hold * (moved - points)
                 moved -= np.clip((inverse @ pull[:, :, None])[:, :, 0], -0.5, 0.5)
-        better = usable & (alike >= np.maximum(before, ALIKE)) & (((moved - points) ** 2).sum(axis=1) < 1)
+        better = usable & (alike >= np.maximum(before, SAME_PATCH)) & (((moved - points) ** 2).sum(axis=1) < 1)
         return np.asarray(np.where(better[:, None], moved, points), dtype=np.float32)
 
     def agrees(self, frame: Grey, points: Floats, visible: Bools, *, pool: ThreadPoolExecutor | None = None) -> Bools:
@@ -139,7 +139,7 @@ class Appearance:
 
     def _correlates(self, image: Floats, points: Floats, affine: Floats, block: slice) -> Bools:
         """Return which points of one block have patches like the template's."""
-        template, floor = self.patches[block], np.float32(len(PATCH) * (self.noise + 1.0))
+        template, floor = self.patches[block], np.float32(len(PATCH_OFFSETS) * (self.noise + 1.0))
         patches = _centred(_cut(image, points[:, None] + _offsets(affine)))
         norms = (_dot(patches, patches) + floor) * (_dot(template, template) + floor)
         return np.asarray(_dot(patches, template) + floor >= LEAST_CORRELATION * np.sqrt(norms))
@@ -173,13 +173,13 @@ def _smooth(image: Grey) -> Floats:
 
 def _by_blocks(function: Callable[[slice], NDArray[Any]], count: int, pool: ThreadPoolExecutor | None) -> NDArray[Any]:
     """Join what a function returns for blocks of points; the blocks do not depend on the number of threads."""
-    blocks = [slice(start, min(start + BLOCK, count)) for start in range(0, max(count, 1), BLOCK)]
+    blocks = [slice(start, min(start + POINTS_AT_ONCE, count)) for start in range(0, max(count, 1), POINTS_AT_ONCE)]
     return np.concatenate(list(map(function, blocks) if pool is None else pool.map(function, blocks)))
 
 
 def _offsets(affine: Floats) -> Floats:
     """Places of the patches' samples relative to their points, shape `(P, 49, 2)`."""
-    return np.asarray(PATCH @ affine.transpose(0, 2, 1))
+    return np.asarray(PATCH_OFFSETS @ affine.transpose(0, 2, 1))
 
 
 def _dot(first: Floats, second: Floats) -> Floats:

@@ -23,7 +23,7 @@ real film, {∞, 1, 2, 4, 8, 16, 32} takes 1.7 times the flows and changes the m
 STEP_VARIANCE = 0.01
 """Variance of one flow whose cycle closes exactly, square pixels: 0.1 px, the accuracy of DIS on textured surfaces."""
 
-MARGIN = 32
+FLOW_MARGIN = 32
 """Pixels around the points within which flow is computed: twice the largest patch that DIS searches at its coarsest scale."""
 
 Read = Callable[[int], Grey]
@@ -140,7 +140,7 @@ def _match_nearby(first: Grey, second: Grey, points: Floats, near: Floats, visib
     if len(around) == 0:
         return Match(points, np.zeros(len(points), np.float32), np.ones(len(points), bool), np.ones(len(points), bool))
     height, width = first.shape
-    margin = MARGIN + 0.1 * np.ptp(around, axis=0).max()
+    margin = FLOW_MARGIN + 0.1 * np.ptp(around, axis=0).max()
     # Multiples of 16 keep the pyramid's levels on whole pixels.
     left, top = (np.maximum(around.min(axis=0) - margin, 0) // 16 * 16).astype(int)
     right, bottom = np.ceil(np.minimum(around.max(axis=0) + margin, (width, height)) / 16).astype(int) * 16

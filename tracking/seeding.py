@@ -12,11 +12,11 @@ from pliant.tracking.flow import Bools, Floats, Grey
 
 Ints = NDArray[np.int32]
 
-STEPS = (4.0, 8.0)
+GRID_STEPS = (4.0, 8.0)
 """Least and largest default distance of neighbouring points, pixels of the tracker's frames. DIS has a match every 3 pixels of
 its finest level, 6 of the frame, so a finer grid adds points but little motion."""
 
-POINTS = 4000
+WANTED_POINTS = 4000
 """Points that the default distance aims at: the solver's working size for a mesh in minutes on two cores."""
 
 TEXTURE_WINDOW = 11
@@ -40,7 +40,7 @@ class Seeds:
 
 def default_step(region: Bools) -> float:
     """Choose the distance of neighbouring points from the region's area, in pixels of the mask."""
-    return float(np.clip(np.sqrt(region.sum() / POINTS), *STEPS))
+    return float(np.clip(np.sqrt(region.sum() / WANTED_POINTS), *GRID_STEPS))
 
 
 def place(template: Grey, region: Bools, *, step: float, everywhere: bool = False) -> tuple[Seeds, float]:

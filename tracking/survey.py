@@ -21,7 +21,7 @@ given. On rendered films of 160×120, enlarging three times halves the median er
 THUMBNAIL = 96
 """Longest side of the pictures in which cuts are sought, pixels."""
 
-ALIKE, CUT = 0.7, 0.4
+SAME_SHOT, CUT = 0.7, 0.4
 """Correlation of successive thumbnails, the first carried by the flow: within a shot usually above the one, across a cut below
 the other."""
 
@@ -118,7 +118,7 @@ def find_cuts(likeness: NDArray[np.float64]) -> tuple[int, ...]:
     cuts = []
     for t in np.flatnonzero(likeness < CUT):
         around = np.concatenate([likeness[max(0, t - AROUND) : t], likeness[t + 1 : t + 1 + AROUND]])
-        if np.median(around) > ALIKE:
+        if np.median(around) > SAME_SHOT:
             cuts.append(int(t))
     return tuple(cuts)
 

@@ -25,7 +25,7 @@ from pydantic import BaseModel, ConfigDict
 PREFIX = "pliant_"
 """Prefix of every token, for scanners of leaked secrets."""
 
-LONGEST_NAME = 100
+LONGEST_TOKEN_NAME = 100
 
 _FORM = re.compile(PREFIX + r"([0-9a-f]{12})_([A-Za-z0-9_-]{43})", re.ASCII)
 _DURATION = re.compile(r"([1-9][0-9]{0,5})([smhdw])", re.ASCII)
@@ -139,9 +139,9 @@ class Tokens:
             There is no token to share jobs with.
         """
         label = " ".join(name.split())
-        if not 1 <= len(label) <= LONGEST_NAME or not label.isprintable():
+        if not 1 <= len(label) <= LONGEST_TOKEN_NAME or not label.isprintable():
             raise InvalidRequest(
-                "invalid_token_name", field="name", expected=f"1–{LONGEST_NAME} printable characters", got=repr(name)[:80],
+                "invalid_token_name", field="name", expected=f"1–{LONGEST_TOKEN_NAME} printable characters", got=repr(name)[:80],
                 hint="Give the user or the purpose of the token.",
             )  # fmt: skip
         if not scopes:

@@ -20,7 +20,7 @@ from threading import Event, Thread
 import httpx
 import numpy as np
 from pliant.client import AsyncClient, Status
-from pliant.client.multipart import LARGE
+from pliant.client.multipart import RESUMABLE_BYTES
 from pliant.solver.gallery import face
 from pliant.worker.errors import NotAllowedNow
 
@@ -182,7 +182,7 @@ def upload(instance: Instance, *, size: int) -> int:
     """Send a large file with the SDK, and watch the memory of the API while it arrives and while a job is made of it."""
     frames, points = 100, size * MB // (100 * 2 * 8)
     tracks = np.random.default_rng(0).normal(size=(frames, points, 2))
-    assert tracks.nbytes > LARGE
+    assert tracks.nbytes > RESUMABLE_BYTES
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "tracks.npz"
         np.savez(path, tracks=tracks)

@@ -76,7 +76,7 @@ class Batch:
     """Further parameters of `Client.submit`."""
     options: dict[str, Any]
     key: str
-    """Told apart from other batches of the same files by it."""
+    """Distinguishes the batch from others of the same files."""
     priority: str
     timeout: float | None
     output: Path | None
@@ -107,7 +107,7 @@ class Batch:
         twice = next((each for each in names if names.count(each) > 1), None)
         if twice is not None:
             raise BadArgument(
-                f"--output: several files are named {twice}, and would share a folder. Submit them apart."
+                f"--output: several files are named {twice}, and would share a folder. Submit them separately."
             )
         for each in names:
             if not force and (self.output / each / "report.json").exists():
@@ -154,10 +154,12 @@ class Batch:
         if as_json:
             print_json([{"file": str(row.file), **_outcome(row)} for row in self.rows])
             return
-        from rich.table import Table
+        from rich.table import Column, Table
         from rich.text import Text
 
-        table = Table("file", "job", "status", "verdict", "seconds", "")
+        longest = max((len(row.job.id) for row in self.rows if row.job is not None), default=0)
+        job_column = Column("job", no_wrap=True, min_width=longest)  # ids are for copying, also from narrow terminals
+        table = Table("file", job_column, "status", "verdict", "seconds", "")
         for row in self.rows:
             job = row.job
             status = "refused" if job is None else str(job.status)

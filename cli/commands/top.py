@@ -33,7 +33,7 @@ class View:
 
 def top(
     ctx: typer.Context,
-    every: Annotated[float, typer.Option("--every", help="Seconds between two looks.", min=0.5)] = 2.0,
+    every: Annotated[float, typer.Option("--every", help="Seconds between updates.", min=0.5)] = 2.0,
     once: Annotated[bool, typer.Option("--once", help="Print once and end.")] = False,
     url: Url = HOME,
     as_json: Json = False,

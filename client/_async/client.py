@@ -2,35 +2,27 @@
 
 from __future__ import annotations
 
-import os
-import ssl
 import tempfile
-from collections.abc import AsyncGenerator, Callable, Iterable, Mapping, Sequence
+from collections.abc import AsyncGenerator, Iterable, Mapping, Sequence
 from contextlib import aclosing
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
-import httpx
 from numpy.typing import ArrayLike
 from pliant.client._async import operations
 from pliant.client._async.batch import OnFailure, mapped
+from pliant.client._async.connection import AsyncConnection
 from pliant.client._async.job import AsyncRemoteJob, AsyncResult
 from pliant.client._async.operations import OnJob
-from pliant.client._async.transport import Exchange
-from pliant.client.call import base_of, headers_of
 from pliant.client.multipart import Inputs, OnBytes, Source
 from pliant.client.requests import further, sharing
 from pliant.client.result import finished, loaded, succeeded
-from pliant.client.retry import Attempts, Contact, Retry
 from pliant.schemas.job import Interpretation, Job, Priority, ServiceLimits, Status
 from pliant.schemas.options import Options, Output
 from pliant.schemas.shares import Share
 
-DEFAULT_URL = "http://127.0.0.1:8000"
 
-
-class AsyncClient:
+class AsyncClient(AsyncConnection):
     """A client of a Pliant service.
 
     Parameters
@@ -54,44 +46,6 @@ class AsyncClient:
     --------
     ``result = await (await AsyncClient().submit(points)).wait(timeout=600)``; ``result.shapes`` is an array (F, P, 3).
     """
-
-    def __init__(
-        self,
-        url: str | None = None,
-        *,
-        token: str | None = None,
-        headers: Mapping[str, str] | None = None,
-        verify: bool | ssl.SSLContext = True,
-        retries: Retry = Retry(),  # noqa: B008 - frozen, so all clients may share it
-        event_hooks: Mapping[str, list[Callable[..., Any]]] | None = None,
-        transport: httpx.AsyncBaseTransport | None = None,
-    ) -> None:
-        self.url = base_of(url if url is not None else os.environ.get("PLIANT_URL") or DEFAULT_URL)
-        bearer = token if token is not None else os.environ.get("PLIANT_TOKEN") or None
-        self._http = httpx.AsyncClient(
-            base_url=self.url,
-            headers=headers_of(bearer, headers),
-            verify=verify,
-            event_hooks=event_hooks,
-            transport=transport,
-        )
-        self._retries = retries
-        self._contact = Contact()
-
-    def __repr__(self) -> str:
-        return f"<AsyncClient {self.url}>"
-
-    async def __aenter__(self) -> Self:
-        return self
-
-    async def __aexit__(
-        self, kind: type[BaseException] | None, fault: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        await self.close()
-
-    async def close(self) -> None:
-        """Close the connections."""
-        await self._http.aclose()
 
     async def submit(
         self,
@@ -439,7 +393,3 @@ class AsyncClient:
     async def ready(self, *, timeout: float | None = None) -> dict[str, Any]:
         """Return the state of each part of the service: queue, storage, workers."""
         return await operations.document(self._exchange(timeout), "/readyz")
-
-    def _exchange(self, timeout: float | None, doing: str = "the call") -> Exchange:
-        attempts = Attempts(retries=self._retries, contact=self._contact, timeout=timeout, doing=doing)
-        return Exchange(self._http, attempts)

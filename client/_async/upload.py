@@ -33,7 +33,7 @@ async def upload_large(exchange: Exchange, form: Form, key: str) -> Form:
     key : str
         Of the submission: the same key and the same content find the bytes of an earlier run.
     """
-    if form.size <= multipart.LARGE:
+    if form.size <= multipart.RESUMABLE_BYTES:
         return form
     total, before, fields, files = form.size, 0, dict(form.fields), dict(form.files)
 

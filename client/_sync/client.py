@@ -3,35 +3,27 @@
 
 from __future__ import annotations
 
-import os
-import ssl
 import tempfile
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
-import httpx
 from numpy.typing import ArrayLike
 from pliant.client._sync import operations
 from pliant.client._sync.batch import OnFailure, mapped
+from pliant.client._sync.connection import Connection
 from pliant.client._sync.job import RemoteJob, Result
 from pliant.client._sync.operations import OnJob
-from pliant.client._sync.transport import Exchange
-from pliant.client.call import base_of, headers_of
 from pliant.client.multipart import Inputs, OnBytes, Source
 from pliant.client.requests import further, sharing
 from pliant.client.result import finished, loaded, succeeded
-from pliant.client.retry import Attempts, Contact, Retry
 from pliant.schemas.job import Interpretation, Job, Priority, ServiceLimits, Status
 from pliant.schemas.options import Options, Output
 from pliant.schemas.shares import Share
 
-DEFAULT_URL = "http://127.0.0.1:8000"
 
-
-class Client:
+class Client(Connection):
     """A client of a Pliant service.
 
     Parameters
@@ -55,44 +47,6 @@ class Client:
     --------
     ``result = (Client().submit(points)).wait(timeout=600)``; ``result.shapes`` is an array (F, P, 3).
     """
-
-    def __init__(
-        self,
-        url: str | None = None,
-        *,
-        token: str | None = None,
-        headers: Mapping[str, str] | None = None,
-        verify: bool | ssl.SSLContext = True,
-        retries: Retry = Retry(),  # noqa: B008 - frozen, so all clients may share it
-        event_hooks: Mapping[str, list[Callable[..., Any]]] | None = None,
-        transport: httpx.BaseTransport | None = None,
-    ) -> None:
-        self.url = base_of(url if url is not None else os.environ.get("PLIANT_URL") or DEFAULT_URL)
-        bearer = token if token is not None else os.environ.get("PLIANT_TOKEN") or None
-        self._http = httpx.Client(
-            base_url=self.url,
-            headers=headers_of(bearer, headers),
-            verify=verify,
-            event_hooks=event_hooks,
-            transport=transport,
-        )
-        self._retries = retries
-        self._contact = Contact()
-
-    def __repr__(self) -> str:
-        return f"<Client {self.url}>"
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, fault: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Close the connections."""
-        self._http.close()
 
     def submit(
         self,
@@ -440,7 +394,3 @@ class Client:
     def ready(self, *, timeout: float | None = None) -> dict[str, Any]:
         """Return the state of each part of the service: queue, storage, workers."""
         return operations.document(self._exchange(timeout), "/readyz")
-
-    def _exchange(self, timeout: float | None, doing: str = "the call") -> Exchange:
-        attempts = Attempts(retries=self._retries, contact=self._contact, timeout=timeout, doing=doing)
-        return Exchange(self._http, attempts)

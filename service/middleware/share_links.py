@@ -15,7 +15,7 @@ from pliant.worker.records import Records, utc_now
 from starlette.datastructures import Headers
 from starlette.types import Scope
 
-_READABLE = re.compile(r"/v1/jobs/(?P<id>[^/]+)(/events|/artifacts(/[^/]+)?)?")
+_READABLE = re.compile(r"/v1/jobs/(?P<id>[^/]+)(/events|/shares|/artifacts(/[^/]+)?)?")
 
 
 def share_of(scope: Scope) -> str | None:
@@ -27,25 +27,27 @@ def share_of(scope: Scope) -> str | None:
 
 
 async def authorize_share(scope: Scope, token: str, records: Records) -> Response | None:
-    """Let a request pass that its link allows, with the job's owner in the scope; return the answer that refuses any other."""
+    """Let a request pass that its link allows, with the job's owner and the link's id in the scope; else return the refusal."""
+    now = utc_now()
     try:
-        found = await to_thread.run_sync(recognise_share, records, token, utc_now())
+        found = await to_thread.run_sync(recognise_share, records, token)
     except StoreUnavailable as error:
         return ProblemResponse(from_error(error, 503), headers={"Retry-After": "2"})
     if found is None:
         detail = "This share link is not valid: it was revoked, or its job was deleted. Ask its sender for a new one."
         return _refused(ProblemCode.INVALID_SHARE, detail)
-    stored, valid = found
-    if not valid:
-        return _refused(ProblemCode.EXPIRED_SHARE, "This share link has expired. Ask its sender for a new one.")
+    stored, share = found
+    if now >= share.expires_at:
+        detail = "This share link has expired. Ask its sender for a new one."
+        return _refused(ProblemCode.EXPIRED_SHARE, detail, got=share.expires_at.isoformat())
     wanted = _READABLE.fullmatch(scope["path"])
     if scope["method"] not in ("GET", "HEAD") or wanted is None or wanted["id"] != stored.job.id:
         detail = "A share link reads the results of its own job and changes nothing. Use a token for anything else."
         return answer(ProblemCode.BEYOND_SHARE, detail=detail, field="Authorization")
-    scope["pliant.owner"] = stored.owner
+    scope["pliant.owner"], scope["pliant.share"] = stored.owner, share.id
     return None
 
 
-def _refused(code: ProblemCode, detail: str) -> Response:
+def _refused(code: ProblemCode, detail: str, *, got: str | None = None) -> Response:
     challenge = 'Bearer realm="pliant", error="invalid_token"'
-    return answer(code, detail=detail, headers={"WWW-Authenticate": challenge}, field="Authorization")
+    return answer(code, detail=detail, headers={"WWW-Authenticate": challenge}, field="Authorization", got=got)

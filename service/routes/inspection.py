@@ -19,11 +19,11 @@ from pliant.worker.uploads.service import Uploads
 
 router = APIRouter(prefix="/v1/inspect", tags=["jobs"])
 
-FRAMES, POINTS = 16, 200
+SAMPLE_FRAMES, SAMPLE_POINTS = 16, 200
 """Largest sample."""
 BOX = 1000
 """Side of the square that holds the sample."""
-HIDDEN = -1
+NOT_SEEN = -1
 
 
 @router.post(
@@ -67,20 +67,20 @@ def sample_of(inputs: Inputs) -> list[list[int]]:
     Returns
     -------
     list of list of int
-        One list per frame: x and y of each point in turn, 0 … `BOX`, x right, y down, to one scale; `HIDDEN` twice for a hidden point.
+        One list per frame: x and y of each point in turn, 0 … `BOX`, x right, y down, to one scale; `NOT_SEEN` twice for a hidden point.
     """
     points, visible = inputs.tracks.points, inputs.tracks.visible
-    frames, chosen = evenly(len(points), FRAMES), evenly(points.shape[1], POINTS)
+    frames, chosen = evenly(len(points), SAMPLE_FRAMES), evenly(points.shape[1], SAMPLE_POINTS)
     some = points[np.ix_(frames, chosen)] * (1.0, -1.0 if inputs.interpretation.y_axis == "up" else 1.0)
     seen = visible[np.ix_(frames, chosen)] > 0
     if not seen.any():
-        return [[HIDDEN] * (2 * len(chosen))] * len(frames)
+        return [[NOT_SEEN] * (2 * len(chosen))] * len(frames)
     # The square holds the positions between the outer percentiles, so that a gross outlier does not shrink the rest to a dot.
     low, high = np.percentile(some[seen], (1, 99), axis=0)
     scale = 0.9 * BOX / max(float((high - low).max()), np.finfo(float).tiny)
     placed = BOX / 2 + scale * (some - (low + high) / 2)
     inside = seen & ((placed >= 0) & (placed <= BOX)).all(axis=2)
-    return [[int(value) for value in frame.ravel()] for frame in np.where(inside[..., None], placed.round(), HIDDEN)]
+    return [[int(value) for value in frame.ravel()] for frame in np.where(inside[..., None], placed.round(), NOT_SEEN)]
 
 
 def evenly(count: int, most: int) -> NDArray[np.intp]:

@@ -14,6 +14,7 @@ from pliant.service.multipart import receive_form
 from pliant.service.openapi import JOB_EXAMPLE, SUBMIT_BODY, problems
 from pliant.service.problems import Refusal
 from pliant.service.submission import accept, form_rules
+from pliant.worker.jobs.retry import retry as run_again
 from pliant.worker.jobs.service import LARGEST_PAGE, Jobs
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
@@ -133,7 +134,7 @@ def cancel(id: Id, jobs: Mine) -> Job:
 )
 def retry(id: Id, response: Response, jobs: Mine, key: Key) -> Job:
     """Queue a new job with the same inputs, options and name; its `retry_of` is the id of the old one."""
-    job = jobs.retry(id, idempotency_key=key)
+    job = run_again(jobs, id, idempotency_key=key)
     response.headers["Location"] = f"/v1/jobs/{job.id}"
     return job
 

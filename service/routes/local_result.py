@@ -46,10 +46,11 @@ def read_result(folder: Path) -> Job:
         }
         trust = {name: report.get(name) for name in ("verdict", "trust_sentence")}
         metrics = {name: value for name, value in known.pop("metrics").items() if value is not None}
+        known["name"] = report.get("name") or folder.resolve().name
         written = datetime.fromtimestamp((folder / REPORT).stat().st_mtime, UTC)
         return Job.model_validate(
             {
-                **known, **trust, "id": ID, "name": folder.resolve().name, "status": Status.SUCCEEDED, "metrics": metrics,
+                **known, **trust, "id": ID, "status": Status.SUCCEEDED, "metrics": metrics,
                 "created_at": written, "finished_at": written, "verdict_reasons": report.get("verdict_reasons", []),
                 "artifacts": [_artifact(path, stated) for path in sorted(folder.iterdir()) if _shown(path, stated)],
             }

@@ -36,9 +36,10 @@ async def create(id: Id, request: Request, jobs: Mine) -> Share:
 
 
 @router.get("", operation_id="list_shares", summary="List share links", responses=problems(401, 403, 404, 503))
-def shares(id: Id, jobs: Mine) -> list[Share]:
-    """Return the valid links of a job, without their tokens."""
-    return list_shares(jobs, id)
+def shares(id: Id, request: Request, jobs: Mine) -> list[Share]:
+    """Return the valid links of a job, without their tokens; through a share link that link alone."""
+    own = request.scope.get("pliant.share")
+    return [each for each in list_shares(jobs, id) if own in (None, each.id)]
 
 
 @router.delete(

@@ -13,12 +13,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 from pliant.solver.errors import InvalidInput
+from pliant.solver.model.so3 import MIRROR
 from pliant.solver.records import Floats
 
 Kind = Literal["sequence", "frame", "frame_scaled", "frame_similarity"]
-
-MIRROR = np.diag([1.0, 1.0, -1.0])
-"""The reflection that orthographic views leave undetermined: the sign of depth (bas-relief ambiguity)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

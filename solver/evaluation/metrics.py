@@ -30,8 +30,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 from pliant.solver.errors import InvalidInput
-from pliant.solver.evaluation.alignment import MIRROR, Aligned, Kind, align, procrustes
-from pliant.solver.records import Camera, Floats, Solution, Tracks
+from pliant.solver.evaluation.alignment import Aligned, Kind, align, procrustes
+from pliant.solver.model.so3 import MIRROR
+from pliant.solver.records import Camera, Floats, Tracks
+from pliant.solver.solution import Solution
 
 NINETY = 4.3
 """Half-width of the central 90 % interval of a position, in standard deviations. For a normal error whose σ is known it would be 1.645; σ

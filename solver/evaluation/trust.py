@@ -32,7 +32,7 @@ NARROW, STILL = 20.0, 5.0
 FLEXIBLE = 0.5
 """Modes of deformation per frame from which the motion hardly determines depth: every second frame has a shape of its own."""
 
-HIDDEN, UNSEEN = 0.6, 0.9
+HIDDEN_SHARE, UNSEEN_SHARE = 0.6, 0.9
 """Share of positions without an observation: the same two degrees."""
 
 
@@ -117,24 +117,33 @@ def assess(
     size = max(float(np.sqrt(np.square(centred).sum(axis=2).mean())), np.finfo(float).tiny)
     seen = visible > 0
     expected = None if shapes_std is None else float(np.sqrt(np.square(shapes_std).mean())) / size
-    interval = (
-        (INTERVAL[0] * expected, INTERVAL[1] * expected)
-        if expected is not None and not (planar or depth_is_typical)
-        else None
-    )
+    bounded = expected is not None and not (planar or depth_is_typical)
+    interval = (INTERVAL[0] * expected, INTERVAL[1] * expected) if expected is not None and bounded else None
     relative = (residuals / scales[:, None])[seen]
     residual = float(np.median(relative)) / size if relative.size else np.inf
     turn = turned(rotations)
     hidden = 1.0 - float(seen.mean())
+    unseen = f"{hidden:.0%} of the positions are not seen and drawn from their surroundings."
     found = [
         _sign(residual, LOOSE, LOST, f"The shapes miss the tracks by {_percent(residual)} of the object's size."),
         _sign(-turn, -NARROW, -STILL, f"The camera turned by {turn:.0f}° only; depth needs {NARROW:.0f}° or more."),
-        _sign(hidden, HIDDEN, UNSEEN, f"{hidden:.0%} of the positions are not seen and drawn from their surroundings."),
+        _sign(hidden, HIDDEN_SHARE, UNSEEN_SHARE, unseen),
     ]
     if interval is not None:
         found.append(_sign(interval[1], POOR, BAD, f"The error may be as large as {_at_most(interval[1])}."))
-    if modes > FLEXIBLE * len(shapes):
-        sentence = f"{modes} modes of deformation in {len(shapes)} frames: the motion hardly determines depth. Use more frames."
+    found += _doubts(modes, len(shapes), planar=planar, depth_is_typical=depth_is_typical)
+    signs = sorted((sign for sign in found if sign[0] is not Verdict.GOOD), key=lambda sign: -_SEVERITY[sign[0]])
+    verdict = signs[0][0] if signs else Verdict.GOOD
+    return Trust(verdict, tuple(sentence for _, sentence in signs), expected, interval, turn, residual, hidden)
+
+
+def _doubts(modes: int, frames: int, *, planar: bool, depth_is_typical: bool) -> list[tuple[Verdict, str]]:
+    """Return the reasons to doubt the model itself, which the standard deviations do not include."""
+    found: list[tuple[Verdict, str]] = []
+    if modes > FLEXIBLE * frames:
+        sentence = (
+            f"{modes} modes of deformation in {frames} frames: the motion hardly determines depth. Use more frames."
+        )
         found.append((Verdict.WITH_CARE, sentence))
     if planar:
         found.append(
@@ -143,9 +152,7 @@ def assess(
     if depth_is_typical:
         sentence = "The tracks hardly show how deep the object is; its depth is one that is usual for its width. Let it turn further."
         found.append((Verdict.WITH_CARE, sentence))
-    signs = sorted((sign for sign in found if sign[0] is not Verdict.GOOD), key=lambda sign: -_RANK[sign[0]])
-    verdict = signs[0][0] if signs else Verdict.GOOD
-    return Trust(verdict, tuple(sentence for _, sentence in signs), expected, interval, turn, residual, hidden)
+    return found
 
 
 def turned(rotations: Floats) -> float:
@@ -155,7 +162,7 @@ def turned(rotations: Floats) -> float:
     return float(np.degrees(np.arccos(np.clip(cosines.min(), 0.0, 1.0))))
 
 
-_RANK = {Verdict.GOOD: 0, Verdict.WITH_CARE: 1, Verdict.DO_NOT_USE: 2}
+_SEVERITY = {Verdict.GOOD: 0, Verdict.WITH_CARE: 1, Verdict.DO_NOT_USE: 2}
 
 
 def _sign(value: float, care: float, never: float, sentence: str) -> tuple[Verdict, str]:

@@ -11,7 +11,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.gallery.sequence import refusal
-from pliant.solver.records import MIN_POINTS, Floats, Ints, Mesh
+from pliant.solver.mesh import Mesh
+from pliant.solver.records import MIN_POINTS, Floats, Ints
 from scipy.spatial import Delaunay
 
 Kind = Literal["grid", "triangles"]

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.errors import InvalidInput
-from pliant.solver.records import Floats, Mesh, Tracks, read_only
+from pliant.solver.mesh import Mesh
+from pliant.solver.records import Floats, Tracks, read_only
 
 PIXELS = 200.0
 """Image pixels per model unit: half of a face's height, half of a flag's, or a sphere's radius."""

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 from pliant.solver.gallery.sequence import Sequence, film, refusal, sweep
-from pliant.solver.records import MIN_POINTS, Floats, Ints, Mesh
+from pliant.solver.mesh import Mesh
+from pliant.solver.records import MIN_POINTS, Floats, Ints
 from scipy.spatial import ConvexHull
 
 LOBES = 5

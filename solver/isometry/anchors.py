@@ -23,7 +23,7 @@ POOL = 1800
 VIEWS = 24
 """Frames in which distances between points of the pool are compared."""
 
-PATCH = (12, 40)
+PATCH_POINTS = (12, 40)
 """Fewest and most points of a patch, the anchor included."""
 
 DENSE = 8
@@ -84,7 +84,7 @@ def choose_anchors(points: Floats, seen: NDArray[np.bool_], count: int) -> Ancho
     views = unlike_frames(points[:, pool], seen[:, pool], VIEWS)
     spread = farthest_points(points[views][:, pool], seen[views][:, pool], min(2 * count, len(pool)))
     share = len(pool) // max(count, 1)
-    size = min(max(share, PATCH[0]), PATCH[1], len(pool))
+    size = min(max(share, PATCH_POINTS[0]), PATCH_POINTS[1], len(pool))
     apart = _apart(points[views][:, pool], seen[views][:, pool], spread)
     patches = pool[np.argsort(apart, axis=1, kind="stable")[:, :size]]
     patches[:, 0] = pool[spread]

@@ -17,16 +17,16 @@ from pliant.solver.records import Floats
 from scipy import sparse
 from scipy.sparse.csgraph import shortest_path
 
-FEWEST = 6
+MIN_ANCHORS = 6
 """Seen anchors below which a frame's image is not used to place points in the template."""
 
 STIFF = 1e-3
 """Smoothing of the splines, in units of the template's squared spread: the anchors' depths are not exact."""
 
-WRONG = 8.0
+OUTLIER_DEVIATIONS = 8.0
 """Robust standard deviations from the surface's image beyond which an observation is an outlier."""
 
-FINEST = 3e-3
+SPLINE_ERROR = 3e-3
 """Smallest such standard deviation, as a share of the image's spread: the splines are no better."""
 
 
@@ -69,14 +69,14 @@ def complete_anchors(points: Floats, seen: NDArray[np.bool_], template: Floats) 
         missing = ~seen[frame]
         for other in _alike(points, seen, int(frame)):
             both, gained = seen[frame] & seen[other], missing & seen[other]
-            if gained.any() and both.sum() >= FEWEST:
+            if gained.any() and both.sum() >= MIN_ANCHORS:
                 moved = _moved(points[other], points[frame], both)
                 left = spline(template[both], (points[frame] - moved)[both], template[gained])
                 filled[frame, gained] = moved[gained] + left
                 missing &= ~gained
             if not missing.any():
                 break
-        if missing.any() and (~missing).sum() >= FEWEST:
+        if missing.any() and (~missing).sum() >= MIN_ANCHORS:
             filled[frame, missing] = spline(template[~missing], filled[frame, ~missing], template[missing])
     return filled
 
@@ -109,7 +109,9 @@ def extend(
     space[..., 2] = np.maximum(space[..., 2], nearest)
     off = np.linalg.norm(focal * space[..., :2] / space[..., 2:] + centre - tracks, axis=2)
     compared = seen & placed
-    limit = WRONG * max(float(np.median(off[compared])) / 1.1774, FINEST * float(images[known].std()))
+    limit = OUTLIER_DEVIATIONS * max(
+        float(np.median(off[compared])) / 1.1774, SPLINE_ERROR * float(images[known].std())
+    )
     outliers: NDArray[np.bool_] = np.asarray(compared & (off > limit))
     own = compared & ~outliers
     rays = np.concatenate([(tracks - centre) / focal, np.ones((*seen.shape, 1))], axis=2)
@@ -139,7 +141,7 @@ def _placed(
 ) -> Floats:
     """Return template positions `(P, 2)`: the median over frames; NaN for points that no usable frame shows."""
     found = np.full((*seen.shape, 2), np.nan)
-    for frame in np.flatnonzero(known.sum(axis=1) >= FEWEST):
+    for frame in np.flatnonzero(known.sum(axis=1) >= MIN_ANCHORS):
         source = images[frame, known[frame]]
         middle, size = source.mean(axis=0), max(float(source.std()), np.finfo(np.float64).tiny)
         target = (tracks[frame, seen[frame]] - middle) / size
@@ -156,7 +158,7 @@ def _alike(points: Floats, seen: NDArray[np.bool_], frame: int) -> Indices:
     distance = np.full(len(points), np.inf)
     for other in range(len(points)):
         both = seen[frame] & seen[other]
-        if other != frame and both.sum() >= FEWEST:
+        if other != frame and both.sum() >= MIN_ANCHORS:
             moved = _moved(points[other], points[frame], both)
             distance[other] = np.square(moved - points[frame])[both].mean()
     return np.argsort(distance, kind="stable")[: int(np.isfinite(distance).sum())]

@@ -17,7 +17,7 @@ from pliant.solver.isometry.inextensible import SurfaceGraph, maximum_depth
 from pliant.solver.isometry.refinement import Isometry, refine
 from pliant.solver.records import Floats
 
-SMALL = 0.012
+MAX_INCONSISTENCY = 0.012
 """Largest I that is accepted. Measured: paper .002 and, with 1 px of noise, .003; a comic page .005; faces, bodies .035 to .07."""
 
 CLEAR = 1.25
@@ -30,7 +30,7 @@ perspective, which some false focal length bends into an isometric one, at most 
 DIP = 0.8
 """Going away from the least, I must not fall below this share of what it was: several minima are no evidence."""
 
-STEP = 1.5
+FOCAL_STEP = 1.5
 """Ratio of neighbouring focal lengths."""
 
 FOCAL_RANGE = (0.2, 6.0)
@@ -80,7 +80,7 @@ class Tried:
 
 
 def sweep(search: FocalSearch, focal: float, diagonal: float, *, given: bool) -> list[Tried]:
-    """Return the focal lengths tried: the given or typical one, downhill by `STEP`, and, unless `given`, within the bracket."""
+    """Return the focal lengths tried: the given or typical one, downhill by `FOCAL_STEP`, and, unless `given`, within the bracket."""
     first = tried_at(search, focal, None)
     if first is None:
         return []
@@ -88,7 +88,7 @@ def sweep(search: FocalSearch, focal: float, diagonal: float, *, given: bool) ->
     low, high = FOCAL_RANGE[0] * diagonal, FOCAL_RANGE[1] * diagonal
     while not search.stopped:
         least = min(tried, key=lambda each: each.found.inconsistency)
-        ahead = [least.focal * STEP, least.focal / STEP]
+        ahead = [least.focal * FOCAL_STEP, least.focal / FOCAL_STEP]
         wanted = [f for f in ahead if low <= f <= high and not any(abs(np.log(t.focal / f)) < 1e-6 for t in tried)]
         if not wanted:
             break
@@ -98,8 +98,8 @@ def sweep(search: FocalSearch, focal: float, diagonal: float, *, given: bool) ->
         tried += _golden(search, min(tried, key=lambda each: each.found.inconsistency))
         least = min(tried, key=lambda each: each.found.inconsistency)
         for side in (-1, 1):  # the search may have moved away from the neighbours it began with
-            if not any(side * np.log(t.focal / least.focal) >= 0.9 * np.log(STEP) for t in tried):
-                further = tried_at(search, least.focal * STEP**side, least)
+            if not any(side * np.log(t.focal / least.focal) >= 0.9 * np.log(FOCAL_STEP) for t in tried):
+                further = tried_at(search, least.focal * FOCAL_STEP**side, least)
                 tried += [further] if further is not None else []
     return tried
 
@@ -107,7 +107,7 @@ def sweep(search: FocalSearch, focal: float, diagonal: float, *, given: bool) ->
 def _golden(search: FocalSearch, middle: Tried) -> list[Tried]:
     """Return what golden-section search tries within a step of the least focal length, and the vertex of a parabola at the end."""
     share = (np.sqrt(5) - 1) / 2
-    low, high = np.log(middle.focal / STEP), np.log(middle.focal * STEP)
+    low, high = np.log(middle.focal / FOCAL_STEP), np.log(middle.focal * FOCAL_STEP)
     made: list[Tried] = []
 
     def at(place: float) -> float:
@@ -161,11 +161,11 @@ def judged(tried: list[Tried], least: Tried) -> tuple[bool, str]:
     value = least.found.inconsistency
     sides = [
         min((t.found.inconsistency for t in tried if (t.focal - least.focal) * side > 0
-             and abs(np.log(t.focal / least.focal)) >= 0.9 * np.log(STEP)), default=0.0)
+             and abs(np.log(t.focal / least.focal)) >= 0.9 * np.log(FOCAL_STEP)), default=0.0)
         for side in (-1, 1)
     ]  # fmt: skip
     ratio = min(sides) / value if value > 0 else np.inf
-    if value > SMALL:
+    if value > MAX_INCONSISTENCY:
         return False, f"Not an isometric sheet: edge lengths change by {value:.1%} or more, whatever the focal length."
     if not (ratio >= CLEAR and min(sides) - value >= RISE and _single(tried, least)):
         return False, "Not taken as an isometric sheet: its edge lengths do not single out a focal length."

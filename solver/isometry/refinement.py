@@ -24,7 +24,7 @@ CONVERGED = 1e-4
 EASE = 0.75
 """ε over the median |residual| at the start: where the loss turns from L2 to L1."""
 
-FINEST = 1e-4
+MIN_EASE = 1e-4
 """Smallest ε, as a share of the mean edge length: exact data are fitted by plain least squares."""
 
 MOST_DAMPED = 1e4
@@ -124,7 +124,7 @@ def refine(
     floor = 1e-6 * float(depths.max())
     log_depths = np.log(np.maximum(depths[graph.seen], floor))
     first, _ = residuals(graph, log_depths, lengths)
-    ease = max(EASE * float(np.median(np.abs(first))), FINEST * float(lengths[lengths > 0].mean()))
+    ease = max(EASE * float(np.median(np.abs(first))), MIN_EASE * float(lengths[lengths > 0].mean()))
     here, damping = _at(graph, log_depths, lengths, ease), 1e-3
     for _ in range(iterations):
         if should_stop is not None and should_stop():

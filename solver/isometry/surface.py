@@ -43,11 +43,11 @@ SMALL_PART = (30, 12, 10)
 TYPICAL_FOCAL = 0.8
 """First focal length tried, over the image's diagonal: about 64° across it."""
 
-SHORT = 8
+LAST_NEIGHBOURS = 8
 """Neighbours in the last refinement. Measured, error of a cylinder rolled ever tighter .015 → .007, a cone .084 → .054, paper .0187 →
 .0179; with 5 no less."""
 
-MARGIN = 1.3
+DIAGONAL_MARGIN = 1.3
 """Image diagonal over that of the box around all tracks, where the image's size is not given."""
 
 FIRST_LOOK = 200
@@ -248,7 +248,9 @@ def _everywhere(search: FocalSearch, tracks: Tracks, seen: NDArray[np.bool_], ch
     else:
         found = replace(found, depths=found.depths[np.argsort(search.frames)])
     if not search.stopped:  # the chord of a long edge is shorter than the surface between its ends
-        near = replace(whole, edges=nearest_neighbours(replace(search.anchors, seen=search.seen), neighbours=SHORT))
+        near = replace(
+            whole, edges=nearest_neighbours(replace(search.anchors, seen=search.seen), neighbours=LAST_NEIGHBOURS)
+        )
         depths = refine(near, found.depths, should_stop=search.should_stop).depths
         lengths = edge_lengths(whole, depths)
         found = Isometry(depths, typical(lengths), inconsistency(lengths))
@@ -299,7 +301,7 @@ def _diagonal(tracks: Tracks, image_size: tuple[float, float] | None) -> float:
     if image_size is not None:
         return float(np.hypot(*image_size))
     low, high = np.quantile(tracks.points[tracks.visible > 0], [0.01, 0.99], axis=0)
-    return MARGIN * float(np.hypot(*(high - low)))
+    return DIAGONAL_MARGIN * float(np.hypot(*(high - low)))
 
 
 def _warnings(clear: bool, focal: float | None, least: Tried, chosen: Tried) -> tuple[str, ...]:

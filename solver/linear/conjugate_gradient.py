@@ -35,7 +35,6 @@ class Solved:
 def conjugate_gradient(
     apply: Linear,
     b: Array,
-    x: Array | None = None,
     *,
     precondition: Linear,
     reduction: float,
@@ -43,7 +42,7 @@ def conjugate_gradient(
     negligible: float = 0.0,
     should_stop: Callable[[], bool] | None = None,
 ) -> Solved:
-    """Improve x, or 0, towards 𝒜 x = b for a symmetric positive (semi)definite 𝒜.
+    """Solve 𝒜 x = b, starting from 0, for a symmetric positive (semi)definite 𝒜.
 
     Every iteration decreases ½ xᵀ𝒜x − bᵀx, so majorise–minimise descends even when the inner solve is stopped early.
     Stops when √(rᵀM⁻¹r) has fallen to `reduction` times its initial value, or to rounding level relative to √(bᵀM⁻¹b),
@@ -53,19 +52,12 @@ def conjugate_gradient(
     Five arrays of the size of x are allocated once and reused; allocating them in every iteration would cost more in
     page faults than in arithmetic.
     """
-    if x is None:
-        x, residual, image = np.zeros_like(b), b.copy(), np.empty_like(b)
-        z = precondition(residual)
-        direction = np.empty_like(b)
-        first = rz = beside = dot(residual, z)
-    else:
-        x, image = x.copy(), apply(x)
-        residual = b - image
-        z, direction = precondition(residual), precondition(b)
-        first, beside = dot(residual, z), abs(dot(b, direction))
-        rz = first
-    enough = max(negligible, reduction**2 * first, (10 * float(np.finfo(b.dtype).eps)) ** 2 * beside)
+    x, residual, image = np.zeros_like(b), b.copy(), np.empty_like(b)
+    z = precondition(residual)
+    direction = np.empty_like(b)
     direction[...] = z
+    first = rz = dot(residual, z)
+    enough = max(negligible, max(reduction, 10 * float(np.finfo(b.dtype).eps)) ** 2 * first)
     done, decrease = 0, 0.0
     while done < max_iterations and rz > enough:
         if should_stop is not None and should_stop():

@@ -21,7 +21,7 @@ from pliant.solver.threads import SMALLEST, available_cores, over_ranges
 from scipy import fft, linalg
 
 Array = NDArray[np.floating]
-POINTS_PER_BLOCK = 1024
+MIN_POINTS_PER_THREAD = 1024
 """Minimum number of points per thread."""
 BENDS = 1.0
 """Ratio of the spatial term to the smallest eigenvalue of the temporal term above which coarser levels are added."""
@@ -138,7 +138,7 @@ def _by_inverse(temporal: Floats, kind: np.dtype[np.floating]) -> Linear:
         def work(start: int, stop: int) -> None:
             into[:, start:stop] = symmetric @ flat[:, start:stop]
 
-        over_ranges(work, flat.shape[1], smallest=POINTS_PER_BLOCK)
+        over_ranges(work, flat.shape[1], smallest=MIN_POINTS_PER_THREAD)
         return result
 
     return apply
@@ -155,7 +155,7 @@ def _by_point(r: Array, temporal: Diagonalised, shift: Floats) -> Array:
         inner /= (temporal.values[:, None] + shifts[start:stop]).astype(r.dtype)
         result[:, start:stop] = temporal.vectors @ inner
 
-    over_ranges(work, flat.shape[1], smallest=POINTS_PER_BLOCK)
+    over_ranges(work, flat.shape[1], smallest=MIN_POINTS_PER_THREAD)
     return result.reshape(r.shape)
 
 

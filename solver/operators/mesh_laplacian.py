@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.errors import InvalidSettings
+from pliant.solver.mesh import Mesh
 from pliant.solver.operators.aggregation import Level, build_levels
-from pliant.solver.records import Floats, Ints, Mesh
+from pliant.solver.records import Floats, Ints
 from scipy import sparse
 
 Matrix = sparse.csr_array[Any]

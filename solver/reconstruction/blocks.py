@@ -14,15 +14,17 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.evaluation.trust import Trust, Verdict, assess
+from pliant.solver.mesh import Mesh
 from pliant.solver.monitor import Monitor
 from pliant.solver.reconstruction.cameras import Cameras
 from pliant.solver.reconstruction.observations import monitored
 from pliant.solver.reconstruction.prior import Prior
 from pliant.solver.reconstruction.shapes import shapes_from
 from pliant.solver.reconstruction.start import prepared, with_outlier_reason, with_outliers_rejected
-from pliant.solver.records import Floats, Ints, Mesh, Outcome, Solution, Step, Trace, Tracks, read_only
+from pliant.solver.records import Floats, Ints, Step, Tracks, read_only
 from pliant.solver.settings import Settings
 from pliant.solver.shapes.sparsely_observed import mesh_of
+from pliant.solver.solution import Outcome, Solution, Trace
 
 BLOCK_OBSERVATIONS = 5_000_000
 """Largest number of frames times points that are solved at once: 2.3 GB."""
@@ -120,14 +122,22 @@ class _Whole:
     def add(self, solution: Solution, own: NDArray[np.intp], places: NDArray[np.intp]) -> None:
         """Keep what belongs to the block's own points, `places` among those solved."""
         self._shapes[:, own] = solution.shapes[:, places]
-        kept: dict[str, None] = {}
         for name in ("residuals", "weights", "shapes_std", "inlier_probability"):
             array = getattr(solution, name)
-            kept[name] = None
             if array is not None:
                 target = self._others.setdefault(name, np.zeros(self._shapes.shape[:2]))
                 target[:, own] = array[:, places]
-        self._parts.append(replace(solution, shapes=np.zeros((0, 0, 3)), **kept))
+        none = np.zeros((0, 0))
+        self._parts.append(
+            replace(
+                solution,
+                shapes=np.zeros((0, 0, 3)),
+                residuals=none,
+                weights=none,
+                shapes_std=None,
+                inlier_probability=None,
+            )
+        )
 
     def solution(self, *, seconds: dict[str, float]) -> Solution:
         """Return the solution of all points, centred per frame where the cameras are orthographic."""

@@ -11,8 +11,9 @@ from pliant.solver.cameras.lens import given_lens
 from pliant.solver.cameras.perspective import Perspective
 from pliant.solver.descent import Descent
 from pliant.solver.errors import InvalidInput
+from pliant.solver.mesh import Mesh
 from pliant.solver.monitor import Monitor
-from pliant.solver.records import KnownCamera, Mesh, Step, Tracks
+from pliant.solver.records import KnownCamera, Step, Tracks
 from pliant.solver.settings import Settings
 from pliant.solver.stages import ITERATION_SECONDS, planned, unseen_frames
 from pliant.solver.tracks.normalization import Normalized, normalize

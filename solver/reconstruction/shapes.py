@@ -9,13 +9,14 @@ import numpy as np
 from pliant.solver.cameras.camera_choice import with_camera_choice
 from pliant.solver.energy.problem import Problem
 from pliant.solver.errors import InvalidInput
+from pliant.solver.mesh import Mesh
 from pliant.solver.monitor import Monitor, enter
 from pliant.solver.reconstruction.cameras import Cameras
 from pliant.solver.reconstruction.observations import OnStep, ShouldStop, in_units_of, monitored
 from pliant.solver.reconstruction.prior import Prior
 from pliant.solver.reconstruction.solution import finish
 from pliant.solver.reconstruction.start import Start, prepared, with_outlier_reason, with_outliers_rejected
-from pliant.solver.records import Floats, Mesh, Outcome, Solution, Step, Tracks
+from pliant.solver.records import Floats, Step, Tracks
 from pliant.solver.settings import Settings
 from pliant.solver.shapes.assessment import assessed
 from pliant.solver.shapes.inliers import with_inlier_probability
@@ -24,6 +25,7 @@ from pliant.solver.shapes.perspective_shapes import corrected_again, seen_in_per
 from pliant.solver.shapes.setup import build_problem
 from pliant.solver.shapes.sparsely_observed import WELL_OBSERVED_SHARE, place_the_rest
 from pliant.solver.shapes.state import State
+from pliant.solver.solution import Outcome, Solution
 from pliant.solver.tracks.noise import OUTLIER_SHARE
 
 DEPTH_ROUNDS, DEPTH_SETTLED = 4, 1e-4

@@ -7,8 +7,9 @@ from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.energy.objective import residuals
 from pliant.solver.energy.problem import Problem
 from pliant.solver.energy.robust_loss import largest_weight
-from pliant.solver.records import Camera, Choices, Floats, Outcome, Solution, Trace, read_only
+from pliant.solver.records import Camera, Choices, Floats, read_only
 from pliant.solver.shapes.state import State
+from pliant.solver.solution import Outcome, Solution, Trace
 from pliant.solver.tracks.normalization import Normalized
 
 

@@ -10,12 +10,13 @@ from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.cameras.perspective import orthographic
 from pliant.solver.energy.problem import Problem
 from pliant.solver.errors import InvalidInput, InvalidSettings
+from pliant.solver.mesh import Mesh
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.monitor import Monitor
 from pliant.solver.reconstruction.cameras import Cameras
 from pliant.solver.reconstruction.observations import Observations, OnStep, ShouldStop, check_fit, monitored
 from pliant.solver.reconstruction.prior import Prior, estimate_with
-from pliant.solver.records import MIN_POINTS, Choices, Floats, Mesh, Step, Tracks
+from pliant.solver.records import MIN_POINTS, Choices, Floats, Step, Tracks
 from pliant.solver.settings import Settings
 from pliant.solver.shapes.initialization import pseudo_inverse, uniform_solution
 from pliant.solver.shapes.irls import init

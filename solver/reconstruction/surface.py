@@ -9,10 +9,11 @@ import numpy as np
 from pliant.solver.errors import InvalidSettings
 from pliant.solver.isometry.surface import IsometricVerdict, isometric_surface
 from pliant.solver.monitor import Monitor
-from pliant.solver.records import Choices, KnownCamera, Solution, Step, Tracks
+from pliant.solver.records import Choices, KnownCamera, Step, Tracks
 from pliant.solver.settings import Settings
 from pliant.solver.shapes.inliers import with_inlier_probability
 from pliant.solver.shapes.isometric_solution import centre_downwards, downwards, isometric_solution
+from pliant.solver.solution import Solution
 from pliant.solver.tracks.normalization import normalize
 
 

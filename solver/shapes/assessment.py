@@ -11,9 +11,10 @@ from pliant.solver.cameras.planar_ambiguity import is_planar
 from pliant.solver.energy.hyperparameters import noise_std
 from pliant.solver.evaluation.trust import assess
 from pliant.solver.model.shape_covariance import ShapeCovariance
-from pliant.solver.records import Floats, Solution, read_only
+from pliant.solver.records import Floats, read_only
 from pliant.solver.shapes.jackknife import learning_std
 from pliant.solver.shapes.uncertainty import Pinhole, bounded_by_neighbours, position_std
+from pliant.solver.solution import Solution
 
 INFLATION = 1.4
 """Factor from the standard deviation that posterior and jackknife give to that of the errors, for what both leave out: wrong models, and

@@ -13,7 +13,7 @@ from pliant.solver.operators.normal_equations import Operator
 from pliant.solver.records import Floats
 from pliant.solver.shapes.irls import inner_precision
 
-EXACT, ROUGH, MOST = 1e-4, 0.1, 200
+EXACT, ROUGH, MAX_START_ITERATIONS = 1e-4, 0.1, 200
 """Reduction of the residual for a final least-squares result, for a starting point, and maximum number of iterations."""
 
 START_NOISE_STD = 0.1
@@ -55,7 +55,7 @@ def uniform_solution(problem: Problem, translations: Floats, *, should_stop: Cal
     operator = operator.rounded(inner_precision(operator, reduction))
     solved = conjugate_gradient(
         operator.apply, operator.right_hand_side(target.astype(operator.weights.dtype)),
-        precondition=build_preconditioner(operator), reduction=reduction, max_iterations=MOST,
+        precondition=build_preconditioner(operator), reduction=reduction, max_iterations=MAX_START_ITERATIONS,
         should_stop=stops,
     )  # fmt: skip
     return solved.x.astype(problem.points.dtype, copy=False)

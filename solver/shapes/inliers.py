@@ -17,7 +17,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from pliant.solver.records import Floats, Solution, Tracks, read_only
+from pliant.solver.records import Floats, Tracks, read_only
+from pliant.solver.solution import Solution
 from pliant.solver.tracks.noise import weighted_median
 from scipy.special import expit
 

@@ -18,8 +18,9 @@ from pliant.solver.linear import block_tridiagonal
 from pliant.solver.linear.conjugate_gradient import conjugate_gradient
 from pliant.solver.linear.preconditioner import build_preconditioner
 from pliant.solver.operators.normal_equations import Operator
-from pliant.solver.records import Floats, Outcome
+from pliant.solver.records import Floats
 from pliant.solver.shapes.state import State
+from pliant.solver.solution import Outcome
 from pliant.solver.threads import SMALLEST, over_ranges
 
 INNER_REDUCTION = 0.1
@@ -164,16 +165,10 @@ def _evaluated(
         raise NotFinite(f"the energy became {value} after {reweighting} reweightings")
     seen = problem.confidence > 0
     return State(
-        shapes=shapes,
-        translations=translations,
-        omega=fresh,
-        rank=rank_term(shapes, weights.low_rank, weights.rank_floor),
-        objective=value,
-        residual=float(np.sqrt(np.median(squared if seen.all() else squared[seen]))),
-        reweighting=reweighting,
-        iterations=0,
-        reduction=INNER_REDUCTION,
-    )
+        shapes=shapes, translations=translations, omega=fresh, rank=rank_term(shapes, weights.low_rank, weights.rank_floor),
+        objective=value, residual=float(np.sqrt(np.median(squared if seen.all() else squared[seen]))),
+        reweighting=reweighting, iterations=0, reduction=INNER_REDUCTION,
+    )  # fmt: skip
 
 
 def _mean(left: Array, weights: Array) -> Floats:

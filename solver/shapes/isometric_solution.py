@@ -13,10 +13,11 @@ import numpy as np
 from pliant.solver.evaluation.alignment import procrustes
 from pliant.solver.evaluation.trust import Trust, Verdict, turned
 from pliant.solver.isometry.surface import IsometricSurface, IsometricVerdict
-from pliant.solver.records import Camera, Choices, Floats, Outcome, Solution, Trace, Tracks, read_only
+from pliant.solver.records import Camera, Choices, Floats, Tracks, read_only
 from pliant.solver.settings import Settings
+from pliant.solver.solution import Outcome, Solution, Trace
 
-ROUNDS = 5
+ALTERNATIONS = 5
 """Alternations between mean shape and rotations; each starts from the last, and the third changes angles by less than 1e-3 already."""
 
 
@@ -109,7 +110,7 @@ def _rotations(centred: Floats) -> Floats:
     """Return camera from world, `(F, 3, 3)`: S_f R_f is nearest to the mean shape; the first is the identity."""
     mean = centred[int(np.square(centred - centred.mean(axis=0)).sum(axis=(1, 2)).argmin())]
     rotations = np.tile(np.eye(3), (len(centred), 1, 1))
-    for _ in range(ROUNDS):
+    for _ in range(ALTERNATIONS):
         rotations = procrustes(centred.transpose(0, 2, 1) @ mean, proper=True)
         mean = (centred @ rotations).mean(axis=0)
     return np.asarray(rotations @ rotations[0].T)

@@ -33,14 +33,14 @@ from scipy.spatial import cKDTree
 PARTS = 6
 """K. More parts cost more; with 3 parts the dance has .063 instead of .115 (true .102)."""
 
-MAX_FRAMES = 100
+MAX_JACKKNIFE_FRAMES = 100
 """Maximum number of frames, evenly spread; the others are interpolated."""
 
-LEARNING, TURNING = 20, 60
+LEARNING_ROUNDS, TURNING_ITERATIONS = 20, 60
 """Rounds of expectation maximisation and L-BFGS iterations of a refinement. One that ends before the minimum understates the change: with 5
 and 15 the dance has .070."""
 
-FEWEST = 4
+MIN_LEARNED_POINTS = 4
 """Minimum number of points to learn from."""
 
 CLUSTERING = 5
@@ -76,7 +76,7 @@ def learning_std(
         Normalized units.
     """
     frames = len(shapes)
-    used = np.unique(np.linspace(0, frames - 1, min(frames, MAX_FRAMES)).round().astype(int))
+    used = np.unique(np.linspace(0, frames - 1, min(frames, MAX_JACKKNIFE_FRAMES)).round().astype(int))
     start = Learned(
         np.asarray(estimate.rotations)[used],
         np.asarray(estimate.scales)[used],
@@ -84,7 +84,7 @@ def learning_std(
         np.inf,
     )
     sample = centred(np.asarray(estimate.sample)[used])
-    if sample.shape[1] <= FEWEST:
+    if sample.shape[1] <= MIN_LEARNED_POINTS:
         return np.zeros(shapes.shape[:2])
     part_of = parts(sample)
     without = []
@@ -93,7 +93,7 @@ def learning_std(
         for part in np.unique(part_of):
             if should_stop is not None and should_stop():
                 return np.zeros(shapes.shape[:2])
-            if (part_of != part).sum() >= FEWEST:
+            if (part_of != part).sum() >= MIN_LEARNED_POINTS:
                 without.append(_onto(_shapes_from(sample, part_of != part, start, turning), everything))
     except (
         np.linalg.LinAlgError
@@ -139,11 +139,11 @@ def _shapes_from(sample: Floats, kept: NDArray[np.bool_], start: Learned, turnin
     rows = columns(sample[:, kept])
     gram = rows @ rows.T / rows.shape[1]
     projections = start.rotations[:, :2] * start.scales[:, None, None]
-    covariance = improve(start.covariance, gram, projections, iterations=LEARNING)
+    covariance = improve(start.covariance, gram, projections, iterations=LEARNING_ROUNDS)
     found = replace(start, covariance=covariance)
     if turning:
         scene = scene_at(gram, start.rotations, with_scales=bool((start.scales != 1).any()), ordered=covariance.ordered)
-        moved = fit(scene, motion_of(scene, found), iterations=TURNING, turning=True)
+        moved = fit(scene, motion_of(scene, found), iterations=TURNING_ITERATIONS, turning=True)
         found = moved_to(scene, found, *moved)
     depths = depth_map(found.rotations, found.scales, found.covariance) @ columns(sample)
     return np.concatenate([sample, depths[..., None]], axis=2)

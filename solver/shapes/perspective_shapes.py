@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.cameras.perspective import Perspective, corrected_tracks
 from pliant.solver.energy.problem import Problem
-from pliant.solver.records import Camera, Floats, Solution, Tracks, read_only
+from pliant.solver.records import Camera, Floats, Tracks, read_only
 from pliant.solver.shapes.state import State
+from pliant.solver.solution import Solution
 from pliant.solver.tracks.normalization import Normalized
 
 

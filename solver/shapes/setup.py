@@ -8,10 +8,11 @@ import numpy as np
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.energy.hyperparameters import bending_weight, choose_weights, without_effect
 from pliant.solver.energy.problem import Problem
+from pliant.solver.mesh import Mesh
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.operators.finite_differences import difference_bands
 from pliant.solver.operators.mesh_laplacian import Laplacian, build_laplacian
-from pliant.solver.records import Choices, Mesh
+from pliant.solver.records import Choices
 from pliant.solver.settings import Settings
 from pliant.solver.shapes.irls import init
 from pliant.solver.shapes.state import State
@@ -49,18 +50,11 @@ def build_problem(
         quadratic=quadratic,
     )
     choices = Choices(
-        basis_size=estimate.basis_size,
-        temporal_weight=weights.temporal,
-        spatial_weight=weights.spatial,
-        robust_scale=weights.robust_scale,
-        temporal_order=weights.order,
-        low_rank_weight=weights.low_rank,
-        laplacian=laplacian.name if laplacian is not None else "none",
-        unit=normalized.unit,
-        noise=noise * normalized.unit,
-        reasons={**estimate.reasons, **reasons},
-        warnings=(*estimate.warnings, *without_effect(settings)),
-    )
+        basis_size=estimate.basis_size, temporal_weight=weights.temporal, spatial_weight=weights.spatial,
+        robust_scale=weights.robust_scale, temporal_order=weights.order, low_rank_weight=weights.low_rank,
+        laplacian=laplacian.name if laplacian is not None else "none", unit=normalized.unit, noise=noise * normalized.unit,
+        reasons={**estimate.reasons, **reasons}, warnings=(*estimate.warnings, *without_effect(settings)),
+    )  # fmt: skip
     return problem, choices
 
 

@@ -23,12 +23,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from pliant.solver.cameras.perspective import NEAREST
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.records import Camera, Floats
+from pliant.solver.shapes.sparsely_observed import WELL_OBSERVED_SHARE
 from scipy import linalg
 from scipy.spatial import cKDTree
 
-MAX_FRAMES = 300
+MAX_POSTERIOR_FRAMES = 300
 """Maximum number of frames evaluated, evenly spread, because the cost is cubic in frames. Fewer observations make the
 numbers larger, never smaller."""
 
@@ -45,12 +47,6 @@ GAPS = (0, 1, 2, 4, 8, 16, 32, np.inf)
 REPRESENTATIVES = 24
 """Points at which the derivative of a perspective image is evaluated. On a face 3 half-sizes away, the median standard deviation differs by
 3 % from that with a derivative for every point, by 5 % with 8 representatives, and by 23 % with that of orthography."""
-
-NEAREST = 0.2
-"""Least 1 + κz, as in `cameras.perspective`."""
-
-WELL_OBSERVED_SHARE = 0.25
-"""Minimum share of the frames in which a well-observed point is visible, as in `shapes.sparsely_observed`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,7 +113,7 @@ def position_std(
         In the unit of the covariance.
     """
     frames = len(projections)
-    used = np.unique(np.linspace(0, frames - 1, min(frames, MAX_FRAMES)).round().astype(int))
+    used = np.unique(np.linspace(0, frames - 1, min(frames, MAX_POSTERIOR_FRAMES)).round().astype(int))
     noise, weights = noise_std**2, confidence[used]
     nearest, chosen = _representatives(pinhole, used, confidence.shape[1])
     moments = [_moments(covariance, _rows(projections, pinhole, point), used) for point in chosen]

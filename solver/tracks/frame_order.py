@@ -18,8 +18,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.errors import InvalidSettings
-from pliant.solver.records import Camera, Floats, KnownCamera, Solution, Tracks, read_only
+from pliant.solver.records import Camera, Floats, KnownCamera, Tracks, read_only
 from pliant.solver.settings import Settings
+from pliant.solver.solution import Solution
 from pliant.solver.tracks.noise import weighted_median
 
 WALK_SHARE = 0.5

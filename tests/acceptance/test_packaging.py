@@ -44,7 +44,7 @@ def test_the_wheel_holds_every_package_under_pliant_and_nothing_else(archives: t
     assert packages == set(DECLARED)
     top = {name.split("/")[0] for name in names}
     assert {name for name in top if not name.endswith(".dist-info")} == {"pliant"}
-    assert "pliant/solver/py.typed" in names
+    assert {"pliant/solver/py.typed", "pliant/schemas/problems.toml"} <= set(names)
 
 
 def test_the_source_archive_holds_no_leftovers(archives: tuple[Path, Path]) -> None:

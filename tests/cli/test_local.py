@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 import redis
 from pliant.cli.demo import GOOD, announced, judge
-from pliant.cli.session import Session, parse_options
+from pliant.cli.session import LONGEST_NAME, Session, name_of, parse_options
 from pliant.cli.solve import file_or_word
 from pliant.client import BadArgument, Unreachable
 from pliant.service.testing import InMemoryService
@@ -38,6 +38,14 @@ def test_a_mesh_is_a_file_if_there_is_one(tmp_path: Path) -> None:
     assert file_or_word(str(tmp_path / "3x4")) == tmp_path / "3x4"
     assert file_or_word("3x4") == "3x4"
     assert file_or_word(None) is None
+
+
+def test_a_job_is_named_after_its_file(tmp_path: Path) -> None:
+    assert name_of("", Path("takes/my face.v2.npz")) == "my face.v2"
+    assert name_of("mine", Path("face.npz")) == "mine"
+    assert name_of("", tmp_path / ".") == tmp_path.name
+    assert name_of("", Path("b\udcff.npz")) == "b?"
+    assert name_of("", Path("x" * 250)) == "x" * LONGEST_NAME
 
 
 def test_an_occupied_port_is_rejected_and_0_finds_a_free_one() -> None:

@@ -14,6 +14,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+import trimesh
 from fastapi.testclient import TestClient
 from pliant.cli import app
 from pliant.cli.exits import Exit
@@ -98,6 +99,22 @@ def test_a_link_is_made_listed_and_revoked(run: Run, job: str, service: InMemory
     assert run("share", job, "--revoke", listed["id"]).exit_code == Exit.NOT_FOUND
     assert json.loads(run("share", job, "--json").stdout)["url"].startswith("http://127.0.0.1:8000/#share=")
     assert run("share", job, "--days", "0").exit_code == Exit.REFUSED
+
+
+def test_both_roads_name_the_object_after_the_file(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.delenv("PLIANT_TOKEN", raising=False)
+    given = tmp_path / "my take.npz"
+    np.savez(given, tracks=np.random.default_rng(0).normal(size=(4, 12, 2)))
+    same = ("-O", "max_reweightings=1", "-O", "outputs=glb,ply,obj", "--mesh", "3x4")
+    session = Session(transport=InMemoryService(reconstruct=None))
+    for command in ("solve", "submit"):
+        ran = CliRunner().invoke(app, [command, str(given), *same, "-o", str(tmp_path / command)], obj=session)
+        assert ran.exit_code == 0, ran.output
+    for name in ("shapes.glb", "shapes_ply.zip", "shapes_obj.zip"):
+        assert (tmp_path / "solve" / name).read_bytes() == (tmp_path / "submit" / name).read_bytes()
+    assert list(trimesh.load(tmp_path / "solve" / "shapes.glb", process=False).geometry) == ["my take"]
+    record = TestClient(create_viewer(tmp_path / "solve", "t"), base_url="http://127.0.0.1:1").get("/t/v1/jobs/local")
+    assert record.json()["name"] == "my take"
 
 
 def test_the_viewer_serves_one_result_under_its_token_alone(folder: Path) -> None:

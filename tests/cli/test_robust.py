@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from pliant.cli import app
 from pliant.cli.exits import Exit, code_of, sentence_of
-from pliant.cli.paths import output_folder
+from pliant.cli.paths import output_file, output_folder
 from pliant.cli.session import Session
 from pliant.client import BadArgument
 from pliant.service.testing import InMemoryService
@@ -57,13 +57,13 @@ def words(ran: Result) -> str:
     return " ".join(ran.stderr.split())
 
 
-NO_FILE = "expected a file, an array or a dictionary of arrays, got no file at"
+NO_FILE = "expected a file, got no file at"
 NO_TRACKS = (
     "FOLDER: expected track files (.csv, .h5, .hdf5, .mat, .npy, .npz, .txt), got an empty folder. Name the files."
 )
 NO_PICTURES = (
-    "film: expected pictures (.png, .jpg, .jpeg, .webp, .bmp), got none in folder. "
-    "Export the film's frames as PNG or JPEG, numbered in order."
+    "tracks: expected a file or a folder of pictures, got the folder FOLDER, which has no pictures. "
+    "Give the path of a file in it."
 )
 A_FILE = "--output: expected a folder, got the file TRACKS. Choose another folder."
 LISTED = "`pliant options` lists every option."
@@ -72,21 +72,37 @@ LISTED = "`pliant options` lists every option."
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        ("solve nofile.npz -o OUT", f"tracks: {NO_FILE} nofile.npz."),
+        ("solve nofile.npz -o OUT", f"tracks: {NO_FILE} nofile.npz. Check the path."),
         ("solve FOLDER -o OUT", NO_PICTURES),
         ("submit FOLDER", NO_TRACKS),
         ("inspect FOLDER", NO_PICTURES),
-        ("inspect TRACKS -g none.npz", f"ground_truth: {NO_FILE} none.npz."),
+        ("inspect TRACKS -g none.npz", f"ground_truth: {NO_FILE} none.npz. Check the path."),
         ("solve TRACKS -o TRACKS", A_FILE),
         ("submit TRACKS -o TRACKS", A_FILE),
         ("solve TRACKS -o TRACKS/below", "--output: TRACKS/below is below a file. Choose another folder."),
+        ("up --port 0 --data TRACKS", "--data: expected a folder, got the file TRACKS. Choose another folder."),
+        ("work --data TRACKS", "--data: expected a folder, got the file TRACKS. Choose another folder."),
+        ("work --data TRACKS/below", "--data: TRACKS/below is below a file. Choose another folder."),
+        ("track FILM -o FOLDER", "--output: expected a file, got the folder FOLDER. Give a file in it."),
+        ("track FILM -o OUT/t.npz", "--output: there is no folder OUT. Create it, or choose another."),
+        ("track FILM -o TRACKS", "--output: TRACKS exists already. Choose another name, or replace it with --force."),
+        (
+            "track FILM -o t.npz --preview TRACKS",
+            "--preview: TRACKS exists already. Choose another name, or replace it with --force.",
+        ),
+        ("track FILM -o t.npz --region no.png", f"--region: {NO_FILE} no.png. Check the path."),
         ("solve TRACKS -o OUT -O frobnicate=1", f"options: frobnicate: there is no such option. {LISTED}"),
         ("submit TRACKS -O los=l1", f"options: los: there is no such option (did you mean loss?). {LISTED}"),
     ],
 )
 def test_wrong_paths_and_options(run: Run, tracks: Path, tmp_path: Path, arguments: str, sentence: str) -> None:
     (tmp_path / "folder").mkdir()
-    names = {"TRACKS": str(tracks), "FOLDER": str(tmp_path / "folder"), "OUT": str(tmp_path / "out")}
+    names = {
+        "FILM": str(tracks),
+        "TRACKS": str(tracks),
+        "FOLDER": str(tmp_path / "folder"),
+        "OUT": str(tmp_path / "out"),
+    }
 
     def filled(text: str) -> str:
         for name, path in names.items():
@@ -105,6 +121,8 @@ def test_a_path_that_the_system_rejects(monkeypatch: pytest.MonkeyPatch, tmp_pat
     monkeypatch.setattr(os, "access", lambda *_: False)
     with pytest.raises(BadArgument, match=rf"the folder {folder} is not writable\. Choose another folder\."):
         output_folder(folder, force=False)
+    with pytest.raises(BadArgument, match=rf"--output: the folder {folder} is not writable\. Choose another folder\."):
+        output_file(folder / "tracks.npz", "--output", force=True)
     monkeypatch.setattr(Path, "mkdir", lambda *_, **__: (_ for _ in ()).throw(PermissionError(13, "Permission denied")))
     with pytest.raises(BadArgument, match=r"cannot create .*: Permission denied"):
         output_folder(tmp_path / "new", force=False)

@@ -27,7 +27,7 @@ def test_a_film_becomes_tracks_and_a_preview(tmp_path: Path) -> None:
         np.testing.assert_allclose(np.median(np.diff(stored["tracks"], axis=0), axis=(0, 1)), [1, 0], atol=0.1)
     with Image.open(tmp_path / "sheet.jpg") as sheet:
         assert sheet.format == "JPEG"
-    ran = CliRunner().invoke(app, ["track", *files, "--frames", ":4"])
+    ran = CliRunner().invoke(app, ["track", *files, "--frames", ":4", "--force"])
     assert "points in 4 frames" in ran.stdout
     assert "Only 4 frames" in ran.stderr
 

@@ -7,11 +7,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
+from pliant.cli.commands.batch import Batch, Row
 from pliant.cli.show import show_job, show_jobs, verdict_lines
 from pliant.cli.solve import show_finished
 from pliant.schemas.job import Interpretation, Job, Status
 from pliant.schemas.options import Options
-from pliant.worker.execution.pipeline import Finished
+from pliant.worker.jobs.finished import Finished
 
 REASON = "The camera turned by 9° only; depth needs 20° or more."
 TRUST = "Expected error about 4 % of the object's size; depth rests on 9° of turn."
@@ -77,3 +78,17 @@ def test_the_list_of_jobs_has_the_verdict(capsys: pytest.CaptureFixture[str]) ->
     assert "verdict" in heading
     assert "Do not use" in bad
     assert old.split()[:2] == ["job", "succeeded"]
+
+
+@pytest.mark.parametrize("columns", ["40", "80", "200"])
+def test_ids_are_whole_on_a_narrow_terminal(
+    columns: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", columns)
+    known = job(id="e2efed37cfcf5352891c", name="a name that is long", verdict="with_care")
+    show_jobs([known], as_json=False)
+    assert known.id in capsys.readouterr().out
+    batch = Batch(files=[], shared={}, options={}, key="", priority="normal", timeout=None, output=None, wait=True)
+    batch.rows = [Row(Path("a file with a long name.npz"), known)]
+    batch.show(as_json=False)
+    assert known.id in capsys.readouterr().out

@@ -119,6 +119,18 @@ def test_a_result_holds_arrays_report_and_job(client: Client, tmp_path: Path) ->
     assert set(everything) == {artifact.name for artifact in result.job.artifacts}
 
 
+def test_a_result_has_the_names_of_its_points_and_of_its_object(client: Client, tmp_path: Path) -> None:
+    heads = [f"{part}_{axis}" for part in ("Nose", "chin", "brow", "tip") for axis in "xy"]
+    rows = np.random.default_rng(0).uniform(0, 100, (1, 8)) + np.arange(5)[:, None]
+    text = "\n".join(",".join(map(str, row)) for row in [heads, *rows.tolist()])
+    (tmp_path / "pose.csv").write_text(text)
+    result = client.submit(tmp_path / "pose.csv", mesh="none", options=FAST, name="a pose").wait(timeout=60)
+    assert result.point_names == ("Nose", "chin", "brow", "tip")
+    assert result.report["name"] == "a pose"
+    assert '"name":"a pose"' in result.save_glb(tmp_path / "it.glb").read_bytes().decode("utf-8", "replace")
+    assert client.submit(moving_points(), options=FAST).wait(timeout=60).point_names is None
+
+
 def test_rejected_requests_raise_typed_errors_with_the_services_message(client: Client) -> None:
     with pytest.raises(InvalidRequest) as caught:
         client.submit(np.ones((2, 9, 2)), name="too-short")
@@ -255,7 +267,7 @@ def test_cancelling_ends_the_wait_and_a_retry_is_a_new_job(kind: str, asked: dic
 def test_large_inputs_are_uploaded_first_with_the_same_result(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
     points, key = moving_points(6, 4000), secrets.token_hex()
     carried = client.submit(points, options=FAST, idempotency_key=key)
-    monkeypatch.setattr("pliant.client.multipart.LARGE", 100_000)
+    monkeypatch.setattr("pliant.client.multipart.RESUMABLE_BYTES", 100_000)
     monkeypatch.setattr("pliant.client.multipart.SMALL", 1000)
     updates: list[tuple[int, int]] = []
     ahead = client.submit(points, options=FAST, idempotency_key=key, on_upload=lambda *now: updates.append(now))

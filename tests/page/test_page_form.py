@@ -107,7 +107,9 @@ def test_after_a_job_more_files_a_link_and_other_options(page: Page, url: str, f
     page.get_by_role("button", name="Revoke").first.click()
     expect(page.get_by_role("button", name="Revoke")).to_have_count(0)
     guest.reload()
-    expect(guest.get_by_role("alert")).to_contain_text("This share link is not valid")
+    expect(guest.get_by_role("heading", name="This result can no longer be seen")).to_be_visible()
+    expect(guest.get_by_text("This share link is not valid: it was revoked")).to_be_visible()
+    expect(guest.get_by_role("alert")).to_have_count(0)
     guest.close()
 
     page.get_by_role("button", name="Run again with other options").click()

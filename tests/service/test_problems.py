@@ -9,7 +9,7 @@ from pathlib import Path
 import httpx
 import pytest
 from pliant.schemas.job import Problem
-from pliant.schemas.problems import ProblemCode, find_code
+from pliant.schemas.problems import ProblemCode, explanations, find_code
 from pliant.service.problems import Refusal
 
 ROOT = Path(__file__).parents[2]
@@ -115,6 +115,10 @@ def test_the_table_holds_exactly_the_codes_that_the_sources_raise() -> None:
     assert len(raised) > 90
     assert {code: place for code, place in raised.items() if find_code(code) is None} == {}, "not in the table"
     assert {code.value for code in ProblemCode} - set(raised) == set(), "in the table, but never raised"
+
+
+def test_the_table_explains_every_code_and_no_other() -> None:
+    assert list(explanations()) == [code.value for code in ProblemCode]
 
 
 @pytest.mark.parametrize("code", ProblemCode)

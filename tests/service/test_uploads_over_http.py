@@ -213,7 +213,7 @@ def test_a_quota_counts_uploads(serve: Serve) -> None:
 
 
 def test_too_many_uploads_are_refused(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pliant.worker.uploads.service.MOST", 2)
+    monkeypatch.setattr("pliant.worker.uploads.service.MAX_UPLOADS", 2)
     url = serve().url
     answers = [httpx.put(f"{url}/v1/uploads/number-{number}", content=io.BytesIO(b"x")) for number in range(3)]
     assert [answer.status_code for answer in answers] == [201, 201, 429]

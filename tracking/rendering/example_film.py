@@ -35,35 +35,33 @@ MARGIN = 8
 """Pixels of texture beyond the face, so that its rim is interpolated between texture and not its border."""
 
 
-def write_example_film(path: Path | str, *, frames: int = FRAMES) -> Path:
+def write_example_film(path: Path | str) -> Path:
     """Render and encode the film; the suffix decides the container, see `RenderedFilm.write`.
 
     Parameters
     ----------
     path
         The file to write.
-    frames
-        Number of frames; the motion is spread over them.
 
     Raises
     ------
     FilmError
         An unknown suffix, or a file that cannot be written.
     """
-    film = _film(frames)
+    film = _film()
     picture, low = _front(film)
     return film.write(path, fps=FPS, frame=lambda index: _frame(film, index, picture, low))
 
 
 def example_region() -> list[list[float]]:
     """Return the corners of the face in the film's first frame, as the option `region_polygon` takes them."""
-    outline = cv2.convexHull(_film(FRAMES).pixels[0].astype(np.float32))
+    outline = cv2.convexHull(_film().pixels[0].astype(np.float32))
     corners = cv2.approxPolyDP(outline, OUTLINE_TOLERANCE, closed=True).reshape(-1, 2).astype(np.float64)
     return [[round(float(x), 1), round(float(y), 1)] for x, y in corners]
 
 
-def _film(frames: int) -> RenderedFilm:
-    return render_film(face(frames, POINTS, degrees=DEGREES), size=SIZE, distance=8.0, fill=0.85)
+def _film() -> RenderedFilm:
+    return render_film(face(FRAMES, POINTS, degrees=DEGREES), size=SIZE, distance=8.0, fill=0.85)
 
 
 def _front(film: RenderedFilm) -> tuple[NDArray[np.float32], NDArray[np.float64]]:

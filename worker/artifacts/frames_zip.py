@@ -8,6 +8,7 @@ from typing import IO
 
 import numpy as np
 from pliant.worker.artifacts.geometry import Floats, triangles_of, vertex_normals
+from pliant.worker.artifacts.names import header_line, word
 from pliant.worker.artifacts.result import Result
 
 FIRST_DAY = (1980, 1, 1, 0, 0, 0)
@@ -38,7 +39,8 @@ def write_ply_zip(result: Result, file: IO[bytes], on_progress: OnProgress) -> N
         for _, name, column in fields:
             table[name] = column
         head = [
-            "ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in _header_lines(result)),
+            "ply", "format binary_little_endian 1.0", f"comment name: {header_line(result.name)}",
+            *(f"comment {line}" for line in _header_lines(result)),
             f"element vertex {len(points)}", *(f"property {kind} {name}" for kind, name, _ in fields),
             f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header\n",
         ]  # fmt: skip
@@ -55,6 +57,7 @@ def write_obj_zip(result: Result, file: IO[bytes], on_progress: OnProgress) -> N
     """
     texture = result.texture
     head = "".join(f"# {line}\n" for line in _header_lines(result)) + (MATERIAL_HEAD if texture is not None else "")
+    head += f"o {word(result.name)}\n"
     moving = result.options.normals == "animated" and len(result.faces) > 0
     places = "" if texture is None else _lines("vt", np.column_stack([texture.uv[:, 0], 1 - texture.uv[:, 1]]), "%.6f")
     corner = _corner(textured=texture is not None, moving=moving)

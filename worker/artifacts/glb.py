@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.worker.artifacts.animation import Animation
 from pliant.worker.artifacts.geometry import Ints, Singles, vertex_normals
+from pliant.worker.artifacts.names import DEFAULT
 from pliant.worker.artifacts.normals import fit_normals
 from pliant.worker.artifacts.view import View
 from pliant.worker.formats import Texture
@@ -103,8 +104,8 @@ class Buffer:
 
 
 def write_glb(
-    file: IO[bytes], animation: Animation, triangles: Ints, *, fps: float, node: dict[str, Any], normals: str = "static",
-    quantized: bool = False, colours: NDArray[np.uint16] | None = None, texture: Texture | None = None,
+    file: IO[bytes], animation: Animation, triangles: Ints, *, fps: float, node: dict[str, Any], name: str = DEFAULT,
+    normals: str = "static", quantized: bool = False, colours: NDArray[np.uint16] | None = None, texture: Texture | None = None,
     view: View | None = None, on_progress: Callable[[float], None] | None = None,
 ) -> None:  # fmt: skip
     """Write the animation.
@@ -121,6 +122,8 @@ def write_glb(
         Frames per second; frame f is at f / fps seconds, with linear interpolation between.
     node : dict
         Properties of the node besides the mesh, e.g. `scale`.
+    name : str
+        Name of node and mesh.
     normals : str
         `static`: of the base shape; `animated`: displaced with the targets; `none`.
     quantized : bool
@@ -172,10 +175,10 @@ def write_glb(
         "asset": {"version": "2.0", "generator": f"Pliant {version('pliant')}"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"name": "shape", "mesh": 0, **placed}],
+        "nodes": [{"name": name, "mesh": 0, **placed}],
         "meshes": [
             {
-                "name": "shape",
+                "name": name,
                 "primitives": [primitive],
                 "weights": animation.weights[0].tolist(),
                 "extras": {"targetNames": animation.names, "pliant": animation.extras},

@@ -16,6 +16,7 @@ from pliant.worker.artifacts.colours import linear
 from pliant.worker.artifacts.frames_zip import OnProgress, write_obj_zip, write_ply_zip
 from pliant.worker.artifacts.geometry import Floats, triangles_of, viewer_scale
 from pliant.worker.artifacts.glb import write_glb
+from pliant.worker.artifacts.names import object_name
 from pliant.worker.artifacts.result import Result
 from pliant.worker.artifacts.scenes import alembic, usd
 from pliant.worker.artifacts.scenes.mdd import write_mdd
@@ -84,10 +85,12 @@ def _npz(result: Result, file: IO[bytes], on_progress: OnProgress) -> dict[str, 
     chosen = result.inputs.selection
     sources = {} if chosen is None else {"source_frames": chosen.frames, "source_points": chosen.points}
     posterior = {"shapes_std": solution.shapes_std, "inlier_probability": solution.inlier_probability}
+    names = result.inputs.point_names
     np.savez(
         file,
         allow_pickle=False,
         **sources,
+        **({} if names is None else {"point_names": np.array(names)}),
         shapes=solution.shapes,
         rotations=camera.rotations,
         scales=camera.scales,
@@ -120,7 +123,7 @@ def _glb(result: Result, file: IO[bytes], on_progress: OnProgress) -> dict[str, 
     view = view_of(result.solution.camera, shapes, y_axis=result.y_axis, scale=scale, image_size=result.image_size)
     on_progress(0.4)
     write_glb(
-        file, animation, triangles_of(result.faces), fps=options.fps, node={"scale": [scale] * 3},
+        file, animation, triangles_of(result.faces), fps=options.fps, node={"scale": [scale] * 3}, name=object_name(result.name),
         normals=options.normals, quantized=options.glb_quantized, colours=colours,
         texture=result.texture, view=view, on_progress=lambda part: on_progress(0.4 + 0.6 * part),
     )  # fmt: skip
@@ -161,6 +164,7 @@ def _preview(result: Result, file: IO[bytes]) -> None:
         y_axis=inputs.interpretation.y_axis,
         fps=result.options.fps,
         image_size=result.options.image_size,
+        point_names=inputs.point_names,
     )
 
 

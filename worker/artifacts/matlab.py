@@ -22,12 +22,14 @@ def fits(num_frames: int, num_points: int) -> bool:
 
 
 def write_mat(result: Result, file: IO[bytes]) -> None:
-    """Write the arrays of `shapes.npz` under the same names; indices in `faces` count from 1."""
+    """Write the arrays of `shapes.npz` under the same names; indices in `faces` count from 1, `point_names` is a cell array."""
     solution, camera = result.solution, result.solution.camera
+    names = result.inputs.point_names
     posterior = {"shapes_std": solution.shapes_std, "inlier_probability": solution.inlier_probability}
     scipy.io.savemat(
         file,  # type: ignore[arg-type]  # documented: "str or file-like object"
         {
+            **({} if names is None else {"point_names": np.array(names, dtype=object)}),
             "shapes": solution.shapes,
             "rotations": camera.rotations,
             "scales": camera.scales,

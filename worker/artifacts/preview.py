@@ -21,6 +21,7 @@ frames     float32 (F, 6)      translation x, y; hidden share; expected error an
 points     uint32 (P, 2)       in how many of all frames each point was seen, and in how many of these it was rejected
 spread     uint16 (F, P)       standard deviation of a position = spread_step · value. Only with a posterior
 rejected   uint8 (F, ⌈P/8⌉)    bits, the lowest first: seen observations that the solver rejected as outliers
+names      UTF-8, P lines      names of the points. Only where the tracks' file has them
 =========  ==================  ===================================================================================
 
 Readers skip sections that they do not know; all after `residuals` may be missing.
@@ -30,6 +31,7 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import IO
 
@@ -86,6 +88,7 @@ def write_preview(
     y_axis: str = "down",
     fps: float = 25.0,
     image_size: str | None = None,
+    point_names: Sequence[str] | None = None,
 ) -> None:
     """Write the file.
 
@@ -103,6 +106,8 @@ def write_preview(
         Frames per second of the animation, before frames are skipped.
     image_size : str, optional
         Width and height of the picture that the tracks refer to, pixels, as the option `image_size` has it.
+    point_names : sequence of str, optional
+        Name of every point.
     """
     stride = max(1, -(-solution.shapes[..., 0].size // MOST_OBSERVATIONS))
     kept = range(0, len(solution.shapes), stride)
@@ -114,6 +119,7 @@ def write_preview(
     seen = tracks.visible > 0
     rejected = seen & (solution.weights == 0)
     spread_step = 0.0 if solution.shapes_std is None else float(solution.shapes_std.max()) / LARGEST_COUNT or 1.0
+    names = "\n".join(point_names or ()).encode()
     sizes = {
         "faces": faces.nbytes,
         "cameras": 40 * len(kept),
@@ -124,6 +130,7 @@ def write_preview(
         "points": 8 * points,
         **({} if solution.shapes_std is None else {"spread": 2 * points * len(kept)}),
         "rejected": -(-points // 8) * len(kept),
+        **({} if point_names is None else {"names": len(names)}),
     }
     camera = solution.camera
     header = {
@@ -158,6 +165,8 @@ def write_preview(
     if (std := solution.shapes_std) is not None:
         _section(file, *(np.rint(std[frame] / spread_step).astype("<u2").tobytes() for frame in kept))
     _section(file, np.packbits(rejected[kept], axis=1, bitorder="little").tobytes())
+    if point_names is not None:
+        _section(file, names)
 
 
 def _frames_table(tracks: Tracks, solution: Solution, truth: Floats | None) -> Floats:

@@ -25,6 +25,7 @@ def build_report(
     *,
     metrics: Mapping[str, float],
     seconds: Mapping[str, float] | None = None,
+    name: str = "",
 ) -> dict[str, Any]:
     """Return the content of `report.json` as plain values for JSON.
 
@@ -36,21 +37,24 @@ def build_report(
         By documented name; numbers that are not finite are written as null.
     seconds : mapping, optional
         Wall time of stages outside the solver, e.g. `loading`; those of the solver are part of the solution.
+    name : str
+        Name of the job.
     """
     choices = asdict(solution.choices)
     reasons, warnings = choices.pop("reasons"), choices.pop("warnings")
-    for name in ("camera", "depth_sign", "focal_candidates"):
-        del choices[name]  # in the section `camera`
+    for elsewhere in ("camera", "depth_sign", "focal_candidates"):
+        del choices[elsewhere]  # in the section `camera`
     report = {
         "report_version": REPORT_VERSION,
+        "name": name,
         **_trust(solution.trust),
         "outcome": solution.outcome.value,
         "sentence": solution.outcome.sentence,
         "warnings": list(warnings),
         "metrics": dict(metrics),
         "choices": {
-            name: {"value": value} | ({"reason": reasons[name]} if name in reasons else {})
-            for name, value in choices.items()
+            each: {"value": value} | ({"reason": reasons[each]} if each in reasons else {})
+            for each, value in choices.items()
         },
         "reasons": reasons,
         "camera": described_camera(solution, options),

@@ -21,6 +21,8 @@ class Result:
     inputs: Inputs
     solution: Solution
     options: Options
+    name: str = ""
+    """Name of the job, from which the objects in the files have theirs; see `names`."""
 
     @property
     def y_axis(self) -> str:

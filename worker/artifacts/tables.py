@@ -14,7 +14,7 @@ from pliant.solver.evaluation.metrics import frame_errors
 from pliant.worker.artifacts.geometry import Floats
 from pliant.worker.artifacts.result import Result
 
-Column = NDArray[np.floating] | NDArray[np.integer] | Iterable[float]
+Column = NDArray[np.floating] | NDArray[np.integer] | Iterable[float] | Iterable[str]
 
 
 def write_frames_csv(result: Result, file: IO[bytes]) -> None:
@@ -39,10 +39,12 @@ def write_frames_csv(result: Result, file: IO[bytes]) -> None:
 
 
 def write_points_csv(result: Result, file: IO[bytes]) -> None:
-    """Write one row per point, otherwise as `write_frames_csv`."""
+    """Write one row per point, with its name if points have names; otherwise as `write_frames_csv`."""
     residuals, seen = result.solution.residuals.T, result.inputs.tracks.visible.T
+    names = result.inputs.point_names
     columns: dict[str, Column] = {
         "point": np.arange(len(residuals)),
+        **({} if names is None else {"name": names}),
         "visible": (seen > 0).sum(axis=1),
         **_residuals(residuals, seen),
         "weight_mean": _mean(result.solution.weights.T, seen > 0),
@@ -70,7 +72,7 @@ def _mean(values: Floats, weights: Floats | NDArray[np.bool_]) -> Floats:
 
 def _write(file: IO[bytes], columns: Mapping[str, Column]) -> None:
     """Return numbers in the shortest form that restores them exactly."""
-    text = io.TextIOWrapper(file, encoding="ascii", newline="")
+    text = io.TextIOWrapper(file, encoding="utf-8", newline="")
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)
     plain = (np.asarray(column).tolist() for column in columns.values())

@@ -22,7 +22,8 @@ REPORT = "How the result came to be: options, choices with reasons, metrics, tra
 
 
 def write_artifacts(
-    inputs: Inputs, solution: Solution, options: Options, report: dict[str, Any], directory: Path, *, on_progress: OnProgress | None = None
+    inputs: Inputs, solution: Solution, options: Options, report: dict[str, Any], directory: Path, *, name: str = "",
+    on_progress: OnProgress | None = None,
 ) -> list[Artifact]:  # fmt: skip
     """Write the result files that a job's options ask for into a directory that exists.
 
@@ -34,6 +35,8 @@ def write_artifacts(
         From `build_report`; `artifacts` and `seconds.exporting` are added to it.
     directory : Path
         Where the files go; files of the same names are replaced.
+    name : str
+        Name of the job, which the object in the files has.
     on_progress : callable, optional
         Called with the share that is done, in [0, 1].
 
@@ -48,7 +51,7 @@ def write_artifacts(
         A requested file cannot be written in this installation.
     """
     began = time.perf_counter()
-    result = Result(inputs, solution, options)
+    result = Result(inputs, solution, options, name)
     report_share: OnProgress = on_progress or (lambda _: None)
     kinds = kinds_for(options, textured=result.texture is not None)
     written, entries = write_kinds(result, kinds, directory, on_progress=report_share)

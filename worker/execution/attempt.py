@@ -32,7 +32,7 @@ from pliant.worker.records import Stored
 from pliant.worker.settings import Settings
 
 if TYPE_CHECKING:
-    from pliant.worker.execution.pipeline import Finished
+    from pliant.worker.jobs.finished import Finished
 
 logger = logging.getLogger(__name__)
 
@@ -158,11 +158,8 @@ class Attempt:
                     held, attempt_id=self.attempt_id, problem=end, now=now, retention=settings.retention
                 )
             return lifecycle.succeed(
-                held, attempt_id=self.attempt_id, prefix=self.prefix, artifacts=end.artifacts, metrics=end.metrics,
-                outcome=end.outcome, sentence=end.sentence, warnings=end.warnings, now=now, retention=settings.retention,
-                interpretation=end.interpretation,
-                verdict=end.verdict, verdict_reasons=end.verdict_reasons, trust_sentence=end.trust_sentence,
-            )  # fmt: skip
+                held, end, attempt_id=self.attempt_id, prefix=self.prefix, now=now, retention=settings.retention
+            )
 
         with contextlib.suppress(StoreUnavailable):
             self._flush()
@@ -268,13 +265,14 @@ def _reconstruct(
     options = stored.job.options
     if not is_source(inputs):
         return (reconstruct or pipeline.reconstruct)(
-            load_inputs(inputs), options, results, on_progress=attempt.report, should_stop=attempt.should_stop
-        )
+            load_inputs(inputs), options, results, name=stored.job.name, on_progress=attempt.report,
+            should_stop=attempt.should_stop,
+        )  # fmt: skip
     settings, scratch = attempt.jobs.settings, inputs.with_name("film")
     source = open_source(inputs, inputs.with_name("source"))
     scratch.mkdir()
     return reconstruct_film(
-        source, options, results, scratch=scratch, threads=settings.threads_per_job, bounds=FilmBounds.of(settings),
+        source, options, results, scratch=scratch, name=stored.job.name, threads=settings.threads_per_job, bounds=FilmBounds.of(settings),
         on_progress=attempt.report, should_stop=attempt.should_stop,
     )  # fmt: skip
 

@@ -12,12 +12,13 @@ from pliant.schemas.job import Artifact, Progress
 from pliant.schemas.options import Options
 from pliant.worker.artifacts import described, kinds_for
 from pliant.worker.errors import Interrupted
-from pliant.worker.execution.pipeline import Finished, Halt, silent, solve_and_write
+from pliant.worker.execution.pipeline import Halt, silent, solve_and_write
 from pliant.worker.execution.progress import FILM_SHARES, Reporter
 from pliant.worker.films import frame_strip
 from pliant.worker.films.inputs import read_tracked
 from pliant.worker.films.sources import FilmBounds, FilmSource
 from pliant.worker.films.tracker import track_film
+from pliant.worker.jobs.finished import Finished
 
 FILES = {
     "tracks.npz": (
@@ -36,6 +37,7 @@ def reconstruct_film(
     directory: Path,
     *,
     scratch: Path,
+    name: str = "",
     threads: int = 1,
     bounds: FilmBounds = FilmBounds(),  # noqa: B008 - frozen
     on_progress: Callable[[Progress], None] | None = None,
@@ -53,6 +55,8 @@ def reconstruct_film(
         Where to write the files; created if missing.
     scratch : Path
         An empty folder for the film process.
+    name : str
+        As in `reconstruct`.
     threads : int
         Threads for optical flow.
     bounds : FilmBounds
@@ -86,7 +90,7 @@ def reconstruct_film(
         spent = {"track": time.perf_counter() - began}
         directory.mkdir(parents=True, exist_ok=True)
         artifacts = [_moved(scratch / name, directory) for name in FILES if (scratch / name).exists()]
-        finished = solve_and_write(inputs, options, directory, reporter=reporter, halt=halt, spent=spent)
+        finished = solve_and_write(inputs, options, directory, reporter=reporter, halt=halt, name=name, spent=spent)
     return replace(
         finished,
         artifacts=(*artifacts, *finished.artifacts),

@@ -14,21 +14,23 @@ from pliant.solver import Camera, Choices, Outcome, Solution, Trace
 from pliant.worker.artifacts import kinds_for
 from pliant.worker.artifacts.result import Result
 from pliant.worker.artifacts.write import write_kinds, write_report
-from pliant.worker.execution.pipeline import Finished, Halt, silent
+from pliant.worker.execution.pipeline import Halt, silent
 from pliant.worker.execution.progress import Reporter
 from pliant.worker.films.inputs import read_tracked
 from pliant.worker.films.tracker import Tracked
 from pliant.worker.formats import Inputs, load_inputs
+from pliant.worker.formats.canonical import OWN_FILES
 from pliant.worker.formats.errors import damaged
 from pliant.worker.formats.reading.arrays import read_file
-from pliant.worker.formats.records import Arrays, Limits
+from pliant.worker.formats.records import Arrays
+from pliant.worker.jobs.finished import Finished
 
 SHARES = {"loading": (0.0, 0.1), "exporting": (0.1, 1.0)}
-_OURS = Limits(max_bytes=1 << 36)
 _NEEDED = frozenset(
     ("shapes", "rotations", "scales", "translations", "focal", "focal_std", "principal_point", "residuals", "weights",
      "trace_objective", "trace_residual", "trace_iterations")
 )  # fmt: skip
+_OPTIONAL = frozenset(("shapes_std", "inlier_probability"))
 
 
 def write_further(
@@ -70,7 +72,7 @@ def write_further(
     if solution.shapes.shape[:2] != (inputs.tracks.num_frames, inputs.tracks.num_points):
         raise damaged("inputs", "tracks and shapes of different sizes")
     directory.mkdir(parents=True, exist_ok=True)
-    result = Result(inputs, solution, options)
+    result = Result(inputs, solution, options, job.name)
     kinds = [kind for kind in kinds_for(options, textured=result.texture is not None) if kind.output is not None]
 
     def exported(done: float) -> None:
@@ -104,7 +106,7 @@ def read_solution(path: Path, *, y_up: bool) -> Solution:
     InvalidInput
         Code damaged_file, when it is not a result of ours or was damaged.
     """
-    arrays = read_file(path, field="result", limits=_OURS)
+    arrays = read_file(path, field="result", limits=OWN_FILES, wanted=_NEEDED | _OPTIONAL)
     missing = sorted(_NEEDED - set(arrays))
     if missing:
         raise damaged("result", f"a shapes.npz without {', '.join(missing)}")

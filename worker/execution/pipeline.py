@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from pliant.schemas.job import Artifact, Interpretation, Progress
+from pliant.schemas.job import Artifact, Progress
 from pliant.schemas.options import SOLVER_FIELDS, Options
 from pliant.solver import Outcome, Settings, Solution, Step, solve
 from pliant.solver.evaluation.metrics import evaluate
@@ -16,44 +16,10 @@ from pliant.worker.artifacts import build_report, kinds_for, write_artifacts
 from pliant.worker.errors import Interrupted, TimedOut
 from pliant.worker.execution.progress import Reporter
 from pliant.worker.formats import Inputs
+from pliant.worker.jobs.finished import Finished
 
 EXPORT_SECONDS = 1.5e-7
 """Seconds per frame and point of writing a file whose `share` is 1, measured on a face of 99 frames and 3,000 points."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Finished:
-    """Outcome of a job and the files in its directory."""
-
-    metrics: dict[str, float]
-    """Every metric for which the inputs suffice and that is finite, by its documented name."""
-
-    outcome: str
-    """Outcome of the solver: `converged`, `max_reweightings` or `rejected`."""
-
-    sentence: str
-    """The outcome in words."""
-
-    warnings: tuple[str, ...]
-    """Warnings about this result."""
-
-    artifacts: tuple[Artifact, ...]
-    """The files by their names in the directory."""
-
-    interpretation: Interpretation | None = None
-    """Interpretation of the inputs if it was not known at submission, as for the tracks of a film."""
-
-    verdict: str | None = None
-    """`good`, `with_care` or `do_not_use`; None if the solver gave no verdict."""
-
-    verdict_reasons: tuple[str, ...] = ()
-    """A sentence for each reason against the result, most severe first."""
-
-    trust_sentence: str | None = None
-    """A sentence with the expected error and the evidence for depth."""
-
-    camera_sentence: str | None = None
-    """The camera model, and of a perspective camera focal length and field of view."""
 
 
 def solver_settings(options: Options, *, y_up: bool = False) -> Settings:
@@ -77,6 +43,7 @@ def reconstruct(
     options: Options,
     directory: Path,
     *,
+    name: str = "",
     on_progress: Callable[[Progress], None] | None = None,
     should_stop: Callable[[], bool] | None = None,
     solver: Callable[..., Solution] | None = None,
@@ -91,6 +58,8 @@ def reconstruct(
         How to solve and which files to write.
     directory : Path
         Where to write the files; created if missing.
+    name : str
+        Name of the job, which the object in the files has.
     on_progress : callable, optional
         Called frequently; throttle if needed.
     should_stop : callable, optional
@@ -112,7 +81,7 @@ def reconstruct(
     reporter = Reporter(on_progress if on_progress is not None else silent)
     halt = Halt(should_stop, options.time_limit)
     with reporter.ticking():
-        return solve_and_write(inputs, options, directory, reporter=reporter, halt=halt, solver=solver)
+        return solve_and_write(inputs, options, directory, name=name, reporter=reporter, halt=halt, solver=solver)
 
 
 def solve_and_write(
@@ -122,6 +91,7 @@ def solve_and_write(
     *,
     reporter: Reporter,
     halt: Halt,
+    name: str = "",
     spent: Mapping[str, float] | None = None,
     solver: Callable[..., Solution] | None = None,
 ) -> Finished:
@@ -135,6 +105,8 @@ def solve_and_write(
         Receives the parts `loading`, `solving` and `exporting`.
     halt : Halt
         The stop condition.
+    name : str
+        As in `reconstruct`.
     spent : mapping, optional
         Seconds of earlier parts, for the report.
     solver : callable, optional
@@ -159,14 +131,20 @@ def solve_and_write(
     solved = time.perf_counter()
     metrics = _metrics(inputs, solution)
     seconds = {**(spent or {}), "solve": solved - began, "metrics": time.perf_counter() - solved}
-    report = build_report(inputs, solution, options, metrics=metrics, seconds=seconds)
+    report = build_report(inputs, solution, options, metrics=metrics, seconds=seconds, name=name)
 
     def exported(done: float) -> None:
         reporter.part("exporting", done)
         halt.check()
 
-    artifacts = write_artifacts(inputs, solution, options, report, directory, on_progress=exported)
+    artifacts = write_artifacts(inputs, solution, options, report, directory, name=name, on_progress=exported)
     exported(1.0)
+    return _finished(solution, metrics, artifacts, camera_sentence=report["camera"]["sentence"])
+
+
+def _finished(
+    solution: Solution, metrics: dict[str, float], artifacts: Iterable[Artifact], *, camera_sentence: str
+) -> Finished:
     trust = solution.trust
     return Finished(
         metrics=metrics,
@@ -175,7 +153,7 @@ def solve_and_write(
         verdict=None if trust is None else trust.verdict.value,
         verdict_reasons=() if trust is None else trust.reasons,
         trust_sentence=None if trust is None else trust.sentence,
-        camera_sentence=report["camera"]["sentence"],
+        camera_sentence=camera_sentence,
         warnings=tuple(solution.choices.warnings),
         artifacts=tuple(artifacts),
     )

@@ -26,7 +26,7 @@ DESCRIPTION = "Small pictures of the tracked frames, which the web page shows be
 
 MAGIC = b"PLIANTFF"
 VERSION = 1
-LONGEST_SIDE = 480
+STRIP_SIDE = 480
 """Of a picture, pixels: about as large as the page shows it."""
 
 MOST_BYTES = 40_000_000
@@ -59,7 +59,7 @@ def write_frames(film: Film, indices: NDArray[np.int64], path: Path) -> bool:
     pictures: list[bytes] = []
     for frame in film.frames():
         if frame.index in wanted:
-            pictures.append(small_jpeg(frame.image, longest_side=LONGEST_SIDE, quality=QUALITY))
+            pictures.append(small_jpeg(frame.image, longest_side=STRIP_SIDE, quality=QUALITY))
         if sum(map(len, pictures)) > MOST_BYTES:
             return False
     if len(pictures) != len(wanted):

@@ -20,7 +20,7 @@ NEEDED = frozenset(("tracks", "visibility", "confidence", "grid"))
 PICTURE = frozenset(("template_image", "uv"))
 
 
-def read_tracked(file: Path, tracked: Tracked, options: Options, *, limits: Limits = Limits()) -> Inputs:  # noqa: B008 - frozen
+def read_tracked(file: Path, tracked: Tracked, options: Options) -> Inputs:
     """Read the `tracks.npz` of a film as the inputs of a solve: points in the film's pixels, y down, and their grid as mesh.
 
     Parameters
@@ -31,15 +31,13 @@ def read_tracked(file: Path, tracked: Tracked, options: Options, *, limits: Limi
         The other results of tracking.
     options : Options
         `stride`, `max_points` and `min_seen`.
-    limits : Limits
-        Largest arrays.
 
     Raises
     ------
     InvalidInput
         The arrays do not fit together, or an option leaves too few points.
     """
-    arrays = read_file(file, field="film", limits=limits, wanted=NEEDED | PICTURE)
+    arrays = read_file(file, field="film", limits=Limits(), wanted=NEEDED | PICTURE)
     if not set(arrays) >= NEEDED or arrays["tracks"].shape[:2] != arrays["confidence"].shape:
         raise damaged("film", "tracks without confidence or grid")
     points = arrays["tracks"].astype(np.float64)

@@ -10,12 +10,15 @@ from numpy.typing import NDArray
 from pliant.schemas.job import Interpretation
 from pliant.solver import KnownCamera, Mesh, Tracks
 from pliant.worker.formats.errors import damaged
+from pliant.worker.formats.point_names import ARRAY as NAMES
+from pliant.worker.formats.point_names import pack, unpack
 from pliant.worker.formats.reading.arrays import read_file
 from pliant.worker.formats.records import Arrays, GroundTruth, Inputs, Limits, Selection
 from pliant.worker.formats.texture import Texture
 
 VERSION = 1
-_OURS = Limits(max_bytes=1 << 36)
+OWN_FILES = Limits(max_bytes=1 << 36)
+"""Limits of files that this package wrote: they were checked when they were made."""
 
 
 def save_inputs(inputs: Inputs, path: Path) -> None:
@@ -45,6 +48,8 @@ def save_inputs(inputs: Inputs, path: Path) -> None:
         arrays["texture"] = np.frombuffer(inputs.texture.jpeg, dtype=np.uint8)
         arrays["texture_size"] = np.array([inputs.texture.width, inputs.texture.height])
         arrays["uv"] = inputs.texture.uv
+    if inputs.point_names is not None:
+        arrays[NAMES] = pack(inputs.point_names)
     with path.open("wb") as file:
         np.savez(file, allow_pickle=False, **arrays)
 
@@ -57,7 +62,7 @@ def load_inputs(path: Path) -> Inputs:
     InvalidInput
         Code damaged_file: `save_inputs` did not write this file, or it was damaged.
     """
-    arrays = read_file(path, field="inputs", limits=_OURS)
+    arrays = read_file(path, field="inputs", limits=OWN_FILES)
     missing = {"version", "points", "visible", "interpretation"} - set(arrays)
     if missing or int(arrays["version"]) != VERSION:
         raise damaged(
@@ -81,8 +86,9 @@ def load_inputs(path: Path) -> Inputs:
         selection = Selection(frames, kept, (int(arrays["source_whole"][0]), int(arrays["source_whole"][1])))
     interpretation = Interpretation.model_validate(json.loads(arrays["interpretation"].tobytes()))
     return Inputs(
-        Tracks(points, _wide(arrays["visible"])), mesh, truth, cameras, interpretation, selection, _texture(arrays)
-    )
+        Tracks(points, _wide(arrays["visible"])), mesh, truth, cameras, interpretation, selection, _texture(arrays),
+        unpack(arrays.get(NAMES), points.shape[1]),
+    )  # fmt: skip
 
 
 def _texture(arrays: Arrays) -> Texture | None:

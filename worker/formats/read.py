@@ -86,7 +86,10 @@ def read_inputs(
     )  # fmt: skip
     texture = None if film is None or film.texture is None else film.texture.at_points(chosen.selection.points)
     selection = chosen.selection if chosen.selection.narrows else None
-    return Inputs(checked, chosen.mesh, truth, cameras, interpretation, selection, texture=texture)
+    names = understood.point_names
+    if names is not None:
+        names = tuple(names[point] for point in chosen.selection.points.tolist())
+    return Inputs(checked, chosen.mesh, truth, cameras, interpretation, selection, texture=texture, point_names=names)
 
 
 def _stated(film: FilmTracks, selection: Selection) -> dict[str, Any]:

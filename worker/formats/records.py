@@ -161,3 +161,6 @@ class Inputs:
 
     texture: Texture | None = None
     """The texture, with coordinates for each of the P points, or None."""
+
+    point_names: tuple[str, ...] | None = None
+    """Names of the P points, where the file has them."""

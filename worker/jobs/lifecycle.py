@@ -12,11 +12,11 @@ A final status never changes: running a finished job again is a new job (`again`
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from datetime import datetime, timedelta
 
-from pliant.schemas.job import Artifact, Interpretation, Problem, Progress, Status
+from pliant.schemas.job import Problem, Progress, Status
 from pliant.worker.errors import NotAllowedNow, StaleAttempt
+from pliant.worker.jobs.finished import Finished
 from pliant.worker.records import Stored
 
 ACTIVE = (Status.RUNNING, Status.CANCELLING)
@@ -52,21 +52,7 @@ def report(stored: Stored, *, attempt_id: str, progress: Progress) -> Stored:
 
 
 def succeed(
-    stored: Stored,
-    *,
-    attempt_id: str,
-    prefix: str,
-    artifacts: Sequence[Artifact],
-    metrics: Mapping[str, float],
-    outcome: str,
-    sentence: str,
-    warnings: Sequence[str],
-    now: datetime,
-    retention: float,
-    interpretation: Interpretation | None = None,
-    verdict: str | None = None,
-    verdict_reasons: Sequence[str] = (),
-    trust_sentence: str | None = None,
+    stored: Stored, finished: Finished, *, attempt_id: str, prefix: str, now: datetime, retention: float
 ) -> Stored:
     """Publish the result, and the interpretation if the job determined it.
 
@@ -81,18 +67,18 @@ def succeed(
     if stored.job.status is Status.CANCELLING:
         return stop(stored, attempt_id=attempt_id, now=now, retention=retention)
     update = {
-        "metrics": dict(metrics),
-        "outcome": outcome,
-        "sentence": sentence,
-        "verdict": verdict,
-        "verdict_reasons": list(verdict_reasons),
-        "trust_sentence": trust_sentence,
-        "warnings": list(warnings),
-        "artifacts": list(artifacts),
-        **({} if interpretation is None else {"interpretation": interpretation}),
+        "metrics": finished.metrics,
+        "outcome": finished.outcome,
+        "sentence": finished.sentence,
+        "verdict": finished.verdict,
+        "verdict_reasons": list(finished.verdict_reasons),
+        "trust_sentence": finished.trust_sentence,
+        "warnings": list(finished.warnings),
+        "artifacts": list(finished.artifacts),
+        **({} if finished.interpretation is None else {"interpretation": finished.interpretation}),
     }
     job = stored.job.model_copy(update=update)
-    size = stored.bytes + sum(each.bytes for each in artifacts)
+    size = stored.bytes + sum(each.bytes for each in finished.artifacts)
     published = stored.model_copy(update={"job": job, "prefix": prefix, "bytes": size})
     return _finish(published, Status.SUCCEEDED, now=now, retention=retention)
 

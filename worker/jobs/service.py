@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -22,7 +21,7 @@ from pliant.worker.errors import (
 from pliant.worker.ids import check_id, is_id, new_attempt_id, new_job_id
 from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.admission import check_fits
-from pliant.worker.jobs.submission import Acceptance, Submission, copy_beside, key_digest, result_beside
+from pliant.worker.jobs.submission import Acceptance, Submission, key_digest, result_beside
 from pliant.worker.jobs.validation import LARGEST_PAGE as LARGEST_PAGE
 from pliant.worker.jobs.validation import check_event_id, check_key, check_page
 from pliant.worker.paths import make_data_directory
@@ -142,58 +141,6 @@ class Jobs:
             self.records.get(id or "")
         except UnknownJob:
             raise TooManyQueued(self.max_queued) from None
-
-    def retry(self, id: str, *, idempotency_key: str | None = None) -> Job:
-        """Run a failed or cancelled job again, as a new job with the same inputs, options, name and webhook.
-
-        Parameters
-        ----------
-        idempotency_key : str, optional
-            A repeated request with the same key returns the first new job.
-
-        Raises
-        ------
-        Conflict
-            The key belongs to a different request.
-        InvalidRequest
-            The key is malformed.
-        NotAllowedNow
-            The job is not finished, or has succeeded.
-        UnknownJob
-            There is no such job, or it was deleted in the meantime.
-        """
-        stored = self.stored(id)
-        job = stored.job
-        submission = Submission(
-            options=job.options, name=job.name, idempotency_key=idempotency_key, webhook=stored.webhook,
-            fingerprint=hashlib.sha256(f"retry of {id}".encode()).hexdigest(),
-        )  # fmt: skip
-        known = self.known(submission)
-        if known is not None:
-            return known
-        if job.status not in (Status.FAILED, Status.CANCELLED):
-            hint = "It has its result." if job.status is Status.SUCCEEDED else "Wait until it ends, or cancel it first."
-            raise NotAllowedNow(id, job.status, wanted="run again", hint=hint)
-        again = Job(
-            id=new_job_id(),
-            name=job.name,
-            status=Status.QUEUED,
-            created_at=self.clock(),
-            retry_of=id,
-            outputs_of=job.outputs_of,
-            priority=job.priority,
-            options=job.options,
-            interpretation=job.interpretation,
-        )
-        try:
-            copies = [(stored.inputs, "inputs.npz"), *([(stored.result, "result.npz")] if stored.result else [])]
-            size = sum(self.blobs.get(key).size for key, _ in copies)
-            return self.create(
-                again, submission, lambda key: copy_beside(self.blobs, copies, key), size=size, owner=stored.owner,
-                from_result=stored.result is not None,
-            )  # fmt: skip
-        except FileNotFoundError:  # deleted between our look and the copy
-            raise UnknownJob(id) from None
 
     def get(self, id: str) -> Job:
         """Return a job."""

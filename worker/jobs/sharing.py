@@ -80,8 +80,8 @@ def revoke_share(jobs: Jobs, id: str, share: str) -> None:
     jobs.records.update(id, change)
 
 
-def recognise_share(records: Records, token: str, now: datetime) -> tuple[Stored, bool] | None:
-    """Return the job of a link's token and whether the link is still valid; None if there is no such link."""
+def recognise_share(records: Records, token: str) -> tuple[Stored, StoredShare] | None:
+    """Return the job of a link's token and the link, which may have expired; None if there is no such link."""
     id, dot, secret = token.removeprefix(SHARE_PREFIX).rpartition(".")
     if len(token) > LONGEST_TOKEN or not token.startswith(SHARE_PREFIX) or not dot or not is_id(id):
         return None
@@ -92,7 +92,7 @@ def recognise_share(records: Records, token: str, now: datetime) -> tuple[Stored
     digest = _digest(secret)
     for each in stored.shares:
         if hmac.compare_digest(each.digest, digest):
-            return stored, now < each.expires_at
+            return stored, each
     return None
 
 

@@ -79,7 +79,7 @@ def connect(url: str, *, decode: bool, retries: int = 3, answer_within: float | 
     return client
 
 
-def check_server(url: str, *, answer_within: float = 3.0) -> str:
+def check_server(url: str) -> str:
     """Send a command that needs the password of the URL; return the server's policy for full memory, empty if it is not readable.
 
     Raises
@@ -88,7 +88,7 @@ def check_server(url: str, *, answer_within: float = 3.0) -> str:
         The server does not answer, or refuses the password.
     """
     try:
-        client = connect(url, decode=True, retries=0, answer_within=answer_within)
+        client = connect(url, decode=True, retries=0, answer_within=3.0)
     except ValueError as error:
         raise StoreUnavailable("The job store", reason=str(error)) from error
     try:

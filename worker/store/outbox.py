@@ -79,11 +79,6 @@ class Outbox:
         with reachable():
             self._postpone(args=[self._at, id, due])
 
-    def owed(self) -> int:
-        """Return the number of pending messages."""
-        with reachable():
-            return int(self._redis.zcard(f"{self._at}outbox"))
-
     def _closed(self, id: str, tally: str) -> None:
         with reachable():
             self._close(args=[self._at, id, tally])

@@ -23,7 +23,7 @@ from pliant.worker.uploads.writer import Capacity as Capacity
 from pliant.worker.uploads.writer import Writer as Writer
 from pliant.worker.uploads.writer import inconsistent
 
-MOST = 100
+MAX_UPLOADS = 100
 """Maximum number of uploads per owner."""
 
 LATE = timedelta(minutes=10)
@@ -210,8 +210,8 @@ class Uploads:
 
     def _check_number(self) -> None:
         owners = self.directory / hashlib.sha256(self.owner.encode()).hexdigest()[:32]
-        if owners.exists() and sum(1 for _ in owners.iterdir()) >= MOST:
-            raise TooManyUploads(MOST)
+        if owners.exists() and sum(1 for _ in owners.iterdir()) >= MAX_UPLOADS:
+            raise TooManyUploads(MAX_UPLOADS)
 
 
 def _moment(seconds: float) -> datetime:

@@ -28,9 +28,9 @@ from pliant.worker.errors import (
 from pliant.worker.ids import check_id, is_id
 from pliant.worker.settings import Settings
 from pliant.worker.store.blobs import Blobs
-from pliant.worker.uploads.service import LATE, MOST, Uploads
+from pliant.worker.uploads.service import LATE, MAX_UPLOADS, Uploads
 from pliant.worker.uploads.states import State, UploadStates, open_states
-from pliant.worker.uploads.writer import STEP, Capacity, Writer, inconsistent
+from pliant.worker.uploads.writer import RESERVED_AT_A_TIME, Capacity, Writer, inconsistent
 
 FOLDER = "uploads/"
 """Beginning of the blob keys."""
@@ -84,8 +84,8 @@ class SharedUploads(Uploads):
         known = before.length if before is not None and offset > 0 else None
         if length is not None and known not in (None, length):
             raise inconsistent(f"{known} bytes, as declared in the first request", str(length))
-        if before is None and sum(name.startswith(f"{self._owner}/") for name in self.states.names()) >= MOST:
-            raise TooManyUploads(MOST)
+        if before is None and sum(name.startswith(f"{self._owner}/") for name in self.states.names()) >= MAX_UPLOADS:
+            raise TooManyUploads(MAX_UPLOADS)
         writer = SharedWriter(
             id=id, folder=self.directory, length=length if length is not None else known, capacity=capacity, uploads=self,
             before=before,
@@ -320,4 +320,4 @@ class SharedWriter(Writer):
             free = capacity.quota - capacity.used - others
             if size > free:
                 raise QuotaExceeded(used=capacity.used + others + self.offset, quota=capacity.quota)
-            self._swap(reserved=size if self.length is not None else min(size + STEP, free))
+            self._swap(reserved=size if self.length is not None else min(size + RESERVED_AT_A_TIME, free))

@@ -13,7 +13,7 @@ from typing import BinaryIO
 from pliant.worker.errors import InvalidRequest, QuotaExceeded, UploadTooLarge
 from pliant.worker.uploads.folder import LENGTH, PART, RESERVED, WHOLE, counting, reserve, taken
 
-STEP = 16 << 20
+RESERVED_AT_A_TIME = 16 << 20
 """Bytes reserved at a time for an upload of unknown length."""
 
 
@@ -168,7 +168,7 @@ class Writer:
             free = capacity.quota - capacity.used - others
             if size > free:
                 raise QuotaExceeded(used=capacity.used + others + self.offset, quota=capacity.quota)
-            self._reserved = size if self.length is not None else min(size + STEP, free)
+            self._reserved = size if self.length is not None else min(size + RESERVED_AT_A_TIME, free)
             os.pwrite(self._reservation, f"{self._reserved:<20}".encode(), 0)
 
 

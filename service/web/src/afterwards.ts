@@ -150,9 +150,3 @@ function sharing(job: Job): HTMLElement {
   list().catch((error: unknown) => trouble(made, error));
   return form;
 }
-
-/** The job of a share link's token. */
-export function sharedJob(token: string): string {
-  return token.slice(token.indexOf(".") + 1, token.lastIndexOf("."));
-}
-

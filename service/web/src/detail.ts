@@ -136,7 +136,7 @@ export class Detail {
     say(this.heading, title(job));
     say(this.status, STATUS_WORDS[job.status]);
     this.status.dataset["status"] = job.status;
-    say(this.when, `${isFinal(job.status) ? "" : "sent "}${ago(job.created_at)}${job.expires_at ? `, kept until ${new Date(job.expires_at).toLocaleDateString()}` : ""}`);
+    say(this.when, `${isFinal(job.status) ? "" : "sent "}${ago(job.created_at)}${job.expires_at && !isShared() ? `, kept until ${new Date(job.expires_at).toLocaleDateString()}` : ""}`);
     this.countdown.show(job);
     this.tab.show(job);
     this.live.show(job);

@@ -1,13 +1,14 @@
 // The page: a form, a list, and the job that the address names (#job=…), so that a reload comes back to it.
 
-import { AGAIN, sharedJob } from "./afterwards";
-import { Refusal, hasToken, setShare, setToken } from "./api";
+import { AGAIN } from "./afterwards";
+import { Refusal, hasToken, setToken } from "./api";
 import { Compose } from "./compose";
 import { Detail } from "./detail";
 import { button, h } from "./dom";
 import { Hero } from "./hero";
 import { JobList } from "./list";
 import { refusalBox } from "./refusal";
+import { openShared, sharedToken } from "./shared";
 import type { Job } from "./types";
 import { title } from "./words";
 
@@ -116,22 +117,16 @@ async function watch(): Promise<void> {
 
 document.addEventListener(AGAIN, (event) => compose.again((event as CustomEvent<Job>).detail));
 
-function sharedToken(): string | null {
-  return new URLSearchParams(location.hash.slice(1)).get("share");
-}
-
-/** Show the one result that a share link opens: no form, no list, nothing that changes anything. */
-function showShared(token: string): void {
-  setShare(token);
-  showAlone(sharedJob(token), "You see a shared result, read-only.");
-}
-
-/** Show one result without form and list. */
-function showAlone(id: string, note: string): void {
+/** Leave form and list out. */
+function alone(): void {
   document.body.classList.add("shared");
   welcome.hidden = true;
+}
+
+/** Show one result and nothing that changes anything. */
+function showAlone(id: string, note: HTMLElement): void {
   detail = new Detail(id, { onJob: (job) => (document.title = `${title(job)} – Pliant`), onDeleted: () => undefined });
-  main.append(h("p", { class: "shared-note" }, note), detail.element);
+  main.append(note, detail.element);
 }
 
 /** The result that `pliant view` shows. */
@@ -148,6 +143,7 @@ if (token === null && local === null) {
   void watch();
 } else {
   addEventListener("hashchange", () => location.reload());
-  if (token !== null) showShared(token);
-  else if (local !== null) showAlone(local, "A result folder on this computer.");
+  alone();
+  if (token !== null) await openShared(token, main, showAlone);
+  else if (local !== null) showAlone(local, h("p", { class: "shared-note" }, "A result folder on this computer."));
 }

@@ -9,6 +9,7 @@ const OURS = ["unreachable", "unknown", "no_events"];
 /** What to do, where the service's own words are about requests. */
 const ON_THE_PAGE: Record<string, string> = {
   film_as_tracks: "Choose it under Film instead: its points are followed for you.",
+  unknown_format: "Choose a file of one of these kinds; the guide shows an example of each.",
   picture_as_tracks: "Depth comes from motion: choose a film, or a zip of all its pictures, under Film.",
 };
 

@@ -22,7 +22,7 @@ export class Snippets {
     const copy = button("Copy", () => void this.copy(), { class: "quiet" });
     this.element = h(
       "section",
-      { class: "panel", "aria-labelledby": "snippet-title" },
+      { class: "panel snippets", "aria-labelledby": "snippet-title" },
       h("h3", { id: "snippet-title" }, "Use from code"),
       h("div", { class: "row", role: "group", "aria-label": "Language" }, ...this.tabs, copy, this.copied),
       h("pre", { tabindex: 0, role: "region", "aria-label": "Code" }, this.code),

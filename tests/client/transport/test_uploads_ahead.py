@@ -22,7 +22,7 @@ POINTS = np.random.default_rng(0).normal(size=(6, 30_000, 2))
 
 @pytest.fixture(autouse=True)
 def small_is_large(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pliant.client.multipart.LARGE", 100_000)
+    monkeypatch.setattr("pliant.client.multipart.RESUMABLE_BYTES", 100_000)
     monkeypatch.setattr("pliant.client.multipart.SMALL", 10_000)
 
 

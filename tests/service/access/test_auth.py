@@ -147,7 +147,7 @@ def test_every_route_has_its_scope() -> None:
 
 
 def test_a_token_that_may_only_submit_sends_large_files(guarded: Running, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pliant.client.multipart.LARGE", 1000)
+    monkeypatch.setattr("pliant.client.multipart.RESUMABLE_BYTES", 1000)
     monkeypatch.setattr("pliant.client.multipart.SMALL", 1000)
     _, text = guarded.tokens.create("sender", scopes=(Scope.SUBMIT,))
     with Client(guarded.url, token=text) as client:

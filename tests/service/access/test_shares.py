@@ -35,9 +35,15 @@ def test_a_link_reads_its_job_and_nothing_else(guarded: Running) -> None:
             part = guest.get(f"/v1/jobs/{id}/artifacts/shapes.npz", headers={"Range": "bytes=0-2"})
             assert (part.status_code, part.content) == (206, b"arr")
             assert "job" in guest.get(f"/v1/jobs/{id}/events").text
+            assert http.post(f"/v1/jobs/{id}/shares").status_code == 201
+            (own,) = guest.get(f"/v1/jobs/{id}/shares").json()  # its own link, not the other one
+            first, _ = http.get(f"/v1/jobs/{id}/shares").json()
+            assert own == first
+            assert own["token"] is None
             forbidden = [
-                ("GET", f"/v1/jobs/{other}"), ("GET", "/v1/jobs"), ("GET", f"/v1/jobs/{id}/log"), ("GET", f"/v1/jobs/{id}/shares"),
-                ("POST", f"/v1/jobs/{id}/shares"), ("DELETE", f"/v1/jobs/{id}"), ("POST", f"/v1/jobs/{id}/outputs"),
+                ("GET", f"/v1/jobs/{other}"), ("GET", "/v1/jobs"), ("GET", f"/v1/jobs/{id}/log"), ("GET", f"/v1/jobs/{other}/shares"),
+                ("POST", f"/v1/jobs/{id}/shares"), ("DELETE", f"/v1/jobs/{id}/shares/{own['id']}"),
+                ("DELETE", f"/v1/jobs/{id}"), ("POST", f"/v1/jobs/{id}/outputs"),
                 ("POST", f"/v1/jobs/{id}/retry"), ("POST", "/v1/jobs"), ("PUT", f"/v1/jobs/{id}"), ("GET", "/metrics"),
                 ("GET", f"/v1/jobs/{id}/artifacts/..%2F..%2F{other}"), ("GET", f"/v1/jobs/{id}%2F..%2F{other}"), ("GET", "/v1/limits"),
             ]  # fmt: skip
@@ -57,6 +63,7 @@ def test_a_link_ends_by_expiry_revocation_and_deletion(running: Running, http: h
         late = guest.get(f"/v1/jobs/{id}")
         assert (late.status_code, late.json()["code"]) == (401, "expired_share")
         assert late.json()["detail"] == "This share link has expired. Ask its sender for a new one."
+        assert datetime.fromisoformat(late.json()["got"]) == past
         assert "www-authenticate" in late.headers
         assert http.get(f"/v1/jobs/{id}/shares").json() == []
     id, _, guest = shared(running, http)

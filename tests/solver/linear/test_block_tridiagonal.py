@@ -73,7 +73,7 @@ def test_inliers_and_outliers_together_cost_few_iterations() -> None:
 
     def iterations(precondition: object) -> int:
         return conjugate_gradient(
-            given.apply, b, np.zeros_like(b), precondition=precondition, reduction=1e-4, max_iterations=500  # type: ignore[arg-type]
+            given.apply, b, precondition=precondition, reduction=1e-4, max_iterations=500  # type: ignore[arg-type]
         ).iterations  # fmt: skip
 
     exact, uniform = (

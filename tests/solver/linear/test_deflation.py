@@ -57,7 +57,7 @@ def test_hidden_points_cost_few_iterations() -> None:
 
     def iterations(precondition: object) -> int:
         return conjugate_gradient(
-            given.apply, b, np.zeros_like(b), precondition=precondition, reduction=1e-4, max_iterations=2000  # type: ignore[arg-type]
+            given.apply, b, precondition=precondition, reduction=1e-4, max_iterations=2000  # type: ignore[arg-type]
         ).iterations  # fmt: skip
 
     assert 1 < iterations(build_preconditioner(given)) < 0.5 * iterations(_alike(given))

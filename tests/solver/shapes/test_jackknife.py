@@ -9,7 +9,7 @@ import pytest
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.cameras.perspective import centred, columns
 from pliant.solver.model.shape_covariance import ShapeCovariance, annealed
-from pliant.solver.shapes.jackknife import FEWEST, PARTS, learning_std, parts
+from pliant.solver.shapes.jackknife import MIN_LEARNED_POINTS, PARTS, learning_std, parts
 from scipy.spatial.transform import Rotation
 
 FRAMES = 12
@@ -63,7 +63,7 @@ def test_it_does_not_depend_on_the_unit_of_the_scales_nor_on_the_world_axes() ->
 def test_more_frames_than_are_evaluated_are_interpolated(monkeypatch: pytest.MonkeyPatch) -> None:
     estimate, covariance, shapes = seen(30)
     whole = learning_std(estimate, covariance, shapes, turning=False)
-    monkeypatch.setattr("pliant.solver.shapes.jackknife.MAX_FRAMES", 8)
+    monkeypatch.setattr("pliant.solver.shapes.jackknife.MAX_JACKKNIFE_FRAMES", 8)
     some = learning_std(estimate, covariance, shapes, turning=False)
     assert some.shape == whole.shape == shapes.shape[:2]
     assert 0.3 < rms(some) / rms(whole) < 3
@@ -71,7 +71,7 @@ def test_more_frames_than_are_evaluated_are_interpolated(monkeypatch: pytest.Mon
 
 def test_hardly_any_points_or_a_request_to_stop_give_zero() -> None:
     estimate, covariance, shapes = seen(20)
-    few = replace(estimate, sample=estimate.sample[:, :FEWEST])
+    few = replace(estimate, sample=estimate.sample[:, :MIN_LEARNED_POINTS])
     assert (learning_std(few, covariance, shapes, turning=True) == 0).all()
     assert (learning_std(estimate, covariance, shapes, turning=True, should_stop=lambda: True) == 0).all()
 

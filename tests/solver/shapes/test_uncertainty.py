@@ -159,7 +159,7 @@ def test_long_films_are_evaluated_at_some_of_their_frames_and_never_too_confiden
     frames = 30
     given, pairs, seen = covariance(5, frames), projections(frames), np.ones((frames, 2))
     exact = position_std(given, pairs, seen, noise_std=NOISE)
-    monkeypatch.setattr(uncertainty, "MAX_FRAMES", 10)
+    monkeypatch.setattr(uncertainty, "MAX_POSTERIOR_FRAMES", 10)
     fewer = position_std(given, pairs, seen, noise_std=NOISE)
     assert fewer.shape == exact.shape
     assert (fewer > 0.99 * exact).mean() > 0.95

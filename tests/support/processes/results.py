@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +12,7 @@ from pliant.schemas.job import Interpretation
 from pliant.schemas.options import Options
 from pliant.solver import Camera, Choices, Mesh, Outcome, Solution, Trace, Tracks
 from pliant.solver.evaluation.trust import assess
+from pliant.worker.artifacts import build_report, write_artifacts
 from pliant.worker.formats import GroundTruth, Inputs, Texture
 from scipy.spatial.transform import Rotation
 
@@ -77,6 +80,21 @@ def make_result(
     if texture:
         inputs = replace(inputs, texture=make_texture(rows, columns))
     return inputs, solution, Options(**options)
+
+
+def write(directory: Path, made: tuple[Inputs, Solution, Options]) -> dict[str, Path]:
+    """Write all files of a result, compare each with its record, and return their paths by name."""
+    inputs, solution, options = made
+    report = build_report(inputs, solution, options, metrics={"e3d_frame": 0.5, "rotation_degrees": float("inf")})
+    written = write_artifacts(inputs, solution, options, report, directory)
+    for artifact in written:
+        content = (directory / artifact.name).read_bytes()
+        assert artifact.bytes == len(content)
+        assert artifact.sha256 == hashlib.sha256(content).hexdigest()
+        assert artifact.media_type
+        assert artifact.description
+    assert {path.name for path in directory.iterdir()} == {artifact.name for artifact in written}
+    return {artifact.name: directory / artifact.name for artifact in written}
 
 
 def make_texture(rows: int, columns: int) -> Texture:

@@ -22,6 +22,7 @@ from fastapi import FastAPI
 from pliant.schemas.job import Artifact, Job
 from pliant.service.settings import ServiceSettings
 from pliant.worker.jobs import lifecycle
+from pliant.worker.jobs.finished import Finished
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.tokens import Scope, Tokens
 
@@ -141,7 +142,7 @@ def finish(running: Running, id: str, contents: bytes, *, name: str = "shapes.np
     running.jobs.records.update(
         id,
         lambda stored: lifecycle.succeed(
-            stored, attempt_id=attempt_id, prefix=prefix, artifacts=[artifact], metrics={}, outcome="converged",
-            sentence="Converged.", warnings=[], now=NOW, retention=0,
+            stored, Finished(metrics={}, outcome="converged", sentence="Converged.", warnings=(), artifacts=(artifact,)),
+            attempt_id=attempt_id, prefix=prefix, now=NOW, retention=0,
         ),
     )  # fmt: skip

@@ -12,8 +12,8 @@ from pliant.schemas.job import Artifact, Interpretation, Progress, Status
 from pliant.schemas.options import Options
 from pliant.worker.errors import Interrupted, StoreUnavailable
 from pliant.worker.execution.attempt import Attempt
-from pliant.worker.execution.pipeline import Finished
 from pliant.worker.jobs import lifecycle
+from pliant.worker.jobs.finished import Finished
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.jobs.submission import Submission
 from pliant.worker.store.blobs import Blobs

@@ -17,6 +17,7 @@ import pytest
 from pliant.schemas.job import Status
 from pliant.worker.execution.pipeline import reconstruct
 from pliant.worker.formats import load_inputs
+from pliant.worker.jobs.retry import retry
 from pliant.worker.maintenance.fsck import findings
 from pliant.worker.settings import Settings
 from pliant.worker.store.connection import connect
@@ -106,7 +107,7 @@ def test_a_killed_job_process_fails_its_job_and_nothing_else(house: House) -> No
     assert "SIGKILL" in job.error.detail
     assert "retry" in job.error.detail
     assert house.jobs.get(other).status is Status.RUNNING
-    again = house.jobs.retry(id)
+    again = retry(house.jobs, id)
     assert again.retry_of == id
     for each in (other, again.id):
         house.jobs.cancel(each)

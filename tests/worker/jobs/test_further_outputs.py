@@ -17,6 +17,7 @@ from pliant.worker.execution.further_outputs import read_solution, write_further
 from pliant.worker.formats import InvalidInput
 from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.further_outputs import make_outputs
+from pliant.worker.jobs.retry import retry
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.jobs.submission import Submission
 from pliant.worker.maintenance.fsck import findings
@@ -81,7 +82,7 @@ def test_a_cancelled_one_is_made_anew_and_can_be_retried(jobs: Jobs, solved: Job
     again, new = make_outputs(jobs, solved.id, WANTED)
     assert new
     assert again.id != more.id
-    retried = jobs.retry(more.id)
+    retried = retry(jobs, more.id)
     assert retried.outputs_of == solved.id
     assert run(jobs, retried, tmp_path / "w").artifacts[0].name == "shapes_obj.zip"
     kept, _ = make_outputs(jobs, solved.id, WANTED, idempotency_key="mine")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import threading
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -19,6 +20,8 @@ from pliant.worker.errors import (
     UnknownJob,
 )
 from pliant.worker.jobs import lifecycle
+from pliant.worker.jobs.finished import Finished
+from pliant.worker.jobs.retry import retry
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.jobs.submission import Submission
 from pliant.worker.records import Stored
@@ -43,9 +46,12 @@ def finish(jobs: Jobs, id: str, file: Path) -> Stored:
     return jobs.records.update(
         id,
         lambda stored: lifecycle.succeed(
-            stored, attempt_id=attempt_id, prefix=prefix, artifacts=[artifact], metrics={"reprojection_median": 0.5},
-            outcome="converged", sentence="Converged.", warnings=[], now=NOW, retention=60,
-            verdict="with_care", verdict_reasons=["The camera turned by 9° only."], trust_sentence="Expected error about 4 %.",
+            stored,
+            Finished(
+                metrics={"reprojection_median": 0.5}, outcome="converged", sentence="Converged.", warnings=(), artifacts=(artifact,),
+                verdict="with_care", verdict_reasons=("The camera turned by 9° only.",), trust_sentence="Expected error about 4 %.",
+            ),
+            attempt_id=attempt_id, prefix=prefix, now=NOW, retention=60,
         ),
     )  # fmt: skip
 
@@ -102,7 +108,7 @@ def test_an_owner_sees_only_own_jobs(jobs: Jobs, submit) -> None:  # type: ignor
     ann, bob = jobs.of("ann"), jobs.of("bob")
     hers, his = submit(ann), submit(bob)
     assert ann.get(hers.id).id == hers.id
-    for call in (bob.get, bob.cancel, bob.retry, bob.delete, bob.log, bob.events):
+    for call in (bob.get, bob.cancel, partial(retry, bob), bob.delete, bob.log, bob.events):
         with pytest.raises(UnknownJob):
             call(hers.id)
     with pytest.raises(UnknownJob):
@@ -267,9 +273,9 @@ def test_deleting_leaves_nothing(jobs: Jobs, submit, inputs_file: Path) -> None:
 def test_running_again_is_a_new_job_with_the_same_inputs(jobs: Jobs, submit, inputs_file: Path) -> None:  # type: ignore[no-untyped-def]
     old = submit(jobs.of("ann"), name="n")
     with pytest.raises(NotAllowedNow, match="cancel it first"):
-        jobs.retry(old.id)
+        retry(jobs, old.id)
     jobs.cancel(old.id)
-    again = jobs.retry(old.id)
+    again = retry(jobs, old.id)
     assert (again.retry_of, again.name, again.options, again.status) == (old.id, "n", old.options, Status.QUEUED)
     assert jobs.get(old.id).status is Status.CANCELLED, "final statuses never change"
     jobs.delete(old.id)
@@ -277,7 +283,7 @@ def test_running_again_is_a_new_job_with_the_same_inputs(jobs: Jobs, submit, inp
     assert jobs.of("ann").get(again.id).id == again.id
     finish(jobs, again.id, inputs_file)
     with pytest.raises(NotAllowedNow, match="has its result"):
-        jobs.retry(again.id)
+        retry(jobs, again.id)
 
 
 def test_events_report_every_change_once(jobs: Jobs, submit, inputs_file: Path) -> None:  # type: ignore[no-untyped-def]
@@ -349,7 +355,7 @@ def test_a_retry_during_a_deletion_reports_an_unknown_job(jobs: Jobs, submit, mo
 
     monkeypatch.setattr(Jobs, "known", deleted_meanwhile)
     with pytest.raises(UnknownJob):
-        jobs.retry(id)
+        retry(jobs, id)
     assert jobs.records.ids(Status.QUEUED) == []
     assert jobs.records.deleted() == {}
 

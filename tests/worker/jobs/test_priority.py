@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from pliant.worker.jobs.retry import retry
 from pliant.worker.jobs.service import Jobs
 from reconciler_world import World
 
@@ -31,7 +32,7 @@ def test_a_job_passes_only_its_owners_jobs(jobs: Jobs, submit) -> None:  # type:
 def test_a_job_run_again_keeps_its_priority(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
     first = submit(name="first", priority="high")
     jobs.cancel(first.id)
-    assert jobs.retry(first.id).priority == "high"
+    assert retry(jobs, first.id).priority == "high"
 
 
 def test_ordering_what_is_not_there_changes_nothing(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]

@@ -16,6 +16,7 @@ import pytest
 from pliant.schemas.job import Artifact, Job, Status
 from pliant.worker.errors import BadBackup, NewerData
 from pliant.worker.jobs import lifecycle
+from pliant.worker.jobs.finished import Finished
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.maintenance.backup import restore_backup, write_backup
 from pliant.worker.maintenance.fsck import findings
@@ -58,8 +59,8 @@ def succeed(jobs: Jobs, id: str, content: bytes, folder: Path) -> None:
     jobs.records.update(
         id,
         lambda held: lifecycle.succeed(
-            held, attempt_id=attempt_id, prefix=prefix, artifacts=[artifact], metrics={"e": 0.5}, outcome="converged",
-            sentence="Converged.", warnings=[], now=NOW, retention=0,
+            held, Finished(metrics={"e": 0.5}, outcome="converged", sentence="Converged.", warnings=(), artifacts=(artifact,)),
+            attempt_id=attempt_id, prefix=prefix, now=NOW, retention=0,
         ),
     )  # fmt: skip
     jobs.records.append_log(id, ["It went well."])

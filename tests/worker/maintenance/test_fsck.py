@@ -11,6 +11,7 @@ from pliant.schemas.job import Artifact, Interpretation, Problem
 from pliant.schemas.options import Options
 from pliant.worker.execution.workdir import working_directory
 from pliant.worker.jobs import lifecycle
+from pliant.worker.jobs.finished import Finished
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.jobs.submission import Submission
 from pliant.worker.maintenance.fsck import findings
@@ -42,8 +43,8 @@ def succeed(jobs: Jobs, stored: Stored, file: Path, *, size: int) -> Stored:
     return jobs.records.update(
         stored.job.id,
         lambda held: lifecycle.succeed(
-            held, attempt_id=held.attempt_id, prefix=prefix, artifacts=[artifact], metrics={}, outcome="converged",
-            sentence="Converged.", warnings=[], now=NOW, retention=0,
+            held, Finished(metrics={}, outcome="converged", sentence="Converged.", warnings=(), artifacts=(artifact,)),
+            attempt_id=held.attempt_id, prefix=prefix, now=NOW, retention=0,
         ),
     )  # fmt: skip
 

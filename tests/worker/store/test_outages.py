@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 from pliant.schemas.job import Status
 from pliant.worker.errors import StoreUnavailable
+from pliant.worker.jobs.retry import retry
 from pliant.worker.maintenance.fsck import findings
 from pliant.worker.processes.valkey import find_binary
 from pliant.worker.settings import Settings
@@ -153,7 +154,7 @@ def test_a_full_disk_fails_the_job_and_the_next_one_succeeds(
         assert (job.status, job.error.code, job.error.retryable) == (Status.FAILED, "storage_failed", True)
         assert "No space left on device" in job.error.detail
         filler.unlink()
-        assert house.final(house.jobs.retry(job.id).id).status is Status.SUCCEEDED
+        assert house.final(retry(house.jobs, job.id).id).status is Status.SUCCEEDED
         settled(house)
 
 

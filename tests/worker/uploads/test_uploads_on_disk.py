@@ -17,7 +17,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pliant.worker import errors
-from pliant.worker.uploads.service import MOST, Capacity, Uploads
+from pliant.worker.uploads.service import MAX_UPLOADS, Capacity, Uploads
 
 CAPACITY = Capacity(max_bytes=1000)
 
@@ -127,9 +127,9 @@ def test_odd_ids_and_too_many_are_refused(uploads: Uploads) -> None:
     for id in ("..", "a/b", "x", "a" * 65, ""):
         with pytest.raises(errors.InvalidRequest):
             send(uploads, id, b"")
-    for number in range(MOST):
+    for number in range(MAX_UPLOADS):
         send(uploads, f"number-{number}", b"")
-    with pytest.raises(errors.TooManyUploads, match=str(MOST)):
+    with pytest.raises(errors.TooManyUploads, match=str(MAX_UPLOADS)):
         send(uploads, "one-more", b"")
     send(uploads.of("somebody else"), "one-more", b"")
 

@@ -17,7 +17,7 @@ from pliant.worker.settings import Settings
 from pliant.worker.store.blobs import Blobs
 from pliant.worker.store.connection import connect
 from pliant.worker.uploads import shared
-from pliant.worker.uploads.service import MOST, Capacity, Uploads
+from pliant.worker.uploads.service import MAX_UPLOADS, Capacity, Uploads
 from pliant.worker.uploads.shared import SharedUploads, open_uploads
 from pliant.worker.uploads.states import RESERVED_FOR, UploadStates
 
@@ -167,7 +167,7 @@ def test_limits_hold_over_all_processes(hosts: list[SharedUploads]) -> None:
     assert two.used() == 350, "the reservation is released"
     state = one.states.get(one.name("first")).model_copy(update={"reserved": 900})
     assert (state.taken(state.touched), state.taken(state.touched + RESERVED_FOR)) == (900, 50), "of a killed process"
-    for number in range(MOST - 2):
+    for number in range(MAX_UPLOADS - 2):
         send(one, f"many-{number}", b"x")
     with pytest.raises(errors.TooManyUploads):
         send(two, "one-more", b"x")

@@ -10,6 +10,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 from pliant.worker.artifacts.geometry import viewer_scale
+from pliant.worker.artifacts.names import identifier
 from pliant.worker.artifacts.result import Result
 from pliant.worker.artifacts.scenes.by_path import path_beside
 
@@ -20,7 +21,7 @@ def available() -> bool:
 
 
 def write_alembic(result: Result, file: IO[bytes], on_progress: Callable[[float], None]) -> None:
-    """Write `/shape/mesh` (`/shape/points` without faces) with a time sample a frame; y up, right-handed, as in the glTF file.
+    """Write `/NAME/mesh` (`/NAME/points` without faces) with a time sample a frame; y up, right-handed, as in the glTF file.
 
     The library requires a path, so a temporary file beside the target is used. The archive has no date: equal results give
     equal files.
@@ -36,7 +37,7 @@ def _build(path: Path, result: Result, on_progress: Callable[[float], None]) -> 
     archive = Abc.OArchive(str(path), True)  # True: the Ogawa format, which all current readers have
     # By its index: a TimeSampling handed to a schema is not kept alive by the binding.
     sampling = archive.addTimeSampling(AbcCoreAbstract.TimeSampling(1 / result.options.fps, 0.0))
-    stand = AbcGeom.OXform(archive.getTop(), "shape")
+    stand = AbcGeom.OXform(archive.getTop(), identifier(result.name))
     scale, placed = AbcGeom.XformOp(AbcGeom.XformOperationType.kScaleOperation, 0), AbcGeom.XformSample()
     placed.addOp(scale, _vector(viewer_scale(result.solution.shapes)))
     stand.getSchema().set(placed)

@@ -13,6 +13,7 @@ from typing import IO, Any
 import numpy as np
 from pliant.worker.artifacts.colours import linear
 from pliant.worker.artifacts.geometry import triangles_of, vertex_normals, viewer_scale
+from pliant.worker.artifacts.names import identifier, object_name
 from pliant.worker.artifacts.result import Result
 from pliant.worker.artifacts.scenes.by_path import path_beside
 from pliant.worker.formats import Texture
@@ -30,7 +31,7 @@ def available() -> bool:
 
 
 def write_usd(result: Result, file: IO[bytes], on_progress: Callable[[float], None]) -> None:
-    """Write `/shape` with one time sample per frame; y up, right-handed, as in the glTF file.
+    """Write `/NAME` with one time sample per frame; y up, right-handed, as in the glTF file.
 
     The library requires a path with its own suffix, so a temporary file beside the target is used.
     """
@@ -100,7 +101,9 @@ def _define(stage: Any, result: Result) -> Any:
 
     scale = viewer_scale(result.solution.shapes)
     faces = result.faces
-    shape = UsdGeom.Mesh.Define(stage, "/shape") if len(faces) else UsdGeom.Points.Define(stage, "/shape")
+    shape = (UsdGeom.Mesh if len(faces) else UsdGeom.Points).Define(stage, f"/{identifier(result.name)}")
+    if (shown := object_name(result.name)) != identifier(result.name):
+        shape.GetPrim().SetDisplayName(shown)
     shape.AddScaleOp().Set(Gf.Vec3f(scale))
     if len(faces) == 0:
         low, high = result.solution.shapes[0].min(axis=0), result.solution.shapes[0].max(axis=0)
@@ -126,9 +129,10 @@ def _put_picture(stage: Any, shape: Any, texture: Texture) -> None:
     kinds = Sdf.ValueTypeNames
     coordinates = UsdGeom.PrimvarsAPI(shape).CreatePrimvar("st", kinds.TexCoord2fArray, UsdGeom.Tokens.vertex)
     coordinates.Set(Vt.Vec2fArray.FromNumpy(places))
-    material = UsdShade.Material.Define(stage, "/shape/film")
+    path = shape.GetPath().AppendChild("film")
+    material = UsdShade.Material.Define(stage, path)
     surface, picture, reader = (
-        UsdShade.Shader.Define(stage, f"/shape/film/{name}") for name in ("surface", "picture", "coordinates")
+        UsdShade.Shader.Define(stage, path.AppendChild(name)) for name in ("surface", "picture", "coordinates")
     )
     reader.CreateIdAttr("UsdPrimvarReader_float2")
     reader.CreateInput("varname", kinds.String).Set("st")

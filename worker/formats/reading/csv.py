@@ -12,6 +12,7 @@ from pliant.worker.formats.errors import damaged, too_large
 from pliant.worker.formats.reading.pose_tables import (
     LONGEST_ROW,
     SEPARATORS,
+    cells,
     columns_of,
     deeplabcut_columns,
     not_a_table,
@@ -109,15 +110,15 @@ def _observations(columns: list[str], rows: list[list[float]], *, field: str, li
 def _wide(first: str, lines: Iterator[str], *, field: str, limits: Limits, before: int) -> Arrays | None:
     """Read a table with one row a frame; None for one with one observation a line."""
     separator = separator_of(first)
-    heads = [split(first, separator)]
-    if heads[0][0] == "scorer":
-        while heads[-1][0] != "coords" and len(heads) < 4:
-            heads.append(split(next(lines, ""), separator))
+    heads = [cells(first, separator)]
+    if heads[0][0].lower() == "scorer":
+        while heads[-1][0].lower() != "coords" and len(heads) < 4:
+            heads.append(cells(next(lines, ""), separator))
         columns = deeplabcut_columns(heads)
         if columns is None:
             raise not_a_table(field, before, first)
     else:
-        columns = None if set(COLUMNS) <= set(heads[0]) else columns_of(heads[0])
+        columns = None if set(COLUMNS) <= set(split(first, separator)) else columns_of(heads[0])
     if columns is None:
         return None
     return read_rows(
@@ -128,10 +129,10 @@ def _wide(first: str, lines: Iterator[str], *, field: str, limits: Limits, befor
 def _columns(first: str, lines: Iterator[str], *, field: str, limits: Limits) -> tuple[list[str], list[list[float]]]:
     """Return the names of the columns and the numbers below them; without names the usual ones are taken."""
     separator = separator_of(first)
-    cells = split(first, separator)
-    named = set(COLUMNS) <= set(cells)
-    columns = cells if named else [*COLUMNS, "visible", *map(str, range(len(cells)))][: len(cells)]
-    if len(cells) < len(COLUMNS) or (not named and len(cells) >= WIDE):
+    heads = split(first, separator)
+    named = set(COLUMNS) <= set(heads)
+    columns = heads if named else [*COLUMNS, "visible", *map(str, range(len(heads)))][: len(heads)]
+    if len(heads) < len(COLUMNS) or (not named and len(heads) >= WIDE):
         raise not_a_table(field, 1, first)
     rows: list[list[float]] = []
     for count, line in enumerate([] if named else [first], 1):
@@ -146,10 +147,10 @@ def _columns(first: str, lines: Iterator[str], *, field: str, limits: Limits) ->
 
 
 def _row(line: str, separator: str, width: int, *, field: str, count: int) -> list[float]:
-    cells = split(line, separator)
-    if len(cells) != width:
+    row = split(line, separator)
+    if len(row) != width:
         raise not_a_table(field, count, line)
     try:
-        return [number(cell, separator) for cell in cells]
+        return [number(cell, separator) for cell in row]
     except ValueError:
         raise not_a_table(field, count, line) from None

@@ -1,11 +1,13 @@
 """HDF5 files: DeepLabCut's tables and SLEAP's analysis files; all others as MATLAB 7.3 writes them.
 
-DeepLabCut's tables are written by pandas, which keeps the names of the columns pickled; those are never read. The order of the columns
-is x, y, likelihood for each body part, and it is checked by the values.
+DeepLabCut's tables are written by pandas, which keeps the names of the columns pickled, or as levels and labels. Pickles are never
+opened: of those, the strings are listed. The order of the columns is x, y, likelihood for each body part, and it is checked by the
+values.
 """
 
 from __future__ import annotations
 
+from pickletools import genops
 from typing import IO
 
 import h5py
@@ -13,11 +15,20 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.solver import InvalidInput
 from pliant.worker.formats.errors import damaged
+from pliant.worker.formats.point_names import found
 from pliant.worker.formats.reading.hdf5 import UNREADABLE, check_before_reading, read_arrays, read_values
 from pliant.worker.formats.records import Arrays, Limits
 
 VALUES = "values_block_0"
 FIXED = "block0_values"
+MOST_LEVELS = 4
+"""Rows above DeepLabCut's columns: scorer, individuals, bodyparts, coords."""
+
+STRINGS = frozenset(
+    ("STRING", "BINSTRING", "SHORT_BINSTRING", "UNICODE", "BINUNICODE", "SHORT_BINUNICODE", "BINUNICODE8")
+)
+"""Instructions of a pickle that hold a string."""
+
 _SLEAP = ("node_names", "track_names", "track_occupancy", "edge_names")
 
 
@@ -46,7 +57,13 @@ def _sleap(file: h5py.File, field: str, limits: Limits) -> Arrays | None:
         return None
     values = read_values(item, "tracks", 0, field, limits)  # axes reversed: frames, nodes, 2, instances
     frames, nodes, _, instances = values.shape
-    return {"sleap": values.transpose(0, 3, 1, 2).reshape(frames, instances * nodes, 2)}
+    parts, animals = (_texts(file, name, field, limits) for name in ("node_names", "track_names"))
+    names = [] if len(parts) != nodes else parts
+    if names and instances > 1:
+        whose = animals if len(animals) == instances else [str(index) for index in range(instances)]
+        names = [f"{animal}/{part}" for animal in whose for part in parts]
+    points = values.transpose(0, 3, 1, 2).reshape(frames, instances * nodes, 2)
+    return {"sleap": points, **found(names)}
 
 
 def _deeplabcut(file: h5py.File, field: str, limits: Limits) -> Arrays | None:
@@ -61,14 +78,15 @@ def _deeplabcut(file: h5py.File, field: str, limits: Limits) -> Arrays | None:
             and table.dtype[VALUES].base.kind == "f"
         ):
             check_before_reading(table, name, 0, field, limits)
-            return _columns(np.asarray(table[()][VALUES], dtype=np.float64), field)
+            return _columns(np.asarray(table[()][VALUES], dtype=np.float64), field, _pickled_heads(group))
         if isinstance(fixed, h5py.Dataset) and fixed.ndim == 2 and fixed.dtype.kind == "f":
-            return _columns(np.asarray(read_values(fixed, name, 0, field, limits).T, dtype=np.float64), field)
+            values = np.asarray(read_values(fixed, name, 0, field, limits).T, dtype=np.float64)
+            return _columns(values, field, _levels(group, field, limits))
     return None
 
 
-def _columns(values: NDArray[np.float64], field: str) -> Arrays:
-    """Take a table of x, y, likelihood for each body part apart."""
+def _columns(values: NDArray[np.float64], field: str, heads: list[tuple[str, ...]]) -> Arrays:
+    """Take a table of x, y, likelihood for each body part apart; `heads` has the names of each column where they are known."""
     likelihood = values[:, 2::3] if values.ndim == 2 else values
     if (
         values.ndim != 2
@@ -79,7 +97,67 @@ def _columns(values: NDArray[np.float64], field: str) -> Arrays:
             "wrong_shape", field=field, expected="a DeepLabCut table: x, y and likelihood from 0 to 1 for each body part",
             got=f"a table of shape {values.shape}", hint="Export it as csv: deeplabcut.analyze_videos_converth5_to_csv(folder).",
         )  # fmt: skip
-    return {"deeplabcut": np.stack([values[:, 0::3], values[:, 1::3]], axis=2), "likelihood": likelihood}
+    points = np.stack([values[:, 0::3], values[:, 1::3]], axis=2)
+    known = [head[-1] for head in heads] == ["x", "y", "likelihood"] * points.shape[1]
+    names = ["/".join(head[1:-1]) for head in heads[::3]] if known else []
+    return {"deeplabcut": points, "likelihood": likelihood, **found(names)}
+
+
+def _levels(group: h5py.Group, field: str, limits: Limits) -> list[tuple[str, ...]]:
+    """Return the names of each column of a table in pandas' fixed form, whose levels are strings; empty where they are not."""
+    columns: list[list[str]] = []
+    for level in range(MOST_LEVELS):
+        words, labels = _texts(group, f"axis0_level{level}", field, limits), _own(group, f"axis0_label{level}")
+        if not isinstance(labels, h5py.Dataset) or labels.ndim != 1 or labels.dtype.kind not in "iu":
+            break
+        places = read_values(labels, "axis0_label", 0, field, limits)
+        if not words or ((places < 0) | (places >= len(words))).any():
+            return []
+        columns.append([words[place] for place in places.tolist()])
+    return (
+        list(zip(*columns, strict=True)) if len({len(column) for column in columns}) == 1 and len(columns) > 2 else []
+    )
+
+
+def _pickled_heads(group: h5py.Group) -> list[tuple[str, ...]]:
+    """Return the names of each column of a table in pandas' table form; empty where they cannot be told."""
+    held = group.attrs.get("non_index_axes")
+    strings = strings_of(held) if isinstance(held, bytes) else []
+    ends = [index for index, string in enumerate(strings) if string == "likelihood"]
+    levels = (ends[0] + 1) // 3 if ends else 0
+    if levels < 3 or (ends[0] + 1) % 3 or len(strings) < (count := 3 * levels * len(ends)):
+        return []
+    return [tuple(strings[at : at + levels]) for at in range(0, count, levels)]
+
+
+def strings_of(pickle: bytes) -> list[str]:
+    """List the strings of a pickle in order, without opening it: its instructions are read and none is carried out."""
+    found: list[str] = []
+    memo: dict[int, str | None] = {}
+    last: str | None = None
+    try:
+        for opcode, argument, _ in genops(pickle):
+            place = argument if isinstance(argument, int) else len(memo)
+            if opcode.name in ("MEMOIZE", "PUT", "BINPUT", "LONG_BINPUT"):
+                memo[place] = last
+                continue
+            last = argument if isinstance(argument, str) and opcode.name in STRINGS else None
+            if opcode.name in ("GET", "BINGET", "LONG_BINGET"):
+                last = memo.get(place)
+            if last is not None:
+                found.append(last)
+    except (ValueError, OverflowError):  # cut off, or no pickle
+        return []
+    return found
+
+
+def _texts(group: h5py.Group, name: str, field: str, limits: Limits) -> list[str]:
+    """Read strings, each as bytes of a fixed or its own length; empty where there are none."""
+    item = _own(group, name)
+    if not isinstance(item, h5py.Dataset) or item.ndim != 1 or h5py.check_string_dtype(item.dtype) is None:
+        return []
+    check_before_reading(item, name, 0, field, limits)
+    return [bytes(text).decode("utf-8", "replace") for text in item[()]]
 
 
 def _own(group: h5py.Group, name: str) -> h5py.Group | h5py.Dataset | None:

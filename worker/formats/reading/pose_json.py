@@ -14,6 +14,8 @@ from typing import IO, Any
 import numpy as np
 from pliant.solver import InvalidInput
 from pliant.worker.formats.errors import too_large
+from pliant.worker.formats.point_names import MEDIAPIPE
+from pliant.worker.formats.point_names import found as found_names
 from pliant.worker.formats.records import Arrays, Limits
 
 MOST_BYTES = 64 << 20
@@ -27,7 +29,7 @@ EXAMPLE = (
 
 
 def read_landmarks(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
-    """Return the landmarks as `mediapipe (F, P, 2)`, NaN where nothing was detected, and `likelihood (F, P)`.
+    """Return the landmarks as `mediapipe (F, P, 2)`, NaN where nothing was detected, `likelihood (F, P)`, and `point_names` if known.
 
     Raises
     ------
@@ -67,7 +69,14 @@ def read_landmarks(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
             if values is None:
                 raise _unreadable(field, f"landmark {place} of frame {number}: {json.dumps(landmark)[:80]}")
             points[number, place], sure[number, place] = values[:2], values[2]
-    return {"mediapipe": points, "likelihood": sure}
+    return {"mediapipe": points, "likelihood": sure, **found_names(_names(next(frame for frame in frames if frame)))}
+
+
+def _names(landmarks: list[Any]) -> list[str]:
+    """Return the names of a frame's landmarks: their member `name`, or those of MediaPipe's models of so many landmarks."""
+    given = [landmark.get("name") for landmark in landmarks]
+    named = [name for name in given if isinstance(name, str)]
+    return named if len(named) == len(given) else list(MEDIAPIPE.get(len(given), ()))
 
 
 def _frames(document: Any, field: str) -> list[Any]:

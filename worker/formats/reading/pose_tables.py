@@ -13,6 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from pliant.solver import InvalidInput
 from pliant.worker.formats.errors import too_large
+from pliant.worker.formats.point_names import MEDIAPIPE
+from pliant.worker.formats.point_names import found as found_names
 from pliant.worker.formats.records import Arrays, Limits
 
 SEPARATORS = "\t;,"
@@ -42,6 +44,7 @@ class Columns:
     confidence: list[int | None]
     writer: str
     """The name under which the track array is handed on."""
+    names: list[str]
 
 
 def separator_of(line: str) -> str:
@@ -51,7 +54,12 @@ def separator_of(line: str) -> str:
 
 def split(line: str, separator: str) -> list[str]:
     """Return the cells of a line, in lower case and without quotes."""
-    return [cell.strip().strip('"').strip().lower() for cell in line.rstrip("\r\n").split(separator)]
+    return [cell.lower() for cell in cells(line, separator)]
+
+
+def cells(line: str, separator: str) -> list[str]:
+    """Return the cells of a line without quotes."""
+    return [cell.strip().strip('"').strip() for cell in line.rstrip("\r\n").split(separator)]
 
 
 def number(cell: str, separator: str) -> float:
@@ -78,42 +86,52 @@ def not_a_table(field: str, count: int, line: str) -> InvalidInput:
     )  # fmt: skip
 
 
-def columns_of(names: list[str]) -> Columns | None:
-    """Return what the columns hold whose names are given; None unless at least two points have x and y."""
+def columns_of(heads: list[str]) -> Columns | None:
+    """Return what the columns hold whose heads are given; None unless at least two points have x and y."""
     found: dict[str, dict[str, int]] = {}
-    for index, name in enumerate(names):
-        fits = _NUMBERED.fullmatch(name) or _NAMED.fullmatch(name)
+    spelled: dict[str, str] = {}
+    for index, head in enumerate(heads):
+        low = head.lower()
+        fits = _NUMBERED.fullmatch(low) or _NAMED.fullmatch(low)
         if fits is not None:
             axis = "confidence" if fits["axis"] in _CONFIDENCE else fits["axis"]
             found.setdefault(fits["point"], {}).setdefault(axis, index)
+            # Of some letters the small one is longer: then the name stays in small letters.
+            spelled.setdefault(fits["point"], (head if len(head) == len(low) else low)[slice(*fits.span("point"))])
     points = [held for held in found.values() if "x" in held and "y" in held]
     if len(points) < 2:
         return None
+    names = [spelled[point] for point, held in found.items() if "x" in held and "y" in held]
     landmarks = len(points) in LANDMARKS and all("z" in held for held in points)
+    if landmarks and all(name.isdecimal() for name in names):
+        names = list(MEDIAPIPE.get(len(points), names))
     confidence = [held.get("confidence") for held in points]
     return Columns(
         [held["x"] for held in points],
         [held["y"] for held in points],
         confidence,
         "mediapipe" if landmarks else "one_row_a_frame",
+        names,
     )
 
 
 def deeplabcut_columns(rows: list[list[str]]) -> Columns | None:
     """Return what the columns of DeepLabCut's header rows hold; None unless they are such rows."""
-    heads = {row[0]: row for row in rows}
+    heads = {row[0].lower(): row for row in rows}
     if not {"bodyparts", "coords"} <= set(heads) or len({len(row) for row in rows}) != 1:
         return None
     places: dict[tuple[str, ...], dict[str, int]] = {}
     for index in range(1, len(heads["coords"])):
         point = tuple(heads[name][index] for name in ("individuals", "bodyparts") if name in heads)
-        places.setdefault(point, {}).setdefault(heads["coords"][index], index)
+        places.setdefault(point, {}).setdefault(heads["coords"][index].lower(), index)
+    names = ["/".join(point) for point, held in places.items() if "x" in held and "y" in held]
     points = [held for held in places.values() if "x" in held and "y" in held]
     return Columns(
         [held["x"] for held in points],
         [held["y"] for held in points],
         [held.get("likelihood") for held in points],
         "deeplabcut",
+        names,
     )
 
 
@@ -134,7 +152,8 @@ def read_rows(
     Returns
     -------
     dict
-        The tracks `(F, P, 2)` under the writer's name, NaN where a cell is empty, and `likelihood (F, P)` if there are confidences.
+        The tracks `(F, P, 2)` under the writer's name, NaN where a cell is empty, `likelihood (F, P)` if there are confidences, and
+        `point_names` if the points have names.
 
     Raises
     ------
@@ -149,11 +168,11 @@ def read_rows(
             continue
         if len(line) >= LONGEST_ROW:
             raise too_large(field, expected=f"rows of at most {LONGEST_ROW} characters", got="longer ones")
-        cells = split(line, separator)
+        row = split(line, separator)
         try:
-            if len(cells) != width:
-                raise ValueError(f"{len(cells)} cells")
-            rows.append([number(cells[index], separator) for index in wanted])
+            if len(row) != width:
+                raise ValueError(f"{len(row)} cells")
+            rows.append([number(row[index], separator) for index in wanted])
         except ValueError:
             raise not_a_table(field, count, line) from None
         if len(rows) * len(wanted) * 8 > limits.max_bytes:
@@ -163,4 +182,4 @@ def read_rows(
     found: Arrays = {columns.writer: np.stack([table[:, :points], table[:, points : 2 * points]], axis=2)}
     if len(seen) == points:
         found["likelihood"] = table[:, 2 * points :]
-    return found
+    return {**found, **found_names(columns.names)}

@@ -90,7 +90,13 @@ def _parse(request: dict[str, Any]) -> str:
     limits = Limits(**request["limits"])
     given, output = request["descriptors"]
     with os.fdopen(given, "rb") as source, os.fdopen(output, "wb") as target:
-        for codec in ("cp437", "utf-8-sig", "latin-1", "ascii"):  # codecs are files too, read on first use
+        for codec in (
+            "cp437",
+            "utf-8-sig",
+            "latin-1",
+            "ascii",
+            "raw-unicode-escape",
+        ):  # codecs are files too, read on first use
             codecs.lookup(codec)
         limit_process(
             {

@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.schemas.options import Options
 from pliant.solver import InvalidInput
+from pliant.worker.formats.point_names import ARRAY as NAMES
+from pliant.worker.formats.point_names import note, unpack
 from pliant.worker.formats.records import Arrays
 from pliant.worker.formats.tracks.dense import flatten
 from pliant.worker.formats.tracks.layouts import Reading, choose
@@ -48,6 +50,9 @@ class Understood:
     arrays: Arrays
     """All arrays of the file, which may include ground truth."""
 
+    point_names: tuple[str, ...] | None = None
+    """Names of the P points, where the file has them."""
+
 
 def understand(arrays: Arrays, options: Options) -> Understood:
     """Interpret the arrays of a tracks file.
@@ -78,9 +83,13 @@ def understand(arrays: Arrays, options: Options) -> Understood:
     whose = [] if dialect.name in PLAIN else [f"Recognised as the output of {dialect.name} by the names in the file."]
     if dialect.note and options.coordinate_order == "auto":
         whose.append(dialect.note)
+    names = unpack(named.get(NAMES), placed.points.shape[1]) if reading.order == "frames_points" else None
+    if names is not None:
+        whose.append(note(names))
     return Understood(
         points=placed.points, visible=visible, format=dialect.name, layout=layout, coordinates=placed.coordinates,
         y_axis=y_axis, grid=flat.grid, notes=[*whose, *notes, *placed.notes, *how, *why], arrays=named,
+        point_names=names,
     )  # fmt: skip
 
 

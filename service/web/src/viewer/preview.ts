@@ -47,6 +47,7 @@ interface Header {
     points?: Section;
     spread?: Section;
     rejected?: Section;
+    names?: Section;
   };
 }
 
@@ -56,6 +57,8 @@ interface Fields {
   truth: Int16Array;
   spread: Uint16Array;
   rejected: Uint8Array;
+  /** Name of every point. */
+  names: string[];
 }
 export type Field = keyof Fields;
 
@@ -64,6 +67,7 @@ const READ: { [Name in Field]: (raw: ArrayBuffer) => Fields[Name] } = {
   truth: (raw) => new Int16Array(raw),
   spread: (raw) => new Uint16Array(raw),
   rejected: (raw) => new Uint8Array(raw),
+  names: (raw) => new TextDecoder().decode(raw).split("\n"),
 };
 
 /** What is known of one frame; null where it is not. */
@@ -142,7 +146,7 @@ export class Preview {
     return preview;
   }
 
-  /** Fetch a further array once: residuals (2 a point), ground truth (3 a point), deviations (1 a point) or rejections (bits). */
+  /** Fetch a further array once: residuals (2 a point), ground truth (3 a point), deviations (1 a point), rejections (bits) or names. */
   field<Name extends Field>(name: Name, signal: AbortSignal): Promise<Fields[Name]> {
     const section = this.header.sections[name];
     if (section === undefined) return Promise.reject(new Error(`The preview has no ${name}.`));

@@ -18,6 +18,7 @@ export class Probe {
   private rejected: Uint8Array | null = null;
   private spread: Uint16Array | null = null;
   private truth: Int16Array | null = null;
+  private names: string[] | null = null;
 
   /** `onChange` asks for a new picture. */
   constructor(
@@ -75,7 +76,8 @@ export class Probe {
 
   private rows(frame: number, point: number, place: [number, number, number]): [string, string][] {
     const { preview } = this;
-    const rows: [string, string][] = [["Position", place.map((value) => number(value)).join(", ")]];
+    const name = this.names?.[point];
+    const rows: [string, string][] = [...(name ? [["Name", name] satisfies [string, string]] : []), ["Position", place.map((value) => number(value)).join(", ")]];
     if (this.spread) {
       const std = ((preview.header.spread_step ?? 0) * (this.spread[preview.points * frame + point] as number)) / preview.size;
       rows.push(["Expected error", percent(std)]);
@@ -100,11 +102,12 @@ export class Probe {
     const { preview, signal } = this;
     const wanted = async <T>(has: boolean, get: () => Promise<T>): Promise<T | null> => (has ? get() : null);
     try {
-      [this.residuals, this.rejected, this.spread, this.truth] = await Promise.all([
+      [this.residuals, this.rejected, this.spread, this.truth, this.names] = await Promise.all([
         preview.field("residuals", signal),
         wanted(preview.has("rejected"), () => preview.field("rejected", signal)),
         wanted(preview.has("spread"), () => preview.field("spread", signal)),
         wanted(preview.has("truth"), () => preview.field("truth", signal)),
+        wanted(preview.has("names"), () => preview.field("names", signal)),
       ]);
     } catch {
       return; // position and count are known without them

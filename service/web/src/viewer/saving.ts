@@ -1,6 +1,6 @@
 // The buttons that save what is seen: picture, film, a page of its own, and USDZ.
 
-import { artifactLink } from "../links";
+import { quickLookLink } from "../links";
 import { button, h, say } from "../dom";
 import { compose, fileName, filmFormat, png, record, save, standalonePage } from "./export";
 
@@ -48,7 +48,7 @@ export class Saving {
         button("Picture", () => void this.picture()),
         ...films,
         hasPage && button("HTML page", () => void this.page()),
-        what.usdz !== undefined && artifactLink(what.usdz, "View in AR (USDZ)"),
+        what.usdz !== undefined && quickLookLink(what.usdz, "View in AR (USDZ)"),
         this.stop,
       ),
       h("p", { class: "hint", hidden: unsupported === "" }, unsupported),

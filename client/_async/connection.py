@@ -1,0 +1,62 @@
+"""How a client reaches its service: address, token, TLS, retries."""
+
+from __future__ import annotations
+
+import os
+import ssl
+from collections.abc import Callable, Mapping
+from types import TracebackType
+from typing import Any, Self
+
+import httpx
+from pliant.client._async.transport import Exchange
+from pliant.client.call import base_of, headers_of
+from pliant.client.retry import Attempts, Contact, Retry
+
+DEFAULT_URL = "http://127.0.0.1:8000"
+
+
+class AsyncConnection:
+    """Base of `AsyncClient`, which states the parameters; close it, or use it in a ``with`` block."""
+
+    def __init__(
+        self,
+        url: str | None = None,
+        *,
+        token: str | None = None,
+        headers: Mapping[str, str] | None = None,
+        verify: bool | ssl.SSLContext = True,
+        retries: Retry = Retry(),  # noqa: B008 - frozen, so all clients may share it
+        event_hooks: Mapping[str, list[Callable[..., Any]]] | None = None,
+        transport: httpx.AsyncBaseTransport | None = None,
+    ) -> None:
+        self.url = base_of(url if url is not None else os.environ.get("PLIANT_URL") or DEFAULT_URL)
+        bearer = token if token is not None else os.environ.get("PLIANT_TOKEN") or None
+        self._http = httpx.AsyncClient(
+            base_url=self.url,
+            headers=headers_of(bearer, headers),
+            verify=verify,
+            event_hooks=event_hooks,
+            transport=transport,
+        )
+        self._retries = retries
+        self._contact = Contact()
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self.url}>"
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, fault: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self.close()
+
+    async def close(self) -> None:
+        """Close the connections."""
+        await self._http.aclose()
+
+    def _exchange(self, timeout: float | None, doing: str = "the call") -> Exchange:
+        attempts = Attempts(retries=self._retries, contact=self._contact, timeout=timeout, doing=doing)
+        return Exchange(self._http, attempts)

@@ -1,0 +1,93 @@
+"""Result of a solve, and how it ended."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import TYPE_CHECKING
+
+from pliant.solver.records import Camera, Choices, Floats, Ints
+
+if TYPE_CHECKING:
+    from pliant.solver.evaluation.trust import Trust
+
+
+class Outcome(StrEnum):
+    """How a solve ended; `sentence` explains each member."""
+
+    CONVERGED = "converged"
+    MAX_REWEIGHTINGS = "max_reweightings"
+    REJECTED = "rejected"
+    STOPPED = "stopped"
+
+    @property
+    def sentence(self) -> str:
+        """What happened, and what to do next where there is something to do."""
+        return _SENTENCES[self]
+
+
+_SENTENCES = {
+    Outcome.CONVERGED: "Converged.",
+    Outcome.MAX_REWEIGHTINGS: (
+        "Stopped at the maximum number of reweightings before the objective converged. The result is usable; "
+        "raise max_reweightings or tolerance if it must converge."
+    ),
+    Outcome.REJECTED: (
+        "The last step increased the objective by more than the tolerance and was rejected; the shapes are those before it. "
+        "Try precision float64 or weaker weights if they are not good enough."
+    ),
+    Outcome.STOPPED: "Stopped on request; the shapes are those of the last finished step.",
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trace:
+    """Per-reweighting history, arrays of equal length; entry 0 is the initialisation."""
+
+    objective: Floats
+    """E, normalized units; never increases, except when the tracks are corrected again for perspective."""
+
+    residual: Floats
+    """Median visible reprojection residual, the tracks' unit."""
+
+    iterations: Ints
+    """Inner conjugate-gradient iterations spent."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Solution:
+    """Result of a solve."""
+
+    shapes: Floats
+    """Shape `(F, P, 3)`, world axes, the tracks' unit, centred per frame."""
+
+    camera: Camera
+    """Estimated or given cameras. Depth has one free sign for the whole sequence (the bas-relief mirror)."""
+
+    residuals: Floats
+    """Length of the reprojection residual, shape `(F, P)`, the tracks' unit; 0 where hidden."""
+
+    weights: Floats
+    """Final IRLS weight relative to its largest possible value, in [0, 1], shape `(F, P)`; 0 where hidden, small for outliers."""
+
+    trace: Trace
+    outcome: Outcome
+    choices: Choices
+    seconds: dict[str, float]
+    """Wall time per stage."""
+
+    shapes_std: Floats | None = None
+    """Posterior standard deviation of every position, shape `(F, P)`, the unit of the shapes; None where the prior has no posterior."""
+
+    trust: Trust | None = None
+    """Expected error, verdict and its reasons."""
+
+    inlier_probability: Floats | None = None
+    """Posterior probability that an observation is an inlier, shape `(F, P)`; 0 where rejected, NaN where hidden. With α the share of
+    outliers, A the area of the tracks, and p the density of the loss at the scale of the noise: (1 − α) p / ((1 − α) p + α / A); in full in
+    `pliant.solver.shapes.inliers`."""
+
+    def __repr__(self) -> str:
+        frames, points, _ = self.shapes.shape
+        verdict = "" if self.trust is None else f", {self.trust.verdict}"
+        return f"<Solution of {frames} frames × {points} points, {self.outcome}{verdict}>"

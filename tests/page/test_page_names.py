@@ -1,0 +1,140 @@
+"""What a visitor sees of one result: names of object and points, when a share link ends, and AR where it plays."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from datetime import datetime
+from pathlib import Path
+
+import httpx
+import pytest
+from browsing import why_not
+from paging import DONE
+from playwright.sync_api import Browser, Page, expect
+from pliant.worker.artifacts import build_report, write_artifacts
+from results import make_result
+
+pytestmark = [
+    pytest.mark.chromium,
+    pytest.mark.skipif(why_not() is not None and not os.environ.get("CI"), reason=str(why_not())),
+]
+
+POINT_NAMES = tuple(f"Lid {number} ü" for number in range(21 * 31))
+QUICK_LOOK = """const supports = DOMTokenList.prototype.supports;
+DOMTokenList.prototype.supports = function (word) { return word === "ar" || supports.call(this, word); };"""
+
+
+@pytest.fixture(scope="module")
+def viewed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """The address that `pliant view` prints for the result of a film with named points."""
+    folder: Path = tmp_path_factory.mktemp("a-folder")
+    inputs, solution, options = make_result(rows=21, columns=31, texture=True, outputs="glb,usd")
+    inputs = replace(inputs, point_names=POINT_NAMES)
+    report = build_report(inputs, solution, options, metrics={}, name="Take 3/Büro")
+    write_artifacts(inputs, solution, options, report, folder, name="Take 3/Büro")
+    command = [sys.executable, "-m", "pliant.cli", "view", str(folder), "--no-browser", "--json"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as viewing:
+        assert viewing.stdout is not None
+        text = ""
+        while not text.endswith("}\n"):
+            text += viewing.stdout.readline()
+        try:
+            yield str(json.loads(text)["url"])
+        finally:
+            viewing.send_signal(signal.SIGINT)
+            viewing.wait(30)
+
+
+def visitor(browser: Browser, **more: str) -> Page:
+    context = browser.new_context(viewport={"width": 1280, "height": 800}, reduced_motion="reduce", **more)  # type: ignore[arg-type]
+    return context.new_page()
+
+
+def test_a_local_result_has_its_own_names(browser: Browser, viewed: str) -> None:
+    page = visitor(browser)
+    page.goto(viewed)
+    expect(page.get_by_role("heading", name="Take 3/Büro")).to_be_visible()
+    page.locator(".view canvas").first.wait_for(timeout=DONE)
+    number = page.get_by_role("spinbutton", name="Point")
+    for point in (7, 640):
+        number.fill(str(point))
+        expect(page.locator(".probe dt").first).to_have_text("Name")
+        expect(page.locator(".probe dd").first).to_have_text(POINT_NAMES[point])
+    number.fill("")
+    canvas = page.get_by_role("application", name=re.compile("^3-D view"))
+    canvas.press("Enter")  # the point in the middle, as a click there
+    expect(page.locator(".probe dd").first).to_have_text(re.compile(r"^Lid \d+ ü$"))
+    expect(page.get_by_text("Use from code")).to_be_hidden()  # there is no service to use
+    expect(page.get_by_role("link", name="View in AR (USDZ)")).to_have_count(0)  # no Quick Look here
+    expect(page.get_by_role("link", name="shapes.usdz", exact=True)).to_be_visible()
+    page.context.close()
+
+
+def test_ar_is_offered_where_it_plays(browser: Browser, viewed: str) -> None:
+    page = visitor(browser)
+    page.add_init_script(QUICK_LOOK)
+    page.goto(viewed)
+    link = page.get_by_role("link", name="View in AR (USDZ)")
+    expect(link).to_be_visible(timeout=DONE)
+    # What Safari asks for: the relation, a picture as the only child, and no download.
+    assert link.evaluate("(it) => [it.rel, it.children.length, it.firstChild.tagName, it.hasAttribute('download')]") == [
+        "ar", 1, "IMG", False,
+    ]  # fmt: skip
+    assert httpx.get(link.evaluate("(it) => it.href")).content[:2] == b"PK"
+    page.context.close()
+
+
+def share(url: str, job: str, **body: int) -> tuple[str, datetime]:
+    made = httpx.post(f"{url}/v1/jobs/{job}/shares", json=body).json()
+    return f"{url}/{made['path']}", datetime.fromisoformat(made["expires_at"])
+
+
+@pytest.mark.parametrize(
+    ("locale", "words"), [("en-GB", "%-d %B %Y at 15:00"), ("de-DE", "%-d. November %Y um 17:00"), ("en-US", "7:00 AM")]
+)
+def test_a_visitor_sees_when_the_link_ends(browser: Browser, url: str, finished: str, locale: str, words: str) -> None:
+    link, _ = share(url, finished, expires_in=86400)
+    zone = {"en-GB": "Europe/London", "de-DE": "Europe/Athens", "en-US": "America/Los_Angeles"}[locale]
+    page = visitor(browser, locale=locale, timezone_id=zone)
+    page.route("**/shares", lambda route: route.fulfill(json=[{"id": "a", "expires_at": "2031-11-20T15:00:00Z"}]))
+    page.goto(link)
+    until = page.locator(".until")
+    expect(until).to_contain_text(datetime(2031, 11, 20).strftime(words))
+    expect(until).to_contain_text("The link is valid until")
+    page.context.close()
+
+
+def test_a_link_that_ends_while_it_is_open_says_so(browser: Browser, url: str, finished: str) -> None:
+    link, _ = share(url, finished, expires_in=3600)
+    page = visitor(browser, locale="en-GB")
+    page.clock.install()
+    page.goto(link)
+    expect(page.locator(".until")).to_contain_text("The link is valid until")
+    expect(page.get_by_role("heading", name="a finished face")).to_be_visible()
+    page.clock.fast_forward("01:00:30")
+    expect(page.locator(".until")).to_contain_text("what is shown stays until you close or reload this page")
+    expect(page.get_by_role("heading", name="a finished face")).to_be_visible()
+    page.context.close()
+
+
+def test_a_link_that_has_ended_is_a_sentence(browser: Browser, url: str, finished: str) -> None:
+    link, _ = share(url, finished)
+    page = visitor(browser, locale="en-GB", timezone_id="Europe/London")
+    problem = {
+        "title": "Expired share link", "status": 401, "code": "expired_share", "got": "2024-03-05T09:30:00+00:00",
+        "detail": "This share link has expired. Ask its sender for a new one.",
+    }  # fmt: skip
+    page.route("**/v1/**", lambda route: route.fulfill(status=401, json=problem))
+    page.goto(link)
+    expect(page.get_by_role("heading", name="This result can no longer be seen")).to_be_visible()
+    expect(page.get_by_text("The link expired on 5 March 2024 at 09:30. Ask its sender for a new one.")).to_be_visible()
+    for role in ("alert", "textbox", "button"):
+        expect(page.get_by_role(role)).to_have_count(0)  # type: ignore[arg-type]
+    page.context.close()

@@ -1,0 +1,111 @@
+"""The report of a job, and what the arrays hold beside it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pliant.schemas.options import Options
+from pliant.solver.records import FocalCandidate
+from pliant.worker.artifacts import build_report
+from results import make_result, write
+
+
+def test_a_perspective_camera_is_in_the_arrays_and_the_report(tmp_path: Path) -> None:
+    inputs, solution, options = make_result()
+    camera = replace(solution.camera, focal=900.0, focal_std=12.0, principal_point=np.array([640.0, 360.0]))
+    candidates = (
+        FocalCandidate(None, False, -1.0),
+        FocalCandidate(900.0, True, -0.5),
+        FocalCandidate(900.0, False, -2.0),
+    )
+    choices = replace(
+        solution.choices, camera="perspective", depth_sign="settled", focal_candidates=candidates,
+        reasons={"camera_model": "Perspective."},
+    )  # fmt: skip
+    files = write(tmp_path, (inputs, replace(solution, camera=camera, choices=choices), options))
+    with np.load(files["shapes.npz"], allow_pickle=False) as got:
+        assert (got["focal"], got["focal_std"]) == (900.0, 12.0)
+        np.testing.assert_array_equal(got["principal_point"], [640.0, 360.0])
+    report = json.loads(files["report.json"].read_text())["camera"]
+    assert {name: report[name] for name in ("model", "focal", "focal_std", "depth_sign", "reason")} == {
+        "model": "perspective", "focal": 900.0, "focal_std": 12.0, "depth_sign": "settled", "reason": "Perspective.",
+    }  # fmt: skip
+    assert report["principal_point"] == [640.0, 360.0]
+    assert (report["field_of_view"], report["sentence"]) == (None, "Perspective camera, focal length 900 px ± 12.")
+    assert report["candidates"][0] == {"focal": None, "mirrored": False, "nll": -1.0}
+
+
+@pytest.mark.parametrize(
+    ("focal", "std", "size", "sentence"),
+    [
+        (
+            900.0,
+            12.0,
+            "1280x720",
+            "Perspective camera, focal length 900 px ± 12, horizontal field of view 70.8° ± 0.72°.",
+        ),
+        (900.0, 0.0, "1280x720", "Perspective camera, focal length 900 px (given), horizontal field of view 70.8°."),
+        (None, None, "1280x720", "Scaled orthographic camera."),
+    ],
+)
+def test_the_report_states_the_field_of_view(focal: float | None, std: float | None, size: str, sentence: str) -> None:
+    inputs, solution, _ = make_result()
+    camera = replace(solution.camera, focal=focal, focal_std=std)
+    model = "scaled_orthographic" if focal is None else "perspective"
+    solution = replace(solution, camera=camera, choices=replace(solution.choices, camera=model))
+    report = build_report(inputs, solution, Options(image_size=size), metrics={})["camera"]
+    assert report["sentence"] == sentence
+    if focal is not None:
+        views = [np.degrees(2 * np.arctan(640 / (focal + shift))) for shift in (0, 1e-3)]
+        assert report["field_of_view"] == pytest.approx(views[0])
+        assert report["field_of_view_std"] == pytest.approx((views[0] - views[1]) / 1e-3 * std, rel=1e-4)
+
+
+def test_the_report_describes_the_computation(tmp_path: Path) -> None:
+    report = json.loads(write(tmp_path, make_result())["report.json"].read_text())
+    assert report["outcome"] == "converged"
+    assert report["sentence"] == "Converged."
+    assert report["warnings"] == ["Look."]
+    assert report["metrics"] == {"e3d_frame": 0.5, "rotation_degrees": None}
+    assert report["choices"]["basis_size"] == {"value": 2, "reason": "Two shapes explain it."}
+    assert report["choices"]["noise"] == {"value": None}
+    assert report["options"]["fps"] == 25
+    assert report["interpretation"]["num_points"] == 30
+    assert report["trace"] == {"objective": [3.0, 2.0], "residual": [1.0, 0.5], "iterations": [0, 9]}
+    assert report["seconds"]["cameras"] == 0.5
+    assert report["seconds"]["exporting"] > 0
+    assert report["peak_memory_bytes"] > 10_000_000
+    assert set(report["versions"]) == {"pliant", "numpy", "scipy", "python", "system"}
+
+
+def test_the_report_states_how_far_to_trust_the_result(tmp_path: Path) -> None:
+    made = make_result(hidden=True)
+    report = json.loads(write(tmp_path, made)["report.json"].read_text())
+    trust = made[1].trust
+    assert trust is not None
+    assert trust.interval is not None
+    assert report["verdict"] == trust.verdict.value
+    assert report["verdict_reasons"] == list(trust.reasons)
+    assert report["expected_error"] == trust.expected_error
+    assert report["expected_error_interval"] == list(trust.interval)
+    assert report["trust_sentence"] == trust.sentence
+    inputs, solution, options = made
+    silent = build_report(inputs, replace(solution, trust=None), options, metrics={})
+    assert [silent[name] for name in ("verdict", "expected_error", "expected_error_interval", "trust_sentence")] == [
+        None
+    ] * 4
+    assert silent["verdict_reasons"] == []
+
+
+def test_a_result_without_deviations_has_no_such_array(tmp_path: Path) -> None:
+    files = write(tmp_path, make_result(std=False, outputs="glb", colours="expected_error"))
+    with np.load(files["shapes.npz"]) as arrays:
+        assert "shapes_std" not in arrays
+    report = json.loads(files["report.json"].read_text())
+    assert report["expected_error"] is None
+    assert report["trust_sentence"].startswith("The error is not estimated")
+    assert "colours" not in report["artifacts"]["shapes.glb"], "nothing is painted where nothing is known"

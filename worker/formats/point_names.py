@@ -1,0 +1,69 @@
+"""Names of points, as pose trackers export them: body parts, nodes of a skeleton, landmarks.
+
+Between processes and in stored inputs they are one array of bytes: UTF-8, one name a line.
+"""
+
+from __future__ import annotations
+
+import unicodedata
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+ARRAY = "point_names"
+
+LONGEST = 100
+"""Characters of a name; longer ones are cut off."""
+
+SHOWN = 4
+"""Names that a note lists."""
+
+POSE = (
+    "nose", "left_eye_inner", "left_eye", "left_eye_outer", "right_eye_inner", "right_eye", "right_eye_outer", "left_ear", "right_ear",
+    "mouth_left", "mouth_right", "left_shoulder", "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist", "left_pinky",
+    "right_pinky", "left_index", "right_index", "left_thumb", "right_thumb", "left_hip", "right_hip", "left_knee", "right_knee",
+    "left_ankle", "right_ankle", "left_heel", "right_heel", "left_foot_index", "right_foot_index",
+)  # fmt: skip
+_FINGERS = ("index_finger", "middle_finger", "ring_finger", "pinky")
+HAND = (
+    "wrist", "thumb_cmc", "thumb_mcp", "thumb_ip", "thumb_tip",
+    *(f"{finger}_{joint}" for finger in _FINGERS for joint in ("mcp", "pip", "dip", "tip")),
+)  # fmt: skip
+MEDIAPIPE = {len(names): names for names in (POSE, HAND)}
+"""Names of MediaPipe's landmarks by their number, from its documentation: exports have none. Those of faces have numbers only."""
+
+
+def one_line(text: str) -> str:
+    """Return a text on one line: what cannot be printed counts as space, and spaces are single."""
+    return " ".join("".join(sign if sign.isprintable() else " " for sign in text).split())
+
+
+def found(names: Sequence[str]) -> dict[str, NDArray[np.generic]]:
+    """Return what a reader hands on of the names in a file: nothing if none of them says more than a number."""
+    lines = [_clean(name) for name in names]
+    return {} if all(line == "" or line.isdecimal() for line in lines) else {ARRAY: pack(lines)}
+
+
+def pack(names: Sequence[str]) -> NDArray[np.uint8]:
+    """Return names, each on one line, as an array of bytes."""
+    return np.frombuffer("\n".join(names).encode(), dtype=np.uint8)
+
+
+def unpack(array: NDArray[np.generic] | None, count: int) -> tuple[str, ...] | None:
+    """Return the names in an array; None where there is none, or it does not name so many points."""
+    if array is None or array.dtype != np.uint8:
+        return None
+    names = tuple(_clean(line) for line in array.tobytes().decode("utf-8", "replace").split("\n"))
+    return names if len(names) == count else None
+
+
+def note(names: Sequence[str]) -> str:
+    """Return a sentence that lists the first names."""
+    more = ", …" if len(names) > SHOWN else ""
+    return f"The file names its {len(names)} points: {', '.join(names[:SHOWN])}{more}."
+
+
+def _clean(name: str) -> str:
+    whole = unicodedata.normalize("NFC", name.encode("utf-8", "replace").decode())
+    return one_line(whole)[:LONGEST].strip()

@@ -1,0 +1,64 @@
+"""A failed or cancelled job once more."""
+
+from __future__ import annotations
+
+import hashlib
+
+from pliant.schemas.job import Job, Status
+from pliant.worker.errors import NotAllowedNow, UnknownJob
+from pliant.worker.ids import new_job_id
+from pliant.worker.jobs.service import Jobs
+from pliant.worker.jobs.submission import Submission, copy_beside
+
+
+def retry(jobs: Jobs, id: str, *, idempotency_key: str | None = None) -> Job:
+    """Run a failed or cancelled job again, as a new job with the same inputs, options, name and webhook.
+
+    Parameters
+    ----------
+    idempotency_key : str, optional
+        A repeated request with the same key returns the first new job.
+
+    Raises
+    ------
+    Conflict
+        The key belongs to a different request.
+    InvalidRequest
+        The key is malformed.
+    NotAllowedNow
+        The job is not finished, or has succeeded.
+    UnknownJob
+        There is no such job, or it was deleted in the meantime.
+    """
+    stored = jobs.stored(id)
+    job = stored.job
+    submission = Submission(
+        options=job.options, name=job.name, idempotency_key=idempotency_key, webhook=stored.webhook,
+        fingerprint=hashlib.sha256(f"retry of {id}".encode()).hexdigest(),
+    )  # fmt: skip
+    known = jobs.known(submission)
+    if known is not None:
+        return known
+    if job.status not in (Status.FAILED, Status.CANCELLED):
+        hint = "It has its result." if job.status is Status.SUCCEEDED else "Wait until it ends, or cancel it first."
+        raise NotAllowedNow(id, job.status, wanted="run again", hint=hint)
+    again = Job(
+        id=new_job_id(),
+        name=job.name,
+        status=Status.QUEUED,
+        created_at=jobs.clock(),
+        retry_of=id,
+        outputs_of=job.outputs_of,
+        priority=job.priority,
+        options=job.options,
+        interpretation=job.interpretation,
+    )
+    try:
+        copies = [(stored.inputs, "inputs.npz"), *([(stored.result, "result.npz")] if stored.result else [])]
+        size = sum(jobs.blobs.get(key).size for key, _ in copies)
+        return jobs.create(
+            again, submission, lambda key: copy_beside(jobs.blobs, copies, key), size=size, owner=stored.owner,
+            from_result=stored.result is not None,
+        )  # fmt: skip
+    except FileNotFoundError:  # deleted between our look and the copy
+        raise UnknownJob(id) from None
