@@ -84,6 +84,19 @@ def test_hidden_points_and_outliers_of_the_other_frames_are_predicted(film: gall
     assert found.estimate.filling is not None
 
 
+@pytest.mark.slow
+@pytest.mark.usefixtures("limited")
+def test_perspective_is_corrected_in_every_frame() -> None:
+    film, focal, distance = gallery.talk(90, 60), 600.0, 600.0
+    seen = np.einsum("fij,fpj->fpi", film.rotations, film.shapes)
+    seen -= seen.mean(axis=1, keepdims=True)
+    points = 320 + focal * seen[..., :2] / (seen[..., 2:] + distance)
+    visible = np.random.default_rng(0).random((90, 60)) > 0.1
+    solution = solve(Tracks.from_arrays(points, visible), film.mesh, settings=Settings(image_size=(641, 641)))
+    assert solution.camera.focal == pytest.approx(focal, rel=0.1)
+    assert metrics.e3d_frame(solution.shapes, film.shapes) < 0.02
+
+
 @pytest.mark.usefixtures("limited")
 def test_a_stop_leaves_cameras_for_every_frame(film: gallery.Sequence) -> None:
     solution = solve(film.tracks, film.mesh, should_stop=lambda: True)
