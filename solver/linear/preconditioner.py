@@ -17,7 +17,7 @@ from pliant.solver.linear import block_tridiagonal, multigrid, points
 from pliant.solver.linear.conjugate_gradient import Linear
 from pliant.solver.operators.normal_equations import Operator
 from pliant.solver.records import Floats, Ints
-from pliant.solver.threads import SMALLEST, available_cores, over_ranges
+from pliant.solver.threads import available_cores, over_ranges
 from scipy import fft, linalg
 
 Array = NDArray[np.floating]
@@ -74,31 +74,14 @@ def build_preconditioner(operator: Operator) -> Linear:
 
 
 def _in_single_precision(inverse: Linear) -> Linear:
-    """Return the inverse for residuals of any precision: a preconditioner needs few digits, and half the memory traffic.
-
-    The copies in single precision are allocated once: touching new pages would cost as much as the conversion.
-    """
-    copies: list[Array] = []
+    """Return the inverse for residuals of any precision: a preconditioner needs few digits, and half the memory traffic."""
 
     def apply(r: Array, /, out: Array | None = None) -> Array:
         result = np.empty_like(r) if out is None else out
-        if not copies:
-            copies.extend(np.zeros(r.shape, dtype=np.float32) for _ in range(2))
-        _converted(r, copies[0])
-        inverse(copies[0], out=copies[1])
-        _converted(copies[1], result)
+        result[...] = inverse(r.astype(np.float32))
         return result
 
     return apply
-
-
-def _converted(source: Array, target: Array) -> None:
-    """Copy to an array of another precision."""
-
-    def work(start: int, stop: int) -> None:
-        target[start:stop] = source[start:stop]
-
-    over_ranges(work, len(source), smallest=max(1, SMALLEST // max(source[0].size, 1)))
 
 
 def bends(operator: Operator) -> bool:
