@@ -19,7 +19,7 @@ from pliant.cli.exits import Exit
 from pliant.cli.extras import require_server
 from pliant.cli.paths import output_folder
 from pliant.cli.session import LINE_EVERY, Json, Session
-from pliant.cli.show import err, out, print_json
+from pliant.cli.show import err, out, print_json, verdict_lines
 
 if TYPE_CHECKING:
     from pliant.schemas.job import Job
@@ -54,6 +54,14 @@ DEGREES, DISTANCE = 30.0, 5.0
 
 GOOD: Mapping[str, float] = {"e3d_frame_scaled": 0.08, "track_median": 0.7, "track_p95": 3.0}
 """Errors above which the demonstration counts as failed: relative 3-D error, pixels, pixels."""
+
+MEANINGS: Mapping[str, str] = {
+    "e3d_frame_scaled": "3-D error, share of the object's size: e3d_frame after one scale, which a film does not show",
+    "track_median": "error of the tracks in pixels, median",
+    "track_p95": "error of the tracks in pixels, 95 % are below",
+    "visibility_precision": "share of the points called visible that are",
+    "visibility_recall": "share of the visible points called visible",
+}
 
 STOPS_WITHIN = 60.0
 
@@ -148,13 +156,13 @@ def report(
     from rich.table import Table
     from rich.text import Text
 
-    table = Table(title=job.trust_sentence or job.sentence, title_justify="left")
-    for heading in ("metric", "value", "good below"):
-        table.add_column(heading, justify="left" if heading == "metric" else "right")
+    table = Table()
+    for heading in ("metric", "value", "good below", "meaning"):
+        table.add_column(heading, justify="left" if heading in ("metric", "meaning") else "right")
     for name, value in metrics.items():
         bound = GOOD.get(name)
         colour = "" if bound is None else "green" if value <= bound else "red"
-        table.add_row(name, Text(f"{value:.4g}", colour), "" if bound is None else f"{bound:g}")
+        table.add_row(name, Text(f"{value:.4g}", colour), "" if bound is None else f"{bound:g}", MEANINGS[name])
     screen = out()
     screen.print(table)
     for warning in job.warnings:
@@ -163,6 +171,8 @@ def report(
         err().print("[bold red]The errors are too large.[/] Please report this with the output of `pliant doctor`.")
     for path in paths.values():
         screen.print(f"  {path}  {path.stat().st_size / 1e6:.2f} MB", markup=False)
+    for line in verdict_lines(job):
+        screen.print(line)
     glb = paths.get("shapes.glb")
     screen.print(f"Open {glb} in Blender or any glTF viewer: it plays." if glb is not None else "", markup=False)
     if url is None:

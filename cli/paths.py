@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 RESULT_FILES = ("shapes.npz", "report.json")
@@ -117,3 +118,16 @@ def output_folder(folder: Path, *, force: bool, files: Iterable[str] = RESULT_FI
         raise BadArgument(
             f"--output: {folder} already holds {', '.join(existing)}. Choose another folder, or replace the files with --force."
         )
+
+
+@contextmanager
+def results_folder(folder: Path, *, force: bool) -> Iterator[None]:
+    """Run the work that writes results into a folder: checked as by `output_folder` before, and removed if it was made in vain."""
+    new = not folder.exists()
+    output_folder(folder, force=force)
+    try:
+        yield
+    finally:
+        if new:
+            with suppress(OSError):  # it holds results
+                folder.rmdir()

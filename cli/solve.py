@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from pliant.cli.films import inspect_film, is_film, refuse_parts_of_tracks, solve_film
-from pliant.cli.paths import input_file, output_folder, tracks_or_film
+from pliant.cli.paths import input_file, results_folder, tracks_or_film
 from pliant.cli.session import (
     LINE_EVERY,
     Force,
@@ -53,14 +53,33 @@ def solve(
     ctx.obj.json = as_json
     check_inputs(tracks, ground_truth, rotations)
     input_file(region, "region")
-    missing = not output.exists()
-    output_folder(output, force=force)
-    if missing:  # made again when there are results: inputs that are refused leave no folder behind
-        output.rmdir()
     from pliant.worker.settings import NUMERICAL_THREADS
 
     # Read by the numerical libraries when they are imported, below; the solver has its own threads.
     os.environ.update(dict.fromkeys(NUMERICAL_THREADS, "1"))
+    with results_folder(output, force=force):
+        options, name = parse_options(option), name_of(name, tracks)
+        if is_film(tracks, region):
+            refuse_parts_of_tracks(mesh=mesh, ground_truth=ground_truth, rotations=rotations)
+            done = solve_film(
+                tracks, output, region=region, options=options, name=name, threads=threads, as_json=as_json
+            )
+        else:
+            parts = {"tracks": tracks, "mesh": file_or_word(mesh), "ground_truth": ground_truth, "rotations": rotations}
+            done = solve_tracks(parts, output, options=options, name=name, threads=threads, as_json=as_json)
+    show_finished(done, output, as_json=as_json)
+
+
+def solve_tracks(
+    parts: dict[str, Any], output: Path, *, options: dict[str, Any], name: str, threads: int | None, as_json: bool
+) -> Finished:
+    """Read and reconstruct tracks; `parts` are the inputs by their names in `read_inputs`.
+
+    Raises
+    ------
+    InvalidInput
+        An input or an option cannot be used.
+    """
     from pliant.client.multipart import checked_options
     from pliant.client.progress import progress_bar
     from pliant.solver import threads_limited
@@ -68,24 +87,13 @@ def solve(
     from pliant.worker.formats import read_inputs
     from pliant.worker.formats.tracks.film_tracks import tracks_options
 
-    if is_film(tracks, region):
-        refuse_parts_of_tracks(mesh=mesh, ground_truth=ground_truth, rotations=rotations)
-        given = parse_options(option)
-        done = solve_film(
-            tracks, output, region=region, options=given, name=name_of(name, tracks), threads=threads, as_json=as_json
-        )
-        show_finished(done, output, as_json=as_json)
-        return
-    options = checked_options(parse_options(option))
-    inputs = read_inputs(
-        tracks=tracks, mesh=file_or_word(mesh), ground_truth=ground_truth, rotations=rotations, options=options
-    )
-    options = tracks_options(options, inputs.interpretation)
+    checked = checked_options(options)
+    inputs = read_inputs(**parts, options=checked)
+    checked = tracks_options(checked, inputs.interpretation)
     if not as_json:
         show_understood(inputs.interpretation)
     with progress_bar(line_every=LINE_EVERY) as bar, threads_limited(threads):
-        done = reconstruct(inputs, options, output, name=name_of(name, tracks), on_progress=bar.on_step)
-    show_finished(done, output, as_json=as_json)
+        return reconstruct(inputs, checked, output, name=name, on_progress=bar.on_step)
 
 
 def inspect(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import secrets
 import socket
 import webbrowser
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -48,7 +49,10 @@ def view(
             err().print("Ctrl-C ends it.")
         if browser:
             webbrowser.open(url)
-        uvicorn.Server(uvicorn.Config(app, log_config=None, server_header=False)).run(sockets=[listening])
+        with suppress(KeyboardInterrupt):
+            uvicorn.Server(uvicorn.Config(app, log_config=None, server_header=False)).run(sockets=[listening])
+    if not as_json:
+        err().print("Stopped.")
 
 
 def share(

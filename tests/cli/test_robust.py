@@ -261,6 +261,7 @@ def test_ctrl_c_while_solving(tmp_path: Path) -> None:
     code, printed = interrupted(["solve", "face.npz", "-o", "out"], "frames ×", cwd=tmp_path)
     assert (code, printed.rpartition("error ")[2]) == (Exit.INTERRUPTED, "Interrupted.")
     assert "Traceback" not in printed
+    assert not (tmp_path / "out").exists()
 
 
 def test_ctrl_c_while_waiting_prints_how_to_resume(

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from pliant.cli.commands.batch import Batch, Row
+from pliant.cli.demo import MEANINGS, report
 from pliant.cli.show import show_job, show_jobs, verdict_lines
 from pliant.cli.solve import show_finished
 from pliant.schemas.job import Interpretation, Job, Status
@@ -78,6 +79,20 @@ def test_the_list_of_jobs_has_the_verdict(capsys: pytest.CaptureFixture[str]) ->
     assert "verdict" in heading
     assert "Do not use" in bad
     assert old.split()[:2] == ["job", "succeeded"]
+
+
+def test_the_demonstration_states_what_its_figures_mean(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    judged = job(verdict="with_care", verdict_reasons=[REASON], trust_sentence=TRUST)
+    report(judged, dict.fromkeys(MEANINGS, 0.04), {}, good=True, url=None, as_json=False)
+    rows = capsys.readouterr().out.splitlines()
+    assert [row for row in rows if row in LAST] == LAST
+    for name, meaning in MEANINGS.items():
+        (row,) = [line for line in rows if name in line.split()]
+        assert meaning in row
+        assert "0.04" in row
 
 
 @pytest.mark.parametrize("columns", ["40", "80", "200"])

@@ -72,6 +72,8 @@ def test_a_local_result_has_its_own_names(browser: Browser, viewed: str) -> None
     canvas.press("Enter")  # the point in the middle, as a click there
     expect(page.locator(".probe dd").first).to_have_text(re.compile(r"^Lid \d+ ü$"))
     expect(page.get_by_text("Use from code")).to_be_hidden()  # there is no service to use
+    expect(page.get_by_label("Compare with")).to_have_count(0)
+    expect(page.get_by_text("Not Found")).to_have_count(0)
     expect(page.get_by_role("link", name="View in AR (USDZ)")).to_have_count(0)  # no Quick Look here
     expect(page.get_by_role("link", name="shapes.usdz", exact=True)).to_be_visible()
     page.context.close()

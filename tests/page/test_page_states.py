@@ -113,3 +113,9 @@ def test_what_cannot_be_shown(page: Page, url: str, finished: str, check: Callab
     page.reload()
     expect(page.get_by_role("alert").first).to_contain_text("This service needs a token")
     check("token-gate")
+    ended = problem | {"code": "expired_share", "got": "2024-03-05T09:30:00Z"}
+    page.route("**/v1/**", lambda route: route.fulfill(status=401, json=ended))
+    page.goto("about:blank")
+    page.goto(f"{url}/#share=share.{finished}.secret")
+    expect(page.get_by_role("heading", name="This result can no longer be seen")).to_be_visible()
+    check("share-ended")

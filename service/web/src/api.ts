@@ -30,7 +30,19 @@ export function setShare(token: string): void {
   share = token;
 }
 
-/** Whether the page reads through a share link, which shows one job and no others. */
+let single = false;
+
+/** Show one result from now on: of a share link, or of a folder on this computer. */
+export function setSingle(): void {
+  single = true;
+}
+
+/** Whether the page shows one result, and there are no others to list. */
+export function isSingle(): boolean {
+  return single;
+}
+
+/** Whether the page reads through a share link. */
 export function isShared(): boolean {
   return share !== null;
 }

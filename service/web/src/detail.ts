@@ -1,6 +1,6 @@
 // One job: where it stands, what it was understood as, and what came of it.
 
-import { Refusal, artifactPath, cancelJob, deleteJob, getReport, isShared, listJobs, retryJob } from "./api";
+import { Refusal, artifactPath, cancelJob, deleteJob, getReport, isShared, isSingle, listJobs, retryJob } from "./api";
 import { Afterwards } from "./afterwards";
 import { Countdown } from "./countdown";
 import { Curves } from "./curves";
@@ -267,7 +267,7 @@ export class Detail {
       preview: artifactPath(job.id, PREVIEW),
       film: path(FILM),
       usdz: path(USDZ),
-      ...(isShared() ? {} : { others }),
+      ...(isSingle() ? {} : { others }),
     };
   }
 }

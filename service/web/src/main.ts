@@ -1,7 +1,7 @@
 // The page: a form, a list, and the job that the address names (#job=…), so that a reload comes back to it.
 
 import { AGAIN } from "./afterwards";
-import { Refusal, hasToken, setToken } from "./api";
+import { Refusal, hasToken, setSingle, setToken } from "./api";
 import { Compose } from "./compose";
 import { Detail } from "./detail";
 import { button, h } from "./dom";
@@ -119,6 +119,7 @@ document.addEventListener(AGAIN, (event) => compose.again((event as CustomEvent<
 
 /** Leave form and list out. */
 function alone(): void {
+  setSingle();
   document.body.classList.add("shared");
   welcome.hidden = true;
 }

@@ -29,7 +29,7 @@ export async function openShared(token: string, place: HTMLElement, show: (id: s
     const ended = sentence(error);
     if (ended !== null) {
       document.title = "Shared result – Pliant";
-      place.append(h("section", { class: "shared-note", role: "status" }, h("h1", {}, "This result can no longer be seen"), h("p", {}, ended)));
+      place.append(h("section", { class: "shared-note", role: "status" }, h("h2", {}, "This result can no longer be seen"), h("p", {}, ended)));
       return;
     }
   }
