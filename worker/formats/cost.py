@@ -39,9 +39,9 @@ LIBRARIES = 110_000_000
 BYTES = {"gaussian": 600, "smooth": 500, "smooth+low_rank": 500}
 """Bytes for each observation, by prior: up to 510 were measured for the solver alone, 520 with exports."""
 
-BLOCK, BEYOND = 5_000_000, 250
+BLOCK, BEYOND = 10_000_000, 250
 """Observations that are solved at once (`solver.reconstruction.blocks.BLOCK_OBSERVATIONS`), and bytes for each further one, of which
-only tracks and results are held: 120 in the solver, the rest for the exports."""
+only tracks and results are held: about 120 in the solver by the sizes of its arrays, the rest for the exports, not measured."""
 
 SECONDS = 0.5
 """Processor seconds of a job that is as small as can be."""
