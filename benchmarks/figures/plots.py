@@ -143,7 +143,7 @@ def _against(axes: Axes, records: Records, levels: dict[str, float]) -> None:
 
 def growth(records: Records) -> Figure:
     """Time and memory against points and frames, with the fitted exponents."""
-    figure, grid = plt.subplots(1, 2, figsize=(8, 3.2))
+    figure, grid = plt.subplots(1, 2, figsize=(8, 4.2))
     for axes, quantity, label in zip(grid, ("seconds", "gigabytes"), ("wall time, s", "peak memory, GB"), strict=True):
         series: dict[tuple[str, str, str], list[tuple[float, float]]] = defaultdict(list)
         for r in records:
@@ -162,7 +162,7 @@ def growth(records: Records) -> Figure:
         axes.set_xlabel("points, or frames")
         axes.set_ylabel(label)
         axes.grid(alpha=0.25, which="both")
-        axes.legend(fontsize=7, frameon=False)
+        axes.legend(fontsize=7, frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.16))
     figure.tight_layout()
     return figure
 
