@@ -28,7 +28,7 @@ from pliant.solver.solution import Outcome, Solution, Trace
 
 BLOCK_OBSERVATIONS = 10_000_000
 """Largest number of frames times points that are solved at once: 4.5 GB. Blocks cost time: a face of 50 × 200,000 took 174 processor
-seconds in two blocks and 117 at once, since every block has iterations of its own."""
+seconds in two blocks and 88 at once, since every block has iterations of its own."""
 
 MARGIN = 16
 """Rings of neighbours around a block. Shapes of a face of 4,000 points in four blocks differ from those solved at once by .0034, .0019 and
