@@ -65,7 +65,7 @@ class Monitor:
         self._last = Step("cameras", 0.0)
         self._reported = clock()
         self._done, self._current, self._ahead = 0.0, plan[0], list(plan[1:])
-        self._units, self._share = 0, 0.0
+        self._units, self._share, self._blocks = 0, 0.0, False
         self._pace, self._load = Pace(work()), Load(clock(), work())
         self._descent = Descent() if descent is None else descent
         self._seconds_per_iteration = seconds_per_iteration
@@ -129,6 +129,12 @@ class Monitor:
             self._share = max(self._share, self._descent.share())
         self._emit(replace(step, fraction=self._fraction()))
 
+    def report_block(self, step: Step, share: float) -> None:
+        """Report a step of one of several blocks of points; `share` of the shapes is done."""
+        self.enter("shapes")
+        self._blocks, self._share = True, max(self._share, share)
+        self._emit(replace(step, fraction=self._fraction()))
+
     def _fraction(self) -> float:
         done = self._done + self._share * self._current.seconds
         left = (1 - self._share) * self._current.seconds + sum(stage.seconds for stage in self._ahead)
@@ -136,7 +142,7 @@ class Monitor:
 
     def _left(self) -> float:
         ahead, now = sum(stage.seconds for stage in self._ahead), self._work()
-        if self._current.name != "shapes":
+        if self._current.name != "shapes" or self._blocks:
             left = self._pace.left(self._current, self._share, ahead, now)
         else:
             per_iteration = self._pace.known * self._seconds_per_iteration

@@ -13,8 +13,10 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from pliant.solver.isometry.surface import IsometricVerdict
 from pliant.solver.mesh import Mesh
 from pliant.solver.monitor import Monitor
+from pliant.solver.reconstruction.blocks import needs_blocks, shapes_in_blocks
 from pliant.solver.reconstruction.cameras import Cameras, cameras_of
 from pliant.solver.reconstruction.observations import Observations, check_fit, monitored, observe
 from pliant.solver.reconstruction.prior import Prior, prior_of
@@ -91,7 +93,10 @@ def _solved(
     cameras, prior = _learned(observations, monitor)
     monitor.report(Step("cameras", 0.0, max_reweightings=settings.max_reweightings))
     learning, began = time.perf_counter() - began, time.perf_counter()
-    start = with_outliers_rejected(prepared(tracks, cameras, prior, mesh, settings), monitor)
+    if needs_blocks(tracks, settings):
+        solution = shapes_in_blocks(tracks, cameras, prior, mesh, settings, monitor, seconds={"cameras": learning})
+        return solution if verdict is None else _with_verdict(solution, verdict, settings)
+    start = with_outliers_rejected(prepared(tracks, cameras, prior, mesh, settings, should_stop=monitor), monitor)
     if start.rejected().any() and not monitor():
         again = time.perf_counter()
         start = _started_again(start, cameras, monitor)
@@ -99,7 +104,11 @@ def _solved(
     start = with_outlier_reason(start)
     seconds = {"cameras": learning, "initialise": time.perf_counter() - began}
     solution = shapes_from(start, monitor, seconds=seconds)
-    return solution if verdict is None else replace(solution, choices=with_verdict(solution.choices, verdict, settings))
+    return solution if verdict is None else _with_verdict(solution, verdict, settings)
+
+
+def _with_verdict(solution: Solution, verdict: IsometricVerdict, settings: Settings) -> Solution:
+    return replace(solution, choices=with_verdict(solution.choices, verdict, settings))
 
 
 def _learned(
@@ -125,4 +134,4 @@ def _started_again(start: Start, before: Cameras, monitor: Monitor) -> Start:
     """
     observations = start.observations
     cameras, prior = _learned(observations, monitor, start.rejected(), before)
-    return prepared(observations.tracks, cameras, prior, start.mesh, start.settings)
+    return prepared(observations.tracks, cameras, prior, start.mesh, start.settings, should_stop=monitor)

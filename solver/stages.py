@@ -58,6 +58,7 @@ UNITS = {
     "scales": (820, 120, 0.85),
     "refinement": (400, 360, 1.1),
     "covariance": (380, 360, 1.0),
+    "extension": (80, 1_000_000, 3.0),
     "trust": (6, 100, 130.0),
 }
 """Stages of the default prior: typical number of units, maximum number of frames used, and cost of a unit against that of an iteration.
@@ -75,6 +76,10 @@ LOAD_SECONDS, LOAD_PRIOR = 20.0, 1.0
 
 OWN_PACE = 4.0
 """Weight of a stage's own pace, per completed share of it, beside that of all stages: its units take about the same time."""
+
+LEARNED_FRAMES = 360
+"""Maximum number of frames from which cameras and covariance are learned together, evenly spread over longer films; the others follow by
+resection (`reconstruction.long_films`)."""
 
 UNITS_PER_START = 348
 """Units that one starting point of the stage `starts` takes."""
@@ -126,6 +131,8 @@ def learning(frames: int, *, gaussian: bool, known_cameras: bool) -> tuple[Stage
         names = ["model_order", "covariance"] if gaussian else []
     elif not gaussian:
         names = ["multistart"]
+    if gaussian and frames > LEARNED_FRAMES:
+        names.append("extension")
     return tuple(stage_of(name, frames) for name in names)
 
 

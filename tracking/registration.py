@@ -102,7 +102,7 @@ class Registration:
             Variance of the frames' noise, square grey levels.
         """
         corners = np.stack([grid[:-1, :-1], grid[:-1, 1:], grid[1:, :-1], grid[1:, 1:]], axis=-1)
-        full = (corners >= 0).all(axis=-1)
+        full = np.asarray((corners >= 0).all(axis=-1))
         corners = corners[full]
         step = float(np.median(points[corners[:, 1], 0] - points[corners[:, 0], 0]))
         side = max(2, round(step / SPACING))
@@ -136,7 +136,7 @@ class Registration:
             Of the matches: the variance is that of the shift which would explain the remaining difference of brightness, the mean squared
             residual around a point over the mean squared slope in the direction of least slope.
         """
-        shown = visible[self.corners].all(axis=1)
+        shown = np.asarray(visible[self.corners].all(axis=1))
         used = np.zeros(len(points), dtype=bool)
         used[self.corners[shown]] = True
         if not used.any():
@@ -263,7 +263,7 @@ class _Surroundings:
         return centred / contrast - self.template, contrast
 
 
-def _weights(corners: NDArray[np.int32], weights: Floats, num_points: int) -> sparse.csr_array:
+def _weights(corners: NDArray[np.int32], weights: NDArray[np.float64], num_points: int) -> sparse.csr_array:
     """Return the matrix that interpolates in every cell at the places with the given weights `(K, 4)`."""
     count, places = len(corners), len(weights)
     columns = np.repeat(corners, places, axis=0).ravel()
@@ -273,7 +273,7 @@ def _weights(corners: NDArray[np.int32], weights: Floats, num_points: int) -> sp
 
 
 def _products(
-    corners: NDArray[np.int32], weights: Floats, num_points: int
+    corners: NDArray[np.int32], weights: NDArray[np.float64], num_points: int
 ) -> tuple[sparse.csr_array, tuple[NDArray[np.int32], NDArray[np.int32]]]:
     """Return `Registration.products` and `pattern`."""
     count, places = len(corners), len(weights)

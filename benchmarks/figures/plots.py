@@ -143,22 +143,26 @@ def _against(axes: Axes, records: Records, levels: dict[str, float]) -> None:
 
 def growth(records: Records) -> Figure:
     """Time and memory against points and frames, with the fitted exponents."""
-    figure, grid = plt.subplots(1, 2, figsize=(8, 3.2))
+    figure, grid = plt.subplots(1, 2, figsize=(8, 4.2))
     for axes, quantity, label in zip(grid, ("seconds", "gigabytes"), ("wall time, s", "peak memory, GB"), strict=True):
-        series: dict[tuple[str, str], list[tuple[float, float]]] = defaultdict(list)
+        series: dict[tuple[str, str, str], list[tuple[float, float]]] = defaultdict(list)
         for r in records:
             if quantity in r:
-                series[r["against"], r["prior"]].append((r[r["against"]], r[quantity]))
-        for (against, prior), points in sorted(series.items()):
+                other = "frames" if r["against"] == "points" else "points"
+                cameras = "" if r.get("cameras", "true") == "true" else ", cameras estimated"
+                series[r["against"], f"{r[other]:,} {other}", r["prior"] + cameras].append(
+                    (r[r["against"]], r[quantity])
+                )
+        for (against, at, prior), points in sorted(series.items()):
             x, y = np.array(sorted(points)).T
-            label_of = f"{against}, prior {prior}"
+            label_of = f"{against} at {at}, {prior}"
             if quantity == "seconds":  # memory holds a constant, so that a slope says little about it
                 label_of += f": slope {np.polyfit(np.log(x), np.log(y), 1)[0]:.2f}"
             axes.loglog(x, y, marker="o", ms=4, label=label_of)
-        axes.set_xlabel("points at 10 frames, or frames at 2,000 points")
+        axes.set_xlabel("points, or frames")
         axes.set_ylabel(label)
         axes.grid(alpha=0.25, which="both")
-        axes.legend(fontsize=7, frameon=False)
+        axes.legend(fontsize=7, frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.16))
     figure.tight_layout()
     return figure
 

@@ -1,7 +1,9 @@
-"""Time and memory: side by side with what else there is, against the size, against the machine.
+r"""Time and memory: side by side with what else there is, against the size, against the machine.
 
     python -m benchmarks.speed compare --data DIR --only facescan99   the solver and the baselines on one energy
     python -m benchmarks.speed growth                                 against P and against F, with fitted exponents
+    python -m benchmarks.speed growth --cameras estimated --settings "" --outliers 0 --kind talk --fixed-points 300 \
+        --against-points "" --against-frames 300,1000,3000,10000 --results benchmarks/results/growth.jsonl
     python -m benchmarks.speed mesh --frames 30 --points 10000        a mesh and a grid of equal F and P
     python -m benchmarks.speed bandwidth --frames 30 --points 30000   an iteration against the machine's copying
     python -m benchmarks.speed profile --data DIR --only facescan99   where the time goes
@@ -19,9 +21,20 @@ from __future__ import annotations
 import argparse
 import cProfile
 import pstats
+import shlex
+import sys
 from pathlib import Path
 
-from benchmarks.speed.growth import FRAMES, POINTS, bandwidth, growth, mesh_against_grid
+from benchmarks.speed.growth import (
+    FIXED_FRAMES,
+    FIXED_POINTS,
+    FRAMES,
+    POINTS,
+    Sizes,
+    bandwidth,
+    growth,
+    mesh_against_grid,
+)
 from benchmarks.speed.side_by_side import BASELINES, Workload, compare, solved
 
 
@@ -29,14 +42,18 @@ def main() -> None:
     """Measure what is asked for."""
     options = _parser().parse_args()
     work = Workload(
-        data=options.data, only=options.only, frames=options.frames, points=options.points, outliers=options.outliers,
+        data=options.data, only=options.only, kind=options.kind, frames=options.frames, points=options.points, outliers=options.outliers,
         noise=options.noise, known=options.cameras == "true", settings=options.settings,
         start=options.start,
     )  # fmt: skip
     if options.what == "compare":
         compare(work, names=options.baselines, cap=options.cap, limit=int(options.memory * 1e9))
     elif options.what == "growth":
-        growth(work, points=options.against_points, frames=options.against_frames)
+        sizes = Sizes(
+            points=options.against_points, frames=options.against_frames,
+            fixed_points=options.fixed_points, fixed_frames=options.fixed_frames,
+        )  # fmt: skip
+        growth(work, sizes, results=options.results, command=f"python -m benchmarks.speed {shlex.join(sys.argv[1:])}")
     elif options.what == "mesh":
         mesh_against_grid(work)
     elif options.what == "bandwidth":
@@ -66,6 +83,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("what", choices=("compare", "growth", "mesh", "bandwidth", "profile"))
     parser.add_argument("--data", type=Path, help="directory of sequences; a gallery face when not given")
     parser.add_argument("--only", default="facescan99", help="the first sequence whose name holds this word")
+    parser.add_argument("--kind", default="face", choices=("face", "flag", "sphere", "talk"), help="gallery sequence")
     parser.add_argument("--frames", type=int, default=20, help="of the gallery face")
     parser.add_argument("--points", type=int, help="of the gallery face, or to thin a sequence to")
     parser.add_argument("--outliers", type=float, default=0.10)
@@ -78,6 +96,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--memory", type=float, default=14.0, help="gigabytes of address space a baseline may take")
     parser.add_argument("--against-points", type=sizes, default=POINTS, help="values of P for growth")
     parser.add_argument("--against-frames", type=sizes, default=FRAMES, help="values of F for growth")
+    parser.add_argument("--fixed-frames", type=int, default=FIXED_FRAMES, help="F of the growth with P")
+    parser.add_argument("--fixed-points", type=int, default=FIXED_POINTS, help="P of the growth with F")
+    parser.add_argument("--results", type=Path, help="file that growth appends its measurements to")
     return parser
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import time
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from pliant.solver.threads import available_cores
@@ -18,6 +20,27 @@ FRAMES = (10, 25, 50, 100, 200, 400, 800)
 """At `FIXED_POINTS` points."""
 FIXED_FRAMES, FIXED_POINTS = 10, 2_000
 
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sizes:
+    """What is measured; an empty series is left out."""
+
+    points: tuple[int, ...] = POINTS
+    frames: tuple[int, ...] = FRAMES
+    fixed_frames: int = FIXED_FRAMES
+    fixed_points: int = FIXED_POINTS
+
+    def series(self) -> list[tuple[str, tuple[int, ...]]]:
+        """Return `P` and `F` with their values."""
+        return [(name, sizes) for name, sizes in (("P", self.points), ("F", self.frames)) if sizes]
+
+    def at(self, name: str, size: int) -> dict[str, int]:
+        """Return frames and points of one measurement."""
+        if name == "P":
+            return {"frames": self.fixed_frames, "points": size}
+        return {"frames": size, "points": self.fixed_points}
+
+
 NUMBERS_MOVED, BYTES = 65, 4
 """Numbers for each of the F·P observations that one iteration of conjugate gradients moves at least, operation by operation, and the
 size of one, corrections being solved in single precision: the operator reads x and the weights and writes 𝒜x (3 + 2 + 3), the
@@ -25,32 +48,55 @@ preconditioner reads and writes (3 + 3) and reads its factors on the way there a
 one (27), two inner products read two (12), and x and its neighbours in time are taken from the cache."""
 
 
-def growth(work: Workload, *, points: tuple[int, ...] = POINTS, frames: tuple[int, ...] = FRAMES) -> list[str]:
-    """Measure; returns the lines of two Markdown tables with the fitted exponents."""
+def growth(work: Workload, sizes: Sizes | None = None, *, results: Path | None = None, command: str = "") -> list[str]:
+    """Measure; returns the lines of two Markdown tables with the fitted exponents.
+
+    With `results` every measurement is appended to a file of JSON lines as soon as it is there, with `command`.
+    """
     lines: list[str] = []
-    for name, sizes in (("P", points), ("F", frames)):
+    sizes = Sizes() if sizes is None else sizes
+    for name, values in sizes.series():
         _say(
             lines,
             f"\n| {name} | cameras | shapes (CPU, whole) | iterations | an iteration | peak memory | bytes a F·P |",
         )
         _say(lines, "| --- | --- | --- | --- | --- | --- | --- |")
         done: list[Measured] = []
-        for size in sizes:
-            sized = replace(
-                work,
-                **(
-                    {"frames": FIXED_FRAMES, "points": size}
-                    if name == "P"
-                    else {"frames": size, "points": FIXED_POINTS}
-                ),
-            )
-            measured = best_of(sized)
+        for size in values:
+            measured = best_of(replace(work, **sizes.at(name, size)))
             done.append(measured)
             _say(lines, f"| {size} {_row(measured)}")
+            if results is not None:
+                _append(
+                    results,
+                    {"against": "points" if name == "P" else "frames", **_record(work, measured), "command": command},
+                )
         _say(lines, "")
-        for label, seconds in _series(done).items():
-            _say(lines, f"exponent in {name} of {label}: {exponent(np.array(sizes, float), np.array(seconds)):.2f}")
+        if len(values) > 1:
+            for label, seconds in _series(done).items():
+                _say(
+                    lines, f"exponent in {name} of {label}: {exponent(np.array(values, float), np.array(seconds)):.2f}"
+                )
     return lines
+
+
+def _record(work: Workload, measured: Measured) -> dict[str, object]:
+    """Return a measurement as it is stored in `benchmarks/results/growth.jsonl`."""
+    ours: Ours = measured.value
+    frames, points = ours.size
+    return {
+        "points": points, "frames": frames, "prior": work.chosen().prior, "sequence": work.kind,
+        "cameras": "true" if work.known else "estimated", "outliers": work.outliers,
+        "seconds": round(measured.seconds, 2), "cpu_seconds": round(measured.cpu_seconds, 2),
+        "gigabytes": round(measured.peak / 1e9, 2), "silence": round(ours.silence, 2),
+        "error": None if ours.error is None else round(ours.error, 5),
+        "machine": f"{available_cores()} cores, load {measured.load:.1f}",
+    }  # fmt: skip
+
+
+def _append(results: Path, record: dict[str, object]) -> None:
+    with results.open("a", encoding="utf-8") as file:
+        file.write(json.dumps(record) + "\n")
 
 
 def best_of(work: Workload, *, repeats: int = 3, enough: float = 10.0) -> Measured:

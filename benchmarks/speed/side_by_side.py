@@ -7,11 +7,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from pliant.solver import KnownCamera, Mesh, Settings, Solution, Tracks, solve
+from pliant.solver import KnownCamera, Mesh, Settings, Solution, Tracks, gallery, solve
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.energy.problem import Problem
 from pliant.solver.evaluation.metrics import e3d_frame
-from pliant.solver.gallery import corrupt_tracks, face
 from pliant.solver.shapes.initialization import pseudo_inverse, uniform_solution
 from pliant.solver.shapes.setup import build_problem
 from pliant.solver.tracks.normalization import normalize
@@ -33,6 +32,8 @@ class Workload:
 
     data: Path | None = None
     only: str = "face"
+    kind: str = "face"
+    """Of the gallery: face, flag, sphere or talk."""
     frames: int = 20
     points: int | None = None
     outliers: float = 0.10
@@ -47,10 +48,14 @@ class Workload:
     def case(self) -> Case:
         """Read the sequence, or make a gallery face, and spoil it."""
         if self.data is None:
-            made = from_gallery(face(self.frames, self.points or 1500, mesh=self.mesh), "face")  # type: ignore[arg-type]
+            make = getattr(gallery, self.kind)
+            options = {} if self.kind == "sphere" else {"mesh": self.mesh}
+            made = from_gallery(make(self.frames, self.points or 1500, **options), self.kind)
         else:
             made = next(iter(cases(self.data, points=self.points, visibility="file", only=[self.only])))
-        tracks, _ = corrupt_tracks(made.tracks, outliers=self.outliers, noise=self.noise)
+        if self.outliers == self.noise == 0:
+            return made
+        tracks, _ = gallery.corrupt_tracks(made.tracks, outliers=self.outliers, noise=self.noise)
         return replace(made, tracks=tracks)
 
     def chosen(self) -> Settings:
@@ -74,6 +79,8 @@ class Ours:
     stages: dict[str, float]
     error: float | None
     size: tuple[int, int]
+    silence: float
+    """Longest time between two reports of progress."""
 
 
 def run_ours(watch: Stopwatch, work: Workload) -> Ours:
@@ -85,6 +92,7 @@ def run_ours(watch: Stopwatch, work: Workload) -> Ours:
         case.tracks, case.mesh, cameras=case.cameras if work.known else None, settings=work.chosen(),
         on_step=lambda step: history.append((time.perf_counter() - watch.began, time.process_time() - watch.cpu, step.objective)),
     )  # fmt: skip
+    moments = [0.0, *(wall for wall, _, _ in history), time.perf_counter() - watch.began]
     best = float(solution.trace.objective[-1])
     valued = [entry for entry in history if entry[2] is not None]
     reached = next((wall, cpu) for wall, cpu, value in valued if value <= GAP * best)
@@ -93,6 +101,7 @@ def run_ours(watch: Stopwatch, work: Workload) -> Ours:
         reached, valued[0][:2], best, (solution.camera.translations - normalized.centroid) / normalized.unit,
         int(solution.trace.iterations.sum()), len(solution.trace.objective) - 1, dict(solution.seconds),
         None if case.shapes is None else e3d_frame(solution.shapes, case.shapes), case.tracks.points.shape[:2],
+        float(np.diff(moments).max()),
     )  # fmt: skip
 
 

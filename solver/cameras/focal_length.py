@@ -31,6 +31,7 @@ from pliant.solver.cameras.perspective import (
     depths_of,
 )
 from pliant.solver.model.expectation_maximisation import annealed
+from pliant.solver.model.image_density import factor_of
 from pliant.solver.model.marginal_likelihood import CAMERA_PRIOR_WEIGHT, UNLIKELY, Motion, energy_with_inverse
 from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.shape_covariance import ShapeCovariance
@@ -302,7 +303,8 @@ class corrected_energy:  # noqa: N801
         nearer = 1 + curvature * self.depths
         if nearer.min() < NEAREST:
             return UNLIKELY, np.zeros_like(flat)
-        scene = replace(self.scene, gram=constant + curvature * linear + curvature**2 * square)
+        gram = constant + curvature * linear + curvature**2 * square
+        scene = replace(self.scene, gram=gram, factor=factor_of(gram))
         value, gradient, inverse = energy_with_inverse(scene, Motion.unflat(flat[:-1], frames))
         if inverse is None:
             return value, np.zeros_like(flat)

@@ -30,9 +30,6 @@ from pliant.solver.tracks.noise import OUTLIER_SHARE
 from pliant.solver.tracks.normalization import Normalized
 from scipy.spatial.transform import Rotation
 
-LEARNED_FRAMES = 360
-"""Maximum number of frames to learn from, evenly spread over longer sequences: the cost grows with F³."""
-
 REFINEMENT_ROUNDS = 5
 """Refinements of rotations and covariance, each with a new L-BFGS memory. EM in between would undo part of the gain,
 since it keeps modes and random walk apart."""
@@ -104,7 +101,7 @@ def refine_cameras(
         Called between refinements; once it returns True, the best so far is returned.
     """
     frames, spoiled = len(estimate.rotations), estimate.outliers > OUTLIER_SHARE
-    used = learned_frames(shown)
+    used = np.flatnonzero(shown)
     start = np.asarray(estimate.scales)
     unscaled, sample = _of_corrected(estimate, start, used)
     enter(should_stop, "model_order")
@@ -238,7 +235,7 @@ def _turned(
     for _ in range(rounds):
         if should_stop is not None and should_stop():
             break
-        found = _turn(gram, found, with_scales=with_scales, should_stop=should_stop)
+        found = turned_once(gram, found, with_scales=with_scales, should_stop=should_stop)
     return found
 
 
@@ -255,7 +252,7 @@ def _best_start(
     moves them back, because every mode would have to move along. The unrefined cameras of a factorization can
     therefore be the better start.
     """
-    some = _some(np.arange(len(used)), START_FRAMES)
+    some = evenly_spread(np.arange(len(used)), START_FRAMES)
     part, ones = _of_frames(gram, some), np.ones(len(some))
     best, lowest = estimate, np.inf
     for start in (estimate, *(restarted(estimate, size, rotations) for size, rotations in estimate.hypotheses)):
@@ -305,7 +302,7 @@ def _free_scales(
     Scales are free from two starts, 1 and those of a rigid shape, on a subset of the frames. Deformation that is
     mistaken for scale ends in a worse minimum than fixed scales, or in one with nearly constant scales.
     """
-    used = _some(np.arange(len(rotations)), SCALE_FRAMES)
+    used = evenly_spread(np.arange(len(rotations)), SCALE_FRAMES)
     part, given, none = _of_frames(gram, used), rotations[used], np.ones(len(used))
 
     def turned(start: Learned, *, with_scales: bool) -> Learned:
@@ -341,7 +338,7 @@ def _scale_gain_share(logs: Floats) -> float:
     return float(np.clip(3 * rough, SMOOTH_SCALE_SHARE, 1.0))
 
 
-def _some(places: NDArray[np.intp], count: int) -> NDArray[np.intp]:
+def evenly_spread(places: NDArray[np.intp], count: int) -> NDArray[np.intp]:
     """Return at most `count` of the places, evenly spread."""
     chosen = np.linspace(0, len(places) - 1, min(len(places), count)).round().astype(np.intp)
     return np.asarray(places[np.unique(chosen)])
@@ -353,11 +350,6 @@ def _of_frames(gram: Floats, used: NDArray[np.intp]) -> Floats:
     return gram[np.ix_(rows, rows)]
 
 
-def learned_frames(shown: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Return the frames to learn from: at most `LEARNED_FRAMES` of those that show enough."""
-    return _some(np.flatnonzero(shown), LEARNED_FRAMES)
-
-
 def informative_frames(visible: Floats) -> NDArray[np.bool_]:
     """Return which frames show at least a tenth of the median number of points, shape `(F,)`; all if fewer than three do."""
     seen = (visible > 0).sum(axis=1)
@@ -365,9 +357,17 @@ def informative_frames(visible: Floats) -> NDArray[np.bool_]:
     return is_identifiable if is_identifiable.sum() >= 3 else np.ones(len(seen), dtype=bool)
 
 
-def _turn(gram: Floats, found: Learned, *, with_scales: bool, should_stop: Callable[[], bool] | None) -> Learned:
-    """Return cameras and covariance of higher likelihood."""
-    scene = scene_at(gram, found.rotations, with_scales=with_scales, ordered=found.covariance.ordered)
+def turned_once(
+    gram: Floats,
+    found: Learned,
+    *,
+    with_scales: bool,
+    factor: Floats | None = None,
+    should_stop: Callable[[], bool] | None = None,
+) -> Learned:
+    """Return cameras and covariance of higher likelihood; `factor` as for `scene_at`."""
+    ordered = found.covariance.ordered
+    scene = scene_at(gram, found.rotations, with_scales=with_scales, ordered=ordered, factor=factor)
     moved = fit(scene, motion_of(scene, found), iterations=ROTATION_ITERATIONS, turning=True, should_stop=should_stop)
     return moved_to(scene, found, *moved)
 

@@ -32,11 +32,17 @@ class Learned:
     """Of `model.marginal_likelihood`, without a penalty on modes; infinite before the first refinement."""
 
 
-def scene_at(gram: Floats, rotations: Floats, *, with_scales: bool, ordered: bool) -> Scene:
-    """Return the scene whose cameras at zero turn are these; if unordered, without the camera-motion prior."""
+def scene_at(
+    gram: Floats, rotations: Floats, *, with_scales: bool, ordered: bool, factor: Floats | None = None
+) -> Scene:
+    """Return the scene whose cameras at zero turn are these; if unordered, without the camera-motion prior.
+
+    `factor`, shape `(2F, r)`, stands for a Gram matrix that is not formed; `gram` is then empty.
+    """
     return Scene(
         gram, rotations, with_scales=with_scales, prior_weight=STEADY if ordered else 0.0,
         noise_std_floor=NOISE_VARIANCE_FLOOR**0.5, smoothness=0.0, ordered=ordered,
+        factor=np.zeros((0, 0)) if factor is None else factor,
     )  # fmt: skip
 
 

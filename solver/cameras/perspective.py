@@ -24,8 +24,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from pliant.solver.model.image_density import Explained, ImageModel
+from pliant.solver.model.marginal_likelihood import root_matrix
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.records import Floats
+from pliant.solver.stages import LEARNED_FRAMES
 from pliant.solver.tracks.completion import Filling, spans
 from pliant.solver.tracks.normalization import Normalized
 from scipy import linalg
@@ -37,6 +40,26 @@ NEAREST = 0.2
 """Least 1 + κz: no point comes nearer to the camera than a fifth of the distance of the shape's origin."""
 
 MIRROR = np.diag([1.0, 1.0, -1.0])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DepthMap:
+    """D by its factors, for films whose (F, 2F) numbers would be too many: a product is linear in the frames."""
+
+    away: Floats
+    """E, shape `(F, 3)`."""
+
+    model: ImageModel
+    covariance: ShapeCovariance
+
+    def __matmul__(self, images: Floats) -> Floats:
+        """Return the posterior mean depths, `(F, n)`, of points with centred image coordinates `(2F, n)`."""
+        covariance, frames = self.covariance, len(self.away)
+        found = Explained.of(self.model, images)
+        means = found.means.reshape(-1, 3, images.shape[1])
+        moved = (covariance.modes @ means[1:].reshape(len(means) - 1, -1)).reshape(frames, 3, -1) + found.strayed
+        middle = self.away @ root_matrix(covariance.mean_covariance) @ means[0]
+        return np.asarray(middle + np.einsum("fc,fcn->fn", self.away @ root_matrix(covariance.axis_covariance), moved))
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +113,7 @@ class Perspective:
     sample: Floats = field(default_factory=lambda: np.zeros((0, 0, 2)))
     """Some complete tracks as they are, relative to the principal point, shape `(F, S, 2)`, normalized units."""
 
-    depth: Floats = field(default_factory=lambda: np.zeros((0, 0)))
+    depth: Floats | DepthMap = field(default_factory=lambda: np.zeros((0, 0)))
     """D of the cameras and the covariance found last, shape `(F, 2F)`."""
 
     @property
@@ -99,8 +122,11 @@ class Perspective:
         return self.curvature != 0
 
 
-def depth_map(rotations: Floats, scales: Floats, covariance: ShapeCovariance) -> Floats:
+def depth_map(rotations: Floats, scales: Floats, covariance: ShapeCovariance) -> Floats | DepthMap:
     """Return D, shape `(F, 2F)`, for points whose centred image coordinates x1, y1, x2 … are one column."""
+    if len(rotations) > LEARNED_FRAMES:
+        away = rotations[:, 2] * scales[:, None]
+        return DepthMap(away, covariance.image_model(rotations[:, :2] * scales[:, None, None]), covariance)
     projections = rotations[:, :2] * scales[:, None, None]
     away, rows = rotations[:, 2] * scales[:, None], projections.reshape(-1, 3)
     wide = np.repeat(covariance.over_frames(), 2, axis=1)
@@ -118,12 +144,12 @@ def centred(points: Floats) -> Floats:
     return np.asarray(points - points.mean(axis=1, keepdims=True))
 
 
-def depths_of(depth: Floats, views: Floats, curvature: float, *, start: Floats | None = None) -> Floats:
+def depths_of(depth: Floats | DepthMap, views: Floats, curvature: float, *, start: Floats | None = None) -> Floats:
     """Return posterior mean depths of the sampled points, mean 0 in every frame, shape `(F, P)`.
 
     Parameters
     ----------
-    depth : array, shape (F, 2F)
+    depth : array, shape (F, 2F), or DepthMap
         From `depth_map`.
     views : array, shape (F, P, 2)
         Complete tracks relative to the principal point, normalized units.

@@ -69,14 +69,15 @@ def choose_weights(
     settings: Settings,
 ) -> tuple[Weights, float, dict[str, str]]:
     """Return the weights, the noise they assume (standard deviation, normalized units) and one sentence for each choice."""
-    rough = roughness_of(normalized)
-    noise = rough.noise_std if covariance is None else noise_std(covariance)
-    if settings.preset == "paper":
-        chosen, reason = PAPER, "The paper's values."
-    elif covariance is not None:
+    if covariance is not None:
+        noise = noise_std(covariance)
         chosen, reason = _from_covariance(covariance, settings)
     else:
+        rough = roughness_of(normalized)
+        noise = rough.noise_std
         chosen, reason = _from_data(rough, settings)
+    if settings.preset == "paper":
+        chosen, reason = PAPER, "The paper's values."
     given = replace(
         chosen,
         temporal=chosen.temporal if settings.temporal_weight is None else settings.temporal_weight,

@@ -50,3 +50,6 @@ class Problem:
     """B (3×3): world shapes are B X. The identity unless the prior is Gaussian; its coordinates are independent along B."""
     quadratic: PathPrior | None = None
     """λ1 times the inverse covariance over frames of each coordinate: the Gaussian prior."""
+
+    moving: bool = True
+    """Whether translations are estimated with the shapes and every frame's shape is centred; not for a part of the points."""

@@ -1,9 +1,10 @@
 """Synthetic sequences with known truth, for demonstrations, tests and benchmarks.
 
-Three kinds of surface, each for any number of frames and points and deterministic for a given seed::
+Each for any number of frames and points and deterministic for a given seed::
 
     face(F, P)      a face whose brows, lids, cheeks, lips and jaw move; open, smooth, with sharp local motion at the mouth
     flag(F, P)      cloth that waves without stretching; open, large bending, one full-size travelling wave
+    talk(F, P)      the same face, whose motion has the same pace in films of any length
     sphere(F, P)    a closed body that expands and bulges while the camera circles it; half of it is always hidden
 
 Axes are those of an image: x right, y down, z away from the viewer; the unit is a pixel.
@@ -14,5 +15,6 @@ from pliant.solver.gallery.face import face
 from pliant.solver.gallery.flag import flag
 from pliant.solver.gallery.sequence import Sequence
 from pliant.solver.gallery.sphere import sphere
+from pliant.solver.gallery.talk import talk
 
-__all__ = ["Sequence", "corrupt", "corrupt_tracks", "face", "flag", "sphere"]
+__all__ = ["Sequence", "corrupt", "corrupt_tracks", "face", "flag", "sphere", "talk"]

@@ -53,7 +53,7 @@ def sweep(num_frames: int, degrees: float, *, tilt: float) -> Floats:
     turn = np.radians(degrees) * (2 * time - 1)
     nod = np.radians(tilt) * np.sin(2 * np.pi * time)
     roll = np.radians(tilt) / 3 * np.sin(4 * np.pi * time)
-    return np.asarray(_about(2, roll) @ _about(0, nod) @ _about(1, turn))
+    return np.asarray(about(2, roll) @ about(0, nod) @ about(1, turn))
 
 
 def film(
@@ -128,7 +128,7 @@ def refusal(name: str, expected: str, got: object) -> InvalidInput:
     return InvalidInput("out_of_range", field=name, expected=expected, got=repr(got), hint="Correct the argument.")
 
 
-def _about(axis: int, angles: Floats) -> Floats:
+def about(axis: int, angles: Floats) -> Floats:
     """Return rotations about one axis, shape `(F, 3, 3)`."""
     first, second = (axis + 1) % 3, (axis + 2) % 3
     matrices = np.tile(np.eye(3), (len(angles), 1, 1))

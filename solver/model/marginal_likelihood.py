@@ -94,7 +94,7 @@ class Scene:
     """The data and settings of the likelihood."""
 
     gram: Floats
-    """W Wᵀ / P of centred, complete tracks, normalized units, shape `(2F, 2F)`."""
+    """G = W Wᵀ / P of centred, complete tracks, normalized units, shape `(2F, 2F)`; empty where `factor` is given."""
 
     rotations: Floats
     """The cameras at zero turn, shape `(F, 3, 3)`."""
@@ -114,12 +114,13 @@ class Scene:
     ordered: bool = True
     """Whether T is a random walk over frames, or the identity."""
 
-    factor: Floats = field(init=False)
-    """F₀ with F₀F₀ᵀ = G, shape `(2F, r)`."""
+    factor: Floats = field(default_factory=lambda: np.zeros((0, 0)))
+    """F₀ with F₀F₀ᵀ = G, shape `(2F, r)`; that of `gram` unless given, as for films whose Gram matrix would be too large."""
 
     def __post_init__(self) -> None:
         """Factor the Gram matrix."""
-        object.__setattr__(self, "factor", factor_of(self.gram))
+        if len(self.factor) == 0:
+            object.__setattr__(self, "factor", factor_of(self.gram))
 
     @classmethod
     def of(

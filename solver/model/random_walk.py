@@ -18,9 +18,10 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 from pliant.solver.operators.finite_differences import difference_bands
 from pliant.solver.records import Floats, read_only
-from scipy.linalg import lapack
+from scipy.linalg import lapack, solveh_banded
 
 FRAMES_PER_BLOCK = 8
 """Frames eliminated together, as one dense block: of 4, 8 and 12 the fastest for 120 to 1,000 frames and 90 to 350 columns."""
@@ -65,6 +66,14 @@ def random_walk(num_frames: int, ordered: bool = True) -> Floats:
     walk = np.asarray(np.linalg.inv(inverse) / norm, dtype=np.float64)
     read_only(walk)
     return walk
+
+
+def random_walk_at(used: NDArray[np.intp], num_frames: int, ordered: bool = True) -> Floats:
+    """Return T restricted to the frames used, shape `(F', F')`, in time and memory linear in F."""
+    bands, norm = walk_bands(num_frames, ordered)
+    columns = np.zeros((num_frames, len(used)))
+    columns[used, np.arange(len(used))] = 1 / norm
+    return np.asarray(solveh_banded(np.stack([np.append(0.0, bands[1, :-1]), bands[0]]), columns)[used])
 
 
 @lru_cache(maxsize=8)

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.model.image_density import ImageModel
 from pliant.solver.model.marginal_likelihood import root_matrix
-from pliant.solver.model.random_walk import random_walk, walk_bands
+from pliant.solver.model.random_walk import random_walk, random_walk_at, walk_bands
 from pliant.solver.operators.gauss_markov import PathPrior
 from pliant.solver.records import Floats
 from scipy import linalg
@@ -62,6 +62,12 @@ class ShapeCovariance:
         """Return C, shape `(F, F)`."""
         covariance: Floats = self.modes @ self.modes.T + self.walk_variance * random_walk(len(self.modes), self.ordered)
         return covariance
+
+    def over_frames_at(self, used: NDArray[np.intp]) -> Floats:
+        """Return C restricted to the frames used, shape `(F', F')`."""
+        modes = self.modes[used]
+        walk = random_walk_at(used, len(self.modes), self.ordered)
+        return np.asarray(modes @ modes.T + self.walk_variance * walk)
 
     def of_image(self, projections: Floats) -> Floats:
         """Return V = ΠΣΠᵀ + σ²I, shape `(2F, 2F)`; `projections` (F, 2, 3) are s_f times the first two rows of R_f."""

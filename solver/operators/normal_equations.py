@@ -109,7 +109,7 @@ class Operator:
         return replace(
             self,
             projections=self.projections.astype(kind),
-            weights=self.weights.astype(kind),
+            weights=self.weights.astype(kind, copy=False),
             laplacian=None if self.laplacian is None else self.laplacian.rounded(kind),
             quadratic=None if self.quadratic is None else self.quadratic.rounded(kind),
         )

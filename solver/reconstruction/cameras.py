@@ -7,22 +7,28 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.cameras import estimation
-from pliant.solver.cameras.covariance_learning import LearningData
+from pliant.solver.cameras.covariance_learning import LearningData, learn_covariance
 from pliant.solver.cameras.depth_rounds import settled
 from pliant.solver.cameras.estimation import CameraEstimate, given_cameras
-from pliant.solver.cameras.joint_refinement import informative_frames, learned_frames, refine_cameras
+from pliant.solver.cameras.joint_refinement import (
+    evenly_spread,
+    informative_frames,
+    refine_cameras,
+)
 from pliant.solver.cameras.planar_ambiguity import is_planar
 from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.monitor import Monitor, enter
+from pliant.solver.reconstruction.long_films import extended
 from pliant.solver.reconstruction.observations import Observations, OnStep, ShouldStop, check_fit, monitored, observe
 from pliant.solver.records import Camera, Floats, KnownCamera, Step, Tracks, read_only
 from pliant.solver.settings import Settings
-from pliant.solver.stages import learning
+from pliant.solver.stages import LEARNED_FRAMES, learning
 from pliant.solver.tracks.frame_order import resolved_order
 from pliant.solver.tracks.noise import OUTLIER_SHARE
 
 STAGES = (
-    "completion", "multistart", "model_order", "starts", "perspective", "scales", "refinement",
+    "completion", "multistart", "model_order", "starts", "perspective", "scales", "refinement", "covariance",
+    "extension",
 )  # fmt: skip
 
 
@@ -138,6 +144,29 @@ def cameras_of(
     silent : bool
         Reports no steps besides the counted units.
     """
+    shown, settings = informative_frames(observations.normalized.visible), observations.settings
+    long = settings.gaussian and len(shown) > LEARNED_FRAMES
+    used = np.flatnonzero(shown)[
+        :: -(-int(shown.sum()) // LEARNED_FRAMES)
+    ]  # at equal distances, as the priors on motion assume
+    estimate, data = _estimated(
+        observations.at(used) if long else observations, monitor,
+        previous=previous, expects_second=expects_second, silent=silent,
+    )  # fmt: skip
+    if long:
+        assert data is not None
+        estimate, covariance = learn_covariance(estimate, data, seed=settings.seed, should_stop=monitor)
+        estimate, data = extended(estimate, covariance, used, observations, should_stop=monitor)
+    return Cameras(
+        camera_of(estimate, observations), estimate.outliers if previous is None else previous.outliers,
+        estimate.reasons, estimate.warnings, rejected, monitor.stopped, estimate, data, observations,
+    )  # fmt: skip
+
+
+def _estimated(
+    observations: Observations, monitor: Monitor, *, previous: Cameras | None, expects_second: bool, silent: bool
+) -> tuple[CameraEstimate, LearningData | None]:
+    """Return the cameras of films of at most `LEARNED_FRAMES` frames, and what their covariance is learned from."""
     settings, known, normalized = observations.settings, observations.known, observations.normalized
     estimate = _without_shapes(observations, monitor, 0 if previous is None else previous.estimate.rank, silent=silent)
     if previous is not None:
@@ -158,13 +187,10 @@ def cameras_of(
         )  # fmt: skip
     elif observations.lens is not None:
         estimate = settled(
-            estimate, normalized, learned_frames(shown), model_order=ModelOrder(ordered=estimate.ordered),
+            estimate, normalized, evenly_spread(np.flatnonzero(shown), LEARNED_FRAMES), model_order=ModelOrder(ordered=estimate.ordered),
             turning=observations.turning, should_stop=monitor,
         )  # fmt: skip
-    return Cameras(
-        camera_of(estimate, observations), estimate.outliers if previous is None else previous.outliers,
-        estimate.reasons, estimate.warnings, rejected, monitor.stopped, estimate, data, observations,
-    )  # fmt: skip
+    return estimate, data
 
 
 def _without_shapes(observations: Observations, monitor: Monitor, rank: int, *, silent: bool) -> CameraEstimate:

@@ -63,6 +63,20 @@ class Observations:
         normalized = normalize(kept)
         return replace(self, normalized=normalized, lens=given_lens(self.tracks, normalized, self.settings, self.known))
 
+    def at(self, used: NDArray[np.intp]) -> Observations:
+        """Return some of the frames, in the unit of all."""
+        tracks = Tracks.from_arrays(self.tracks.points[used], self.tracks.visible[used])
+        whole = self.normalized
+        normalized = replace(
+            whole, points=whole.points[used], visible=whole.visible[used], centroid=whole.centroid[used]
+        )
+        lens = None if self.lens is None else replace(self.lens, offsets=self.lens.offsets[used])
+        known = self.known
+        if known is not None:
+            scales = None if known.scales is None else known.scales[used]
+            known = replace(known, rotations=known.rotations[used], scales=scales)
+        return Observations(tracks, normalized, self.settings, lens, known)
+
     def of(self, tracks: Tracks) -> Observations:
         """Return other tracks of the same frames, in the unit and about the centroids of these.
 

@@ -168,7 +168,7 @@ def _with_the_rest(start: Start, state: State) -> tuple[Start, State]:
     whole, _ = build_problem(start.flat, start.estimate, start.mesh, start.settings, covariance)
     confidence = whole.confidence.copy()
     confidence[:, part.kept] = start.problem.confidence
-    whole = replace(whole, confidence=confidence)
+    whole = replace(whole, confidence=confidence, moving=start.problem.moving)
     sparse, never = 1 - len(part.kept) / confidence.shape[1], float((confidence == 0).all(axis=0).mean())
     whole, state = place_the_rest(part, whole, covariance, state, spoiled=start.outliers > OUTLIER_SHARE)
     reason = (
@@ -190,11 +190,13 @@ def _finished(start: Start, history: list[State], outcome: Outcome, monitor: Mon
     choices = with_camera_choice(
         start.choices, estimate.perspective, start.settings, unit=normalized.unit, given=observations.known is not None
     )
+    monitor()
     solution = finish(problem, history, outcome, normalized=normalized, estimate=estimate, choices=choices)
     if estimate.perspective is not None:
         solution = seen_in_perspective(solution, tracks, estimate.perspective, normalized.unit, start.kept)
     enter(monitor, "trust")
     confidence = np.asarray(problem.confidence, dtype=np.float64)
+    monitor()
     solution = with_inlier_probability(solution, tracks, confidence, loss=problem.loss)
     solution = assessed(
         solution, confidence, estimate, start.covariance, normalized.unit,

@@ -112,9 +112,18 @@ def find_outliers(
 
 
 def prepared(
-    tracks: Tracks, cameras: Cameras, prior: Prior | None, mesh: Mesh | None, settings: Settings | None
+    tracks: Tracks,
+    cameras: Cameras,
+    prior: Prior | None,
+    mesh: Mesh | None,
+    settings: Settings | None,
+    *,
+    moving: bool = True,
+    should_stop: ShouldStop | None = None,
 ) -> Start:
-    """Return the start of the minimisation, with nothing rejected.
+    """Return the start of the minimisation, with nothing rejected; once `should_stop` returns True, shapes that are less converged.
+
+    `moving` as in `Problem`.
 
     Raises
     ------
@@ -145,7 +154,7 @@ def prepared(
             got=f"{0 if covariance is None else len(covariance.modes)}", hint="Learn the prior from tracks of the same frames.",
         )  # fmt: skip
     flat = orthographic(observations.normalized, estimate.perspective)
-    return _begun(observations, mesh, settings, flat, estimate, covariance, cameras.outliers)
+    return _begun(observations, mesh, settings, flat, estimate, covariance, cameras.outliers, moving, should_stop)
 
 
 def _begun(
@@ -156,24 +165,31 @@ def _begun(
     estimate: CameraEstimate,
     covariance: ShapeCovariance | None,
     outliers: float,
+    moving: bool,
+    should_stop: ShouldStop | None,
 ) -> Start:
+    tick = should_stop if should_stop is not None else bool
+    tick()
     part = None if covariance is None or settings.temporal_weight == 0 else well_observed(flat, mesh)
     if part is None:
         problem, choices = build_problem(flat, estimate, mesh, settings, covariance)
     else:
         problem, choices = build_problem(part.normalized, estimate, part.mesh, settings, covariance)
-    state = _initial(problem, estimate, settings)
+    problem = replace(problem, moving=moving)
+    tick()
+    state = _initial(problem, estimate, settings, should_stop)
+    tick()
     return Start(
         observations, mesh, settings, flat, estimate, covariance, outliers, part,
         *with_bending(problem, choices, state, settings),
     )  # fmt: skip
 
 
-def _initial(problem: Problem, estimate: CameraEstimate, settings: Settings) -> State:
+def _initial(problem: Problem, estimate: CameraEstimate, settings: Settings, should_stop: ShouldStop | None) -> State:
     translations = np.array(estimate.translations, dtype=np.float64)
     if settings.method == "pseudo_inverse":
         return init(problem, pseudo_inverse(problem, translations), translations)
-    return init(problem, uniform_solution(problem, translations), translations)
+    return init(problem, uniform_solution(problem, translations, should_stop=should_stop), translations)
 
 
 def with_outliers_rejected(start: Start, monitor: Monitor) -> Start:

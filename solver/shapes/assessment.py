@@ -53,6 +53,8 @@ def assessed(
         Called between units of work; once it returns True, what is left is not computed.
     """
     std, modes = None, 0
+    tick = should_stop if should_stop is not None else bool
+    tick()
     confidence = np.asarray(confidence, dtype=np.float64)
     if covariance is not None:
         projections = np.asarray(estimate.scales)[:, None, None] * np.asarray(estimate.rotations)[:, :2]
@@ -60,6 +62,7 @@ def assessed(
         posterior = unit * position_std(
             covariance, projections, confidence, noise_std=noise_std(covariance), pinhole=pinhole, seed=seed
         )
+        tick()
         posterior = bounded_by_neighbours(posterior, solution.shapes, confidence)
         learning = unit * learning_std(
             estimate, covariance, solution.shapes / unit, turning=turning, should_stop=should_stop
@@ -67,6 +70,7 @@ def assessed(
         std = INFLATION * np.hypot(posterior, learning)
         modes = covariance.modes.shape[1]
         read_only(std)
+    tick()
     trust = assess(
         solution.shapes,
         solution.camera.rotations,

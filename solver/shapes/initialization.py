@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from itertools import count
+
 import numpy as np
 from pliant.solver.energy.problem import Array, Problem
 from pliant.solver.linear.conjugate_gradient import conjugate_gradient
@@ -28,12 +31,13 @@ def pseudo_inverse(problem: Problem, translations: Floats) -> Array:
     return flat
 
 
-def uniform_solution(problem: Problem, translations: Floats) -> Array:
+def uniform_solution(problem: Problem, translations: Floats, *, should_stop: Callable[[], bool] | None = None) -> Array:
     """Return the least-squares shapes with equal weights for all observations (eq. 5 if λ2 is 0).
 
     Minimises ‖W − R S‖² + λ1 ‖H S‖² + λ2 ‖A S‖²: the result for least squares, and a starting point for robust losses.
     With a Gaussian prior the starting point assumes large noise (`START_NOISE_STD`), because shapes that follow an
-    outlier would give it full weight and the reweighting would be slow to reject it.
+    outlier would give it full weight and the reweighting would be slow to reject it. `should_stop` is called in every iteration; once it
+    returns True, the shapes so far are returned, those of one iteration at least.
     """
     weights = np.array(np.broadcast_to(problem.confidence[:, None, :], problem.points.shape))
     if problem.quadratic is not None and problem.weights.temporal > 0:
@@ -42,10 +46,16 @@ def uniform_solution(problem: Problem, translations: Floats) -> Array:
         problem.projections, weights, problem.bands, problem.laplacian, problem.weights.spatial, None, problem.quadratic
     )
     target = problem.points - translations[:, :, None].astype(problem.points.dtype)
+    asked = count()
+
+    def stops() -> bool:
+        return should_stop is not None and should_stop() and next(asked) > 0
+
     reduction = EXACT if problem.loss == "l2" else ROUGH
     operator = operator.rounded(inner_precision(operator, reduction))
     solved = conjugate_gradient(
         operator.apply, operator.right_hand_side(target.astype(operator.weights.dtype)),
         precondition=build_preconditioner(operator), reduction=reduction, max_iterations=MAX_START_ITERATIONS,
+        should_stop=stops,
     )  # fmt: skip
-    return solved.x.astype(problem.points.dtype)
+    return solved.x.astype(problem.points.dtype, copy=False)

@@ -60,13 +60,18 @@ def step(
     operator = operator_at(problem, state)
     target = problem.points - state.translations[:, :, None].astype(problem.points.dtype)
     gradient = operator.gradient(state.shapes, target)
+    tick = should_stop if should_stop is not None else bool
+    tick()
     inner = operator.rounded(inner_precision(operator, reduction))
+    precondition = build_preconditioner(inner)
+    tick()
     solved = conjugate_gradient(
-        inner.apply, (-gradient).astype(inner.weights.dtype), precondition=build_preconditioner(inner),
+        inner.apply, np.negative(gradient).astype(inner.weights.dtype, copy=False), precondition=precondition,
         reduction=reduction, max_iterations=max_inner, negligible=NEGLIGIBLE * tolerance * abs(state.objective),
         should_stop=should_stop,
     )  # fmt: skip
     shapes = np.add(state.shapes, solved.x, out=gradient)
+    tick()
     after = _evaluated(problem, shapes, state.translations, state.omega, reweighting=state.reweighting + 1)
     gained = state.objective - after.objective
     unforeseen = abs(gained - solved.decrease) / gained if gained > 0 else INNER_REDUCTION
@@ -125,7 +130,7 @@ def no_higher(before: State, after: State) -> State:
 def _evaluated(
     problem: Problem, shapes: Array, translations: Floats, omega: Array | None, *, reweighting: int
 ) -> State:
-    """Centre every frame's shape, in place, and return the state there.
+    """Centre every frame's shape, in place, and return the state there; without `problem.moving` translations and centres stay.
 
     The translation compensates the shift: the data term and AX are unchanged (rows of A sum to 0), and ‖HX‖ and the rank
     penalty cannot increase. With weights ω, the translations are first fitted to the residuals.
@@ -140,13 +145,14 @@ def _evaluated(
             if not np.isfinite(np.vdot(shapes[frame], shapes[frame])):
                 continue
             left = residuals_of(problem, shapes, translations, frame)
-            if omega is not None:
+            if omega is not None and problem.moving:
                 shift = _mean(left, omega[frame])
                 left -= shift[:, None].astype(kind)
                 translations[frame] += shift
-            middle = shapes[frame].mean(axis=1, dtype=np.float64)
-            shapes[frame] -= middle[:, None].astype(kind)
-            translations[frame] += problem.projections[frame].astype(np.float64) @ middle
+            if problem.moving:
+                middle = shapes[frame].mean(axis=1, dtype=np.float64)
+                shapes[frame] -= middle[:, None].astype(kind)
+                translations[frame] += problem.projections[frame].astype(np.float64) @ middle
             losses[frame] = loss_of(problem, left, frame)
             fresh[frame] = weights_of(problem, left, frame)
             np.einsum("cp,cp->p", left, left, out=squared[frame])

@@ -95,7 +95,7 @@ def well_observed(normalized: Normalized, mesh: Mesh | None) -> WellObserved | N
     if len(kept) == count or len(kept) < max(MIN_POINTS, (1 - MAX_SPARSE_SHARE) * count):
         return None
     part = Normalized(normalized.points[:, kept], normalized.visible[:, kept], normalized.centroid, normalized.unit)
-    return WellObserved(part, _mesh_of(mesh, kept), kept, TENSION**0.5 * _differences(mesh))
+    return WellObserved(part, mesh_of(mesh, kept), kept, TENSION**0.5 * _differences(mesh))
 
 
 def place_the_rest(
@@ -250,7 +250,7 @@ def _differences(mesh: Mesh) -> Matrix:
     return sparse.csr_array((values, places), shape=(len(edges), mesh.num_points))
 
 
-def _mesh_of(mesh: Mesh, kept: NDArray[np.intp]) -> Mesh:
+def mesh_of(mesh: Mesh, kept: NDArray[np.intp]) -> Mesh:
     """Return the mesh of the kept points, renumbered: a grid with more holes, or the remaining faces."""
     number = np.full(mesh.num_points + 1, -1, dtype=np.int32)  # the last entry stands for −1, a hole
     number[kept] = np.arange(len(kept))

@@ -182,7 +182,10 @@ def bounded_by_neighbours(std: Floats, shapes: Floats, visible: Floats) -> Float
 def _moments(covariance: ShapeCovariance, projections: Floats, used: NDArray[np.intp]) -> tuple[Floats, Floats, Floats]:
     """Return tr Σ_ff (F,), Σ Πᵀ of shape (3F, 2F) and Π Σ Πᵀ (2F, 2F) for the frames used."""
     rows = projections[used].reshape(-1, 3)
-    over_frames = covariance.over_frames()[np.ix_(used, used)]
+    if len(used) == len(projections):
+        over_frames = covariance.over_frames()
+    else:
+        over_frames = covariance.over_frames_at(used)
     mean = rows @ covariance.mean_covariance
     path = rows @ covariance.axis_covariance
     wide = np.repeat(over_frames, 2, axis=1)

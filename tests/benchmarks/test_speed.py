@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -60,6 +61,21 @@ def test_growth_prints_an_exponent_for_each_size():
     assert sum(line.startswith(("| 100 ", "| 200 ", "| 4 ", "| 8 ")) for line in lines) == 4
     assert sum(line.startswith("exponent in P of") for line in lines) == 3
     assert sum(line.startswith("exponent in F of") for line in lines) == 3
+
+
+def test_measurements_of_growth_are_appended_to_a_file(tmp_path):
+    results = tmp_path / "growth.jsonl"
+    for _ in range(2):
+        speed(
+            "growth", "--kind", "talk", "--cameras", "estimated", "--settings", "", "--outliers", "0",
+            "--against-points", "", "--against-frames", "5", "--fixed-points", "40", "--results", str(results),
+        )  # fmt: skip
+    rows = [json.loads(line) for line in results.read_text().splitlines()]
+    assert [(row["against"], row["frames"], row["points"], row["sequence"], row["cameras"]) for row in rows] == [
+        ("frames", 5, 40, "talk", "estimated")
+    ] * 2
+    assert all(0 < row["silence"] <= row["seconds"] and row["gigabytes"] > 0.02 for row in rows)
+    assert rows[0]["command"].startswith("python -m benchmarks.speed growth --kind talk")
 
 
 def test_a_mesh_is_timed_against_a_grid():

@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from pliant.solver import InvalidInput, Mesh
-from pliant.solver.gallery import corrupt, face, flag, sphere
+from pliant.solver.gallery import corrupt, face, flag, sphere, talk
 from pliant.solver.gallery.sequence import facing, vertex_normals
 
 MADE = [
     face(12, 400), face(12, 400, mesh="triangles"), flag(12, 300), flag(12, 301, mesh="triangles"), sphere(12, 200),
+    talk(12, 200),
 ]  # fmt: skip
-NAMES = ["face", "face-triangles", "flag", "flag-triangles", "sphere"]
+NAMES = ["face", "face-triangles", "flag", "flag-triangles", "sphere", "talk"]
 
 
 def residual(sequence):

@@ -39,6 +39,10 @@ LIBRARIES = 110_000_000
 BYTES = {"gaussian": 600, "smooth": 500, "smooth+low_rank": 500}
 """Bytes for each observation, by prior: up to 510 were measured for the solver alone, 520 with exports."""
 
+BLOCK, BEYOND = 10_000_000, 250
+"""Observations that are solved at once (`solver.reconstruction.blocks.BLOCK_OBSERVATIONS`), and bytes for each further one, of which
+only tracks and results are held: about 120 in the solver by the sizes of its arrays, the rest for the exports, not measured."""
+
 SECONDS = 0.5
 """Processor seconds of a job that is as small as can be."""
 
@@ -57,14 +61,23 @@ def estimated(num_frames: int, num_points: int, options: Options, *, has_rotatio
     """Estimate what a job of this size needs; `has_rotations` where the cameras are given."""
     observations = num_frames * num_points
     learns = options.prior == "gaussian" and options.method == "robust" and options.preset == "auto"
+    at_once = int(min(observations, _largest_block(options)))
     learning = LEARNING[learns, has_rotations] * min(num_frames, LEARNED_FRAMES)
     return Estimate(
-        memory_bytes=LIBRARIES + BYTES[options.prior] * observations,
+        memory_bytes=LIBRARIES + BYTES[options.prior] * at_once + BEYOND * (observations - at_once),
         seconds=round(SECONDS + learning + MICROSECONDS * 1e-6 * observations, 1),
     )
 
 
 def largest_that_fits(memory: int, num_frames: int, num_points: int, options: Options) -> tuple[int, int]:
     """Return how many points of these frames, and how many frames of these points, fit into so many bytes."""
-    observations = max(0, memory - LIBRARIES) // BYTES[options.prior]
+    left, each, block = max(0, memory - LIBRARIES), BYTES[options.prior], _largest_block(options)
+    observations = left // each
+    if observations > block:
+        observations = int(block + (left - each * block) // BEYOND)
     return observations // max(1, num_frames), observations // max(1, num_points)
+
+
+def _largest_block(options: Options) -> float:
+    """Return the observations that are solved at once: all with a prior on the rank of all points together."""
+    return float("inf") if options.prior == "smooth+low_rank" or options.method == "pseudo_inverse" else BLOCK

@@ -166,18 +166,6 @@ def test_gross_outliers_are_rejected_and_reported(face: gallery.Sequence) -> Non
     assert np.median(found.residuals[gross]) > 0.2 * found.choices.unit  # they are reported, not hidden
 
 
-@pytest.mark.slow
-@pytest.mark.long
-def test_a_long_film_is_learned_from_some_of_its_frames(monkeypatch: pytest.MonkeyPatch) -> None:
-    long = gallery.face(40, 150)
-    whole = metrics.e3d_frame(solve(long.tracks).shapes, long.shapes)
-    monkeypatch.setattr("pliant.solver.cameras.joint_refinement.LEARNED_FRAMES", 25)
-    some = metrics.e3d_frame(solve(long.tracks).shapes, long.shapes)
-    smooth = metrics.e3d_frame(solve(long.tracks, settings=Settings(prior="smooth")).shapes, long.shapes)
-    assert whole < some + 0.01
-    assert some < smooth
-
-
 def test_frames_with_few_visible_points_are_not_learned_from() -> None:
     visible = np.ones((10, 50))
     visible[3] = 0

@@ -1,0 +1,195 @@
+"""Films of more frames than cameras and covariance are learned from together: the rest follows by resection, then all are refined.
+
+Cameras and covariance are learned from evenly spread frames. Every frame then gets the camera and the deformation with which the
+points' mean shapes explain it best (`model.resection`), whatever its neighbours look like, and the cameras of all frames are refined
+together by the marginal likelihood. Both are linear in the frames: the likelihood takes the tracks of a sample of points as the factor of
+their Gram matrix, which is never formed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from pliant.solver.cameras.covariance_learning import LearningData
+from pliant.solver.cameras.estimation import CameraEstimate
+from pliant.solver.cameras.joint_refinement import turned_once
+from pliant.solver.cameras.learned import Learned
+from pliant.solver.cameras.perspective import Perspective, centred, columns, corrected, depth_map
+from pliant.solver.model.model_order import ModelOrder
+from pliant.solver.model.resection import MeanShapes, Poses, Views, interpolated, predicted, resected
+from pliant.solver.model.shape_covariance import ShapeCovariance
+from pliant.solver.model.so3 import angles_between, start_at_identity
+from pliant.solver.monitor import enter
+from pliant.solver.reconstruction.observations import Observations
+from pliant.solver.records import Floats, read_only
+from pliant.solver.tracks.completion import Filling, choose_points, gross
+
+PREDICTED_TOGETHER = 256
+"""Frames predicted at once; bounds the memory."""
+
+
+def extended(
+    estimate: CameraEstimate,
+    covariance: ShapeCovariance,
+    used: NDArray[np.intp],
+    observations: Observations,
+    *,
+    should_stop: Callable[[], bool] | None = None,
+) -> tuple[CameraEstimate, LearningData]:
+    """Return cameras and covariance of all frames of a film.
+
+    Parameters
+    ----------
+    estimate, covariance
+        Of the frames used, in the same axes.
+    used : array of int, shape (F',)
+        Increasing.
+    observations : Observations
+        Of all F frames.
+    should_stop : callable, optional
+        Called between units of work; once it returns True, what is left is interpolated.
+    """
+    enter(should_stop, "extension")
+    normalized, frames = observations.normalized, len(observations.normalized.points)
+    turning = observations.turning
+    scales, thin = np.asarray(estimate.scales), np.asarray(estimate.rotations)
+    with_scales = bool((scales != 1).any()) and not _has_scales(observations)
+    shapes = MeanShapes.of(covariance, thin, scales, np.asarray(estimate.sample))
+    chosen = choose_points(normalized.visible[used], np.random.default_rng(observations.settings.seed))
+    views = _views(observations, estimate, chosen)
+    poses = interpolated(used, thin, scales, covariance.modes, frames)
+    if observations.known is not None:
+        poses = replace(poses, rotations=np.array(observations.known.rotations))
+        if _has_scales(observations):
+            poses = replace(poses, scales=np.array(observations.known.scales))
+    begun = poses.rotations
+    poses = resected(views, shapes, poses, turning=turning, with_scales=with_scales, should_stop=should_stop)
+    if turning:
+        sample = _completed(views, shapes, poses)
+        start = Learned(poses.rotations, poses.scales, replace(covariance, modes=poses.coefficients), np.inf)
+        moved = turned_once(
+            np.zeros((0, 0)), start, with_scales=with_scales,
+            factor=columns(sample) / sample.shape[1] ** 0.5, should_stop=should_stop,
+        )  # fmt: skip
+        poses = replace(poses, rotations=moved.rotations, scales=moved.scales * np.exp(np.log(poses.scales).mean()))
+        poses = resected(views, shapes, poses, turning=False, with_scales=False, should_stop=should_stop)
+    return _whole(estimate, covariance, observations, views, shapes, poses, begun)
+
+
+def _has_scales(observations: Observations) -> bool:
+    return observations.known is not None and observations.known.scales is not None
+
+
+def _views(observations: Observations, estimate: CameraEstimate, chosen: NDArray[np.intp]) -> Views:
+    """Return the tracks of the sampled points, relative to the principal point where perspective is corrected."""
+    normalized, view = observations.normalized, estimate.perspective
+    points = normalized.points[:, chosen].transpose(0, 2, 1)
+    weight = normalized.visible[:, chosen]
+    weight = weight / max(float(weight.max()), np.finfo(float).tiny)
+    if view is None or not view.bends or observations.lens is None:
+        return Views(np.ascontiguousarray(points), weight)
+    return Views(points + observations.lens.offsets[:, :, None], weight, view.curvature)
+
+
+def _completed(views: Views, shapes: MeanShapes, poses: Poses) -> Floats:
+    """Return the sampled tracks with hidden positions and outliers predicted, corrected for perspective and centred, `(F, S, 2)`."""
+    return centred(_filled(views, shapes, poses, as_seen=False))
+
+
+def _filled(views: Views, shapes: MeanShapes, poses: Poses, *, as_seen: bool) -> Floats:
+    """Return the sampled tracks with hidden positions and outliers predicted; `as_seen` under perspective, else corrected for it."""
+    done = []
+    std = shapes.variance**0.5
+    for low in range(0, len(views.points), PREDICTED_TOGETHER):
+        part = slice(low, low + PREDICTED_TOGETHER)
+        _, image, nearer = predicted(shapes, poses.part(part), views.curvature)
+        seen, guess = (each.transpose(0, 2, 1) for each in (views.points[part], image))
+        if views.curvature and as_seen:
+            guess = guess / nearer[..., None]
+        elif views.curvature:
+            seen = corrected(seen, (nearer - 1) / views.curvature, views.curvature)
+        trust = np.where(gross(seen, views.weight[part], guess, std), 0.0, views.weight[part])[..., None]
+        done.append(np.where(trust == 1, seen, guess + trust * (seen - guess)))
+    return np.concatenate(done)
+
+
+def _whole(
+    estimate: CameraEstimate,
+    covariance: ShapeCovariance,
+    observations: Observations,
+    views: Views,
+    shapes: MeanShapes,
+    poses: Poses,
+    begun: Floats,
+) -> tuple[CameraEstimate, LearningData]:
+    """Return the estimate of all frames, the first of them at the identity, and its covariance as learning data."""
+    size = 1.0 if _has_scales(observations) else float(np.exp(np.log(poses.scales).mean()))
+    scales = poses.scales / size
+    first = poses.rotations[0] if observations.known is None else np.eye(3)
+    rotations = start_at_identity(poses.rotations) if observations.known is None else poses.rotations
+    whole = replace(
+        covariance,
+        mean_covariance=size**2 * first @ covariance.mean_covariance @ first.T,
+        axis_covariance=first @ covariance.axis_covariance @ first.T,
+        modes=size * poses.coefficients,
+        walk_variance=size**2 * covariance.walk_variance,
+    )
+    sample = _completed(views, shapes, poses)
+    clean = estimate.filling is None and bool((observations.normalized.visible == 1).all())
+    moved = poses.translations
+    if views.curvature and observations.lens is not None:
+        moved = moved - observations.lens.offsets
+    turn = float(np.degrees(angles_between(poses.rotations, begun).mean()))
+    reasons = dict(estimate.reasons)
+    if observations.turning:
+        reasons["rotations"] = (
+            f"{reasons.get('rotations', '')} These are {len(estimate.rotations)} of {len(rotations)} frames; the others follow by "
+            f"resection, {turn:.2f}° on average from what lies between these, and all are refined together."
+        ).strip()
+    for array in (rotations, scales):
+        read_only(array)
+    filling = None if clean else _filling(whole, rotations, scales, poses, shapes)
+    estimate = replace(
+        estimate, rotations=rotations, scales=scales, translations=np.zeros_like(moved) if clean and not views.curvature else moved,
+        sample=sample, reasons=reasons, hypotheses=(), candidates=(), filling=filling,
+        perspective=_perspective(estimate, observations, views, shapes, poses, whole, rotations, scales, filling),
+    )  # fmt: skip
+    data = LearningData(
+        np.zeros((0, 0)), sample, rotations[:, :2] * scales[:, None, None], np.arange(len(rotations)),
+        ModelOrder(ordered=covariance.ordered), selects_again=False, stopped=whole,
+        rotations=rotations, scales=scales, turned=False,
+    )  # fmt: skip
+    return estimate, data
+
+
+def _filling(
+    covariance: ShapeCovariance, rotations: Floats, scales: Floats, poses: Poses, shapes: MeanShapes
+) -> Filling:
+    """Return the factor that predicts hidden entries of any point: the images of the covariance's columns."""
+    images = covariance.image_model(rotations[:, :2] * scales[:, None, None]).columns.reshape(len(rotations), 2, -1)
+    basis = np.concatenate([images, poses.translations[:, :, None]], axis=2)
+    return Filling(basis, np.eye(images.shape[2]), shapes.variance**0.5)
+
+
+def _perspective(
+    estimate: CameraEstimate,
+    observations: Observations,
+    views: Views,
+    shapes: MeanShapes,
+    poses: Poses,
+    covariance: ShapeCovariance,
+    rotations: Floats,
+    scales: Floats,
+    filling: Filling | None,
+) -> Perspective | None:
+    view, lens = estimate.perspective, observations.lens
+    if view is None or lens is None:
+        return view
+    view = replace(view, offsets=lens.offsets, filling=filling)
+    if not view.bends:
+        return replace(view, sample=np.zeros((0, 0, 2)))
+    seen = _filled(views, shapes, poses, as_seen=True)
+    return replace(view, sample=seen, depth=depth_map(rotations, scales, covariance))

@@ -1,0 +1,128 @@
+"""Films of more frames than are learned from together."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pliant.solver import (
+    KnownCamera,
+    Outcome,
+    Settings,
+    Tracks,
+    estimate_cameras,
+    gallery,
+    learn_prior,
+    solve,
+    solve_shapes,
+)
+from pliant.solver.cameras import perspective
+from pliant.solver.evaluation import metrics
+from pliant.solver.model.shape_covariance import ShapeCovariance
+from pliant.solver.model.so3 import exponential
+from pliant.solver.reconstruction import cameras, long_films
+
+LEARNED = 40
+
+
+@pytest.fixture
+def limited(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cameras, "LEARNED_FRAMES", LEARNED)
+    monkeypatch.setattr(perspective, "LEARNED_FRAMES", LEARNED)
+
+
+@pytest.fixture(scope="module")
+def film() -> gallery.Sequence:
+    return gallery.talk(240, 60)
+
+
+def given(sequence: gallery.Sequence) -> KnownCamera:
+    return KnownCamera.from_arrays(sequence.rotations, sequence.scales)
+
+
+@pytest.mark.usefixtures("limited")
+def test_deformation_between_the_frames_learned_from_is_found(film: gallery.Sequence) -> None:
+    found = estimate_cameras(film.tracks, given(film))
+    prior = learn_prior(film.tracks, found)
+    used = np.arange(0, 240, 6)
+    thin = replace(prior.normalized, modes=prior.normalized.modes[used]).stretched(used, 240)
+    error, interpolated = (
+        metrics.e3d_frame(solve_shapes(film.tracks, found, each, film.mesh).shapes, film.shapes)
+        for each in (prior, replace(prior, normalized=thin))
+    )
+    assert error < 0.5 * interpolated
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("limited")
+def test_a_quick_motion_that_interpolation_loses_is_found(
+    film: gallery.Sequence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    solution = solve(film.tracks, film.mesh)
+    monkeypatch.setattr(long_films, "resected", lambda views, shapes, poses, **_: poses)
+    monkeypatch.setattr(long_films, "turned_once", lambda gram, found, **_: found)
+    interpolated = solve(film.tracks, film.mesh)
+    found, lost = (metrics.e3d_frame(each.shapes, film.shapes) for each in (solution, interpolated))
+    assert found < 0.1 * lost
+    assert f"These are {LEARNED} of 240 frames" in solution.choices.reasons["rotations"]
+    assert solution.camera.rotations[0] == pytest.approx(np.eye(3), abs=1e-12)
+    assert np.log(solution.camera.scales).mean() == pytest.approx(0, abs=1e-9)
+
+
+@pytest.mark.usefixtures("limited")
+def test_hidden_points_and_outliers_of_the_other_frames_are_predicted(film: gallery.Sequence) -> None:
+    spoiled, _ = gallery.corrupt_tracks(film.tracks, outliers=0.03, noise=0.0)
+    visible = np.random.default_rng(0).random((240, 60)) > 0.2
+    tracks = Tracks.from_arrays(spoiled.points, visible)
+    found = estimate_cameras(tracks, given(film))
+    assert found.estimate.sample.shape == (240, 60, 2)
+    truth = film.tracks.points - film.tracks.points.mean(axis=1, keepdims=True)
+    error = np.linalg.norm(found.estimate.sample * found.observations.normalized.unit - truth, axis=2)
+    assert np.median(error) < 0.02 * found.observations.normalized.unit
+    assert np.quantile(error, 0.99) < 0.2 * found.observations.normalized.unit
+    assert found.estimate.filling is not None
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("limited")
+def test_perspective_is_corrected_in_every_frame() -> None:
+    film, focal, distance = gallery.talk(90, 60), 600.0, 600.0
+    seen = np.einsum("fij,fpj->fpi", film.rotations, film.shapes)
+    seen -= seen.mean(axis=1, keepdims=True)
+    points = 320 + focal * seen[..., :2] / (seen[..., 2:] + distance)
+    visible = np.random.default_rng(0).random((90, 60)) > 0.1
+    solution = solve(Tracks.from_arrays(points, visible), film.mesh, settings=Settings(image_size=(641, 641)))
+    assert solution.camera.focal == pytest.approx(focal, rel=0.1)
+    assert metrics.e3d_frame(solution.shapes, film.shapes) < 0.02
+
+
+@pytest.mark.usefixtures("limited")
+def test_a_stop_leaves_cameras_for_every_frame(film: gallery.Sequence) -> None:
+    solution = solve(film.tracks, film.mesh, should_stop=lambda: True)
+    assert solution.outcome is Outcome.STOPPED
+    assert solution.shapes.shape == (240, 60, 3)
+    assert np.isfinite(solution.shapes).all()
+
+
+@pytest.mark.usefixtures("limited")
+def test_scales_that_are_not_given_are_found_in_every_frame(film: gallery.Sequence) -> None:
+    zoom = np.exp(0.2 * np.sin(np.arange(240) / 3))
+    points = film.tracks.points * zoom[:, None, None]
+    settings = Settings(camera="scaled_orthographic")
+    found = estimate_cameras(Tracks.from_arrays(points), KnownCamera.from_arrays(film.rotations), settings=settings)
+    ratio = np.log(found.camera.scales / zoom)
+    assert np.std(ratio) < 0.03  # without resection 0.14
+
+
+def test_depths_by_factors_are_those_of_the_matrix(monkeypatch: pytest.MonkeyPatch) -> None:
+    random = np.random.default_rng(0)
+    rotations, scales = exponential(0.3 * random.normal(size=(20, 3))), np.exp(0.1 * random.normal(size=20))
+    covariance = ShapeCovariance(np.eye(3), np.diag([1.5, 1.0, 0.5]), random.normal(size=(20, 2)), 0.01, 1e-4, 0.0)
+    images = random.normal(size=(40, 7))
+    matrix = perspective.depth_map(rotations, scales, covariance)
+    monkeypatch.setattr(perspective, "LEARNED_FRAMES", 10)
+    factors = perspective.depth_map(rotations, scales, covariance)
+    assert isinstance(matrix, np.ndarray)
+    assert isinstance(factors, perspective.DepthMap)
+    assert factors @ images == pytest.approx(matrix @ images, abs=1e-8)

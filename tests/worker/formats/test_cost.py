@@ -1,0 +1,24 @@
+"""The estimate of memory and time before a solve."""
+
+from __future__ import annotations
+
+import pytest
+from pliant.schemas.options import Options
+from pliant.worker.formats.cost import BEYOND, BLOCK, BYTES, LIBRARIES, estimated, largest_that_fits
+
+
+@pytest.mark.parametrize("prior", ["gaussian", "smooth", "smooth+low_rank"])
+@pytest.mark.parametrize("points", [1_000, 100_000, 1_000_000])
+def test_what_fits_is_what_is_estimated(prior: str, points: int) -> None:
+    options = Options(prior=prior)
+    memory = estimated(50, points, options).memory_bytes
+    most_points, most_frames = largest_that_fits(memory, 50, points, options)
+    assert most_points == points
+    assert most_frames == 50
+    assert largest_that_fits(memory - 50 * BYTES[prior], 50, points, options)[0] < points
+
+
+def test_further_observations_of_large_jobs_take_less_memory() -> None:
+    large = estimated(100, 1_000_000, Options()).memory_bytes
+    assert large == LIBRARIES + BYTES["gaussian"] * BLOCK + BEYOND * (100_000_000 - BLOCK)
+    assert estimated(100, 1_000_000, Options(prior="smooth+low_rank")).memory_bytes > large
