@@ -37,7 +37,7 @@ AT_HOME = {
     "typer": {"cli"},
     "rich": {"cli", "client"},
     "httpx": {"client", "cli", "service", "worker"},  # service: the in-memory service is a transport
-    "scipy": {"solver", "worker"},
+    "scipy": {"solver", "tracking", "worker"},
     "cv2": {"tracking"},
     "clarabel": {"solver"},
 }

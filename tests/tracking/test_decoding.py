@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 import zipfile
+import zlib
 from pathlib import Path
 
 import cv2
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from pliant.tracking import Film, FilmError, FilmLimits, open_film
+from pliant.tracking.decoding.pictures import readable
 
 PICTURES = films.textured_pictures(8)
 
@@ -142,6 +144,22 @@ def test_a_tiny_film_is_refused(tmp_path: Path) -> None:
     path = films.zip_of(tmp_path / "film.zip", {"1.png": films.png(np.zeros((8, 8, 3), np.uint8))})
     with pytest.raises(FilmError, match="16×16"):
         open_film(path)
+
+
+def test_a_zip_with_a_broken_deflate_stream_is_refused(tmp_path: Path) -> None:
+    path = films.zip_of(tmp_path / "film.zip", {"1.png": bytes(2000)})
+    broken = bytearray(path.read_bytes())
+    start = 30 + len("1.png")  # after the local header
+    broken[start : start + 4] = b"\xff" * 4
+    path.write_bytes(broken)
+    with pytest.raises(FilmError, match="while decompressing") as caught:
+        read(open_film(path))
+    assert caught.value.code == "broken_picture"
+
+
+def test_memory_that_zlib_lacks_is_no_fault_of_the_picture() -> None:
+    with pytest.raises(MemoryError, match="Error -4"), readable("1.png"):
+        raise zlib.error("Error -4 while decompressing data")
 
 
 def test_a_zip_bomb_is_refused_before_it_is_unpacked(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import io
 import re
 import warnings
 import zipfile
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -27,9 +28,13 @@ LARGEST_DIRECTORY = 4 << 20
 Colour = NDArray[np.uint8]
 
 
+NO_MEMORY = "Error -4 "
+"""How zlib reports Z_MEM_ERROR: `zlib.error` has no number."""
+
+
 @contextmanager
 def readable(name: str) -> Iterator[None]:
-    """Turn what Pillow and zipfile raise on broken files into one error."""
+    """Turn what Pillow, zipfile and zlib raise on broken files into one error, and zlib's lack of memory into `MemoryError`."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # `checked` applies the film's own limit
@@ -37,7 +42,9 @@ def readable(name: str) -> Iterator[None]:
     except FilmError:
         raise
     except (OSError, SyntaxError, ValueError, EOFError, IndexError, zipfile.BadZipFile, Image.DecompressionBombError,
-            NotImplementedError, RuntimeError, OverflowError) as error:  # fmt: skip
+            NotImplementedError, RuntimeError, OverflowError, zlib.error) as error:  # fmt: skip
+        if str(error).startswith(NO_MEMORY):
+            raise MemoryError(str(error)) from error
         raise FilmError(
             "broken_picture", field="film", expected="pictures that can be decoded", got=f"{name}: {error}",
             hint="Save it again as PNG or JPEG.",
