@@ -1,9 +1,9 @@
-"""Where a frame shows the points of a template: the whole grid of points is registered at once.
+"""Where a frame shows the points of a template: all points of the grid are registered together.
 
-The picture between four neighbouring points moves with them bilinearly. Gauss and Newton's steps minimise the squared difference between
-the moved picture and the template, with brightness and contrast free in a window around every place, and the bending of the motion. A
-patch of its own for every point finds the point from an affine map that the neighbours' errors spoil, and nothing where the patch has no
-texture; here neighbours are estimated together. The template is always the same, so that errors do not accumulate over the frames.
+The picture between four neighbouring points moves bilinearly with them (Szeliski and Coughlan, Spline-based image registration, 1997).
+Gauss–Newton steps minimise the squared difference between the moved picture and the template, plus the bending of the motion; brightness
+and contrast are free within a window. A point with little texture follows its neighbours, and no local affine map has to be estimated
+from noisy tracks. Every frame is compared with the same template, so that errors do not accumulate over the frames.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ OUTLIER = 3.0
 """Standard deviations beyond which a difference of brightness counts less and less (Cauchy)."""
 
 STEPS, ITERATIONS = 4, 25
-"""Steps of Gauss and Newton, and of conjugate gradients in each."""
+"""Gauss–Newton steps, and iterations of conjugate gradients in each."""
 
 LONGEST_STEP, FARTHEST = 1.0, 2.0
-"""Pixels that a point moves at most in one step, and from the end of the flow in all; beyond that its flow is believed."""
+"""Pixels that a point moves at most in one step, and in all from the end of the flow; one that would move farther stays there."""
 
 UNLIKE = 0.36
-"""Share of the template's contrast around a point that the frame leaves unexplained, from which on it shows something else, or the same
-too much changed, and the flow is believed: a correlation of .8."""
+"""Share of the template's contrast around a point that may remain unexplained; above it (correlation below .8) the frame shows something
+else there, and the point stays where the flow ends."""
 
 LEAST_SLOPE, ROUNDING = 0.25, 1e-4
 """Mean squared slope that counts at least, (grey levels / pixel)², half a grey level a pixel, which is the rounding of 8-bit film; and the
