@@ -34,7 +34,7 @@ EDGE = 2.0
 OUTLIER = 3.0
 """Standard deviations beyond which a difference of brightness counts less and less (Cauchy)."""
 
-STEPS, ITERATIONS = 4, 25
+STEPS, ITERATIONS = 4, 15
 """Gauss–Newton steps, and iterations of conjugate gradients in each."""
 
 LONGEST_STEP, FARTHEST = 1.0, 2.0
