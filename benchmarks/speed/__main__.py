@@ -53,13 +53,22 @@ def main() -> None:
             points=options.against_points, frames=options.against_frames,
             fixed_points=options.fixed_points, fixed_frames=options.fixed_frames,
         )  # fmt: skip
-        growth(work, sizes, results=options.results, command=f"python -m benchmarks.speed {shlex.join(sys.argv[1:])}")
+        growth(work, sizes, results=options.results, command=command_of(sys.argv[1:]))
     elif options.what == "mesh":
         mesh_against_grid(work)
     elif options.what == "bandwidth":
         bandwidth(work)
     else:
         profile(work)
+
+
+def command_of(arguments: list[str]) -> str:
+    """Return the command that measures the same, without the place where its rows went."""
+    kept = [each for each in arguments if not each.startswith("--results=")]
+    if "--results" in kept:
+        place = kept.index("--results")
+        del kept[place : place + 2]
+    return f"python -m benchmarks.speed {shlex.join(kept)}"
 
 
 def profile(work: Workload, *, lines: int = 20) -> None:

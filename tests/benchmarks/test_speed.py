@@ -76,6 +76,7 @@ def test_measurements_of_growth_are_appended_to_a_file(tmp_path):
     ] * 2
     assert all(0 <= row["silence"] <= row["seconds"] and row["gigabytes"] > 0.02 for row in rows)
     assert rows[0]["command"].startswith("python -m benchmarks.speed growth --kind face")
+    assert "results" not in rows[0]["command"]
 
 
 def test_a_mesh_is_timed_against_a_grid():
