@@ -56,7 +56,7 @@ UNITS = {
     "starts": (1740, 40, 0.8),
     "perspective": (10, 360, 30.0),
     "scales": (820, 120, 0.85),
-    "refinement": (400, 360, 1.1),
+    "refinement": (1500, 360, 1.1),
     "covariance": (380, 360, 1.0),
     "extension": (80, 1_000_000, 3.0),
     "trust": (6, 100, 130.0),
@@ -67,7 +67,7 @@ Measured on sequences of 10 to 80 frames, clean and spoiled."""
 PACE_PRIOR = 0.5
 """Seconds of the plan that count as measured at the planned pace, so that the first units do not decide the pace alone."""
 
-REFINEMENT_UNITS = {True: 600, False: 185}
+REFINEMENT_UNITS = {True: 2930, False: 185}
 """Units of the stage `refinement` where the covariance may couple the modes, and where the model order rules that out. The plan has a
 number between, until this is known."""
 

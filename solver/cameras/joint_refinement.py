@@ -41,9 +41,6 @@ of 99 frames with 60, 90 and 150: .0146, .0132, .0138, differences that may be c
 ROTATION_ITERATIONS = 60
 """L-BFGS iterations per refinement of the rotations."""
 
-SETTLING_ITERATIONS = 40
-"""L-BFGS iterations of the covariance alone after the cameras of `full_mode_covariance`."""
-
 START_FRAMES, START_ROUNDS = 40, 2
 """Frames and refinements used to compare the starting cameras."""
 
@@ -373,19 +370,13 @@ def turned_once(
 
 
 def _coupled(gram: Floats, found: Learned, *, with_scales: bool, should_stop: Callable[[], bool] | None) -> Learned:
-    """Return the cameras refined with modes that have axes of their own (`model.full_mode_covariance`), if they are more probable.
-
-    They are compared as they are: refined once more, the separable model would move them back toward its own optimum.
-    """
+    """Return the cameras refined with modes that have axes of their own (`model.full_mode_covariance`), if they are more probable."""
     scene = scene_at(gram, found.rotations, with_scales=with_scales, ordered=found.covariance.ordered)
-    rotations, scales, _ = full_mode_covariance.refined(scene, found.scales, found.covariance, should_stop=should_stop)
-    again = _learned_at(gram, rotations, scales, ModelOrder(ordered=scene.ordered), should_stop)
-    if should_stop is not None and should_stop():
-        return found
-    scene = scene_at(gram, rotations, with_scales=with_scales, ordered=scene.ordered)
-    again = moved_to(scene, again, *fit(
-        scene, motion_of(scene, again), iterations=SETTLING_ITERATIONS, turning=False, white=True, should_stop=should_stop
-    ))  # fmt: skip
+    rotations, scales = full_mode_covariance.refined(scene, found.scales, found.covariance, should_stop=should_stop)
+    again = refined(
+        gram, rotations, scales, with_scales=with_scales, rounds=START_ROUNDS,
+        model_order=ModelOrder(ordered=scene.ordered), should_stop=should_stop,
+    )  # fmt: skip
     return again if again.energy < found.energy else found
 
 

@@ -20,13 +20,12 @@ decides whether it is used.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from pliant.solver.model.camera_motion_prior import rotation_roughness, scale_roughness
 from pliant.solver.model.image_density import ImageModel, terms
 from pliant.solver.model.marginal_likelihood import UNLIKELY, Scene, cameras_of, root_matrix
-from pliant.solver.model.random_walk import coloured, whitened
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import left_jacobian, vee
 from pliant.solver.records import Floats
@@ -39,9 +38,12 @@ MAX_NOISE_STD = 1e-3
 """Noise standard deviation, normalized units, above which the basis would fit noise and is not used: at .01 it raises
 the error of faces from .044 to .28."""
 
-MAX_STEPS, MAX_BASIS_FRAMES = 150, 160
-"""L-BFGS iterations and maximum number of frames. After more iterations Ω, which has as many entries as a few hundred points have
-coordinates, begins to fit them: cameras of the faces .84° after 150, 1.0° after 300."""
+MAX_STEPS, MAX_FRAME_STEPS, MAX_BASIS_FRAMES = 2400, 240_000, 160
+"""Maximum L-BFGS iterations, maximum product of iterations and frames, and maximum number of frames: bounds on the
+time."""
+
+LBFGS_TOLERANCE = 1e-7
+"""Relative decrease of the energy per iteration below which the refinement ends."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -151,45 +153,22 @@ def refined(
     covariance: ShapeCovariance,
     *,
     should_stop: Callable[[], bool] | None = None,
-) -> tuple[Floats, Floats, float]:
-    """Return rotations (F, 3, 3) and scales (F,) of lower energy than the scene's cameras, and that energy."""
+) -> tuple[Floats, Floats]:
+    """Return rotations (F, 3, 3) and scales (F,) that minimise the energy, starting from the scene's cameras."""
     frames, size = len(scene.rotations), covariance.modes.shape[1] + 1
-    start = _whitened(begin(scene, scales, covariance), ordered=scene.ordered)
-
-    def reached(flat: Floats) -> Basis:
-        return _coloured(Basis.unflat(flat, frames, size), ordered=scene.ordered)
+    start = begin(scene, scales, covariance)
 
     def objective(flat: Floats) -> tuple[float, Floats]:
-        value, gradient = energy(scene, covariance.axis_covariance, reached(flat))
-        return value, _coloured(gradient, ordered=scene.ordered, transposed=True).flat()
+        value, gradient = energy(scene, covariance.axis_covariance, Basis.unflat(flat, frames, size))
+        return value, gradient.flat()
 
     def stop_check(xk: Floats) -> None:  # noqa: ARG001 - SciPy calls it by this name
         if should_stop is not None and should_stop():
             raise StopIteration
 
+    steps = min(MAX_STEPS, MAX_FRAME_STEPS // frames)
     found = minimize(
         objective, start.flat(), jac=True, method="L-BFGS-B", callback=stop_check,
-        options={"maxiter": MAX_STEPS, "maxcor": 20},
+        options={"maxiter": steps, "maxfun": 2 * steps, "maxcor": 20, "ftol": LBFGS_TOLERANCE},
     )  # fmt: skip
-    return *cameras_of(scene, reached(np.asarray(found.x))), float(found.fun)
-
-
-def _whitened(basis: Basis, *, ordered: bool) -> Basis:
-    """Return the parameters in coordinates in which a random walk over frames is white, as `marginal_likelihood.fit` does."""
-    return replace(
-        basis,
-        turns=whitened(basis.turns, ordered=ordered),
-        log_scales=whitened(basis.log_scales[:, None], ordered=ordered)[:, 0],
-        weights=whitened(basis.weights, ordered=ordered),
-    )
-
-
-def _coloured(basis: Basis, *, ordered: bool, transposed: bool = False) -> Basis:
-    """Return the parameters of white ones; `transposed`: the gradient with respect to white parameters."""
-
-    def each(columns: Floats) -> Floats:
-        return coloured(columns, ordered=ordered, transposed=transposed)
-
-    return replace(
-        basis, turns=each(basis.turns), log_scales=each(basis.log_scales[:, None])[:, 0], weights=each(basis.weights)
-    )
+    return cameras_of(scene, Basis.unflat(np.asarray(found.x), frames, size))

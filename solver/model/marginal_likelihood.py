@@ -20,13 +20,12 @@ the cost does not depend on P.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
 from pliant.solver.model.camera_motion_prior import rotation_roughness, scale_roughness
 from pliant.solver.model.image_density import ImageModel, factor_of, inverted, terms
-from pliant.solver.model.random_walk import coloured, whitened
 from pliant.solver.model.so3 import exponential, left_jacobian, vee
 from pliant.solver.records import Floats
 from scipy.optimize import minimize
@@ -251,35 +250,20 @@ def energy(scene: Scene, motion: Motion) -> tuple[float, Motion]:
 
 
 def fit(
-    scene: Scene,
-    motion: Motion,
-    *,
-    iterations: int,
-    turning: bool,
-    white: bool = False,
-    should_stop: Callable[[], bool] | None = None,
+    scene: Scene, motion: Motion, *, iterations: int, turning: bool, should_stop: Callable[[], bool] | None = None
 ) -> tuple[Motion, float]:
     """Return the parameters that minimise the energy, by L-BFGS from `motion`, and the energy reached.
 
     With `turning` False the rotations stay fixed; everything else, including scales, is fitted. `should_stop` is
     called after every iteration; once it returns True, the parameters reached so far are returned.
-
-    With `white`, turns, scales and modes of a film change in coordinates in which a random walk over frames is white. V⁻¹ resists changes
-    between neighbouring frames much more than slow ones; in these coordinates it resists both about equally, and the optimum is reached
-    in several times fewer iterations. Without, a limited number of iterations moves slow motion of the cameras hardly at all.
     """
     frames = len(scene.rotations)
     held = 0 if turning else 3 * frames
-    walks = white and scene.ordered
-    given = (_whitened(motion) if walks else motion).flat()
-
-    def reached(free: Floats) -> Motion:
-        motion = Motion.unflat(np.concatenate([given[:held], free]), frames)
-        return _coloured(motion) if walks else motion
+    given = motion.flat()
 
     def objective(free: Floats) -> tuple[float, Floats]:
-        value, gradient = energy(scene, reached(free))
-        return value, (_coloured(gradient, transposed=True) if walks else gradient).flat()[held:]
+        value, gradient = energy(scene, Motion.unflat(np.concatenate([given[:held], free]), frames))
+        return value, gradient.flat()[held:]
 
     def stop_check(xk: Floats) -> None:  # noqa: ARG001 - SciPy calls it by this name
         if should_stop is not None and should_stop():
@@ -289,27 +273,7 @@ def fit(
         objective, given[held:], jac=True, method="L-BFGS-B", callback=stop_check,
         options={"maxiter": iterations, "maxcor": 20},
     )  # fmt: skip
-    return reached(np.asarray(found.x)), float(found.fun)
-
-
-def _whitened(motion: Motion) -> Motion:
-    """Return the parameters in coordinates in which a random walk over frames is white."""
-    return replace(
-        motion,
-        turns=whitened(motion.turns),
-        log_scales=whitened(motion.log_scales[:, None])[:, 0],
-        modes=whitened(motion.modes),
-    )
-
-
-def _coloured(motion: Motion, *, transposed: bool = False) -> Motion:
-    """Return the parameters of white ones; `transposed`: the gradient with respect to white parameters."""
-    return replace(
-        motion,
-        turns=coloured(motion.turns, transposed=transposed),
-        log_scales=coloured(motion.log_scales[:, None], transposed=transposed)[:, 0],
-        modes=coloured(motion.modes, transposed=transposed),
-    )
+    return Motion.unflat(np.concatenate([given[:held], np.asarray(found.x)]), frames), float(found.fun)
 
 
 def root_of(matrix: Floats) -> Floats:

@@ -6,16 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pliant.solver.model.marginal_likelihood import (
-    UNLIKELY,
-    Motion,
-    Scene,
-    cameras_of,
-    covariances_of,
-    energy,
-    fit,
-    start,
-)
+from pliant.solver.model.marginal_likelihood import UNLIKELY, Motion, Scene, cameras_of, covariances_of, energy, start
 from pliant.solver.model.random_walk import random_walk
 from pliant.solver.model.so3 import exponential
 
@@ -52,36 +43,3 @@ def test_a_random_walk_that_vanishes_to_rounding_is_unlikely_instead_of_a_divisi
     value, gradient = energy(scene, replace(motion, logs=np.array([motion.logs[0], -1000.0])))
     assert value == UNLIKELY
     assert (gradient.flat() == 0).all()
-
-
-@pytest.mark.parametrize("ordered", [True, False])
-def test_white_coordinates_reach_the_same_optimum_of_a_film_in_fewer_iterations(ordered: bool) -> None:
-    random, frames = np.random.default_rng(4), 12
-    time = np.linspace(0, 1, frames)
-    rotations = exponential(time[:, None] * np.array([0.2, 1.0, 0.1]))
-    cloud = random.normal(size=(3, 80)) + 0.2 * np.sin(5 * time)[:, None, None] * random.normal(size=(3, 80))
-    tracks = (rotations[:, :2] @ cloud).reshape(2 * frames, -1) + 0.02 * random.normal(size=(2 * frames, 80))
-    wrong = exponential(0.05 * np.sin(4 * time)[:, None] * np.ones(3)) @ rotations
-    scene = Scene(tracks @ tracks.T / 80, wrong, False, 0.0, 1e-3, smoothness=0.0, ordered=ordered)
-    begun = start(scene, np.ones(frames), num_modes=1)
-    reached = {
-        (white, iterations): fit(scene, begun, iterations=iterations, turning=True, white=white)[1]
-        for white in (False, True)
-        for iterations in (15, 2000)
-    }
-    assert reached[True, 2000] <= reached[True, 15] <= energy(scene, begun)[0]
-    assert reached[True, 2000] == pytest.approx(reached[False, 2000], abs=1e-3)
-    if ordered:
-        assert reached[True, 15] < reached[False, 15]
-    else:  # the walk is white as it is
-        assert reached[True, 15] == reached[False, 15]
-
-
-def test_white_coordinates_leave_fixed_rotations_as_they_are() -> None:
-    random, frames = np.random.default_rng(1), 8
-    tracks = random.normal(size=(2 * frames, 40))
-    scene = Scene.of(tracks @ tracks.T / 40, exponential(random.normal(0, 0.4, (frames, 3))), with_scales=False)
-    begun = start(scene, np.ones(frames))
-    found, value = fit(scene, begun, iterations=10, turning=False, white=True)
-    assert (found.turns == 0).all()
-    assert value < energy(scene, begun)[0]
