@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from pliant.solver.descent import expected_iterations, expected_reweightings
+from pliant.solver.limits import LEARNED_FRAMES
 from pliant.solver.records import Floats
 
 UNIT_SECONDS, FRAME_SECONDS = 7e-5, 1.3e-5
@@ -76,10 +77,6 @@ LOAD_SECONDS, LOAD_PRIOR = 20.0, 1.0
 
 OWN_PACE = 4.0
 """Weight of a stage's own pace, per completed share of it, beside that of all stages: its units take about the same time."""
-
-LEARNED_FRAMES = 360
-"""Maximum number of frames from which cameras and covariance are learned together, evenly spread over longer films; the others follow by
-resection (`reconstruction.long_films`)."""
 
 UNITS_PER_START = 348
 """Units that one starting point of the stage `starts` takes."""

@@ -47,8 +47,8 @@ class Appearance:
     @classmethod
     def of(cls, template: Grey, points: Floats, neighbours: NDArray[np.int64]) -> Appearance:
         """Cut the patches out of a template."""
-        image, places = _smooth(template), points[:, None] + PATCH_OFFSETS
-        patches = _cut(image, places)
+        image, places = smooth(template), points[:, None] + PATCH_OFFSETS
+        patches = cut(image, places)
         return cls(points, neighbours, _centred(patches), noise_variance(template))
 
     def agrees(self, frame: Grey, points: Floats, visible: Bools, *, pool: ThreadPoolExecutor | None = None) -> Bools:
@@ -66,7 +66,7 @@ class Appearance:
         pool
             Threads to use; the result does not depend on them.
         """
-        image, affine = _smooth(frame), self._affine(points, visible)
+        image, affine = smooth(frame), self._affine(points, visible)
         seen = visible & _by_blocks(
             lambda block: self._correlates(image, points[block], affine[block], block), len(points), pool
         )
@@ -75,7 +75,7 @@ class Appearance:
     def _correlates(self, image: Floats, points: Floats, affine: Floats, block: slice) -> Bools:
         """Return which points of one block have patches like the template's."""
         template, floor = self.patches[block], np.float32(len(PATCH_OFFSETS) * (self.noise + 1.0))
-        patches = _centred(_cut(image, points[:, None] + _offsets(affine)))
+        patches = _centred(cut(image, points[:, None] + _offsets(affine)))
         norms = (_dot(patches, patches) + floor) * (_dot(template, template) + floor)
         return np.asarray(_dot(patches, template) + floor >= LEAST_CORRELATION * np.sqrt(norms))
 
@@ -102,7 +102,8 @@ def noise_variance(image: Grey) -> float:
     return float((np.median(response) / 0.6745) ** 2 / 36)
 
 
-def _smooth(image: Grey) -> Floats:
+def smooth(image: Grey) -> Floats:
+    """Return an image as it is compared, blurred by a binomial of 3 × 3 pixels."""
     return np.asarray(cv2.GaussianBlur(image.astype(np.float32), (3, 3), 0), dtype=np.float32)
 
 
@@ -125,8 +126,8 @@ def _centred(patches: Floats) -> Floats:
     return np.asarray(patches - patches.mean(axis=1, keepdims=True))
 
 
-def _cut(image: Floats, places: Floats) -> Floats:
-    """Interpolate an image at places `(P, K, 2)`; the border repeats."""
+def cut(image: Floats, places: Floats) -> Floats:
+    """Interpolate an image `(H, W)` or `(H, W, C)` at places `(P, K, 2)`, rounded to 1/32 pixel; the border repeats."""
     x, y = (np.ascontiguousarray(places[..., axis], dtype=np.float32) for axis in (0, 1))
     # OpenCV keeps sizes of maps in 16 bits, so many points go in blocks.
     blocks = [

@@ -132,8 +132,6 @@ def estimate_cameras(
     factorized: list[Upgrade] = []
     entries: list[Candidate] = []
     for each in upgrades(gram, _sizes(completed, settings)):
-        if entries and should_stop is not None and should_stop():
-            break
         factorized.append(each)
         entries.append(
             with_fixed_rotations(
@@ -146,6 +144,8 @@ def estimate_cameras(
             )
         )
         report(Step("cameras", (0.4 + 0.04 * len(entries)) * PROGRESS_SHARE))
+        if should_stop is not None and should_stop():
+            break
     best, ran = min(entries, key=lambda candidate: candidate.energy), entries
     if settings.refine_rotations:
         best, ran = run_multistart(part, entries, ordered=ordered, should_stop=should_stop)

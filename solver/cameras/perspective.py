@@ -24,11 +24,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from pliant.solver.limits import LEARNED_FRAMES
 from pliant.solver.model.image_density import Explained, ImageModel
 from pliant.solver.model.marginal_likelihood import root_matrix
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.records import Floats
-from pliant.solver.stages import LEARNED_FRAMES
 from pliant.solver.tracks.completion import Filling, spans
 from pliant.solver.tracks.normalization import Normalized
 from scipy import linalg

@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.evaluation.trust import Trust, Verdict, assess
+from pliant.solver.limits import BLOCK_OBSERVATIONS
 from pliant.solver.mesh import Mesh
 from pliant.solver.monitor import Monitor
 from pliant.solver.reconstruction.cameras import Cameras
@@ -25,10 +26,6 @@ from pliant.solver.records import Floats, Ints, Step, Tracks, read_only
 from pliant.solver.settings import Settings
 from pliant.solver.shapes.sparsely_observed import mesh_of
 from pliant.solver.solution import Outcome, Solution, Trace
-
-BLOCK_OBSERVATIONS = 10_000_000
-"""Largest number of frames times points that are solved at once: 4.5 GB. Blocks cost time: a face of 50 × 200,000 took 174 processor
-seconds in two blocks and 88 at once, since every block has iterations of its own."""
 
 MARGIN = 16
 """Rings of neighbours around a block. Shapes of a face of 4,000 points in four blocks differ from those solved at once by .0034, .0019 and

@@ -10,19 +10,16 @@ from pliant.solver.cameras import estimation
 from pliant.solver.cameras.covariance_learning import LearningData, learn_covariance
 from pliant.solver.cameras.depth_rounds import settled
 from pliant.solver.cameras.estimation import CameraEstimate, given_cameras
-from pliant.solver.cameras.joint_refinement import (
-    evenly_spread,
-    informative_frames,
-    refine_cameras,
-)
+from pliant.solver.cameras.joint_refinement import evenly_spread, informative_frames, refine_cameras
 from pliant.solver.cameras.planar_ambiguity import is_planar
+from pliant.solver.limits import LEARNED_FRAMES
 from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.monitor import Monitor, enter
 from pliant.solver.reconstruction.long_films import extended
 from pliant.solver.reconstruction.observations import Observations, OnStep, ShouldStop, check_fit, monitored, observe
 from pliant.solver.records import Camera, Floats, KnownCamera, Step, Tracks, read_only
 from pliant.solver.settings import Settings
-from pliant.solver.stages import LEARNED_FRAMES, learning
+from pliant.solver.stages import learning
 from pliant.solver.tracks.frame_order import resolved_order
 from pliant.solver.tracks.noise import OUTLIER_SHARE
 
@@ -146,9 +143,8 @@ def cameras_of(
     """
     shown, settings = informative_frames(observations.normalized.visible), observations.settings
     long = settings.gaussian and len(shown) > LEARNED_FRAMES
-    used = np.flatnonzero(shown)[
-        :: -(-int(shown.sum()) // LEARNED_FRAMES)
-    ]  # at equal distances, as the priors on motion assume
+    # At equal distances, as the priors on motion assume.
+    used = np.flatnonzero(shown)[:: -(-int(shown.sum()) // LEARNED_FRAMES)]
     estimate, data = _estimated(
         observations.at(used) if long else observations, monitor,
         previous=previous, expects_second=expects_second, silent=silent,

@@ -32,7 +32,7 @@ MAX_PAIRS, MAX_POINTS = 200, 2000
 
 MAX_UNORDERED_FRAMES = 360
 """Maximum number of photographs: all of them are learned from, since between photographs nothing can be interpolated
-(`stages.LEARNED_FRAMES`)."""
+(`limits.LEARNED_FRAMES`)."""
 
 
 def resolved_order(tracks: Tracks, settings: Settings) -> tuple[Settings, str]:

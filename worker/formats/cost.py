@@ -32,6 +32,7 @@ from __future__ import annotations
 
 from pliant.schemas.job import Estimate
 from pliant.schemas.options import Options
+from pliant.solver.limits import BLOCK_OBSERVATIONS, LEARNED_FRAMES
 
 LIBRARIES = 110_000_000
 """Bytes of a job process before it has read its inputs."""
@@ -39,9 +40,9 @@ LIBRARIES = 110_000_000
 BYTES = {"gaussian": 600, "smooth": 500, "smooth+low_rank": 500}
 """Bytes for each observation, by prior: up to 510 were measured for the solver alone, 520 with exports."""
 
-BLOCK, BEYOND = 10_000_000, 250
-"""Observations that are solved at once (`solver.reconstruction.blocks.BLOCK_OBSERVATIONS`), and bytes for each further one, of which
-only tracks and results are held: about 120 in the solver by the sizes of its arrays, the rest for the exports, not measured."""
+BEYOND = 250
+"""Bytes for each observation beyond those solved at once, of which only tracks and results are held: about 120 in the solver by the sizes
+of its arrays, the rest for the exports, not measured."""
 
 SECONDS = 0.5
 """Processor seconds of a job that is as small as can be."""
@@ -49,9 +50,6 @@ SECONDS = 0.5
 LEARNING = {(True, False): 0.13, (True, True): 0.045, (False, False): 0.045, (False, True): 0.005}
 """Processor seconds for each frame that cameras and prior are learned from: by whether the prior is learned, and whether rotations are
 given."""
-
-LEARNED_FRAMES = 360
-"""Largest number of those frames."""
 
 MICROSECONDS = 8.0
 """Processor time for each observation."""
@@ -80,4 +78,6 @@ def largest_that_fits(memory: int, num_frames: int, num_points: int, options: Op
 
 def _largest_block(options: Options) -> float:
     """Return the observations that are solved at once: all with a prior on the rank of all points together."""
-    return float("inf") if options.prior == "smooth+low_rank" or options.method == "pseudo_inverse" else BLOCK
+    return (
+        float("inf") if options.prior == "smooth+low_rank" or options.method == "pseudo_inverse" else BLOCK_OBSERVATIONS
+    )

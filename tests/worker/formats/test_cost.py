@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 from pliant.schemas.options import Options
-from pliant.worker.formats.cost import BEYOND, BLOCK, BYTES, LIBRARIES, estimated, largest_that_fits
+from pliant.solver.limits import BLOCK_OBSERVATIONS
+from pliant.worker.formats.cost import BEYOND, BYTES, LIBRARIES, estimated, largest_that_fits
 
 
 @pytest.mark.parametrize("prior", ["gaussian", "smooth", "smooth+low_rank"])
@@ -20,5 +21,5 @@ def test_what_fits_is_what_is_estimated(prior: str, points: int) -> None:
 
 def test_further_observations_of_large_jobs_take_less_memory() -> None:
     large = estimated(100, 1_000_000, Options()).memory_bytes
-    assert large == LIBRARIES + BYTES["gaussian"] * BLOCK + BEYOND * (100_000_000 - BLOCK)
+    assert large == LIBRARIES + BYTES["gaussian"] * BLOCK_OBSERVATIONS + BEYOND * (100_000_000 - BLOCK_OBSERVATIONS)
     assert estimated(100, 1_000_000, Options(prior="smooth+low_rank")).memory_bytes > large
