@@ -170,7 +170,7 @@ def service_child(settings: Settings, host: str, port: int, url: str, *, auth: s
     from pliant.worker.processes.supervisor import Child
 
     env = {**settings.to_environment(), "PLIANT_HOST": host, "PLIANT_PORT": str(port), "PLIANT_AUTH": auth}
-    # No access log between the lines of this terminal, unless it is asked for.
+    # No access log between the lines of this terminal, unless it is requested.
     env["PLIANT_LOG_LEVEL"] = os.environ.get("PLIANT_LOG_LEVEL") or "warning"
     command = [sys.executable, "-m", "pliant.service"]
     return Child(name="service", argv=command, env=env, ready=until_ready(url), grace=15.0)

@@ -11,11 +11,11 @@ from pliant.solver.cameras.depth_alternation import alternated, factorized_again
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.cameras.focal_length import search
 from pliant.solver.cameras.learned import Learned
-from pliant.solver.cameras.perspective import MIRROR, Perspective, corrected_moments, depth_map, mirrored
+from pliant.solver.cameras.perspective import Perspective, corrected_moments, depth_map, mirrored
 from pliant.solver.cameras.planar_ambiguity import is_planar
 from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.shape_covariance import ShapeCovariance
-from pliant.solver.model.so3 import exponential, logarithm
+from pliant.solver.model.so3 import MIRROR, exponential, logarithm
 from pliant.solver.records import Floats, read_only
 from pliant.solver.tracks.frame_selection import between
 from pliant.solver.tracks.normalization import Normalized
@@ -25,7 +25,7 @@ RESTARTS = 3
 
 MIN_GAIN = 0.01
 """Decrease of the energy, per point and frame, below which another restart is not tried: equal solutions from different starts differ by
-as much (`focal_length.GAIN`)."""
+as much (`focal_length.MIN_PERSPECTIVE_GAIN`)."""
 
 
 def settled(

@@ -12,8 +12,8 @@ from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.shape_covariance import AXIS_VARIANCE_FLOOR, NOISE_VARIANCE_FLOOR, ShapeCovariance
 from pliant.solver.records import Floats
 
-STEADY = 0.01
-"""Weight of the camera's unsteadiness: less is needed once the covariance is known."""
+REFINEMENT_PRIOR_WEIGHT = 0.01
+"""Weight of the camera-motion prior: less is needed once the covariance is known."""
 
 LEAST_NOISE = 1e-12
 """What is left of σ² where it lies at its floor, which the likelihood adds again."""
@@ -50,7 +50,7 @@ def scene_at(
     `factor`, shape `(2F, r)`, stands for a Gram matrix that is not formed; `gram` is then empty.
     """
     return Scene(
-        gram, rotations, with_scales=with_scales, prior_weight=STEADY if ordered else 0.0,
+        gram, rotations, with_scales=with_scales, prior_weight=REFINEMENT_PRIOR_WEIGHT if ordered else 0.0,
         noise_std_floor=NOISE_VARIANCE_FLOOR**0.5, smoothness=0.0, ordered=ordered,
         factor=np.zeros((0, 0)) if factor is None else factor,
     )  # fmt: skip

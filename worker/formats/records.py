@@ -17,7 +17,7 @@ Arrays = dict[str, NDArray[np.generic]]
 """Named arrays of a file, not yet interpreted; members of nested structures have dotted names."""
 
 
-FARTHEST = 1e12
+MAX_COORDINATE = 1e12
 """Largest absolute coordinate that is accepted; squares of larger ones may overflow."""
 
 
@@ -118,10 +118,10 @@ def _true_points(shapes: ArrayLike, like: tuple[int, int]) -> NDArray[np.float64
             expected="finite coordinates", got=f"{int((~np.isfinite(points)).sum())} that are not",
             hint="Give truth for every point and frame, or omit it.",
         )  # fmt: skip
-    if np.abs(points).max() > FARTHEST:
+    if np.abs(points).max() > MAX_COORDINATE:
         raise InvalidInput(
             "out_of_range", field="ground_truth.shapes",
-            expected=f"coordinates within ±{FARTHEST:g}", got=f"{np.abs(points).max():.3g}",
+            expected=f"coordinates within ±{MAX_COORDINATE:g}", got=f"{np.abs(points).max():.3g}",
             hint="Check the file, or choose a larger unit.",
         )  # fmt: skip
     if not (np.ptp(points, axis=1) > 0).any(axis=1).all():
