@@ -50,7 +50,8 @@ def given_lens(
     if not np.abs(offsets).max() < MAX_CENTRE_RADII:
         raise InvalidInput(
             "principal_point_far", field="options.principal_point",
-            expected=f"a point within {MAX_CENTRE_RADII:.0f} RMS radii of the tracks", got=f"({point[0]:.5g}, {point[1]:.5g})", hint="Give x, y in the unit and axes of the tracks.",
+            expected=f"a point within {MAX_CENTRE_RADII:.0f} RMS radii of the tracks",
+            got=f"({point[0]:.5g}, {point[1]:.5g})", hint="Give x, y in the unit and axes of the tracks.",
         )  # fmt: skip
     first = -1 if settings.y_up else 1
     return Perspective(
