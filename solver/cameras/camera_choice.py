@@ -1,4 +1,4 @@
-"""What a report says about the choice between orthography and perspective."""
+"""Sentences of a report about the choice between orthography and perspective."""
 
 from __future__ import annotations
 
@@ -78,8 +78,8 @@ def improbable(view: Perspective, unit: float) -> str | None:
     best = min(nll, key=lambda each: nll[each], default=0.0)
     if not own - nll.get(best, np.inf) > MIN_PERSPECTIVE_GAIN:
         return None
-    rival = "orthography" if best == 0 else f"a focal length of {unit / abs(best):.4g}"
+    other = "orthography" if best == 0 else f"a focal length of {unit / abs(best):.4g}"
     return (
-        f"The focal length given, {unit / view.given:.4g}, is improbable: {rival} gains {own - nll[best]:.3f} in the log likelihood per "
+        f"The focal length given, {unit / view.given:.4g}, is improbable: {other} gains {own - nll[best]:.3f} in the log likelihood per "
         "point and frame."
     )

@@ -106,7 +106,7 @@ def refine_cameras(
     seed : int
         Seed of the split of the points where some are held out.
     normalized : Normalized, optional
-        The tracks themselves, needed where `estimate.perspective` says that perspective is possible.
+        The tracks themselves, needed where `estimate.perspective` is given.
     y_up : bool
         Whether y points up in the images.
     should_stop : callable, optional
@@ -350,7 +350,7 @@ def _with_depth_choice(estimate: CameraEstimate, stretch: float) -> CameraEstima
     if abs(np.log(stretch)) < np.log(DECIDED):
         return estimate
     sentence = (
-        f"The tracks hardly tell depth from rotation: {1 / stretch:.2g} times the depth with {stretch:.2g} times the rotation explains "
-        "them about as well. The depth is one that is usual for the width, as of half a sphere."
+        f"The tracks hardly distinguish depth from rotation: {1 / stretch:.2g} times the depth with {stretch:.2g} times the rotation "
+        "explains them about as well. The depth is one that is usual for the width, as of half a sphere."
     )
     return replace(estimate, depth_is_typical=True, reasons={**estimate.reasons, "depth_extent": sentence})

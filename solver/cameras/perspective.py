@@ -10,7 +10,7 @@ with c the principal point, t_f the image of the shape's origin relative to c, a
 
 is exactly a scaled-orthographic track of the same shape. Depths follow from the shapes, shapes from the corrected tracks; κ = 1/φ is
 the only new unknown, and κ = 0 is scaled orthography. Reversing the sign of κ is the same as mirroring all depths, x → J x, R → J R J
-with J = diag(1, 1, −1), which orthography cannot tell apart.
+with J = diag(1, 1, −1), which orthography cannot distinguish.
 
 Here depths are posterior means under the Gaussian of `pliant.solver.model.shape_covariance`. They are linear in the corrected tracks,
 

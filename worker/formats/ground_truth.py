@@ -131,8 +131,8 @@ def as_shapes(array: NDArray[np.generic], understood: Understood) -> tuple[NDArr
     best = int(np.argmin(costs))
     if costs[0] <= MIN_FIT_RATIO * costs[best]:
         best = 0
-    rival = min(cost for place, cost in enumerate(costs) if place != best)
-    evidence = f"True shapes read as {found[best][0]}: a camera leaves {costs[best]:.1%} of the tracks unexplained; next {rival:.1%}."
+    next_best = min(cost for place, cost in enumerate(costs) if place != best)
+    evidence = f"True shapes read as {found[best][0]}: a camera leaves {costs[best]:.1%} of the tracks unexplained; next {next_best:.1%}."
     return found[best][1], [evidence, *_far(costs[best])]
 
 

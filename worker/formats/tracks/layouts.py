@@ -149,10 +149,10 @@ def choose(
     ranked = sorted(allowed, key=lambda one: costs[one.layout])
     order = None if array.ndim == 3 and dialect.name in OF_ANY_ORDER else dialect.order
     documented = [one for one in ranked if order in (None, one.order) or options.layout != "auto"] or ranked
-    best, rivals = documented[0], documented[1:]
-    clear = all(costs[rival.layout] >= MIN_SMOOTHNESS_RATIO * costs[best.layout] for rival in rivals)
+    best, others = documented[0], documented[1:]
+    clear = all(costs[other.layout] >= MIN_SMOOTHNESS_RATIO * costs[best.layout] for other in others)
     if clear and costs[best.layout] <= CONTRADICTED * costs[ranked[0].layout]:
-        return best, [_evidence(best, rivals[0], costs)] if rivals else []
+        return best, [_evidence(best, others[0], costs)] if others else []
     choices: list[dict[str, Any]] = [
         {"layout": one.layout, "options": one.options, "evidence": f"mean step in time: {_number(costs[one.layout])}"}
         for one in ranked
@@ -169,10 +169,10 @@ def _is_allowed(reading: Reading, options: Options) -> bool:
     )
 
 
-def _evidence(best: Reading, rival: Reading, costs: dict[str, float]) -> str:
+def _evidence(best: Reading, other: Reading, costs: dict[str, float]) -> str:
     return (
         f"Read as {best.layout}, where the mean step in time is {_number(costs[best.layout])}; "
-        f"as {rival.layout}: {_number(costs[rival.layout])}."
+        f"as {other.layout}: {_number(costs[other.layout])}."
     )
 
 
