@@ -22,6 +22,8 @@ points     uint32 (P, 2)       in how many of all frames each point was seen, an
 spread     uint16 (F, P)       standard deviation of a position = spread_step · value. Only with a posterior
 rejected   uint8 (F, ⌈P/8⌉)    bits, the lowest first: seen observations that the solver rejected as outliers
 names      UTF-8, P lines      names of the points. Only where the tracks' file has them
+places     float32 (P, 2)      place of every point in the picture, 0 to 1: u right, v down. Only of a film
+picture    JPEG                the film's template frame. Only of a film
 =========  ==================  ===================================================================================
 
 Readers skip sections that they do not know; all after `residuals` may be missing.
@@ -41,6 +43,7 @@ from pliant.solver import Mesh, Solution, Tracks
 from pliant.solver.evaluation.alignment import align
 from pliant.solver.evaluation.metrics import frame_errors
 from pliant.worker.artifacts.geometry import size_of
+from pliant.worker.formats.texture import Texture
 
 NAME = "preview.bin"
 MEDIA_TYPE = "application/octet-stream"
@@ -133,6 +136,7 @@ def write_preview(
     fps: float = 25.0,
     image_size: str | None = None,
     point_names: Sequence[str] | None = None,
+    texture: Texture | None = None,
 ) -> None:
     """Write the file.
 
@@ -152,6 +156,8 @@ def write_preview(
         Width and height of the picture that the tracks refer to, pixels, as the option `image_size` has it.
     point_names : sequence of str, optional
         Name of every point.
+    texture : Texture, optional
+        The film's picture and where the points are in it.
     """
     stride = max(1, -(-solution.shapes[..., 0].size // MOST_OBSERVATIONS))
     facing, mirrored = (None, False) if truth is None else _onto(solution.shapes, truth)
@@ -177,6 +183,11 @@ def write_preview(
     if point_names is not None:
         names = "\n".join(point_names).encode()
         sections.append(Section("names", len(names), [names]))
+    if texture is not None:
+        sections += [
+            Section.of("places", texture.uv.astype("<f4")),
+            Section("picture", len(texture.jpeg), [texture.jpeg]),
+        ]
     _write(file, header, sections)
 
 

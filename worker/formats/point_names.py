@@ -5,11 +5,14 @@ Between processes and in stored inputs they are one array of bytes: UTF-8, one n
 
 from __future__ import annotations
 
+import sys
 import unicodedata
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from pliant.solver import InvalidInput
+from pliant.worker.formats.errors import damaged
 
 ARRAY = "point_names"
 
@@ -30,8 +33,12 @@ HAND = (
     "wrist", "thumb_cmc", "thumb_mcp", "thumb_ip", "thumb_tip",
     *(f"{finger}_{joint}" for finger in _FINGERS for joint in ("mcp", "pip", "dip", "tip")),
 )  # fmt: skip
-MEDIAPIPE = {len(names): names for names in (POSE, HAND)}
-"""Names of MediaPipe's landmarks by their number, from its documentation: exports have none. Those of faces have numbers only."""
+FACE, IRISES = (tuple(f"face_{index}" for index in range(count)) for count in (468, 478))
+"""The vertices of MediaPipe's face mesh, without and with irises: it documents their numbers only, and groups of them such as the lips."""
+
+MEDIAPIPE = {len(names): names for names in (POSE, HAND, FACE, IRISES)}
+"""Names of MediaPipe's landmarks by their number, from its documentation: exports have none. The 543 of the holistic model have no
+documented order, and so no names."""
 
 
 def one_line(text: str) -> str:
@@ -48,6 +55,27 @@ def found(names: Sequence[str]) -> dict[str, NDArray[np.generic]]:
 def pack(names: Sequence[str]) -> NDArray[np.uint8]:
     """Return names, each on one line, as an array of bytes."""
     return np.frombuffer("\n".join(names).encode(), dtype=np.uint8)
+
+
+def stated(array: NDArray[np.generic], count: int) -> tuple[str, ...]:
+    """Return the names that a NumPy array states, each on one line.
+
+    Raises
+    ------
+    InvalidInput
+        Codes wrong_shape, damaged_file: not one name for each of `count` points, or texts that are not Unicode.
+    """
+    field = f"tracks.{ARRAY}"
+    if array.shape != (count,):
+        raise InvalidInput(
+            "wrong_shape", field=field, expected=f"({count},), one name for each point", got=str(array.shape),
+            hint="Give as many names as the tracks have points, or leave them out.",
+        )  # fmt: skip
+    if array.dtype.kind == "U" and (np.ascontiguousarray(array).view(np.uint32) > sys.maxunicode).any():
+        raise damaged(field, "texts that are not Unicode")
+    return tuple(
+        _clean(each.decode("utf-8", "replace") if isinstance(each, bytes) else each) for each in array.tolist()
+    )
 
 
 def unpack(array: NDArray[np.generic] | None, count: int) -> tuple[str, ...] | None:
