@@ -180,15 +180,19 @@ def write_preview(
         "image_size": None if image_size is None else [float(side) for side in image_size.split("x")],
     }
     sections = [Section.of("faces", faces), *_sections(tracks, solution, truth, facing, kept, rounding)]
+    _write(file, header, [*sections, *_input_sections(point_names, texture)])
+
+
+def _input_sections(point_names: Sequence[str] | None, texture: Texture | None) -> list[Section]:
+    """Return the sections that only some inputs have: names of the points, and the picture with their places in it."""
+    sections = []
     if point_names is not None:
         names = "\n".join(point_names).encode()
         sections.append(Section("names", len(names), [names]))
     if texture is not None:
-        sections += [
-            Section.of("places", texture.uv.astype("<f4")),
-            Section("picture", len(texture.jpeg), [texture.jpeg]),
-        ]
-    _write(file, header, sections)
+        sections.append(Section.of("places", texture.uv.astype("<f4")))
+        sections.append(Section("picture", len(texture.jpeg), [texture.jpeg]))
+    return sections
 
 
 def _sections(
