@@ -16,10 +16,10 @@ from pliant.worker.formats.errors import damaged
 
 ARRAY = "point_names"
 
-LONGEST = 100
+MAX_POINT_NAME = 100
 """Characters of a name; longer ones are cut off."""
 
-SHOWN = 4
+LISTED_NAMES = 4
 """Names that a note lists."""
 
 POSE = (
@@ -88,10 +88,10 @@ def unpack(array: NDArray[np.generic] | None, count: int) -> tuple[str, ...] | N
 
 def note(names: Sequence[str]) -> str:
     """Return a sentence that lists the first names."""
-    more = ", …" if len(names) > SHOWN else ""
-    return f"The file names its {len(names)} points: {', '.join(names[:SHOWN])}{more}."
+    more = ", …" if len(names) > LISTED_NAMES else ""
+    return f"The file names its {len(names)} points: {', '.join(names[:LISTED_NAMES])}{more}."
 
 
 def _clean(name: str) -> str:
     whole = unicodedata.normalize("NFC", name.encode("utf-8", "replace").decode())
-    return one_line(whole)[:LONGEST].strip()
+    return one_line(whole)[:MAX_POINT_NAME].strip()

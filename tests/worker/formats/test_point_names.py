@@ -14,7 +14,7 @@ import pytest
 from pliant.schemas.options import Options
 from pliant.solver import InvalidInput
 from pliant.worker.formats import Inputs, Limits, load_inputs, read_inputs, save_inputs
-from pliant.worker.formats.point_names import FACE, HAND, IRISES, LONGEST, POSE, pack, unpack
+from pliant.worker.formats.point_names import FACE, HAND, IRISES, MAX_POINT_NAME, POSE, pack, unpack
 from pliant.worker.formats.reading import containers
 from pliant.worker.formats.reading.parsers import PARSERS
 from pliant.worker.formats.reading.pose_hdf5 import strings_of
@@ -202,7 +202,7 @@ def test_an_npz_may_name_its_points(order: str, tmp_path: Path) -> None:
     odd = np.array(["a\tb", " c ", "x" * 300, "é", "🙂", ""])
     np.savez(path, tracks=tracks, point_names=odd)
     got = read(path, layout=layout)
-    assert got.point_names == ("a b", "c", "x" * LONGEST, "é", "🙂", "")
+    assert got.point_names == ("a b", "c", "x" * MAX_POINT_NAME, "é", "🙂", "")
     assert "The file names its 6 points: a b, c, " in " ".join(got.interpretation.notes)
     np.savez(path, tracks=tracks, point_names=np.array([part.encode() for part in PARTS]))
     assert read(path, layout=layout).point_names == PARTS
@@ -262,7 +262,7 @@ def test_names_are_lines_that_can_be_printed(here: None, tmp_path: Path) -> None
         for landmark, name in zip(frame, odd, strict=True):
             landmark["name"] = name
     (tmp_path / "t.json").write_text(json.dumps(frames))
-    clean = ("a b", "c d", "?", "x" * LONGEST, "é", "🙂")
+    clean = ("a b", "c d", "?", "x" * MAX_POINT_NAME, "é", "🙂")
     got = read(tmp_path / "t.json", image_size="640x480")
     assert got.point_names == clean
     assert unpack(pack(clean), P) == clean
