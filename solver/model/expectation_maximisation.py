@@ -304,9 +304,11 @@ def _linear_round(
     square = along.T @ along + 2 * covariance.walk_variance * np.eye(count)
     total = float((along**2).sum()) + frames * covariance.walk_variance
     total += (float((square * inner).sum()) + covariance.walk_variance * float((walk * by_walk).sum())) / 3
-    values, vectors = _nystrom(
-        product, np.hstack([along, _cosines(frames, max_modes)]) if subspace is None else subspace
-    )
+    if subspace is None:
+        subspace = np.hstack([along, _cosines(frames, max_modes)])
+    if subspace.shape[1] == 0:  # neither modes nor permission for any: the walk alone improves
+        subspace = _cosines(frames, 1)
+    values, vectors = _nystrom(product, subspace)
     modes, walk_variance = _kept(values, vectors, total, floor, min(max_modes, frames - 1))
     better = _improved(
         covariance, coloured(modes, ordered=ordered), walk_variance,
