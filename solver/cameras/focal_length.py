@@ -98,10 +98,10 @@ def search(
         Cameras found under orthography.
     view : Perspective
         What is given; `curvature` of the result is negative if the depths of these cameras have to be mirrored.
-    model_order : Support
+    model_order : ModelOrder
         Modes at most, and the noise to begin with.
     should_stop : callable, optional
-        Asked between values of κ; once it says True, the best so far counts.
+        Called between values of κ; once it returns True, the best so far counts.
     """
     count = max(min(SEARCH_FRAMES, len(views), views.shape[1] // 2), 3)
     used = np.unique(np.linspace(0, len(views) - 1, min(count, len(views))).round().astype(np.intp))
@@ -110,17 +110,7 @@ def search(
     trials = {0.0: _Trial(0.0, flat.nll, np.zeros(some.shape[:2]), flat)}
 
     def judge(curvature: float) -> None:
-        trial = trials[0.0]
-        for _ in range(UPDATES):
-            try:
-                depth = depth_map(rotations[used], scales[used], trial.covariance)
-                depths = depths_of(depth, some, curvature, start=trial.depths)
-                covariance = _learn(some, depths, curvature, projections, model_order)
-            except np.linalg.LinAlgError:  # depths beyond any measure
-                trial = replace(trial, curvature=curvature, nll=UNLIKELY)
-                break
-            trial = _Trial(curvature, covariance.nll + density(depths, curvature), depths, covariance)
-        trials[curvature] = trial
+        trials[curvature] = _judged(curvature, trials[0.0], some, rotations[used], scales[used], model_order)
 
     def stopped() -> bool:
         return should_stop is not None and should_stop()
@@ -130,13 +120,29 @@ def search(
             break
         judge(sign * size)
     for _ in range(POLISHES if view.given is None and _promising(view, trials) else 0):
-        between = _between(trials)
-        if between is None or stopped():
+        middle = _between(trials)
+        if middle is None or stopped():
             break
-        judge(between)
+        judge(middle)
     view = _decided(view, trials, len(used), some.shape[1])
     covariance = trials[view.curvature if view.curvature in trials else 0.0].covariance
     return view, covariance if len(used) == len(views) else covariance.stretched(used, len(views))
+
+
+def _judged(
+    curvature: float, trial: _Trial, views: Floats, rotations: Floats, scales: Floats, model_order: ModelOrder
+) -> _Trial:
+    """Return what κ leads to after `UPDATES` of depths and covariance that begin with those of a trial."""
+    projections = rotations[:, :2] * scales[:, None, None]
+    for _ in range(UPDATES):
+        try:
+            depth = depth_map(rotations, scales, trial.covariance)
+            depths = depths_of(depth, views, curvature, start=trial.depths)
+            covariance = _learn(views, depths, curvature, projections, model_order)
+        except np.linalg.LinAlgError:  # depths beyond any measure
+            return replace(trial, curvature=curvature, nll=UNLIKELY)
+        trial = _Trial(curvature, covariance.nll + density(depths, curvature), depths, covariance)
+    return trial
 
 
 def _walk(view: Perspective, trials: dict[float, _Trial]) -> Iterator[tuple[float, int]]:

@@ -9,7 +9,6 @@ import pytest
 from learning import learn
 from pliant.solver import KnownCamera, Settings, gallery, solve
 from pliant.solver.cameras.estimation import CameraEstimate
-from pliant.solver.cameras.joint_refinement import informative_frames
 from pliant.solver.evaluation import metrics
 from pliant.solver.model.expectation_maximisation import (
     MAX_DENSE_FRAMES,
@@ -26,6 +25,7 @@ from pliant.solver.model.expectation_maximisation import (
 from pliant.solver.model.random_walk import random_walk
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import exponential
+from pliant.solver.tracks.frame_selection import informative_frames
 
 FRAMES = 14
 

@@ -2,7 +2,7 @@
 
 import { type Preview, isHidden, isRejected } from "./preview";
 
-export type Colouring = "plain" | "expected" | "seen" | "displacement" | "error" | "residual" | "difference";
+export type Colouring = "film" | "plain" | "expected" | "seen" | "displacement" | "error" | "residual" | "difference";
 
 /** Six colours, evenly spaced, rising in lightness all the way, so that they also read in grey and without red or green. */
 export const SCALE = ["#2b2f77", "#28608f", "#1f8f8a", "#58b96d", "#b5d44a", "#fbe94b"];
@@ -28,7 +28,7 @@ export interface Values {
 /** A value of a point in a frame; NaN where there is none. */
 type Value = (frame: number, point: number) => number;
 
-/** Prepare a colouring; null for plain. */
+/** Prepare a colouring; null for those without values: plain, and the film's picture. */
 export async function valuesFor(colouring: Colouring, preview: Preview, signal: AbortSignal): Promise<Values | null> {
   if (colouring === "displacement") return displacement(preview);
   if (colouring === "seen") return seen(preview);
@@ -47,6 +47,7 @@ export async function valuesFor(colouring: Colouring, preview: Preview, signal: 
 /** The colourings that a preview has data for, with people's names. */
 export function colourings(preview: Preview): [Colouring, string][] {
   const all: [Colouring, string, boolean][] = [
+    ["film", "film", preview.has("picture") && preview.faces.length > 0],
     ["plain", "plain", true],
     ["expected", "expected error", preview.has("spread")],
     ["error", "3-D error", preview.has("truth")],
