@@ -294,6 +294,8 @@ def _linear_round(
     total = float((along**2).sum()) + frames * covariance.walk_variance
     total += (float((square * inner).sum()) + covariance.walk_variance * float((walk * by_walk).sum())) / 3
     begun = np.hstack([along, _cosines(frames, max_modes)]) if subspace is None else subspace
+    if begun.shape[1] == 0:  # neither modes nor permission for any: the walk alone improves
+        begun = _cosines(frames, 1)
     values, vectors = _nystrom(_mode_operator(covariance, along, walk, seen), begun)
     modes, walk_variance = _kept(values, vectors, total, floor, min(max_modes, frames - 1))
     better = _improved(

@@ -13,6 +13,7 @@ from pliant.solver.evaluation import metrics
 from pliant.solver.model.expectation_maximisation import (
     MAX_DENSE_FRAMES,
     MAX_ITERATIONS,
+    MAX_MODES,
     MEAN_MODE_STD,
     WALK_VARIANCE_FLOOR,
     annealed,
@@ -209,6 +210,7 @@ def test_a_long_rigid_film_without_modes_is_learned() -> None:
     rows = projections.reshape(-1, 3) @ rng.normal(size=(3, 50)) + 1e-4 * rng.normal(size=(2 * frames, 50))
     gram = rows @ rows.T / 50
     rigid = replace(begin(gram, projections), modes=np.zeros((frames, 0)), walk_variance=WALK_VARIANCE_FLOOR)
-    found = improve(rigid, gram, projections, iterations=2)
-    assert found.modes.shape == (frames, 0)
-    assert np.isfinite(found.nll)
+    for max_modes in (0, MAX_MODES):
+        found = improve(rigid, gram, projections, iterations=2, max_modes=max_modes)
+        assert found.modes.shape == (frames, 0)
+        assert np.isfinite(found.nll)
