@@ -29,6 +29,7 @@ from pliant.solver.model.expectation_maximisation import improve
 from pliant.solver.model.marginal_likelihood import fit
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.records import Floats
+from pliant.solver.tracks.frame_selection import evenly_spread
 from scipy.spatial import cKDTree
 
 PARTS = 6
@@ -77,7 +78,7 @@ def learning_std(
         Normalized units.
     """
     frames = len(shapes)
-    used = np.unique(np.linspace(0, frames - 1, min(frames, MAX_JACKKNIFE_FRAMES)).round().astype(int))
+    used = evenly_spread(frames, MAX_JACKKNIFE_FRAMES)
     start = Learned(
         np.asarray(estimate.rotations)[used],
         np.asarray(estimate.scales)[used],

@@ -27,6 +27,7 @@ from pliant.solver.model.resection import MIN_RELATIVE_DISTANCE
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.records import Camera, Floats
 from pliant.solver.shapes.sparsely_observed import WELL_OBSERVED_SHARE
+from pliant.solver.tracks.frame_selection import evenly_spread
 from scipy import linalg
 from scipy.spatial import cKDTree
 
@@ -113,7 +114,7 @@ def position_std(
         In the unit of the covariance.
     """
     frames = len(projections)
-    used = np.unique(np.linspace(0, frames - 1, min(frames, MAX_POSTERIOR_FRAMES)).round().astype(int))
+    used = evenly_spread(frames, MAX_POSTERIOR_FRAMES)
     noise, weights = noise_std**2, confidence[used]
     nearest, chosen = _representatives(pinhole, used, confidence.shape[1])
     moments = [_moments(covariance, _rows(projections, pinhole, point), used) for point in chosen]
