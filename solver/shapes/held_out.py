@@ -128,7 +128,8 @@ def _spread(shapes: Floats, counts: NDArray[np.intp], frames: int) -> NDArray[np
     """Return points that are observed often, and in three frames at least; the order of the points does not matter."""
     often = np.flatnonzero(counts >= max(3, WELL_OBSERVED_SHARE * frames))
     ordered = often[np.argsort(ranks(shapes[:, often].mean(axis=0)[None]))]
-    return ordered[np.unique(np.linspace(0, len(often) - 1, min(len(often), MAX_HELD_OUT_POINTS)).round().astype(int))]
+    places = np.unique(np.linspace(0, len(often) - 1, min(len(often), MAX_HELD_OUT_POINTS)).round().astype(int))
+    return np.asarray(ordered[places])
 
 
 def _corrected(points: Floats, shapes: Floats, camera: Camera) -> Floats:
