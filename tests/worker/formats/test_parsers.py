@@ -15,7 +15,7 @@ from pliant.schemas.options import Options
 from pliant.solver import InvalidInput
 from pliant.worker.formats import Limits, read_inputs
 from pliant.worker.formats.meshes.surface import read_surface
-from pliant.worker.formats.reading import arrays
+from pliant.worker.formats.reading import arrays, sandbox
 from pliant.worker.formats.reading.csv import read_csv
 from pliant.worker.formats.reading.gltf import read_glb
 from pliant.worker.formats.reading.meshes import read_obj, read_ply
@@ -78,6 +78,12 @@ def test_a_parser_that_runs_out_of_memory_refuses_the_file() -> None:
         raise MemoryError
 
     assert code(lambda: parse(hungry, io.BytesIO(), field="tracks", limits=Limits())) == "too_large"
+
+
+def test_without_a_sandbox_only_arrays_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sandbox, "find_spec", lambda name: None)
+    read = lambda: sandbox.parse_in_sandbox("obj", tmp_path / "m.obj", field="mesh", limits=Limits())  # noqa: E731
+    assert code(read) == "unsupported_feature"
 
 
 def test_an_array_that_ends_early_is_damaged() -> None:
