@@ -115,7 +115,8 @@ def measured(case: Case, solution: Solution, *, scale_free: bool) -> dict[str, A
     row: dict[str, Any] = {
         "frames": case.tracks.num_frames, "points": case.tracks.num_points, "verdict": trust.verdict.value, "reasons": list(trust.reasons),
         "expected": trust.expected_error, "interval": trust.interval, "residual": trust.residual, "turn": trust.turn_degrees,
-        "hidden": trust.hidden, "true": None,
+        "hidden": trust.hidden, "held_out": trust.held_out_error, "degrees_per_frame": trust.degrees_per_frame,
+        "deformation_per_frame": trust.deformation_per_frame, "true": None,
     }  # fmt: skip
     if case.shapes is None:
         return row

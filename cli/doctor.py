@@ -8,7 +8,7 @@ import socket
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Annotated, Literal
@@ -16,6 +16,7 @@ from typing import Annotated, Literal
 import typer
 from pliant.cli.exits import Exit
 from pliant.cli.extras import missing_modules, require_server
+from pliant.cli.paths import installation
 from pliant.cli.session import HOME, Json, Session, Url
 from pliant.cli.show import out, print_json
 
@@ -74,6 +75,9 @@ def fsck(ctx: typer.Context, data: Data = Path("pliant-data"), as_json: Json = F
     session: Session = ctx.obj
     session.json = as_json
     require_server("pliant fsck")
+    from pliant.worker.settings import Settings
+
+    installation(replace(Settings.from_environment(), data=data))
     report(list(check_stored(data)), as_json=as_json)
 
 
@@ -160,7 +164,7 @@ def check_cores() -> Iterator[Finding]:
 
     settings = Settings() if missing_modules() else Settings.from_environment()
     threads, cores = settings.threads_per_job, usable_cores()
-    found = f"{cores} usable; {settings.workers} worker(s) of {threads} thread(s)"
+    found = f"{cores} usable cores; {settings.workers} worker(s) of {threads} thread(s)"
     if threads * settings.workers > cores:
         yield Finding("cores", "note", found, "More threads than cores: lower PLIANT_WORKERS or PLIANT_THREADS.")
     else:
@@ -237,8 +241,6 @@ def check_service(session: Session, url: str) -> Iterator[Finding]:
 
 def check_stored(data: Path) -> Iterator[Finding]:
     """Compare records, queue, blobs, scratch directories, uploads and incomplete request bodies with each other."""
-    from dataclasses import replace
-
     from pliant.service.spool import Incoming
     from pliant.worker.errors import StoreUnavailable
     from pliant.worker.jobs.service import Jobs

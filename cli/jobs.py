@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from pliant.cli.films import is_film
@@ -31,66 +31,54 @@ from pliant.cli.session import (
 from pliant.cli.show import err, out, print_json, show_job, show_jobs, show_options
 
 if TYPE_CHECKING:
+    from pliant.client import Client, RemoteJob
     from pliant.schemas.job import Job
 
+Files = Annotated[
+    list[Path],
+    typer.Argument(
+        help="Track files in any format `pliant inspect` reads, or a film. Several files, a folder of track files or a quoted "
+        "pattern such as 'takes/*.npz' make a job each.",
+        metavar="FILE...",
+        show_default=False,
+    ),
+]
+Priority = Annotated[
+    Literal["high", "normal", "low"], typer.Option("--priority", help="Order among your own waiting jobs.")
+]
+OwnId = Annotated[
+    str | None, typer.Option("--id", help="Your own id. Submitting the same content under it again creates no second job.")
+]  # fmt: skip
+Key = Annotated[str | None, typer.Option("--key", help="Idempotency key: a repeated submission creates no second job.")]
+Webhook = Annotated[
+    str | None,
+    typer.Option(
+        "--webhook", help="URL that receives the finished job, signed with PLIANT_WEBHOOK_SECRET.", metavar="URL"
+    ),
+]
+Wait = Annotated[bool, typer.Option("--wait", "-w", help="Wait until the job is finished.")]
 Folder = Annotated[Path | None, typer.Option("--output", "-o", help="Wait, then download the files into this folder.")]
 
 
 def submit(
-    ctx: typer.Context,
-    files: Annotated[
-        list[Path],
-        typer.Argument(
-            help="Track files in any format `pliant inspect` reads, or a film. Several files, a folder of track files or a quoted "
-            "pattern such as 'takes/*.npz' make a job each.",
-            metavar="FILE...",
-            show_default=False,
-        ),
-    ],
-    mesh: Mesh = None,
-    ground_truth: GroundTruth = None,
-    rotations: Rotations = None,
-    region: Region = None,
-    option: OptionPairs = None,
-    name: Name = "",
-    priority: Annotated[
-        Literal["high", "normal", "low"], typer.Option("--priority", help="Order among your own waiting jobs.")
-    ] = "normal",
-    job_id: Annotated[
-        str | None,
-        typer.Option("--id", help="Your own id. Submitting the same content under it again creates no second job."),
-    ] = None,
-    key: Annotated[
-        str | None, typer.Option("--key", help="Idempotency key: a repeated submission creates no second job.")
-    ] = None,
-    webhook: Annotated[
-        str | None,
-        typer.Option(
-            "--webhook", help="URL that receives the finished job, signed with PLIANT_WEBHOOK_SECRET.", metavar="URL"
-        ),
-    ] = None,
-    wait: Annotated[bool, typer.Option("--wait", "-w", help="Wait until the job is finished.")] = False,
-    output: Folder = None,
-    force: Force = False,
-    url: Url = HOME,
-    timeout: Timeout = None,
-    as_json: Json = False,
-) -> None:
+    ctx: typer.Context, files: Files, mesh: Mesh = None, ground_truth: GroundTruth = None, rotations: Rotations = None,
+    region: Region = None, option: OptionPairs = None, name: Name = "", priority: Priority = "normal", job_id: OwnId = None,
+    key: Key = None, webhook: Webhook = None, wait: Wait = False, output: Folder = None, force: Force = False, url: Url = HOME,
+    timeout: Timeout = None, as_json: Json = False,
+) -> None:  # fmt: skip
     """Submit tracks or a film to a service and print the job; of several files a table.
 
     Repeating the command for several files finds the jobs that exist already: each is known by the content of its file and the options.
     """
     from pliant.cli.commands.batch import Batch, expanded
-    from pliant.client.progress import progress_bar
 
     session: Session = ctx.obj
     session.json = as_json
-    options = parse_options(option)
-    chosen = expanded(files, region)
+    options, chosen, waits = parse_options(option), expanded(files, region), wait or output is not None
+    parts = {"mesh": mesh, "ground_truth": ground_truth, "rotations": rotations, "webhook": webhook}
     if chosen != files or len(chosen) > 1:
         batch = Batch(
-            files=chosen, shared={"mesh": mesh, "ground_truth": ground_truth, "rotations": rotations, "webhook": webhook},
-            options=options, key=key or "", priority=priority, timeout=timeout, output=output, wait=wait or output is not None,
+            files=chosen, shared=parts, options=options, key=key or "", priority=priority, timeout=timeout, output=output, wait=waits,
         )  # fmt: skip
         batch.check(name=name, job_id=job_id, region=region, force=force)
         with session.client(url, as_json=as_json) as client:
@@ -101,36 +89,34 @@ def submit(
     tracks_or_film(tracks)
     if output is not None:
         output_folder(output, force=force)
-    film = is_film(tracks, region)
+    given = {
+        "film" if is_film(tracks, region) else "tracks": tracks, "region": region, **parts, "options": options,
+        "name": name_of(name, tracks), "job_id": job_id, "idempotency_key": key, "priority": priority, "timeout": timeout,
+        "webhook_secret": None if webhook is None else os.environ.get("PLIANT_WEBHOOK_SECRET"),
+    }  # fmt: skip
     with session.client(url, as_json=as_json) as client:
-        with progress_bar(line_every=LINE_EVERY) as bar:
-            job = client.submit(
-                None if film else tracks,
-                film=tracks if film else None,
-                region=region,
-                mesh=mesh,
-                ground_truth=ground_truth,
-                rotations=rotations,
-                options=options,
-                name=name_of(name, tracks),
-                job_id=job_id,
-                idempotency_key=key,
-                webhook=webhook,
-                webhook_secret=None if webhook is None else os.environ.get("PLIANT_WEBHOOK_SECRET"),
-                priority=priority,
-                on_upload=bar.on_upload,
-                timeout=timeout,
-            )
-            if wait or output is not None:
-                session.following = job.id
-                if not as_json:
-                    err().print(f"Job {job.id}", highlight=False)
-                done = job.wait(on_progress=bar.on_progress, load=False, timeout=timeout)
-                if output is not None:
-                    done.download(output, on_download=bar.on_download)
+        job = _submitted(session, client, given, wait=waits, output=output)
         show_job(job.record, as_json=as_json)
         if not job.status.final and not as_json:
             err().print(f"Follow it with: pliant watch {job.id}", highlight=False)
+
+
+def _submitted(
+    session: Session, client: Client, given: dict[str, Any], *, wait: bool, output: Path | None
+) -> RemoteJob:
+    """Submit one job with a progress bar, and follow it to its end and download its files where that is wanted."""
+    from pliant.client.progress import progress_bar
+
+    with progress_bar(line_every=LINE_EVERY) as bar:
+        job = client.submit(**given, on_upload=bar.on_upload)
+        if wait:
+            session.following = job.id
+            if not session.json:
+                err().print(f"Job {job.id}", highlight=False)
+            done = job.wait(on_progress=bar.on_progress, load=False, timeout=given["timeout"])
+            if output is not None:
+                done.download(output, on_download=bar.on_download)
+    return job
 
 
 def status(ctx: typer.Context, job: JobId, url: Url = HOME, as_json: Json = False) -> None:

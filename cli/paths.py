@@ -6,6 +6,10 @@ import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pliant.worker.settings import Settings
 
 RESULT_FILES = ("shapes.npz", "report.json")
 """Files of every result: a folder that has one of them holds a result."""
@@ -46,6 +50,25 @@ def tracks_or_film(path: Path, name: str = "tracks") -> None:
         raise BadArgument(
             f"{name}: expected a file or a folder of pictures, got the folder {path}, which has no pictures. "
             "Give the path of a file in it."
+        )
+
+
+def installation(settings: Settings) -> None:
+    """Check that a service has used the data directory, before anything is created in it. A Redis server needs no directory.
+
+    Raises
+    ------
+    BadArgument
+        It is missing, or has none of an installation's folders.
+    """
+    from pliant.client.errors import BadArgument
+    from pliant.worker.paths import FOLDERS
+
+    data = settings.data
+    if settings.redis_url is None and not any((data / name).is_dir() for name in FOLDERS):
+        what = "which has none of its folders" if data.exists() else "which does not exist"
+        raise BadArgument(
+            f"--data: expected the directory of an installation, got {data}, {what}. Give the one that `pliant up` uses."
         )
 
 

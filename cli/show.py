@@ -27,6 +27,21 @@ def out() -> Console:
     return Console(highlight=False, soft_wrap=True)
 
 
+METRIC_MEANINGS: Mapping[str, str] = {
+    "e3d_frame": "3-D error: distance from the ground truth, each frame turned to fit best; share of the object's size",
+    "e3d_frame_scaled": "the same after one scale for the whole sequence",
+    "e3d_sequence": "the same after one orthogonal alignment for the whole sequence",
+    "e3d_frame_similarity": "the same after rotating, mirroring and scaling each frame to fit",
+    "e3d_mocap": "as the motion capture literature defines it; share of the shape's spread",
+    "coverage": "share of the positions within their 90 % interval",
+    "reprojection_median": "from a visible track to the projected shape, median; in the tracks' unit",
+    "reprojection_rms": "the same, root mean square: sensitive to outliers",
+    "rotation_degrees": "mean angle between estimated and true cameras, in degrees",
+    "focal_error": "of the focal length, share of the true one",
+}
+"""What each metric of a job is, the headline first. The page has the same words (`service/web/src/results.ts`)."""
+
+
 def err() -> Console:
     """Console on standard error, for everything but the command's output."""
     return Console(stderr=True, highlight=False, soft_wrap=True)
@@ -135,13 +150,19 @@ def understood(interpretation: Interpretation) -> list[tuple[str, str]]:
 
 
 def metrics_table(metrics: Mapping[str, float], title: str = "") -> Table:
-    """Return the metrics as a table."""
+    """Return the metrics and what they mean as a table, `e3d_frame` first."""
     table = Table(title=title or None, title_justify="left")
     table.add_column("metric")
     table.add_column("value", justify="right")
-    for name, value in metrics.items():
-        table.add_row(name, f"{value:.4g}")
+    table.add_column("meaning")
+    for name in sorted(metrics, key=_place):
+        table.add_row(name, f"{metrics[name]:.4g}", METRIC_MEANINGS.get(name, ""))
     return table
+
+
+def _place(metric: str) -> int:
+    order = list(METRIC_MEANINGS)
+    return order.index(metric) if metric in order else len(order)
 
 
 def show_jobs(jobs: Iterable[Job], *, as_json: bool) -> None:

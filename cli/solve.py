@@ -122,12 +122,9 @@ def inspect(
         from pliant.client.multipart import checked_options
         from pliant.worker.formats import read_inputs
 
+        checked, faces = checked_options(options), file_or_word(mesh)
         interpretation = read_inputs(
-            tracks=file,
-            mesh=file_or_word(mesh),
-            ground_truth=ground_truth,
-            rotations=rotations,
-            options=checked_options(options),
+            tracks=file, mesh=faces, ground_truth=ground_truth, rotations=rotations, options=checked
         ).interpretation
     else:
         with ctx.obj.client(url, as_json=as_json) as client:

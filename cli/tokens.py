@@ -21,46 +21,45 @@ MB = 2**20
 
 app = typer.Typer(name="token", help="Create, list and revoke the tokens of a service.", no_args_is_help=True)
 
+Scopes = Annotated[
+    list[str] | None,
+    typer.Option("--scope", help="read, submit or admin; may be repeated.", show_default="read and submit"),
+]
+Lifetime = Annotated[
+    str | None, typer.Option("--expires", help="Lifetime, e.g. 12h, 90d, 52w.", show_default="never expires")
+]
+Sharing = Annotated[
+    str | None,
+    typer.Option("--sharing", help="Id of a token whose jobs the new one shares, e.g. to replace it.", metavar="ID"),
+]
+Registered = Annotated[
+    Path | None,
+    typer.Option(
+        "--from",
+        help="File with a token to register, in place of a new one. Does nothing if it is registered.",
+        metavar="FILE",
+    ),
+]
 TokenId = Annotated[str, typer.Argument(help="Id of the token, from `pliant token list`.", show_default=False)]
+
+
+def limit(help: str) -> Any:  # noqa: A002
+    """Return the option for a limit of the new token."""
+    return typer.Option(help=help, min=1, show_default="the service's")
 
 
 @app.command()
 def create(
     ctx: typer.Context,
     name: Annotated[str, typer.Argument(help="Name of its user or purpose.", show_default=False)],
-    scope: Annotated[
-        list[str] | None,
-        typer.Option("--scope", help="read, submit or admin; may be repeated.", show_default="read and submit"),
-    ] = None,
-    expires: Annotated[
-        str | None, typer.Option("--expires", help="Lifetime, e.g. 12h, 90d, 52w.", show_default="never expires")
-    ] = None,
-    sharing: Annotated[
-        str | None,
-        typer.Option(
-            "--sharing", help="Id of a token whose jobs the new one shares, e.g. to replace it.", metavar="ID"
-        ),
-    ] = None,
-    max_body_mb: Annotated[
-        int | None, typer.Option(help="Largest body of one request.", min=1, show_default="the service's")
-    ] = None,
-    max_queued: Annotated[
-        int | None, typer.Option(help="Most queued jobs.", min=1, show_default="the service's")
-    ] = None,
-    max_running: Annotated[
-        int | None, typer.Option(help="Most running jobs.", min=1, show_default="the service's")
-    ] = None,
-    requests_per_minute: Annotated[
-        int | None, typer.Option(help="Requests per minute.", min=1, show_default="the service's")
-    ] = None,
-    source: Annotated[
-        Path | None,
-        typer.Option(
-            "--from",
-            help="File with a token to register, in place of a new one. Does nothing if it is registered.",
-            metavar="FILE",
-        ),
-    ] = None,
+    scope: Scopes = None,
+    expires: Lifetime = None,
+    sharing: Sharing = None,
+    max_body_mb: Annotated[int | None, limit("Largest body of one request.")] = None,
+    max_queued: Annotated[int | None, limit("Most queued jobs.")] = None,
+    max_running: Annotated[int | None, limit("Most running jobs.")] = None,
+    requests_per_minute: Annotated[int | None, limit("Requests per minute.")] = None,
+    source: Registered = None,
     data: Data = None,
     as_json: Json = False,
 ) -> None:

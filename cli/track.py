@@ -16,14 +16,17 @@ if TYPE_CHECKING:
     from pliant.tracking import OnStep, TrackedFilm, TrackingStep
 
 
+Film = Annotated[
+    Path,
+    typer.Argument(
+        help="mp4, mov, webm, mkv or avi film, animated GIF, zip or folder of pictures.", show_default=False
+    ),
+]
+
+
 def track(
     ctx: typer.Context,
-    film: Annotated[
-        Path,
-        typer.Argument(
-            help="mp4, mov, webm, mkv or avi film, animated GIF, zip or folder of pictures.", show_default=False
-        ),
-    ],
+    film: Film,
     output: Annotated[Path, typer.Option("--output", "-o", help="tracks.npz to write.", show_default=False)],
     region: Annotated[
         Path | None, typer.Option("--region", help="Mask picture of the film's size: white is tracked.")

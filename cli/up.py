@@ -38,34 +38,33 @@ Workers = Annotated[
 ]  # fmt: skip
 
 
+Host = Annotated[
+    str | None, typer.Option("--host", envvar="PLIANT_HOST", help="Address to listen on.", show_default="127.0.0.1")
+]
+Port = Annotated[
+    int | None,
+    typer.Option(
+        "--port", envvar="PLIANT_PORT", help="Port to listen on; 0: a free one.", min=0, max=65535, show_default="8000"
+    ),
+]
+Auth = Annotated[
+    Literal["auto", "required", "off"] | None,
+    typer.Option(
+        "--auth",
+        envvar="PLIANT_AUTH",
+        help="Whether requests need a token; auto: not on the loopback address.",
+        show_default="auto",
+    ),
+]
+
+
 def up(
     ctx: typer.Context,
-    host: Annotated[
-        str | None,
-        typer.Option("--host", envvar="PLIANT_HOST", help="Address to listen on.", show_default="127.0.0.1"),
-    ] = None,
-    port: Annotated[
-        int | None,
-        typer.Option(
-            "--port",
-            envvar="PLIANT_PORT",
-            help="Port to listen on; 0: a free one.",
-            min=0,
-            max=65535,
-            show_default="8000",
-        ),
-    ] = None,
+    host: Host = None,
+    port: Port = None,
     data: Data = None,
     workers: Workers = None,
-    auth: Annotated[
-        Literal["auto", "required", "off"] | None,
-        typer.Option(
-            "--auth",
-            envvar="PLIANT_AUTH",
-            help="Whether requests need a token; auto: not on the loopback address.",
-            show_default="auto",
-        ),
-    ] = None,
+    auth: Auth = None,
     as_json: Json = False,
 ) -> None:
     """Run everything: service, page, queue and workers. Ctrl-C stops it.
@@ -171,7 +170,7 @@ def service_child(settings: Settings, host: str, port: int, url: str, *, auth: s
     from pliant.worker.processes.supervisor import Child
 
     env = {**settings.to_environment(), "PLIANT_HOST": host, "PLIANT_PORT": str(port), "PLIANT_AUTH": auth}
-    # No access log between the lines of this terminal, unless it is asked for.
+    # No access log between the lines of this terminal, unless it is requested.
     env["PLIANT_LOG_LEVEL"] = os.environ.get("PLIANT_LOG_LEVEL") or "warning"
     command = [sys.executable, "-m", "pliant.service"]
     return Child(name="service", argv=command, env=env, ready=until_ready(url), grace=15.0)

@@ -23,7 +23,10 @@ class Message:
 
 
 class Parser:
-    """Incremental parser of an event stream (HTML standard, section 9.2.6)."""
+    """Incremental parser of an event stream (HTML standard, section 9.2.6).
+
+    It is fed bytes, so that the caller sees every chunk, comments included, and can enforce its time limit on them.
+    """
 
     def __init__(self) -> None:
         self._rest = b""

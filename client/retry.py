@@ -39,7 +39,7 @@ class Retry:
     """Upper bound of every pause, seconds."""
 
     long_poll: float = 20.0
-    """Longest time that `wait` asks the service to hold one answer back, seconds."""
+    """Longest time, seconds, for which `wait` lets the service hold one answer back."""
 
     poll_interval: float = 0.5
     """Pause between two reads of a job where the service does not hold answers back, seconds."""

@@ -124,7 +124,7 @@ def _counter(
 
 
 def _durations(tallies: Mapping[str, float]) -> Metric:
-    """Return the histogram of run times: the store counts per bucket, Prometheus wants each bucket with all below it."""
+    """Return the histogram of run times: the store counts per bucket; in Prometheus each bucket includes all below it."""
     text = "Run time of jobs' last attempts, by final status."
     family = HistogramMetricFamily("pliant_job_run_seconds", text, labels=["status"])
     for status in (each.value for each in Status if each.final):

@@ -62,8 +62,8 @@ class PageFiles(StaticFiles):
             "Cache-Control": REVALIDATE if path.suffix == ".html" else IMMUTABLE,
             "Vary": "Accept-Encoding",
         }
-        asked, packed = Headers(scope=scope), path.with_name(f"{path.name}.gz")
-        accepted = {item.split(";")[0].strip() for item in asked.get("accept-encoding", "").split(",")}
+        requested, packed = Headers(scope=scope), path.with_name(f"{path.name}.gz")
+        accepted = {item.split(";")[0].strip() for item in requested.get("accept-encoding", "").split(",")}
         if "gzip" in accepted and packed.is_file():
             path, stat_result, headers["Content-Encoding"] = packed, packed.stat(), "gzip"
         response = FileResponse(
@@ -73,7 +73,7 @@ class PageFiles(StaticFiles):
             media_type=media_type,
             stat_result=stat_result,
         )
-        if self.is_not_modified(response.headers, asked):
+        if self.is_not_modified(response.headers, requested):
             unchanged = NotModifiedResponse(response.headers)
             # A browser replaces the headers it has stored by those of the 304, so the page's policy must be among them.
             unchanged.headers.update(HEADERS)
@@ -82,7 +82,7 @@ class PageFiles(StaticFiles):
 
 
 def mount_page(app: FastAPI, directory: Path = BUILT) -> None:
-    """Serve the built page. Without one, `/`, `/guide` and `/docs` answer 503 with a sentence that says how to build it.
+    """Serve the built page. Without one, `/`, `/guide` and `/docs` answer 503 with how to build it.
 
     Parameters
     ----------

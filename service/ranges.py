@@ -12,7 +12,7 @@ _TAG = re.compile(r'(?:W/)?"[^"]*"')
 
 @dataclass(frozen=True)
 class Slice:
-    """What to send of a file: `length` bytes from `start` on, with the status that says so."""
+    """What to send of a file: `length` bytes from `start` on, and the status of the answer."""
 
     status: int
     """200 whole, 206 a part, 304 nothing because the client has it, 412 not the file it meant, 416 no such part."""

@@ -141,6 +141,31 @@ def _against(axes: Axes, records: Records, levels: dict[str, float]) -> None:
     axes.grid(alpha=0.25)
 
 
+def error_by_level(records: Records) -> Figure:
+    """Error of the default against the level of each spoiling: every draw, and their mean."""
+    figure, panels = plt.subplots(1, 3, figsize=(8, 3), sharey=True)
+    for axes, (spoiling, words) in zip(
+        panels, (("outliers", "share of outliers"), ("hidden", "share hidden"), ("noise", "noise r")), strict=True
+    ):
+        for at, sequence in enumerate(dict.fromkeys(r["sequence"] for r in records)):
+            draws = defaultdict(list)
+            for r in records:
+                if r["sequence"] == sequence and r["spoiling"] in (spoiling, "clean"):
+                    draws[r["level"]].append(r["e3d_frame"])
+            levels = sorted(draws)
+            name = SEQUENCES.get(sequence, sequence.replace("_", " "))
+            axes.plot(levels, [np.mean(draws[level]) for level in levels], color=f"C{at}", lw=1.2, label=name)
+            for level in levels:
+                axes.plot([level] * len(draws[level]), draws[level], ".", ms=3, alpha=0.5, color=f"C{at}")
+        axes.set_yscale("log")
+        axes.set_xlabel(words)
+        axes.grid(alpha=0.3)
+    panels[0].set_ylabel("e3d_frame")
+    panels[1].legend(fontsize=7, frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.22), ncols=3)
+    figure.tight_layout()
+    return figure
+
+
 def growth(records: Records) -> Figure:
     """Time and memory against points and frames, with the fitted exponents."""
     figure, grid = plt.subplots(1, 2, figsize=(8, 4.2))
@@ -228,6 +253,7 @@ def progress(records: Records) -> Figure:
 FIGURES: dict[str, tuple[str, Callable[[Records], Figure]]] = {
     "error-by-sequence": ("accuracy", error_by_sequence),
     "error-by-corruption": ("accuracy", error_by_corruption),
+    "error-by-level": ("curves", error_by_level),
     "growth": ("growth", growth),
     "baselines": ("baselines", baselines),
     "error-by-distance": ("distances", distance),

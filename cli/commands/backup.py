@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from pliant.cli.extras import require_server
+from pliant.cli.paths import installation
 from pliant.cli.session import Json
 from pliant.cli.show import err, print_json
 from pliant.cli.up import Data, chosen
@@ -31,6 +32,7 @@ def backup(
     from pliant.worker.processes.valkey import attended
 
     settings = chosen(data, None)
+    installation(settings)
     with attended(settings):
         summary = write_backup(settings, target)
     _show("Backed up", summary, target, as_json=as_json)

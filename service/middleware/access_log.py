@@ -17,7 +17,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 HEADER = "X-Request-ID"
 QUIET = frozenset({"/healthz", "/readyz", "/metrics"})
-"""Paths that monitoring asks every few seconds: logged at level debug unless they fail."""
+"""Paths that monitoring requests every few seconds, logged at level debug unless they fail."""
 
 _ALLOWED = re.compile(r"[A-Za-z0-9._:+=/-]{1,128}")
 _JOB = re.compile(r"/v1/jobs/([A-Za-z0-9_-]{3,64})")

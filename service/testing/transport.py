@@ -101,7 +101,7 @@ class Request:
         return None
 
     async def close(self) -> None:
-        """Tell the application that the client has disconnected."""
+        """Disconnect the client."""
         self._closed.set()
 
     async def _next(self) -> Message | None:

@@ -1,11 +1,11 @@
-"""What a report says about the choice between orthography and perspective."""
+"""Sentences of a report about the choice between orthography and perspective."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 import numpy as np
-from pliant.solver.cameras.focal_length import GAIN
+from pliant.solver.cameras.focal_length import MIN_PERSPECTIVE_GAIN
 from pliant.solver.cameras.perspective import Perspective
 from pliant.solver.records import Choices, FocalCandidate
 from pliant.solver.settings import Settings
@@ -59,7 +59,7 @@ def described(view: Perspective, unit: float) -> str:
             return "Orthography: perspective was not compared."
         return (
             f"Orthography: the best perspective compared, focal length {unit / abs(best):.4g}, changes the log likelihood per point "
-            f"and frame by {nll[0.0] - nll[best]:+.3f}; more than {GAIN} is asked for, and a clear sign of depth."
+            f"and frame by {nll[0.0] - nll[best]:+.3f}; more than {MIN_PERSPECTIVE_GAIN} is required, and a clear sign of depth."
         )
     gain = nll[0.0] - min((value for each, value in nll.items() if each != 0), default=nll[0.0])
     how = "as given" if view.given is not None else f"± {unit * view.curvature_std / view.curvature**2:.2g}"
@@ -76,10 +76,10 @@ def improbable(view: Perspective, unit: float) -> str | None:
     nll = {each.curvature: each.nll for each in view.candidates}
     own = min((nll[each] for each in (view.given, -view.given) if each in nll), default=np.inf)
     best = min(nll, key=lambda each: nll[each], default=0.0)
-    if not own - nll.get(best, np.inf) > GAIN:
+    if not own - nll.get(best, np.inf) > MIN_PERSPECTIVE_GAIN:
         return None
-    rival = "orthography" if best == 0 else f"a focal length of {unit / abs(best):.4g}"
+    other = "orthography" if best == 0 else f"a focal length of {unit / abs(best):.4g}"
     return (
-        f"The focal length given, {unit / view.given:.4g}, is improbable: {rival} gains {own - nll[best]:.3f} in the log likelihood per "
+        f"The focal length given, {unit / view.given:.4g}, is improbable: {other} gains {own - nll[best]:.3f} in the log likelihood per "
         "point and frame."
     )

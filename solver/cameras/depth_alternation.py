@@ -16,16 +16,16 @@ from pliant.solver.cameras.factorization import upgrades
 from pliant.solver.cameras.focal_length import refined_with_focal
 from pliant.solver.cameras.learned import Learned
 from pliant.solver.cameras.multistart import CANDIDATES
-from pliant.solver.cameras.perspective import MIRROR, Perspective, centred, columns, corrected, depth_map, depths_of
+from pliant.solver.cameras.perspective import Perspective, centred, columns, corrected, depth_map, depths_of
 from pliant.solver.model.expectation_maximisation import annealed
 from pliant.solver.model.model_order import ModelOrder
-from pliant.solver.model.so3 import nearest
+from pliant.solver.model.so3 import MIRROR, nearest
 from pliant.solver.records import Floats
 
-ROUNDS = 3
+ALTERNATION_ROUNDS = 3
 """Updates of depths, covariance, cameras and κ every time that cameras were found or refined."""
 
-LEARNING = 60
+ALTERNATION_EM_ROUNDS = 60
 """Rounds of expectation maximisation of an update."""
 
 COMPARED_FRAMES = 40
@@ -39,7 +39,7 @@ def alternated(
     *,
     model_order: ModelOrder,
     turning: bool,
-    rounds: int = ROUNDS,
+    rounds: int = ALTERNATION_ROUNDS,
     should_stop: Callable[[], bool] | None = None,
 ) -> tuple[Learned, Perspective]:
     """Return cameras, covariance and κ after rounds of alternation.
@@ -130,7 +130,7 @@ def _relearned(view: Perspective, found: Learned, used: NDArray[np.intp], model_
         max_modes=model_order.max_modes,
         noisy_start=model_order.noisy_start,
         ordered=model_order.ordered,
-        iterations=LEARNING,
+        iterations=ALTERNATION_EM_ROUNDS,
     )
     return replace(found, covariance=covariance)
 

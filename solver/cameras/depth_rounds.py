@@ -11,12 +11,13 @@ from pliant.solver.cameras.depth_alternation import alternated, factorized_again
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.cameras.focal_length import search
 from pliant.solver.cameras.learned import Learned
-from pliant.solver.cameras.perspective import MIRROR, Perspective, corrected_moments, depth_map, mirrored
+from pliant.solver.cameras.perspective import Perspective, corrected_moments, depth_map, mirrored
 from pliant.solver.cameras.planar_ambiguity import is_planar
 from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.shape_covariance import ShapeCovariance
-from pliant.solver.model.so3 import exponential, logarithm
+from pliant.solver.model.so3 import MIRROR, exponential, logarithm
 from pliant.solver.records import Floats, read_only
+from pliant.solver.tracks.frame_selection import between
 from pliant.solver.tracks.normalization import Normalized
 
 RESTARTS = 3
@@ -24,7 +25,7 @@ RESTARTS = 3
 
 MIN_GAIN = 0.01
 """Decrease of the energy, per point and frame, below which another restart is not tried: equal solutions from different starts differ by
-as much (`focal_length.GAIN`)."""
+as much (`focal_length.MIN_PERSPECTIVE_GAIN`)."""
 
 
 def settled(
@@ -46,12 +47,12 @@ def settled(
         The tracks as they are.
     used : array of int, shape (F',)
         Frames to learn from.
-    model_order : Support
+    model_order : ModelOrder
         Modes at most, and the noise to begin with.
     turning : bool
         False leaves the rotations, but for the sign of depth.
     should_stop : callable, optional
-        Asked between fits; once it says True, the best so far is returned.
+        Called between fits; once it returns True, the best so far is returned.
     """
     assert estimate.perspective is not None
     shift = estimate.perspective.offsets + estimate.translations
@@ -160,8 +161,3 @@ def _applied(
     return replace(
         estimate, rotations=rotations, gram=gram, translations=translations, sample=sample, perspective=view
     )  # fmt: skip
-
-
-def between(used: NDArray[np.intp], values: Floats, frames: int) -> Floats:
-    """Return values of all frames, interpolated between those of the frames used, shape `(F, n)`."""
-    return np.stack([np.interp(np.arange(frames), used, each) for each in values.T], axis=1)

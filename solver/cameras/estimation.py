@@ -129,37 +129,21 @@ def estimate_cameras(
     gram = completed.gram / np.outer(np.repeat(scales, 2), np.repeat(scales, 2))
     used = frames_used(len(scales))
     part = gram_of(gram, used)
-    factorized: list[Upgrade] = []
-    entries: list[Candidate] = []
-    for each in upgrades(gram, _sizes(completed, settings)):
-        factorized.append(each)
-        entries.append(
-            with_fixed_rotations(
-                part,
-                _thinned(each, used),
-                np.ones(len(part) // 2),
-                with_scales=False,
-                ordered=ordered,
-                should_stop=should_stop,
-            )
-        )
-        report(Step("cameras", (0.4 + 0.04 * len(entries)) * PROGRESS_SHARE))
-        if should_stop is not None and should_stop():
-            break
+    factorized, entries = _factorized(
+        gram, part, used, _sizes(completed, settings), ordered=ordered, report=report, should_stop=should_stop
+    )
     best, ran = min(entries, key=lambda candidate: candidate.energy), entries
     if settings.refine_rotations:
         best, ran = run_multistart(part, entries, ordered=ordered, should_stop=should_stop)
     own = next(each for each in factorized if each.basis_size == best.basis_size)
     report(Step("cameras", 0.8 * PROGRESS_SHARE))
     rotations, refined = _everywhere(own.rotations, best, used, settings)
-    hypotheses: tuple[tuple[int, Floats], ...] = ()
-    candidates: tuple[Floats, ...] = ()
-    if settings.refine_rotations and is_planar(gram):
-        rotations, sheet = resolve_pose_signs(gram, rotations, ordered=ordered, should_stop=should_stop)
-        refined = f"{refined} {sheet}"
-    elif settings.refine_rotations:
-        hypotheses = _hypotheses(factorized, ran, part, used)
-        candidates = tuple(_everywhere(own.rotations, each, used, settings)[0] for each in ran)
+    if planar := settings.refine_rotations and is_planar(gram):
+        rotations, pose_signs = resolve_pose_signs(gram, rotations, ordered=ordered, should_stop=should_stop)
+        refined = f"{refined} {pose_signs}"
+    compared = ran if settings.refine_rotations and not planar else []
+    hypotheses = _hypotheses(factorized, compared, part, used)
+    candidates = tuple(_everywhere(own.rotations, each, used, settings)[0] for each in compared)
     read_only(rotations)
     read_only(scales)
     report(Step("cameras", PROGRESS_SHARE))
@@ -169,6 +153,33 @@ def estimate_cameras(
         hypotheses, completed.outliers, completed.rank, completed.filling, None, ordered, reasons, _warnings(rotations),
         candidates=candidates,
     )  # fmt: skip
+
+
+def _factorized(
+    gram: Floats,
+    part: Floats,
+    used: slice,
+    sizes: list[int],
+    *,
+    ordered: bool,
+    report: Callable[[Step], None],
+    should_stop: Callable[[], bool] | None,
+) -> tuple[list[Upgrade], list[Candidate]]:
+    """Return the factorization with every K of `sizes`, and the candidates for the multistart that they give at the frames used."""
+    factorized: list[Upgrade] = []
+    entries: list[Candidate] = []
+    for each in upgrades(gram, sizes):
+        factorized.append(each)
+        thinned = Upgrade(each.basis_size, each.rotations[used], each.scales[used], each.residual)
+        entries.append(
+            with_fixed_rotations(
+                part, thinned, np.ones(len(part) // 2), with_scales=False, ordered=ordered, should_stop=should_stop
+            )
+        )
+        report(Step("cameras", (0.4 + 0.04 * len(entries)) * PROGRESS_SHARE))
+        if should_stop is not None and should_stop():
+            break
+    return factorized, entries
 
 
 def restarted(estimate: CameraEstimate, size: int, rotations: Floats) -> CameraEstimate:
@@ -188,7 +199,7 @@ def _hypotheses(
     factorized: list[Upgrade], ran: list[Candidate], gram: Floats, used: slice
 ) -> tuple[tuple[int, Floats], ...]:
     """Return K and rotations of factorizations that reached nearly the lowest energy in the first round and are not too deep."""
-    lowest = min(candidate.energy for candidate in ran)
+    lowest = min((candidate.energy for candidate in ran), default=np.inf)
     near = {each.basis_size for each in ran if not each.smooth_start and each.energy <= lowest + MAX_HYPOTHESIS_GAP}
     return tuple(
         (each.basis_size, each.rotations)
@@ -206,12 +217,8 @@ def _everywhere(before: Floats, best: Candidate, used: slice, settings: Settings
         return before, "A refinement was tried and refused: it left the finite numbers."
     after = start_at_identity(after)
     turn = float(np.degrees(angles_between(after, before).mean()))
-    how = ", from a steadied start" if best.smooth_start else ""
+    how = ", from a smooth-camera start" if best.smooth_start else ""
     return after, f"Refined by variable projection{how}; rotations moved by {turn:.2f}° on average."
-
-
-def _thinned(full: Upgrade, used: slice) -> Upgrade:
-    return Upgrade(full.basis_size, full.rotations[used], full.scales[used], full.residual)
 
 
 def given_cameras(normalized: Normalized, known: KnownCamera, settings: Settings, *, rank: int = 0) -> CameraEstimate:
@@ -263,11 +270,9 @@ def _why(ran: list[Candidate], best: Candidate, settings: Settings) -> str:
     if settings.basis_size is not None:
         return f"K = {size} as set."
     tried = ", ".join(
-        f"{each.basis_size}{' smooth_start' if each.smooth_start else ''}: {each.energy:.3f}" for each in ran
+        f"{each.basis_size}{' with a smooth start' if each.smooth_start else ''}: {each.energy:.3f}" for each in ran
     )
-    return (
-        f"K = {size} leads to the most probable motion under the steadiest camera (negative log-likelihood: {tried})."
-    )
+    return f"K = {size} leads to the most probable motion of object and camera (negative log likelihood: {tried})."
 
 
 def _warnings(rotations: Floats) -> tuple[str, ...]:

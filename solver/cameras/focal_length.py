@@ -20,7 +20,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from pliant.solver.cameras.learned import Learned, motion_of, moved_to, scene_at
 from pliant.solver.cameras.perspective import (
-    NEAREST,
     Candidate,
     Perspective,
     centred,
@@ -34,11 +33,12 @@ from pliant.solver.model.expectation_maximisation import annealed
 from pliant.solver.model.image_density import factor_of
 from pliant.solver.model.marginal_likelihood import CAMERA_PRIOR_WEIGHT, UNLIKELY, Motion, energy_with_inverse
 from pliant.solver.model.model_order import ModelOrder
+from pliant.solver.model.resection import MIN_RELATIVE_DISTANCE
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.records import Floats
 from scipy.optimize import minimize
 
-GRID = (0.02, 0.035, 0.06, 0.1, 0.16, 0.25, 0.38)
+CURVATURES = (0.02, 0.035, 0.06, 0.1, 0.16, 0.25, 0.38)
 """κ compared, in inverse RMS radii of the tracks, each with both signs. At .02 the correction is 1 % to 2 % of a position; at .38 an object
 fills 80° of the view."""
 
@@ -48,24 +48,24 @@ SEARCH_FRAMES = 32
 UPDATES = 2
 """Updates of depths and covariance for every κ."""
 
-ROUNDS = 40
+SEARCH_EM_ROUNDS = 40
 """Rounds of expectation maximisation of an update, from scratch, so that all values of κ are judged alike."""
 
-POLISHES = 3
+MAX_POLISHES = 3
 """Values of κ that are compared between the best of the grid and its neighbours."""
 
-GAIN = 0.02
+MIN_PERSPECTIVE_GAIN = 0.02
 """Likelihood per point and frame, as a logarithm, by which perspective must be more probable than orthography, and one sign of depth than
 the other. Equal κ from different starts differ by up to .01."""
 
-DECISIVE = 10.0
+MIN_TOTAL_GAIN = 10.0
 """Likelihood of all observations together, as a logarithm, by which perspective must be more probable: few observations are no evidence.
 Kass and Raftery (1995), Bayes factors, call 5 very strong."""
 
-WRONG = 1.6
+COMPARED_RATIO = 1.6
 """A given focal length is compared with ones that are longer and shorter by this factor."""
 
-ITERATIONS = 60
+UPDATE_ITERATIONS = 60
 """L-BFGS iterations of κ, cameras and modes between two updates of the depths."""
 
 
@@ -98,10 +98,10 @@ def search(
         Cameras found under orthography.
     view : Perspective
         What is given; `curvature` of the result is negative if the depths of these cameras have to be mirrored.
-    model_order : Support
+    model_order : ModelOrder
         Modes at most, and the noise to begin with.
     should_stop : callable, optional
-        Asked between values of κ; once it says True, the best so far counts.
+        Called between values of κ; once it returns True, the best so far counts.
     """
     count = max(min(SEARCH_FRAMES, len(views), views.shape[1] // 2), 3)
     used = np.unique(np.linspace(0, len(views) - 1, min(count, len(views))).round().astype(np.intp))
@@ -110,17 +110,7 @@ def search(
     trials = {0.0: _Trial(0.0, flat.nll, np.zeros(some.shape[:2]), flat)}
 
     def judge(curvature: float) -> None:
-        trial = trials[0.0]
-        for _ in range(UPDATES):
-            try:
-                depth = depth_map(rotations[used], scales[used], trial.covariance)
-                depths = depths_of(depth, some, curvature, start=trial.depths)
-                covariance = _learn(some, depths, curvature, projections, model_order)
-            except np.linalg.LinAlgError:  # depths beyond any measure
-                trial = replace(trial, curvature=curvature, nll=UNLIKELY)
-                break
-            trial = _Trial(curvature, covariance.nll + density(depths, curvature), depths, covariance)
-        trials[curvature] = trial
+        trials[curvature] = _judged(curvature, trials[0.0], some, rotations[used], scales[used], model_order)
 
     def stopped() -> bool:
         return should_stop is not None and should_stop()
@@ -129,14 +119,30 @@ def search(
         if stopped():
             break
         judge(sign * size)
-    for _ in range(POLISHES if view.given is None and _promising(view, trials) else 0):
-        between = _between(trials)
-        if between is None or stopped():
+    for _ in range(MAX_POLISHES if view.given is None and _promising(view, trials) else 0):
+        middle = _between(trials)
+        if middle is None or stopped():
             break
-        judge(between)
+        judge(middle)
     view = _decided(view, trials, len(used), some.shape[1])
     covariance = trials[view.curvature if view.curvature in trials else 0.0].covariance
     return view, covariance if len(used) == len(views) else covariance.stretched(used, len(views))
+
+
+def _judged(
+    curvature: float, trial: _Trial, views: Floats, rotations: Floats, scales: Floats, model_order: ModelOrder
+) -> _Trial:
+    """Return what κ leads to after `UPDATES` of depths and covariance that begin with those of a trial."""
+    projections = rotations[:, :2] * scales[:, None, None]
+    for _ in range(UPDATES):
+        try:
+            depth = depth_map(rotations, scales, trial.covariance)
+            depths = depths_of(depth, views, curvature, start=trial.depths)
+            covariance = _learn(views, depths, curvature, projections, model_order)
+        except np.linalg.LinAlgError:  # depths beyond any measure
+            return replace(trial, curvature=curvature, nll=UNLIKELY)
+        trial = _Trial(curvature, covariance.nll + density(depths, curvature), depths, covariance)
+    return trial
 
 
 def _walk(view: Perspective, trials: dict[float, _Trial]) -> Iterator[tuple[float, int]]:
@@ -146,19 +152,21 @@ def _walk(view: Perspective, trials: dict[float, _Trial]) -> Iterator[tuple[floa
     at, a sign is given up when the other is clearly better, and the way ends beyond its minimum.
     """
     if view.given is not None:
-        yield from ((view.given * factor, sign) for factor in (1, 1 / WRONG, WRONG) for sign in view.signs)
+        yield from (
+            (view.given * factor, sign) for factor in (1, 1 / COMPARED_RATIO, COMPARED_RATIO) for sign in view.signs
+        )
         return
     signs = list(view.signs)
-    for index, size in enumerate(GRID):
+    for index, size in enumerate(CURVATURES):
         for sign in signs:
             yield size, sign
         done = [trials[sign * size].nll for sign in signs if sign * size in trials]
         if len(done) < len(signs) or (index == 1 and not _promising(view, trials)):
             return
-        if len(signs) == 2 and abs(done[0] - done[1]) > GAIN and index > 0:
+        if len(signs) == 2 and abs(done[0] - done[1]) > MIN_PERSPECTIVE_GAIN and index > 0:
             signs = [signs[int(np.argmin(done))]]
             done = [min(done)]
-        if index > 1 and min(done) > trials[_best(trials)].nll + GAIN:
+        if index > 1 and min(done) > trials[_best(trials)].nll + MIN_PERSPECTIVE_GAIN:
             return
 
 
@@ -172,7 +180,7 @@ def _learn(
     rows = columns(centred(corrected(views, depths, curvature)))
     return annealed(
         rows @ rows.T / rows.shape[1], projections, max_modes=model_order.max_modes, noisy_start=model_order.noisy_start,
-        ordered=model_order.ordered, iterations=ROUNDS,
+        ordered=model_order.ordered, iterations=SEARCH_EM_ROUNDS,
     )  # fmt: skip
 
 
@@ -227,8 +235,8 @@ def _decided(view: Perspective, trials: dict[float, _Trial], frames: int, points
         return replace(view, curvature=best, candidates=candidates)
     nll = trials[best].nll
     opposite = min((each.nll for each in candidates if each.curvature * best < 0), default=np.inf)
-    settled = len(view.signs) == 1 or bool(np.isfinite(opposite) and opposite - nll > GAIN)
-    needed = trials[0.0].nll - nll > max(GAIN, DECISIVE / (frames * points)) and settled
+    settled = len(view.signs) == 1 or bool(np.isfinite(opposite) and opposite - nll > MIN_PERSPECTIVE_GAIN)
+    needed = trials[0.0].nll - nll > max(MIN_PERSPECTIVE_GAIN, MIN_TOTAL_GAIN / (frames * points)) and settled
     if not (needed or view.required or view.given is not None):
         return replace(view, curvature=0.0, candidates=candidates)
     std, found = 0.0, _around(trials)
@@ -246,7 +254,7 @@ def refined_with_focal(
     free: bool,
     turning: bool,
     with_scales: bool,
-    iterations: int = ITERATIONS,
+    iterations: int = UPDATE_ITERATIONS,
 ) -> tuple[Learned, float]:
     """Return cameras, covariance and κ of higher likelihood, after one update of the depths.
 
@@ -301,7 +309,7 @@ class corrected_energy:  # noqa: N801
         frames, curvature = len(self.depths), float(flat[-1])
         constant, linear, square = self.grams
         nearer = 1 + curvature * self.depths
-        if nearer.min() < NEAREST:
+        if nearer.min() < MIN_RELATIVE_DISTANCE:
             return UNLIKELY, np.zeros_like(flat)
         gram = constant + curvature * linear + curvature**2 * square
         scene = replace(self.scene, gram=gram, factor=factor_of(gram))

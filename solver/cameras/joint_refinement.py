@@ -8,7 +8,7 @@ modes, which the random walk replaces); they are improved alternately.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,16 +16,16 @@ from pliant.solver.cameras.bas_relief import DECIDED, facing, settled_depth
 from pliant.solver.cameras.covariance_learning import LearningData
 from pliant.solver.cameras.depth_rounds import settled, settled_again
 from pliant.solver.cameras.estimation import CameraEstimate, restarted
-from pliant.solver.cameras.learned import Learned, motion_of, moved_to, scene_at
-from pliant.solver.cameras.scale import WIDEST, rigid_scales
+from pliant.solver.cameras.learned import Learned, refined, scene_at, turned
+from pliant.solver.cameras.scale import SCALE_ROUNDS, ScaleTrial, try_free_scales
 from pliant.solver.model import full_mode_covariance
-from pliant.solver.model.expectation_maximisation import MAX_MODES, learned
-from pliant.solver.model.marginal_likelihood import fit
+from pliant.solver.model.expectation_maximisation import MAX_MODES
 from pliant.solver.model.model_order import ModelOrder, select_model_order
 from pliant.solver.model.so3 import angles_between, exponential
 from pliant.solver.monitor import enter
 from pliant.solver.records import Floats, read_only
 from pliant.solver.stages import REFINEMENT_UNITS, UNITS_PER_START
+from pliant.solver.tracks.frame_selection import between, evenly_spread, of_frames
 from pliant.solver.tracks.noise import OUTLIER_SHARE
 from pliant.solver.tracks.normalization import Normalized
 from scipy.spatial.transform import Rotation
@@ -34,35 +34,50 @@ REFINEMENT_ROUNDS = 5
 """Refinements of rotations and covariance, each with a new L-BFGS memory. EM in between would undo part of the gain,
 since it keeps modes and random walk apart."""
 
-START_EM_ROUNDS = 90
-"""Maximum number of EM rounds of a run before a refinement; L-BFGS, which follows, gains more in the same time. Error of faces
-of 99 frames with 60, 90 and 150: .0146, .0132, .0138, differences that may be chance."""
-
-ROTATION_ITERATIONS = 60
-"""L-BFGS iterations per refinement of the rotations."""
-
 START_FRAMES, START_ROUNDS = 40, 2
 """Frames and refinements used to compare the starting cameras."""
 
 CANDIDATE_ROUNDS = 3
 """Refinements of every candidate where they are compared at settled depths."""
 
-SCALE_FRAMES = 120
-"""Frames used to decide whether scales are free; with 60 instead of 120 chance gains of fixed scales reach .054."""
 
-SCALE_ROUNDS = 2
-"""Refinements used to decide whether scales are free."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Evidence:
+    """An estimate, and the completed tracks of the frames used, divided by the scales of the start."""
 
-MIN_SCALE_GAIN = 0.12
-"""Decrease of the energy, per point and frame, required to free scales that vary from frame to frame. BIC for one
-parameter per frame gives .075; fixed scales gain up to .08 by chance, real scale changes .23 and more."""
+    estimate: CameraEstimate
 
-SMOOTH_SCALE_SHARE = 0.4
-"""Share of `MIN_SCALE_GAIN` required of slowly varying scales, which need fewer parameters: a swing of .05 over 60
-frames gains .058, none up to .04."""
+    used: NDArray[np.intp]
+    """Shape `(F',)`, increasing."""
 
-MIN_SCALE_STD = 0.01
-"""Standard deviation of log s below which scales stay 1."""
+    start_scales: Floats
+    """Of all frames, shape `(F,)`."""
+
+    gram: Floats
+    """Shape `(2F', 2F')`."""
+
+    sample: Floats
+    """Shape `(F', S, 2)`."""
+
+    @classmethod
+    def of(cls, estimate: CameraEstimate, used: NDArray[np.intp], start_scales: Floats) -> _Evidence:
+        wide = np.repeat(start_scales, 2)
+        gram = of_frames(estimate.gram / np.outer(wide, wide), used)
+        return cls(estimate, used, start_scales, gram, (estimate.sample / start_scales[:, None, None])[used])
+
+    def corrected(self, estimate: CameraEstimate) -> _Evidence:
+        """Return an estimate whose tracks are corrected for other depths, at the same frames."""
+        return _Evidence.of(estimate, self.used, self.start_scales)
+
+    @property
+    def rotations(self) -> Floats:
+        """Of the frames used, shape `(F', 3, 3)`."""
+        return np.asarray(self.estimate.rotations)[self.used]
+
+    @property
+    def projections(self) -> Floats:
+        """Their first two rows, shape `(F', 2, 3)`."""
+        return np.asarray(self.estimate.rotations)[self.used, :2]
 
 
 def refine_cameras(
@@ -91,149 +106,165 @@ def refine_cameras(
     seed : int
         Seed of the split of the points where some are held out.
     normalized : Normalized, optional
-        The tracks themselves, needed where `estimate.perspective` says that perspective is possible.
+        The tracks themselves, needed where `estimate.perspective` is given.
     y_up : bool
         Whether y points up in the images.
     should_stop : callable, optional
         Called between refinements; once it returns True, the best so far is returned.
     """
-    frames, spoiled = len(estimate.rotations), estimate.outliers > OUTLIER_SHARE
-    used = np.flatnonzero(shown)
-    start = np.asarray(estimate.scales)
-    unscaled, sample = _of_corrected(estimate, start, used)
-    enter(should_stop, "model_order")
-    model_order = select_model_order(
-        sample,
-        np.asarray(estimate.rotations)[used, :2],
-        spoiled=spoiled and not turning,
-        ordered=estimate.ordered,
-        seed=seed,
-        should_stop=should_stop,
-    )
-    if spoiled and turning:
-        # Few modes would let the cameras follow the deformation; the order is selected later, for the shapes.
-        model_order = replace(model_order, max_modes=MAX_MODES)
-    if turning and estimate.hypotheses:
-        enter(should_stop, "starts", units=UNITS_PER_START * (1 + len(estimate.hypotheses)))
-        estimate = _best_start(estimate, unscaled, used, model_order, should_stop)
-    if estimate.perspective is not None and normalized is not None:
-        enter(should_stop, "perspective")
-        estimate = settled(
-            estimate, normalized, used, model_order=model_order, turning=turning, should_stop=should_stop
-        )
-        unscaled, sample = _of_corrected(estimate, start, used)
-    at_first = np.asarray(estimate.rotations)
-    before = at_first[used]
-    start_scales, why, fixed = None, None, None
-    if turning and estimates_scales and (start == 1).all():
-        enter(should_stop, "scales")
-        start_scales, why, fixed = _free_scales(unscaled, before, model_order, should_stop)
-    rotations, scales, found = before, np.ones(len(used)), None
-    if turning:
-        may_couple = model_order == ModelOrder(ordered=estimate.ordered)
-        enter(should_stop, "refinement", units=REFINEMENT_UNITS[may_couple])
-        if fixed is None or start_scales is not None or len(fixed.rotations) < len(used):
-            found = refined(
-                unscaled, before, scales if start_scales is None else start_scales, with_scales=start_scales is not None,
-                rounds=REFINEMENT_ROUNDS, model_order=model_order, should_stop=should_stop,
-            )  # fmt: skip
-        else:
-            rounds = REFINEMENT_ROUNDS - SCALE_ROUNDS
-            found = _turned(unscaled, fixed, with_scales=False, rounds=rounds, should_stop=should_stop)
-        bends = estimate.perspective is not None and estimate.perspective.bends
-
-        def again(found: Learned) -> tuple[CameraEstimate, Learned, Floats, Floats]:
-            assert normalized is not None
-            better, moved = settled_again(
-                estimate, normalized, used, found, start[used], model_order=model_order, should_stop=should_stop
-            )
-            return better, moved, *_of_corrected(better, start, used)
-
-        if bends:
-            estimate, found, unscaled, sample = again(found)
-        if may_couple and full_mode_covariance.is_identifiable(found.covariance, estimate.sample.shape[1]):
-            found = _coupled(unscaled, found, with_scales=start_scales is not None, should_stop=should_stop)
-            if bends:
-                estimate, found, unscaled, sample = again(found)
-        if not bends and np.isfinite(found.energy):
-            found, stretch = settled_depth(unscaled, found)
-            estimate = _with_depth_choice(estimate, stretch)
-            if estimate.depth_is_typical:
-                found = _steadiest(estimate, unscaled, used, found, model_order, should_stop)
-                found = facing(found, sample, y_up=y_up)
-        before = np.asarray(estimate.rotations)[used] if bends else before
-        rotations, scales = found.rotations, found.scales
-    stopped = found.covariance if found is not None and not np.isfinite(found.energy) else None
-    projections = rotations[:, :2] * scales[:, None, None]
-    data = LearningData(
-        unscaled, sample, projections, used, model_order, spoiled and turning, stopped,
-        np.asarray(estimate.rotations), np.asarray(estimate.scales), turning,
-    )  # fmt: skip
+    start = _Evidence.of(estimate, np.flatnonzero(shown), np.asarray(estimate.scales))
+    model_order = _model_order(start, turning=turning, seed=seed, should_stop=should_stop)
+    start = _started(start, normalized, model_order, turning=turning, should_stop=should_stop)
+    estimate = start.estimate
     if not turning:
-        return estimate, data
-    turns = Rotation.from_matrix(rotations @ before.transpose(0, 2, 1)).as_rotvec()
-    whole = exponential(_between(used, turns, frames)) @ estimate.rotations
-    if why is not None:
-        estimate = replace(estimate, reasons={**estimate.reasons, "scales": why})
-    if start_scales is not None:
-        logs = _between(used, np.log(scales)[:, None], frames)[:, 0]
+        return estimate, LearningData(
+            start.gram, start.sample, start.projections, start.used, model_order, selects_again=False, stopped=None,
+            rotations=np.asarray(estimate.rotations), scales=np.asarray(estimate.scales), turned=False,
+        )  # fmt: skip
+    trial = None
+    if estimates_scales and (start.start_scales == 1).all():
+        enter(should_stop, "scales")
+        trial = try_free_scales(start.gram, start.rotations, model_order, should_stop)
+    evidence, found = _refined(start, normalized, trial, model_order, y_up=y_up, should_stop=should_stop)
+    refined_estimate, rotations = _of_all_frames(start, evidence, found, trial)
+    return refined_estimate, LearningData(
+        evidence.gram, evidence.sample, found.rotations[:, :2] * found.scales[:, None, None], start.used, model_order,
+        selects_again=_is_spoiled(estimate), stopped=None if np.isfinite(found.energy) else found.covariance,
+        rotations=rotations, scales=np.asarray(refined_estimate.scales), turned=True,
+    )  # fmt: skip
+
+
+def _is_spoiled(estimate: CameraEstimate) -> bool:
+    return estimate.outliers > OUTLIER_SHARE
+
+
+def _model_order(
+    evidence: _Evidence, *, turning: bool, seed: int, should_stop: Callable[[], bool] | None
+) -> ModelOrder:
+    """Return the number of modes and the starting noise with which cameras are refined."""
+    enter(should_stop, "model_order")
+    spoiled, ordered = _is_spoiled(evidence.estimate), evidence.estimate.ordered
+    model_order = select_model_order(
+        evidence.sample, evidence.projections,
+        spoiled=spoiled and not turning, ordered=ordered, seed=seed, should_stop=should_stop,
+    )  # fmt: skip
+    # Few modes would let the cameras follow the deformation; the order is selected later, for the shapes.
+    return replace(model_order, max_modes=MAX_MODES) if spoiled and turning else model_order
+
+
+def _started(
+    start: _Evidence,
+    normalized: Normalized | None,
+    model_order: ModelOrder,
+    *,
+    turning: bool,
+    should_stop: Callable[[], bool] | None,
+) -> _Evidence:
+    """Return the most probable start, with tracks corrected for perspective where they need it."""
+    if turning and start.estimate.hypotheses:
+        enter(should_stop, "starts", units=UNITS_PER_START * (1 + len(start.estimate.hypotheses)))
+        best = _best_start(start.estimate, start.gram, start.used, model_order, should_stop)
+        start = replace(start, estimate=best)
+    if start.estimate.perspective is None or normalized is None:
+        return start
+    enter(should_stop, "perspective")
+    return start.corrected(
+        settled(
+            start.estimate, normalized, start.used, model_order=model_order, turning=turning, should_stop=should_stop
+        )
+    )
+
+
+def _refined(
+    evidence: _Evidence,
+    normalized: Normalized | None,
+    trial: ScaleTrial | None,
+    model_order: ModelOrder,
+    *,
+    y_up: bool,
+    should_stop: Callable[[], bool] | None,
+) -> tuple[_Evidence, Learned]:
+    """Return the refined cameras and covariance of the frames used, and the tracks as their depths correct them."""
+    estimate, with_scales = evidence.estimate, trial is not None and trial.start is not None
+    bends = estimate.perspective is not None and estimate.perspective.bends
+    may_couple = model_order == ModelOrder(ordered=estimate.ordered)
+    enter(should_stop, "refinement", units=REFINEMENT_UNITS[may_couple])
+    found = _first_rounds(evidence, trial, model_order, should_stop)
+    if bends:
+        evidence, found = _with_settled_depths(evidence, normalized, found, model_order, should_stop)
+    if may_couple and full_mode_covariance.is_identifiable(found.covariance, estimate.sample.shape[1]):
+        found = _coupled(evidence.gram, found, with_scales=with_scales, should_stop=should_stop)
+        if bends:
+            evidence, found = _with_settled_depths(evidence, normalized, found, model_order, should_stop)
+    if not bends and np.isfinite(found.energy):
+        return _with_probable_depth(evidence, found, model_order, y_up=y_up, should_stop=should_stop)
+    return evidence, found
+
+
+def _first_rounds(
+    evidence: _Evidence, trial: ScaleTrial | None, model_order: ModelOrder, should_stop: Callable[[], bool] | None
+) -> Learned:
+    """Return cameras and covariance after `REFINEMENT_ROUNDS`, of which the trial of scales may have done some."""
+    count = len(evidence.used)
+    if trial is not None and trial.start is None and len(trial.fixed.rotations) == count:
+        rounds = REFINEMENT_ROUNDS - SCALE_ROUNDS
+        return turned(evidence.gram, trial.fixed, with_scales=False, rounds=rounds, should_stop=should_stop)
+    scales = None if trial is None else trial.start
+    return refined(
+        evidence.gram, evidence.rotations, np.ones(count) if scales is None else scales,
+        with_scales=scales is not None, rounds=REFINEMENT_ROUNDS, model_order=model_order, should_stop=should_stop,
+    )  # fmt: skip
+
+
+def _with_settled_depths(
+    evidence: _Evidence,
+    normalized: Normalized | None,
+    found: Learned,
+    model_order: ModelOrder,
+    should_stop: Callable[[], bool] | None,
+) -> tuple[_Evidence, Learned]:
+    """Return the tracks corrected with the depths of the cameras and the covariance found, and both refined once more."""
+    assert normalized is not None
+    used = evidence.used
+    estimate, found = settled_again(
+        evidence.estimate, normalized, used, found, evidence.start_scales[used],
+        model_order=model_order, should_stop=should_stop,
+    )  # fmt: skip
+    return evidence.corrected(estimate), found
+
+
+def _with_probable_depth(
+    evidence: _Evidence,
+    found: Learned,
+    model_order: ModelOrder,
+    *,
+    y_up: bool,
+    should_stop: Callable[[], bool] | None,
+) -> tuple[_Evidence, Learned]:
+    """Return cameras and covariance at the most probable depth; where the tracks hardly determine it, the best of all candidates."""
+    found, stretch = settled_depth(evidence.gram, found)
+    estimate = _with_depth_choice(evidence.estimate, stretch)
+    if estimate.depth_is_typical:
+        found = _best_candidate(estimate, evidence.gram, evidence.used, found, model_order, should_stop)
+        found = facing(found, evidence.sample, y_up=y_up)
+    return replace(evidence, estimate=estimate), found
+
+
+def _of_all_frames(
+    start: _Evidence, evidence: _Evidence, found: Learned, trial: ScaleTrial | None
+) -> tuple[CameraEstimate, Floats]:
+    """Return the estimate with the cameras found, interpolated to all frames, and its rotations in the axes of `found`."""
+    estimate, used, frames = evidence.estimate, evidence.used, len(evidence.start_scales)
+    turns = Rotation.from_matrix(found.rotations @ evidence.rotations.transpose(0, 2, 1)).as_rotvec()
+    rotations = exponential(between(used, turns, frames)) @ estimate.rotations
+    if trial is not None:
+        estimate = replace(estimate, reasons={**estimate.reasons, "scales": trial.reason})
+    if trial is not None and trial.start is not None:
+        logs = between(used, np.log(found.scales)[:, None], frames)[:, 0]
         scales = np.exp(logs - logs.mean())
         read_only(scales)
         estimate = replace(estimate, scales=scales)
-    data = replace(data, rotations=whole, scales=np.asarray(estimate.scales))
-    return _with_rotation_reason(estimate, whole, at_first), data
-
-
-def _of_corrected(estimate: CameraEstimate, scales: Floats, used: NDArray[np.intp]) -> tuple[Floats, Floats]:
-    """Return Gram matrix and sample of the frames used, divided by the scales."""
-    unscaled = _of_frames(estimate.gram / np.outer(np.repeat(scales, 2), np.repeat(scales, 2)), used)
-    return unscaled, (estimate.sample / scales[:, None, None])[used]
-
-
-def refined(
-    gram: Floats,
-    rotations: Floats,
-    scales: Floats,
-    *,
-    with_scales: bool,
-    rounds: int,
-    model_order: ModelOrder,
-    should_stop: Callable[[], bool] | None = None,
-) -> Learned:
-    """Return cameras and covariance after rounds of alternating refinement; scales stay 1 without `with_scales`."""
-    start = _learned_at(gram, rotations, scales, model_order, should_stop)
-    return _turned(gram, start, with_scales=with_scales, rounds=rounds, should_stop=should_stop)
-
-
-def _learned_at(
-    gram: Floats,
-    rotations: Floats,
-    scales: Floats,
-    model_order: ModelOrder,
-    should_stop: Callable[[], bool] | None,
-) -> Learned:
-    """Return given cameras and the covariance learned with them from scratch."""
-    covariance = learned(
-        gram,
-        rotations[:, :2] * scales[:, None, None],
-        max_modes=model_order.max_modes,
-        noisy_start=model_order.noisy_start,
-        ordered=model_order.ordered,
-        iterations=START_EM_ROUNDS,
-        should_stop=should_stop,
-    )
-    return Learned(rotations, scales, covariance, np.inf)
-
-
-def _turned(
-    gram: Floats, found: Learned, *, with_scales: bool, rounds: int, should_stop: Callable[[], bool] | None
-) -> Learned:
-    """Return cameras and covariance after rounds of refinement."""
-    for _ in range(rounds):
-        if should_stop is not None and should_stop():
-            break
-        found = turned_once(gram, found, with_scales=with_scales, should_stop=should_stop)
-    return found
+    return _with_rotation_reason(estimate, rotations, np.asarray(start.estimate.rotations)), rotations
 
 
 def _best_start(
@@ -250,7 +281,7 @@ def _best_start(
     therefore be the better start.
     """
     some = evenly_spread(np.arange(len(used)), START_FRAMES)
-    part, ones = _of_frames(gram, some), np.ones(len(some))
+    part, ones = of_frames(gram, some), np.ones(len(some))
     best, lowest = estimate, np.inf
     for start in (estimate, *(restarted(estimate, size, rotations) for size, rotations in estimate.hypotheses)):
         if should_stop is not None and should_stop():
@@ -264,7 +295,7 @@ def _best_start(
     return best
 
 
-def _steadiest(
+def _best_candidate(
     estimate: CameraEstimate,
     gram: Floats,
     used: NDArray[np.intp],
@@ -274,8 +305,8 @@ def _steadiest(
 ) -> Learned:
     """Return the most probable cameras among `found` and those from every candidate of the multistart, each at its settled depth.
 
-    Rotations that are too small by different factors are not equally steady; only at comparable depths does steadiness tell a turn of the
-    object from its deformation.
+    The prior on camera motion prefers rotations that are too small, whatever their direction. Only at comparable depths does it distinguish
+    a turn of the object from its deformation.
     """
     for rotations in estimate.candidates:
         if should_stop is not None and should_stop():
@@ -291,84 +322,6 @@ def _steadiest(
     return found
 
 
-def _free_scales(
-    gram: Floats, rotations: Floats, model_order: ModelOrder, should_stop: Callable[[], bool] | None
-) -> tuple[Floats | None, str, Learned]:
-    """Return scales to start from, or None where free scales gain no more than chance, a sentence, and what was found without.
-
-    Scales are free from two starts, 1 and those of a rigid shape, on a subset of the frames. Deformation that is
-    mistaken for scale ends in a worse minimum than fixed scales, or in one with nearly constant scales.
-    """
-    used = evenly_spread(np.arange(len(rotations)), SCALE_FRAMES)
-    part, given, none = _of_frames(gram, used), rotations[used], np.ones(len(used))
-
-    def turned(start: Learned, *, with_scales: bool) -> Learned:
-        return _turned(part, start, with_scales=with_scales, rounds=SCALE_ROUNDS, should_stop=should_stop)
-
-    even, rigid = (
-        _learned_at(part, given, scales, model_order, should_stop) for scales in (none, rigid_scales(part, given))
-    )
-    fixed, runs = turned(even, with_scales=False), [turned(each, with_scales=True) for each in (even, rigid)]
-    best = min(runs, key=lambda run: run.energy)
-    gain, least, largest = fixed.energy - best.energy, float(best.scales.min()), float(best.scales.max())
-    if np.log(best.scales).std() > WIDEST:
-        return (
-            None,
-            f"Every scale is 1: those found, from {least:.3f} to {largest:.3f}, are wider apart than any camera's.",
-            fixed,
-        )
-    share = _scale_gain_share(np.log(best.scales)) if model_order.ordered else 1.0
-    if not (gain > MIN_SCALE_GAIN * share and np.log(best.scales).std() > MIN_SCALE_STD):
-        why = (
-            f"Every scale is 1: free ones, from {least:.3f} to {largest:.3f}, would gain {gain:.3f} in the logarithm of the "
-            "likelihood, no more than deformation alone does."
-        )
-        return None, why, fixed
-    logs = _between(used, np.log(best.scales)[:, None], len(rotations))[:, 0]
-    why = f"Scales from {least:.3f} to {largest:.3f} gain {gain:.3f} in the logarithm of the likelihood, per point and frame."
-    return np.exp(logs - logs.mean()), why, fixed
-
-
-def _scale_gain_share(logs: Floats) -> float:
-    """Return the share of `MIN_SCALE_GAIN` required: `SMOOTH_SCALE_SHARE` for slowly varying scales, up to 1 for independent ones."""
-    rough = float(np.diff(logs).var()) / max(2 * float(logs.var()), np.finfo(float).tiny)
-    return float(np.clip(3 * rough, SMOOTH_SCALE_SHARE, 1.0))
-
-
-def evenly_spread(places: NDArray[np.intp], count: int) -> NDArray[np.intp]:
-    """Return at most `count` of the places, evenly spread."""
-    chosen = np.linspace(0, len(places) - 1, min(len(places), count)).round().astype(np.intp)
-    return np.asarray(places[np.unique(chosen)])
-
-
-def _of_frames(gram: Floats, used: NDArray[np.intp]) -> Floats:
-    """Return the Gram matrix of some frames."""
-    rows = np.stack([2 * used, 2 * used + 1], axis=1).ravel()
-    return gram[np.ix_(rows, rows)]
-
-
-def informative_frames(visible: Floats) -> NDArray[np.bool_]:
-    """Return which frames show at least a tenth of the median number of points, shape `(F,)`; all if fewer than three do."""
-    seen = (visible > 0).sum(axis=1)
-    is_identifiable = np.asarray(seen >= max(3.0, 0.1 * float(np.median(seen[seen > 0]))))
-    return is_identifiable if is_identifiable.sum() >= 3 else np.ones(len(seen), dtype=bool)
-
-
-def turned_once(
-    gram: Floats,
-    found: Learned,
-    *,
-    with_scales: bool,
-    factor: Floats | None = None,
-    should_stop: Callable[[], bool] | None = None,
-) -> Learned:
-    """Return cameras and covariance of higher likelihood; `factor` as for `scene_at`."""
-    ordered = found.covariance.ordered
-    scene = scene_at(gram, found.rotations, with_scales=with_scales, ordered=ordered, factor=factor)
-    moved = fit(scene, motion_of(scene, found), iterations=ROTATION_ITERATIONS, turning=True, should_stop=should_stop)
-    return moved_to(scene, found, *moved)
-
-
 def _coupled(gram: Floats, found: Learned, *, with_scales: bool, should_stop: Callable[[], bool] | None) -> Learned:
     """Return the cameras refined with modes that have axes of their own (`model.full_mode_covariance`), if they are more probable."""
     scene = scene_at(gram, found.rotations, with_scales=with_scales, ordered=found.covariance.ordered)
@@ -378,11 +331,6 @@ def _coupled(gram: Floats, found: Learned, *, with_scales: bool, should_stop: Ca
         model_order=ModelOrder(ordered=scene.ordered), should_stop=should_stop,
     )  # fmt: skip
     return again if again.energy < found.energy else found
-
-
-def _between(used: NDArray[np.intp], turns: Floats, frames: int) -> Floats:
-    """Return turns of all frames, interpolated between those of the frames used."""
-    return np.stack([np.interp(np.arange(frames), used, axis) for axis in turns.T], axis=1)
 
 
 def _with_rotation_reason(estimate: CameraEstimate, rotations: Floats, before: Floats) -> CameraEstimate:
@@ -402,7 +350,7 @@ def _with_depth_choice(estimate: CameraEstimate, stretch: float) -> CameraEstima
     if abs(np.log(stretch)) < np.log(DECIDED):
         return estimate
     sentence = (
-        f"The tracks hardly tell depth from rotation: {1 / stretch:.2g} times the depth with {stretch:.2g} times the rotation explains "
-        "them about as well. The depth is one that is usual for the width, as of half a sphere."
+        f"The tracks hardly distinguish depth from rotation: {1 / stretch:.2g} times the depth with {stretch:.2g} times the rotation "
+        "explains them about as well. The depth is one that is usual for the width, as of half a sphere."
     )
     return replace(estimate, depth_is_typical=True, reasons={**estimate.reasons, "depth_extent": sentence})

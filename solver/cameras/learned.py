@@ -1,19 +1,29 @@
-"""Cameras and shape covariance that belong together, and the way from there to the parameters of the likelihood and back."""
+"""Cameras and shape covariance that belong together, and their refinement by the marginal likelihood."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from pliant.solver.model.marginal_likelihood import Motion, Scene, cameras_of, covariances_of, root_of
+from pliant.solver.model.expectation_maximisation import learned
+from pliant.solver.model.marginal_likelihood import Motion, Scene, cameras_of, covariances_of, fit, root_of
+from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.shape_covariance import AXIS_VARIANCE_FLOOR, NOISE_VARIANCE_FLOOR, ShapeCovariance
 from pliant.solver.records import Floats
 
-STEADY = 0.01
-"""Weight of the camera's unsteadiness: less is needed once the covariance is known."""
+REFINEMENT_PRIOR_WEIGHT = 0.01
+"""Weight of the camera-motion prior: less is needed once the covariance is known."""
 
 LEAST_NOISE = 1e-12
 """What is left of σ² where it lies at its floor, which the likelihood adds again."""
+
+START_EM_ROUNDS = 90
+"""Maximum number of EM rounds of a run before a refinement; L-BFGS, which follows, gains more in the same time. Error of faces
+of 99 frames with 60, 90 and 150: .0146, .0132, .0138, differences that may be chance."""
+
+ROTATION_ITERATIONS = 60
+"""L-BFGS iterations per refinement of the rotations."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,7 +50,7 @@ def scene_at(
     `factor`, shape `(2F, r)`, stands for a Gram matrix that is not formed; `gram` is then empty.
     """
     return Scene(
-        gram, rotations, with_scales=with_scales, prior_weight=STEADY if ordered else 0.0,
+        gram, rotations, with_scales=with_scales, prior_weight=REFINEMENT_PRIOR_WEIGHT if ordered else 0.0,
         noise_std_floor=NOISE_VARIANCE_FLOOR**0.5, smoothness=0.0, ordered=ordered,
         factor=np.zeros((0, 0)) if factor is None else factor,
     )  # fmt: skip
@@ -70,3 +80,64 @@ def moved_to(scene: Scene, found: Learned, moved: Motion, energy: float) -> Lear
         noise_variance=noise,
     )
     return Learned(*cameras_of(scene, moved), better, energy)
+
+
+def refined(
+    gram: Floats,
+    rotations: Floats,
+    scales: Floats,
+    *,
+    with_scales: bool,
+    rounds: int,
+    model_order: ModelOrder,
+    should_stop: Callable[[], bool] | None = None,
+) -> Learned:
+    """Return cameras and covariance after rounds of alternating refinement; scales stay 1 without `with_scales`."""
+    start = learned_at(gram, rotations, scales, model_order, should_stop)
+    return turned(gram, start, with_scales=with_scales, rounds=rounds, should_stop=should_stop)
+
+
+def learned_at(
+    gram: Floats,
+    rotations: Floats,
+    scales: Floats,
+    model_order: ModelOrder,
+    should_stop: Callable[[], bool] | None,
+) -> Learned:
+    """Return given cameras and the covariance learned with them from scratch."""
+    covariance = learned(
+        gram,
+        rotations[:, :2] * scales[:, None, None],
+        max_modes=model_order.max_modes,
+        noisy_start=model_order.noisy_start,
+        ordered=model_order.ordered,
+        iterations=START_EM_ROUNDS,
+        should_stop=should_stop,
+    )
+    return Learned(rotations, scales, covariance, np.inf)
+
+
+def turned(
+    gram: Floats, found: Learned, *, with_scales: bool, rounds: int, should_stop: Callable[[], bool] | None
+) -> Learned:
+    """Return cameras and covariance after rounds of refinement."""
+    for _ in range(rounds):
+        if should_stop is not None and should_stop():
+            break
+        found = turned_once(gram, found, with_scales=with_scales, should_stop=should_stop)
+    return found
+
+
+def turned_once(
+    gram: Floats,
+    found: Learned,
+    *,
+    with_scales: bool,
+    factor: Floats | None = None,
+    should_stop: Callable[[], bool] | None = None,
+) -> Learned:
+    """Return cameras and covariance of higher likelihood; `factor` as for `scene_at`."""
+    ordered = found.covariance.ordered
+    scene = scene_at(gram, found.rotations, with_scales=with_scales, ordered=ordered, factor=factor)
+    moved = fit(scene, motion_of(scene, found), iterations=ROTATION_ITERATIONS, turning=True, should_stop=should_stop)
+    return moved_to(scene, found, *moved)

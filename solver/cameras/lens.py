@@ -9,7 +9,7 @@ from pliant.solver.records import KnownCamera, Tracks
 from pliant.solver.settings import Settings
 from pliant.solver.tracks.normalization import Normalized
 
-FARTHEST = 100.0
+MAX_CENTRE_RADII = 100.0
 """RMS radii from the tracks' centre within which a principal point must lie where the picture's size is unknown: a view of 1° or more."""
 
 
@@ -47,9 +47,10 @@ def given_lens(
     else:
         point = normalized.centroid.mean(axis=0)
     offsets = (normalized.centroid - point) / normalized.unit
-    if not np.abs(offsets).max() < FARTHEST:
+    if not np.abs(offsets).max() < MAX_CENTRE_RADII:
         raise InvalidInput(
-            "principal_point_far", field="options.principal_point", expected=f"a point within {FARTHEST:.0f} RMS radii of the tracks",
+            "principal_point_far", field="options.principal_point",
+            expected=f"a point within {MAX_CENTRE_RADII:.0f} RMS radii of the tracks",
             got=f"({point[0]:.5g}, {point[1]:.5g})", hint="Give x, y in the unit and axes of the tracks.",
         )  # fmt: skip
     first = -1 if settings.y_up else 1

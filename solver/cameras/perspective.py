@@ -10,7 +10,7 @@ with c the principal point, t_f the image of the shape's origin relative to c, a
 
 is exactly a scaled-orthographic track of the same shape. Depths follow from the shapes, shapes from the corrected tracks; κ = 1/φ is
 the only new unknown, and κ = 0 is scaled orthography. Reversing the sign of κ is the same as mirroring all depths, x → J x, R → J R J
-with J = diag(1, 1, −1), which orthography cannot tell apart.
+with J = diag(1, 1, −1), which orthography cannot distinguish.
 
 Here depths are posterior means under the Gaussian of `pliant.solver.model.shape_covariance`. They are linear in the corrected tracks,
 
@@ -27,19 +27,16 @@ import numpy as np
 from pliant.solver.limits import LEARNED_FRAMES
 from pliant.solver.model.image_density import Explained, ImageModel
 from pliant.solver.model.marginal_likelihood import root_matrix
+from pliant.solver.model.resection import MIN_RELATIVE_DISTANCE
 from pliant.solver.model.shape_covariance import ShapeCovariance
+from pliant.solver.model.so3 import MIRROR
 from pliant.solver.records import Floats
 from pliant.solver.tracks.completion import Filling, spans
 from pliant.solver.tracks.normalization import Normalized
 from scipy import linalg
 
-STEPS = 8
+DEPTH_STEPS = 8
 """Steps of the fixed point for the depths; each leaves about κ|v| ≤ .3 of the error: 1e-4 of a depth at the end."""
-
-NEAREST = 0.2
-"""Least 1 + κz: no point comes nearer to the camera than a fifth of the distance of the shape's origin."""
-
-MIRROR = np.diag([1.0, 1.0, -1.0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -159,7 +156,7 @@ def depths_of(depth: Floats | DepthMap, views: Floats, curvature: float, *, star
         Depths to start the fixed point from; 0 without it.
     """
     depths = np.zeros(views.shape[:2]) if start is None else start
-    for _ in range(STEPS if curvature else 1):
+    for _ in range(DEPTH_STEPS if curvature else 1):
         depths = depth @ columns(centred(corrected(views, depths, curvature)))
         depths -= depths.mean(axis=1, keepdims=True)
     return depths
@@ -167,12 +164,12 @@ def depths_of(depth: Floats | DepthMap, views: Floats, curvature: float, *, star
 
 def corrected(views: Floats, depths: Floats, curvature: float) -> Floats:
     """Return v (1 + κz): the scaled-orthographic tracks of the same shapes, about the principal point, shape `(F, P, 2)`."""
-    return np.asarray(views * np.maximum(1 + curvature * depths, NEAREST)[..., None])
+    return np.asarray(views * np.maximum(1 + curvature * depths, MIN_RELATIVE_DISTANCE)[..., None])
 
 
 def density(depths: Floats, curvature: float) -> float:
     """Return −2 mean log(1 + κz): what the change of variables u → u (1 + κz) adds to the negative log likelihood."""
-    return -2 * float(np.log(np.maximum(1 + curvature * depths, NEAREST)).mean())
+    return -2 * float(np.log(np.maximum(1 + curvature * depths, MIN_RELATIVE_DISTANCE)).mean())
 
 
 def mirrored(rotations: Floats, covariance: ShapeCovariance) -> tuple[Floats, ShapeCovariance]:

@@ -8,6 +8,7 @@ camera that hardly turned around the object, a sheet whose pose signs are ambigu
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -28,6 +29,14 @@ shape leaves .6 and more; tracker noise of 5 % leaves .06."""
 
 NARROW, STILL = 20.0, 5.0
 """Degrees of turn between the two most different views: the same two degrees. Depth error grows as the inverse of the turn."""
+
+UNTOLD = 1.0
+"""Radians that the camera turns in a frame per share of its size that the shape changes in it, both medians over a film, below which
+rotation and deformation are hard to tell apart. With fewer frames a second both grow alike: the ratio is a property of the motion. Solves
+of `benchmarks.trust` below 1 have errors of .05 and more."""
+
+LOOSE_HELD_OUT, LOST_HELD_OUT = 0.08, 0.25
+"""Median distance of held-out observations from their prediction, share of the size: the same two degrees."""
 
 FLEXIBLE = 0.5
 """Modes of deformation per frame from which the motion hardly determines depth: every second frame has a shape of its own."""
@@ -67,6 +76,16 @@ class Trust:
     hidden: float
     """Share of positions that no observation shows."""
 
+    held_out_error: float | None = None
+    """Median distance of observations from their prediction by a tenth of the frames less (`shapes.held_out`), share of the size; None
+    without a posterior."""
+
+    degrees_per_frame: float | None = None
+    """Median angle between the viewing directions of consecutive frames, degrees; None for photographs in no order."""
+
+    deformation_per_frame: float | None = None
+    """Median over consecutive frames of the root mean square motion of the points in world axes, share of the size; None likewise."""
+
     @property
     def sentence(self) -> str:
         """The expected error and what depth rests on, in words."""
@@ -86,6 +105,8 @@ def assess(
     *,
     scales: Floats,
     shapes_std: Floats | None,
+    held_out_error: float | None = None,
+    ordered: bool = True,
     planar: bool = False,
     modes: int = 0,
     depth_is_typical: bool = False,
@@ -106,6 +127,10 @@ def assess(
         Image units per unit of the shapes.
     shapes_std : ndarray, shape (F, P), or None
         Posterior standard deviations, the unit of the shapes.
+    held_out_error : float or None
+        Median distance of held-out observations from their prediction, share of the size.
+    ordered : bool
+        The frames are those of a film.
     planar : bool
         The tracks are those of a sheet, so that its pose signs are weakly determined.
     modes : int
@@ -113,8 +138,7 @@ def assess(
     depth_is_typical : bool
         The extent of depth rests on a prior and not on the tracks.
     """
-    centred = shapes - shapes.mean(axis=1, keepdims=True)
-    size = max(float(np.sqrt(np.square(centred).sum(axis=2).mean())), np.finfo(float).tiny)
+    size = size_of(shapes)
     seen = visible > 0
     expected = None if shapes_std is None else float(np.sqrt(np.square(shapes_std).mean())) / size
     bounded = expected is not None and not (planar or depth_is_typical)
@@ -131,10 +155,31 @@ def assess(
     ]
     if interval is not None:
         found.append(_sign(interval[1], POOR, BAD, f"The error may be as large as {_at_most(interval[1])}."))
+    if held_out_error is not None:
+        far = f"{_percent(held_out_error)} of the object's size"
+        sentence = f"Observations that were left out are {far} from where the others predict them."
+        found.append(_sign(held_out_error, LOOSE_HELD_OUT, LOST_HELD_OUT, sentence))
+    turning, deforming = per_frame(shapes, rotations) if ordered else (None, None)
+    if turning is not None and deforming is not None:
+        found += _untold(turning, deforming)
     found += _doubts(modes, len(shapes), planar=planar, depth_is_typical=depth_is_typical)
     signs = sorted((sign for sign in found if sign[0] is not Verdict.GOOD), key=lambda sign: -_SEVERITY[sign[0]])
     verdict = signs[0][0] if signs else Verdict.GOOD
-    return Trust(verdict, tuple(sentence for _, sentence in signs), expected, interval, turn, residual, hidden)
+    return Trust(
+        verdict, tuple(sentence for _, sentence in signs), expected, interval, turn, residual, hidden,
+        held_out_error, turning, deforming,
+    )  # fmt: skip
+
+
+def _untold(turning: float, deforming: float) -> list[tuple[Verdict, str]]:
+    """Return the reason where the shape changes by more in a frame than the camera turns."""
+    if np.radians(turning) >= UNTOLD * deforming:
+        return []
+    sentence = (
+        f"The camera turns by {turning:.2g}° in a frame, while the shape changes by {_percent(deforming)} of its size, as much as "
+        f"{np.degrees(deforming):.2g}° would: rotation and deformation are hard to tell apart."
+    )
+    return [(Verdict.WITH_CARE, sentence)]
 
 
 def _doubts(modes: int, frames: int, *, planar: bool, depth_is_typical: bool) -> list[tuple[Verdict, str]]:
@@ -153,6 +198,25 @@ def _doubts(modes: int, frames: int, *, planar: bool, depth_is_typical: bool) ->
         sentence = "The tracks hardly show how deep the object is; its depth is one that is usual for its width. Let it turn further."
         found.append((Verdict.WITH_CARE, sentence))
     return found
+
+
+def size_of(shapes: Floats) -> float:
+    """Return the root mean square distance of the points from their frame's mean point; positive."""
+    centred = shapes - shapes.mean(axis=1, keepdims=True)
+    return max(float(np.sqrt(np.square(centred).sum(axis=2).mean())), np.finfo(float).tiny)
+
+
+def per_frame(shapes: Floats, rotations: Floats) -> tuple[float | None, float | None]:
+    """Return degrees of turn and share of the size that the shape changes, medians over consecutive frames; None for one frame."""
+    if len(shapes) < 2:
+        return None, None
+    directions, steps = rotations[:, 2], []
+    cosines = np.abs((directions[1:] * directions[:-1]).sum(axis=1))
+    for before, after in itertools.pairwise(shapes):
+        moved = after - before
+        steps.append(np.square(moved - moved.mean(axis=0)).sum(axis=1).mean())
+    turning = float(np.degrees(np.median(np.arccos(np.clip(cosines, 0.0, 1.0)))))
+    return turning, float(np.sqrt(np.median(steps))) / size_of(shapes)
 
 
 def turned(rotations: Floats) -> float:

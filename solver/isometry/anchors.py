@@ -50,7 +50,7 @@ RIDGE = 1e-6
 NEIGHBOURS = 15
 """k of the graph of nearest neighbours; 10 to 20 in the paper by Chhatkuli and others."""
 
-LARGEST = 0.9
+LARGEST_QUANTILE = 0.9
 """Quantile over frames that stands for the largest image distance of two points, so that a few wrong ones do not separate neighbours."""
 
 
@@ -103,7 +103,7 @@ def choose_anchors(points: Floats, seen: NDArray[np.bool_], count: int) -> Ancho
 def nearest_neighbours(anchors: Anchors, *, neighbours: int = NEIGHBOURS) -> Indices:
     """Return edges `(E, 2)` from every anchor to those whose largest image distance over frames is least."""
     count = anchors.points.shape[1]
-    apart = _apart(anchors.points, anchors.seen, np.arange(count), quantile=LARGEST)
+    apart = _apart(anchors.points, anchors.seen, np.arange(count), quantile=LARGEST_QUANTILE)
     together = anchors.seen.T.astype(np.float64) @ anchors.seen
     apart[together < 2] = np.inf
     np.fill_diagonal(apart, np.inf)

@@ -62,37 +62,16 @@ def learn_with_early_stopping(
         Some points of centred, complete tracks, normalized units; held out only if they are all points and fewer than 2F.
     gram, projections
         As for `pliant.solver.model.expectation_maximisation.learned`.
-    model_order : Support
+    model_order : ModelOrder
         Maximum number of modes, and the starting noise.
     seed : int
         Seed of the folds.
     should_stop : callable, optional
         Called between rounds; once it returns True, scoring ends.
     """
-    frames, count = sample.shape[:2]
-    if MIN_JUDGED_POINTS <= count < min(2 * frames, MAX_SAMPLE_POINTS):
-        points = sample.transpose(0, 2, 1).reshape(2 * frames, count)
-        ways = [
-            (each, floors)
-            for each in sorted({model_order.max_modes, MAX_MODES})
-            for floors in (ANNEALED_FLOORS, CONSTANT_FLOORS)
-        ]
-        paths = [
-            _judged(points, projections, replace(model_order, max_modes=max_modes), floors, seed, should_stop)
-            for max_modes, floors in ways
-        ]
-        best = min(paths, key=min)
-        if min(best) < min(path[-1] for path in paths) - MIN_NLL_GAIN:
-            max_modes, floors = ways[paths.index(best)]
-            start = scratch(
-                gram, projections, max_modes, noisy_start=model_order.noisy_start, ordered=model_order.ordered
-            )
-            path = rounds(start, gram, projections, floors=floors, max_modes=max_modes)
-            number = best.index(min(best)) + 1
-            reason = f"learned in {number} rounds, for more would make points that are not learned from less probable."
-            covariance = next(islice(path, number - 1, None))
-            return covariance, described(covariance, reason)
-    reason = f"more than {model_order.max_modes} modes, learned from some points, do not make the others more probable."
+    stopped = _stopped_early(sample, gram, projections, model_order, seed, should_stop)
+    if stopped is not None:
+        return stopped
     covariance = learned(
         gram,
         projections,
@@ -101,7 +80,42 @@ def learn_with_early_stopping(
         ordered=model_order.ordered,
         should_stop=should_stop,
     )
+    reason = f"more than {model_order.max_modes} modes, learned from some points, do not make the others more probable."
     return covariance, described(covariance, reason if model_order.max_modes < MAX_MODES else "")
+
+
+def _stopped_early(
+    sample: Floats,
+    gram: Floats,
+    projections: Floats,
+    model_order: ModelOrder,
+    seed: int,
+    should_stop: Callable[[], bool] | None,
+) -> tuple[ShapeCovariance, str] | None:
+    """Return the covariance after the rounds that held-out points favour, and a sentence; None where they favour all rounds."""
+    frames, count = sample.shape[:2]
+    if not MIN_JUDGED_POINTS <= count < min(2 * frames, MAX_SAMPLE_POINTS):
+        return None
+    points = sample.transpose(0, 2, 1).reshape(2 * frames, count)
+    ways = [
+        (each, floors)
+        for each in sorted({model_order.max_modes, MAX_MODES})
+        for floors in (ANNEALED_FLOORS, CONSTANT_FLOORS)
+    ]
+    paths = [
+        _judged(points, projections, replace(model_order, max_modes=max_modes), floors, seed, should_stop)
+        for max_modes, floors in ways
+    ]
+    best = min(paths, key=min)
+    if not min(best) < min(path[-1] for path in paths) - MIN_NLL_GAIN:
+        return None
+    max_modes, floors = ways[paths.index(best)]
+    start = scratch(gram, projections, max_modes, noisy_start=model_order.noisy_start, ordered=model_order.ordered)
+    path = rounds(start, gram, projections, floors=floors, max_modes=max_modes)
+    number = best.index(min(best)) + 1
+    covariance = next(islice(path, number - 1, None))
+    reason = f"learned in {number} rounds; more would make held-out points less probable."
+    return covariance, described(covariance, reason)
 
 
 def described(covariance: ShapeCovariance, more: str = "") -> str:

@@ -289,6 +289,30 @@ def _linear_round(
     own, by_own = (each[:, :, 1:].transpose(2, 0, 1, 3).reshape(count, 6 * frames) for each in (columns, by_columns))
     axis_moments = own.reshape(-1, 3).T @ by_own.reshape(-1, 3) + np.einsum("fic,fid->cd", walk, by_walk)
     along, ordered = whitened(covariance.modes, ordered=covariance.ordered), covariance.ordered
+    inner = own @ by_own.T
+    square = along.T @ along + 2 * covariance.walk_variance * np.eye(count)
+    total = float((along**2).sum()) + frames * covariance.walk_variance
+    total += (float((square * inner).sum()) + covariance.walk_variance * float((walk * by_walk).sum())) / 3
+    begun = np.hstack([along, _cosines(frames, max_modes)]) if subspace is None else subspace
+    if begun.shape[1] == 0:  # neither modes nor permission for any: the walk alone improves
+        begun = _cosines(frames, 1)
+    values, vectors = _nystrom(_mode_operator(covariance, along, walk, seen), begun)
+    modes, walk_variance = _kept(values, vectors, total, floor, min(max_modes, frames - 1))
+    better = _improved(
+        covariance, coloured(modes, ordered=ordered), walk_variance,
+        mean_covariance=root0 @ (np.eye(3) + mean_moments) @ root0.T,
+        axis_covariance=root1 @ (np.eye(3) + axis_moments / frames) @ root1.T,
+        surplus=-found.by_noise_variance,
+        nll=found.value,
+    )  # fmt: skip
+    return better, vectors[:, : modes.shape[1] + GUARD_VECTORS]
+
+
+def _mode_operator(
+    covariance: ShapeCovariance, along: Floats, walk: Floats, seen: Explained
+) -> Callable[[Floats], Floats]:
+    """Return the product of C̃ + C̃ m C̃/3 with columns of vectors; `along` are the whitened modes, `walk` the images of the random walk."""
+    frames, ordered = len(along), covariance.ordered
 
     def spread(vectors: Floats) -> Floats:  # C̃ times them
         result: Floats = along @ (along.T @ vectors) + covariance.walk_variance * vectors
@@ -300,22 +324,7 @@ def _linear_round(
         moved = seen.surplus(images.reshape(2 * frames, -1)).reshape(frames, 6, -1)
         return wide + spread(coloured((walk.reshape(frames, 1, 6) @ moved)[:, 0], ordered=ordered, transposed=True)) / 3
 
-    inner = own @ by_own.T
-    square = along.T @ along + 2 * covariance.walk_variance * np.eye(count)
-    total = float((along**2).sum()) + frames * covariance.walk_variance
-    total += (float((square * inner).sum()) + covariance.walk_variance * float((walk * by_walk).sum())) / 3
-    values, vectors = _nystrom(
-        product, np.hstack([along, _cosines(frames, max_modes)]) if subspace is None else subspace
-    )
-    modes, walk_variance = _kept(values, vectors, total, floor, min(max_modes, frames - 1))
-    better = _improved(
-        covariance, coloured(modes, ordered=ordered), walk_variance,
-        mean_covariance=root0 @ (np.eye(3) + mean_moments) @ root0.T,
-        axis_covariance=root1 @ (np.eye(3) + axis_moments / frames) @ root1.T,
-        surplus=-found.by_noise_variance,
-        nll=found.value,
-    )  # fmt: skip
-    return better, vectors[:, : modes.shape[1] + GUARD_VECTORS]
+    return product
 
 
 def _cosines(frames: int, count: int, *, first: int = 0) -> Floats:

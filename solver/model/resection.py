@@ -26,7 +26,7 @@ from pliant.solver.records import Floats
 from pliant.solver.threads import over_ranges
 from scipy.spatial.transform import Rotation, Slerp
 
-STEPS = 12
+MAX_STEPS = 12
 """Maximum number of steps for a frame."""
 
 SETTLED = 1e-5
@@ -41,8 +41,8 @@ OUTLYING = 3.0
 LEARNED_DOUBT = 1e-3
 """Prior variance in a learned frame over that midway between two: such frames hardly move."""
 
-NEAREST = 0.2
-"""Least 1 + κz, as in `cameras.perspective`."""
+MIN_RELATIVE_DISTANCE = 0.2
+"""Least 1 + κz: no point comes nearer to the camera than a fifth of the distance of the shape's origin."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -252,7 +252,11 @@ def predicted(shapes: MeanShapes, poses: Poses, curvature: float) -> tuple[Float
     """Return s R x `(n, 3, S)`, the images under orthography, translations included `(n, 2, S)`, and 1 + κz `(n, S)`."""
     turned = poses.scales[:, None, None] * (poses.rotations @ shapes.at(poses.coefficients))
     depths = turned[:, 2] - turned[:, 2].mean(axis=1, keepdims=True)
-    return turned, turned[:, :2] + poses.translations[:, :, None], np.maximum(1 + curvature * depths, NEAREST)
+    return (
+        turned,
+        turned[:, :2] + poses.translations[:, :, None],
+        np.maximum(1 + curvature * depths, MIN_RELATIVE_DISTANCE),
+    )
 
 
 def _turn(poses: Poses) -> Floats:
@@ -279,7 +283,7 @@ def _descended(
     """Return poses and their costs after steps of Levenberg and Marquardt."""
     at = _fit(views, shapes, poses)
     damping = np.full(len(at.cost), 1e-3)
-    for _ in range(STEPS):
+    for _ in range(MAX_STEPS):
         trial = _stepped(shapes, poses, at, damping, turning, with_scales)
         new = _fit(views, shapes, trial)
         better = new.cost < at.cost

@@ -160,11 +160,13 @@ class _Whole:
             return None
         some = slice(None, None, -(-self._tracks.num_points // JUDGED_POINTS))
         std, weights = solution.shapes_std, self._tracks.visible[:, some]
+        parts = [part.trust for part in self._parts if part.trust is not None]
+        held_out = [trust.held_out_error for trust in parts if trust.held_out_error is not None]
         judged = assess(
             solution.shapes[:, some], solution.camera.rotations, solution.residuals[:, some], weights,
             scales=solution.camera.scales, shapes_std=None if std is None else std[:, some],
+            held_out_error=float(np.median(held_out)) if held_out else None, ordered=example.degrees_per_frame is not None,
         )  # fmt: skip
-        parts = [part.trust for part in self._parts if part.trust is not None]
         reasons = dict.fromkeys(each for trust in (judged, *parts) for each in trust.reasons)
         worst = max((trust.verdict for trust in (judged, *parts)), key=list(Verdict).index)
         interval = None if any(trust.interval is None for trust in parts) else judged.interval

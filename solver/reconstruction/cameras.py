@@ -10,7 +10,7 @@ from pliant.solver.cameras import estimation
 from pliant.solver.cameras.covariance_learning import LearningData, learn_covariance
 from pliant.solver.cameras.depth_rounds import settled
 from pliant.solver.cameras.estimation import CameraEstimate, given_cameras
-from pliant.solver.cameras.joint_refinement import evenly_spread, informative_frames, refine_cameras
+from pliant.solver.cameras.joint_refinement import refine_cameras
 from pliant.solver.cameras.planar_ambiguity import is_planar
 from pliant.solver.limits import LEARNED_FRAMES
 from pliant.solver.model.model_order import ModelOrder
@@ -21,6 +21,7 @@ from pliant.solver.records import Camera, Floats, KnownCamera, Step, Tracks, rea
 from pliant.solver.settings import Settings
 from pliant.solver.stages import learning
 from pliant.solver.tracks.frame_order import resolved_order
+from pliant.solver.tracks.frame_selection import evenly_spread, informative_frames
 from pliant.solver.tracks.noise import OUTLIER_SHARE
 
 STAGES = (

@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.cameras.covariance_learning import LearningData
 from pliant.solver.cameras.estimation import CameraEstimate
-from pliant.solver.cameras.joint_refinement import turned_once
-from pliant.solver.cameras.learned import Learned
+from pliant.solver.cameras.learned import Learned, turned_once
 from pliant.solver.cameras.perspective import Perspective, centred, columns, corrected, depth_map
 from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.resection import MeanShapes, Poses, Views, interpolated, predicted, resected
@@ -130,13 +129,7 @@ def _whole(
     scales = poses.scales / size
     first = poses.rotations[0] if observations.known is None else np.eye(3)
     rotations = start_at_identity(poses.rotations) if observations.known is None else poses.rotations
-    whole = replace(
-        covariance,
-        mean_covariance=size**2 * first @ covariance.mean_covariance @ first.T,
-        axis_covariance=first @ covariance.axis_covariance @ first.T,
-        modes=size * poses.coefficients,
-        walk_variance=size**2 * covariance.walk_variance,
-    )
+    whole = _of_all_frames(covariance, poses.coefficients, first, size)
     sample = _completed(views, shapes, poses)
     clean = estimate.filling is None and bool((observations.normalized.visible == 1).all())
     moved = poses.translations
@@ -163,6 +156,17 @@ def _whole(
         rotations=rotations, scales=scales, turned=False,
     )  # fmt: skip
     return estimate, data
+
+
+def _of_all_frames(covariance: ShapeCovariance, coefficients: Floats, axes: Floats, size: float) -> ShapeCovariance:
+    """Return the covariance with the coefficients of all frames, in other axes (rows of a rotation) and `size` times as large."""
+    return replace(
+        covariance,
+        mean_covariance=size**2 * axes @ covariance.mean_covariance @ axes.T,
+        axis_covariance=axes @ covariance.axis_covariance @ axes.T,
+        modes=size * coefficients,
+        walk_variance=size**2 * covariance.walk_variance,
+    )
 
 
 def _filling(

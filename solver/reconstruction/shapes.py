@@ -199,7 +199,7 @@ def _finished(start: Start, history: list[State], outcome: Outcome, monitor: Mon
     monitor()
     solution = with_inlier_probability(solution, tracks, confidence, loss=problem.loss)
     solution = assessed(
-        solution, confidence, estimate, start.covariance, normalized.unit,
+        solution, tracks, confidence, estimate, start.covariance, normalized.unit,
         turning=observations.turning, seed=start.settings.seed, should_stop=monitor,
     )  # fmt: skip
     return replace(solution, outcome=Outcome.STOPPED) if monitor.stopped else solution

@@ -215,7 +215,5 @@ def with_outlier_reason(start: Start) -> Start:
     if outliers <= OUTLIER_SHARE or start.problem.quadratic is None or not start.problem.weights.temporal > 0:
         return start
     share = 1 - np.count_nonzero(start.confidence()) / np.count_nonzero(start.observations.tracks.visible)
-    reason = (
-        f"{share:.1%} of what was seen is left out as gross outliers; {outliers:.1%} looked like it before the fit."
-    )
+    reason = f"{share:.1%} of the visible observations are rejected as gross outliers; {outliers:.1%} looked like outliers before the fit."
     return replace(start, choices=replace(start.choices, reasons={**start.choices.reasons, "outliers": reason}))

@@ -11,7 +11,8 @@ from pliant.solver.cameras.planar_ambiguity import is_planar
 from pliant.solver.energy.hyperparameters import noise_std
 from pliant.solver.evaluation.trust import assess
 from pliant.solver.model.shape_covariance import ShapeCovariance
-from pliant.solver.records import Floats, read_only
+from pliant.solver.records import Floats, Tracks, read_only
+from pliant.solver.shapes.held_out import held_out_error
 from pliant.solver.shapes.jackknife import learning_std
 from pliant.solver.shapes.uncertainty import Pinhole, bounded_by_neighbours, position_std
 from pliant.solver.solution import Solution
@@ -24,6 +25,7 @@ other optima of the cameras. With it the median coverage of the 90 % intervals i
 
 def assessed(
     solution: Solution,
+    tracks: Tracks,
     confidence: Floats,
     estimate: CameraEstimate,
     covariance: ShapeCovariance | None,
@@ -39,6 +41,8 @@ def assessed(
     ----------
     solution : Solution
         The tracks' unit.
+    tracks : Tracks
+        What it was solved from.
     confidence : ndarray, shape (F, P)
         Of the observations that were used; 0 where hidden or rejected.
     estimate, covariance
@@ -52,7 +56,7 @@ def assessed(
     should_stop : callable, optional
         Called between units of work; once it returns True, what is left is not computed.
     """
-    std, modes = None, 0
+    std, modes, held_out = None, 0, None
     tick = should_stop if should_stop is not None else bool
     tick()
     confidence = np.asarray(confidence, dtype=np.float64)
@@ -68,6 +72,7 @@ def assessed(
             estimate, covariance, solution.shapes / unit, turning=turning, should_stop=should_stop
         )
         std = INFLATION * np.hypot(posterior, learning)
+        held_out = held_out_error(tracks, solution.shapes, solution.camera, confidence, covariance, unit=unit)
         modes = covariance.modes.shape[1]
         read_only(std)
     tick()
@@ -78,6 +83,8 @@ def assessed(
         confidence,
         scales=solution.camera.scales,
         shapes_std=std,
+        held_out_error=held_out,
+        ordered=estimate.ordered,
         planar=is_planar(estimate.gram),
         modes=modes,
         depth_is_typical=estimate.depth_is_typical,

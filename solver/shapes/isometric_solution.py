@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 from pliant.solver.evaluation.alignment import procrustes
-from pliant.solver.evaluation.trust import Trust, Verdict, turned
+from pliant.solver.evaluation.trust import Trust, Verdict, per_frame, turned
 from pliant.solver.isometry.surface import IsometricSurface, IsometricVerdict
 from pliant.solver.records import Camera, Choices, Floats, Tracks, read_only
 from pliant.solver.settings import Settings
@@ -55,14 +55,22 @@ def isometric_solution(
     choices = _choices(verdict, surface, unit, float(surface.outliers.sum() / seen.sum()))
     return Solution(
         shapes, camera, residual, weights, trace, Outcome.CONVERGED, choices, seconds,
-        trust=_trust(verdict, camera, median / unit, float((weights == 0).mean())),
+        trust=_trust(
+            verdict, camera, shapes, residual=median / unit, hidden=float((weights == 0).mean()), ordered=settings.order == "film"
+        ),
     )  # fmt: skip
 
 
-def _trust(verdict: IsometricVerdict, camera: Camera, residual: float, hidden: float) -> Trust:
+def _trust(
+    verdict: IsometricVerdict, camera: Camera, shapes: Floats, *, residual: float, hidden: float, ordered: bool
+) -> Trust:
     """Return the verdict without an expected error: isometry is no Gaussian model and has no posterior."""
     grade = Verdict.WITH_CARE if verdict.warnings else Verdict.GOOD
-    return Trust(grade, verdict.warnings, None, None, turned(camera.rotations), residual, hidden)
+    turning, deforming = per_frame(shapes, camera.rotations) if ordered else (None, None)
+    return Trust(
+        grade, verdict.warnings, None, None, turned(camera.rotations), residual, hidden,
+        degrees_per_frame=turning, deformation_per_frame=deforming,
+    )  # fmt: skip
 
 
 def in_world_axes(surface: IsometricSurface) -> tuple[Floats, Camera]:

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.solver.cameras.perspective import NEAREST
+from pliant.solver.model.resection import MIN_RELATIVE_DISTANCE
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.records import Camera, Floats
 from pliant.solver.shapes.sparsely_observed import WELL_OBSERVED_SHARE
@@ -77,7 +77,7 @@ class Pinhole:
     def derivatives(self, projections: Floats, point: int) -> Floats:
         """Return ∂v/∂x of a point in every frame, shape `(F, 2, 3)`."""
         bent = projections - self.curvature * self.views[:, point, :, None] * self.depth_rows[:, None]
-        nearer = np.maximum(1 + self.curvature * self.depths[:, point], NEAREST)
+        nearer = np.maximum(1 + self.curvature * self.depths[:, point], MIN_RELATIVE_DISTANCE)
         return np.asarray(bent / nearer[:, None, None])
 
 

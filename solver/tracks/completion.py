@@ -27,7 +27,7 @@ RANKS = (4, 7, 10, 16, 25, 40)
 """Numbers of basis columns that are compared, translation included; each fit starts from the previous one. On a dancer
 with half of the points hidden, the error is .123 with 40 and .134 without; 60 gives no further gain."""
 
-ALTERNATIONS = 8
+ALTERNATIONS_PER_RANK = 8
 """Alternations per rank."""
 
 HELD_OUT_SHARE = 0.05
@@ -176,7 +176,7 @@ def fit_basis(
         if rank > min(2 * frames, count) - 1 or rank * (2 * frames + count) > 0.7 * 2 * (kept > 0).sum():
             break
         basis = _widen(basis, points, kept, start, rank)
-        basis, coefficients, spread, scale = alternate(points, kept, basis, sweeps=ALTERNATIONS)
+        basis, coefficients, spread, scale = alternate(points, kept, basis, sweeps=ALTERNATIONS_PER_RANK)
         if not hidden and not gross(points, weight, predict(basis, coefficients), scale).any():
             return basis, spread, scale
         error = _typical(_lengths(points - predict(basis, coefficients)), np.where(held, weight, 0.0))
@@ -188,7 +188,7 @@ def fit_basis(
             break
     if not np.isfinite(best_error):
         best = _widen(np.zeros((frames, 2, 0)), points, weight, start, min(3, min(2 * frames, count) - 1))
-    basis, _, spread, scale = alternate(points, weight, best, sweeps=2 * ALTERNATIONS)
+    basis, _, spread, scale = alternate(points, weight, best, sweeps=2 * ALTERNATIONS_PER_RANK)
     return basis, spread, scale
 
 

@@ -231,9 +231,13 @@ def test_fsck_compares_the_stores_with_the_records(tmp_path: Path) -> None:
         ran = pliant("fsck", "--data", data, "--json", folder=tmp_path)
         return ran.returncode, [(finding["verdict"], finding["found"]) for finding in json.loads(ran.stdout)]
 
+    refused = pliant("fsck", "--data", data, folder=tmp_path)
+    assert refused.returncode == 3
+    assert "expected the directory of an installation" in refused.stderr
+    assert not data.exists()
+    valkey = Valkey.claim(data)
     code, ((verdict, found),) = fsck()
     assert (code, verdict, "is unavailable" in found) == (8, "bad", True)
-    valkey = Valkey.claim(data)
     server = valkey.start()
     try:
         assert fsck() == (0, [("good", "the stores are consistent with the job records")])

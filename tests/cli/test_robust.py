@@ -222,6 +222,22 @@ def test_commands_of_the_server_name_what_to_install(
     assert words(ran) == f"error {name} needs the service, which is not installed: pip install 'pliant[server]'"
 
 
+@pytest.mark.parametrize("command", [["fsck"], ["backup", "copy"]], ids=" ".join)
+def test_no_installation_is_refused_and_nothing_is_created(
+    command: list[str], run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("PLIANT_REDIS_URL", raising=False)
+    (tmp_path / "empty").mkdir()
+    for name, what in (("new", "which does not exist"), ("empty", "which has none of its folders")):
+        ran = run(*command, "--data", name)
+        assert ran.exit_code == Exit.REFUSED
+        assert words(ran) == (
+            f"error --data: expected the directory of an installation, got {name}, {what}. Give the one that `pliant up` uses."
+        )
+    assert [each.name for each in tmp_path.rglob("*")] == ["empty"]
+
+
 def test_a_module_of_the_server_that_is_missing_elsewhere(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*_: object, **__: object) -> None:
         raise ModuleNotFoundError("No module named 'redis'", name="redis")

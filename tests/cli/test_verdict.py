@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 from pliant.cli.commands.batch import Batch, Row
 from pliant.cli.demo import MEANINGS, report
-from pliant.cli.show import show_job, show_jobs, verdict_lines
+from pliant.cli.show import METRIC_MEANINGS, metrics_table, show_job, show_jobs, verdict_lines
 from pliant.cli.solve import show_finished
 from pliant.schemas.job import Interpretation, Job, Status
 from pliant.schemas.options import Options
@@ -93,6 +94,23 @@ def test_the_demonstration_states_what_its_figures_mean(
         (row,) = [line for line in rows if name in line.split()]
         assert meaning in row
         assert "0.04" in row
+
+
+def test_one_headline_error_with_the_same_meaning_everywhere() -> None:
+    headline = next(iter(METRIC_MEANINGS))
+    assert headline == next(iter(MEANINGS)) == "e3d_frame"
+    assert MEANINGS[headline].startswith(METRIC_MEANINGS[headline])
+    page = (Path(__file__).parents[2] / "service" / "web" / "src" / "results.ts").read_text()
+    words = dict(re.findall(r'^  (\w+): \["(?:[^"]*)", "([^"]*)"\],$', page, flags=re.MULTILINE))
+    assert list(words) == list(METRIC_MEANINGS)
+    assert {name: meaning.removeprefix("3-D error: ") for name, meaning in METRIC_MEANINGS.items()} == words
+
+
+def test_the_headline_error_stands_first() -> None:
+    table = metrics_table({"of_a_newer_service": 1.0, "reprojection_rms": 0.5, "e3d_sequence": 0.2, "e3d_frame": 0.1})
+    names, _, meanings = (list(column.cells) for column in table.columns)
+    assert names == ["e3d_frame", "e3d_sequence", "reprojection_rms", "of_a_newer_service"]
+    assert meanings == [*(METRIC_MEANINGS[name] for name in names[:3]), ""]
 
 
 @pytest.mark.parametrize("columns", ["40", "80", "200"])

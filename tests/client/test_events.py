@@ -133,6 +133,24 @@ def test_following_ends_with_the_timeout() -> None:
             list(job.events(timeout=0.2))
 
 
+def test_the_timeout_also_ends_a_stream_without_events() -> None:
+    class Heartbeats(httpx.SyncByteStream):
+        def __iter__(self) -> Iterator[bytes]:
+            while True:
+                yield b": heartbeat\n\n"
+
+    class Silent(InMemoryService):
+        def handle_request(self, request: httpx.Request) -> httpx.Response:
+            if request.url.path.endswith("/events"):
+                return httpx.Response(200, stream=Heartbeats(), headers={"Content-Type": "text/event-stream"})
+            return super().handle_request(request)
+
+    with Client("http://pliant.test", transport=Silent(), retries=QUICK) as client:
+        job = client.submit(POINTS)
+        with pytest.raises(WaitTimeout):
+            list(job.events(timeout=0.1))
+
+
 def test_the_asynchronous_client_follows_too() -> None:
     async def use() -> list[Status]:
         async with AsyncClient("http://pliant.test", transport=InMemoryService(steps=3), retries=QUICK) as client:

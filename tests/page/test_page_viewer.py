@@ -13,8 +13,12 @@ import numpy as np
 import pytest
 from browsing import differing_pixels, why_not
 from paging import DONE, TRACKS, packed, seek, until
+from PIL import Image
 from playwright.sync_api import Browser, Locator, Page, expect
+from pliant.solver import solve
 from pliant.solver.gallery import corrupt, flag
+from pliant.worker.artifacts.preview import write_preview
+from pliant.worker.formats.texture import Texture
 
 pytestmark = [
     pytest.mark.chromium,
@@ -208,6 +212,53 @@ def test_another_job_is_compared_point_by_point(viewer: Page) -> None:
     until(lambda: differing_pixels(viewer, before, other.screenshot()) > 0.02)
     viewer.get_by_label("Compare with").select_option("")
     expect(other).to_have_count(0)
+
+
+def painted() -> bytes:
+    """A preview of a flag whose left half is red and whose right half is blue in the film's picture."""
+    sequence = flag(FRAMES, POINTS)
+    solution = solve(sequence.tracks, sequence.mesh)
+    first = sequence.tracks.points[0]
+    places = (first - first.min(axis=0)) / np.ptp(first, axis=0)
+    halves = np.zeros((64, 64, 3), dtype=np.uint8)
+    halves[:, :32, 0] = halves[:, 32:, 2] = 230
+    into = io.BytesIO()
+    write_preview(
+        into,
+        tracks=sequence.tracks,
+        mesh=sequence.mesh,
+        solution=solution,
+        texture=Texture.from_tracked(halves, places),
+    )
+    return into.getvalue()
+
+
+def test_a_films_picture_is_on_the_mesh_first_and_after_a_comparison(
+    page: Page, url: str, jobs: tuple[str, str]
+) -> None:
+    preview = painted()
+    page.route(f"**/{jobs[0]}/**/preview.bin", lambda route: route.fulfill(body=preview))
+    page.goto(f"{url}/#job={jobs[0]}")
+    colour = page.get_by_label("Colour", exact=True)
+    colour.wait_for(timeout=DONE)
+    assert colour.input_value() == "film"
+    seek(page, 0)
+
+    def halves() -> tuple[float, float]:
+        """Share of red pixels in the left half of the view, and of blue ones in the right half."""
+        with Image.open(io.BytesIO(canvas(page).screenshot())) as shot:
+            pixels = np.asarray(shot.convert("RGB"), dtype=float)
+        middle = pixels.shape[1] // 2
+        red, blue = pixels[..., 0] - pixels[..., 2] > 80, pixels[..., 2] - pixels[..., 0] > 80
+        return float(red[:, :middle].mean()), float(blue[:, middle:].mean())
+
+    until(lambda: min(halves()) > 0.1)
+    colour.select_option("plain")
+    until(lambda: max(halves()) == 0)
+    page.get_by_label("Compare with").select_option(label="clean flag")
+    until(lambda: colour.input_value() == "difference")
+    page.get_by_label("Compare with").select_option("")
+    until(lambda: min(halves()) > 0.1)
 
 
 def test_help_opens_and_closes_by_keyboard(viewer: Page) -> None:

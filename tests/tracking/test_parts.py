@@ -11,6 +11,7 @@ import films
 import numpy as np
 import pytest
 from PIL import Image
+from pliant.solver.evaluation.metrics import e3d_frame, e3d_frame_scaled
 from pliant.solver.gallery import sphere
 from pliant.tracking import FilmError
 from pliant.tracking.appearance import Appearance, noise_variance
@@ -19,7 +20,7 @@ from pliant.tracking.flow import match, opencv_serial, sample
 from pliant.tracking.frame_store import CACHED, FrameStore
 from pliant.tracking.region import read_region
 from pliant.tracking.registration import Registration
-from pliant.tracking.rendering import render_film
+from pliant.tracking.rendering import Truth, render_film
 from pliant.tracking.seeding import keep, neighbours, place, quads
 from pliant.tracking.survey import find_cuts, sharpest, tracking_scale
 from scipy import sparse
@@ -261,3 +262,16 @@ def test_a_cell_moves_bilinearly_and_a_plane_does_not_bend() -> None:
     sums = sparse.csr_array((registration.products @ weights, columns, pointers)).toarray()
     dense = registration.between.toarray()
     np.testing.assert_allclose(sums, dense.T @ (weights[:, None] * dense), atol=1e-4)
+
+
+def test_the_error_of_a_film_is_that_of_every_frame_after_one_scale() -> None:
+    rng = np.random.default_rng(0)
+    true, on = rng.normal(size=(4, 6, 3)), np.array([True, False, True, True, True, True, False, True])
+    truth = Truth(on, true[..., :2], np.ones((4, 6), dtype=bool), true)
+    found = np.zeros((4, 8, 3))
+    found[:, on] = 7 * (true + 0.1 * rng.normal(size=true.shape))
+    assert truth.shape_error(found) == pytest.approx(e3d_frame_scaled(found[:, on], true))
+    assert truth.shape_error(found[:, [0, 1, 3, 4, 7]], [0, 1, 3, 4, 7]) == pytest.approx(
+        e3d_frame_scaled(found[:, [0, 3, 4, 7]], true[:, [0, 2, 3, 5]])
+    )
+    assert truth.shape_error(found) < 0.2 < e3d_frame(found[:, on], true)

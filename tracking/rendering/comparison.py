@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pliant.solver.evaluation.metrics import e3d_frame_scaled
+from pliant.solver.evaluation.alignment import align
+from pliant.solver.evaluation.metrics import e3d_frame
 from pliant.tracking.rendering.rasterising import Floats
 from pliant.tracking.rendering.rendered_film import RenderedFilm
 
@@ -76,7 +77,9 @@ class Truth:
         )
 
     def shape_error(self, shapes: ArrayLike, points: ArrayLike | None = None) -> float:
-        """Return `e3d_frame_scaled` of reconstructed shapes.
+        """Return `e3d_frame` of reconstructed shapes after one scale for the film, which does not show how large things are.
+
+        The scale is that of `e3d_frame_scaled`, whose value this is.
 
         Parameters
         ----------
@@ -89,4 +92,5 @@ class Truth:
         chosen = np.arange(len(self.on)) if points is None else np.asarray(points, dtype=np.int64)
         place = np.cumsum(self.on) - 1
         known = self.on[chosen]
-        return e3d_frame_scaled(found[:, known], self.shapes[:, place[chosen[known]]])
+        ours, true = found[:, known], self.shapes[:, place[chosen[known]]]
+        return e3d_frame(align(ours, true, kind="frame_scaled").scales[0] * ours, true)

@@ -20,7 +20,7 @@ import scipy.linalg
 from pliant.worker.artifacts.geometry import Floats, Singles, upright
 
 MAX_FRAME_TARGETS = 200
-MAX_MODES = 200
+MAX_MODE_TARGETS = 200
 BLOCK = 1 << 21
 """Numbers in a block of points over all frames (16 MB)."""
 
@@ -64,7 +64,7 @@ def animate(shapes: Floats, *, y_axis: str = "up", motion: str = "auto") -> Anim
         auto: as few modes as keep every point within `ERROR_BOUND`. frames: exact, up to 200 frames.
     """
     if len(shapes) > MAX_FRAME_TARGETS:
-        return _modes(shapes, y_axis, MAX_MODES)
+        return _modes(shapes, y_axis, MAX_MODE_TARGETS)
     if motion == "frames" or len(shapes) < 3:
         return _per_frame(shapes, y_axis)
     return _modes(shapes, y_axis, len(shapes) - 1)  # as many hold any motion, and are still fewer than the frames

@@ -138,67 +138,79 @@ def write_glb(
         Called with the share of bytes written.
     """
     buffer = Buffer()
-    placed = dict(node)
-    positions: Array = animation.base
-    target: Callable[[int], Array] = animation.target
-    if quantized:
-        positions, target, placed = _quantize(animation, node)
-    smooth = normals if len(triangles) else "none"
-    attributes = {"POSITION": buffer.add(positions, target=VERTICES, bounds=True, normalised=quantized)}
-    still, moving = _normals(animation, triangles, smooth)
-    if still is not None:
-        attributes["NORMAL"] = buffer.add(
-            _in_bytes(still) if quantized else still, target=VERTICES, normalised=quantized
-        )
-    if colours is not None:
-        attributes["COLOR_0"] = buffer.add(colours, target=VERTICES, normalised=True)
-    if texture is not None:
-        attributes["TEXCOORD_0"] = buffer.add(texture.uv, target=VERTICES)
-    primitive: dict[str, Any] = {
-        "attributes": attributes,
-        "material": 0,
-        "mode": TRIANGLES if len(triangles) else POINTS,
-    }
+    positions, target, placed = _rounded(animation, node, quantized=quantized)
+    still, moving = _normals(animation, triangles, normals if len(triangles) else "none")
+    attributes = _attributes(buffer, positions, still, colours, texture, quantized=quantized)
+    primitive = {"attributes": attributes, "material": 0, "mode": TRIANGLES if len(triangles) else POINTS}
     if len(triangles):
         short = len(animation.base) < 0xFFFF
-        primitive["indices"] = buffer.add(
-            triangles.reshape(-1).astype(np.uint16 if short else np.uint32), target=INDICES
-        )
+        indices = triangles.reshape(-1).astype(np.uint16 if short else np.uint32)
+        primitive["indices"] = buffer.add(indices, target=INDICES)
     primitive["targets"] = _targets(buffer, animation, target, quantized=quantized, normals=moving)
-    times = (np.arange(len(animation.weights)) / fps).astype(np.float32)
-    sampler = {
-        "input": buffer.add(times, bounds=True),
-        "output": buffer.add(animation.weights.reshape(-1)),
-        "interpolation": "LINEAR",
+    mesh = {
+        "name": name,
+        "primitives": [primitive],
+        "weights": animation.weights[0].tolist(),
+        "extras": {"targetNames": animation.names, "pliant": animation.extras},
     }
     document: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": f"Pliant {version('pliant')}"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"name": name, "mesh": 0, **placed}],
-        "meshes": [
-            {
-                "name": name,
-                "primitives": [primitive],
-                "weights": animation.weights[0].tolist(),
-                "extras": {"targetNames": animation.names, "pliant": animation.extras},
-            }
-        ],
+        "meshes": [mesh],
         "materials": [_material(coloured=colours is not None, textured=texture is not None)],
-        "animations": [{"name": "motion", "samplers": [sampler], "channels": [{"sampler": 0, "target": {"node": 0, "path": "weights"}}]}],
+        "animations": [_motion(buffer, animation, fps)],
         "bufferViews": buffer.views,
         "accessors": buffer.accessors,
-    }  # fmt: skip
+    }
     if view is not None:
         _add_camera(document, buffer, view)
     if texture is not None:
-        document["images"] = [{"name": "film", "mimeType": "image/jpeg", "bufferView": buffer.attach(texture.jpeg)}]
-        document["samplers"] = [{"magFilter": LINEAR, "minFilter": MIPMAPS, "wrapS": CLAMPED, "wrapT": CLAMPED}]
-        document["textures"] = [{"source": 0, "sampler": 0}]
+        _add_picture(document, buffer, texture)
     document["buffers"] = [{"byteLength": buffer.bytes}]
     if quantized:
         document["extensionsUsed"] = document["extensionsRequired"] = ["KHR_mesh_quantization"]
     _write(file, document, buffer, on_progress)
+
+
+def _attributes(
+    buffer: Buffer,
+    positions: Array,
+    normals: Singles | None,
+    colours: NDArray[np.uint16] | None,
+    texture: Texture | None,
+    *,
+    quantized: bool,
+) -> dict[str, int]:
+    """Add what every point of the base shape has."""
+    attributes = {"POSITION": buffer.add(positions, target=VERTICES, bounds=True, normalised=quantized)}
+    if normals is not None:
+        rounded = _in_bytes(normals) if quantized else normals
+        attributes["NORMAL"] = buffer.add(rounded, target=VERTICES, normalised=quantized)
+    if colours is not None:
+        attributes["COLOR_0"] = buffer.add(colours, target=VERTICES, normalised=True)
+    if texture is not None:
+        attributes["TEXCOORD_0"] = buffer.add(texture.uv, target=VERTICES)
+    return attributes
+
+
+def _motion(buffer: Buffer, animation: Animation, fps: float) -> dict[str, Any]:
+    """Add the times and the weights of the targets; return the glTF animation that plays them."""
+    times = (np.arange(len(animation.weights)) / fps).astype(np.float32)
+    sampler = {
+        "input": buffer.add(times, bounds=True),
+        "output": buffer.add(animation.weights.reshape(-1)),
+        "interpolation": "LINEAR",
+    }
+    channel = {"sampler": 0, "target": {"node": 0, "path": "weights"}}
+    return {"name": "motion", "samplers": [sampler], "channels": [channel]}
+
+
+def _add_picture(document: dict[str, Any], buffer: Buffer, texture: Texture) -> None:
+    document["images"] = [{"name": "film", "mimeType": "image/jpeg", "bufferView": buffer.attach(texture.jpeg)}]
+    document["samplers"] = [{"magFilter": LINEAR, "minFilter": MIPMAPS, "wrapS": CLAMPED, "wrapT": CLAMPED}]
+    document["textures"] = [{"source": 0, "sampler": 0}]
 
 
 def _add_camera(document: dict[str, Any], buffer: Buffer, view: View) -> None:
@@ -263,8 +275,12 @@ def _in_bytes(normals: Singles) -> NDArray[np.int8]:
     return np.rint(np.clip(normals, -1, 1) * 127).astype(np.int8)
 
 
-def _quantize(animation: Animation, node: dict[str, Any]) -> tuple[Array, Callable[[int], Array], dict[str, Any]]:
-    """Return positions and displacements as 16-bit fractions of one size, which the node's scale restores."""
+def _rounded(
+    animation: Animation, node: dict[str, Any], *, quantized: bool
+) -> tuple[Array, Callable[[int], Array], dict[str, Any]]:
+    """Return positions, displacements and node; if `quantized`, 16-bit fractions of one size, which the node's scale restores."""
+    if not quantized:
+        return animation.base, animation.target, node
     low, high = animation.base.min(axis=0), animation.base.max(axis=0)
     centre = ((low + high) / 2).astype(np.float64)
     moved = max(float(np.abs(animation.target(index)).max()) for index in range(len(animation.names)))

@@ -165,6 +165,7 @@ def _preview(result: Result, file: IO[bytes]) -> None:
         fps=result.options.fps,
         image_size=result.options.image_size,
         point_names=inputs.point_names,
+        texture=inputs.texture,
     )
 
 

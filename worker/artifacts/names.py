@@ -10,7 +10,7 @@ from pliant.worker.formats.point_names import one_line
 DEFAULT = "shape"
 """Name of an object whose job has none, or none that a format can write."""
 
-LONGEST = 200
+MAX_OBJECT_NAME = 200
 """Characters of a name."""
 
 
@@ -20,7 +20,7 @@ def object_name(text: str) -> str:
     Composed (NFC), so that a file's name is the same on every system; bytes of a path that are not UTF-8 become `?`.
     """
     whole = unicodedata.normalize("NFC", text.encode("utf-8", "replace").decode())
-    return one_line(whole)[:LONGEST].strip() or DEFAULT
+    return one_line(whole)[:MAX_OBJECT_NAME].strip() or DEFAULT
 
 
 def identifier(text: str) -> str:

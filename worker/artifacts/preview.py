@@ -22,6 +22,8 @@ points     uint32 (P, 2)       in how many of all frames each point was seen, an
 spread     uint16 (F, P)       standard deviation of a position = spread_step · value. Only with a posterior
 rejected   uint8 (F, ⌈P/8⌉)    bits, the lowest first: seen observations that the solver rejected as outliers
 names      UTF-8, P lines      names of the points. Only where the tracks' file has them
+places     float32 (P, 2)      place of every point in the picture, 0 to 1: u right, v down. Only of a film
+picture    JPEG                the film's template frame. Only of a film
 =========  ==================  ===================================================================================
 
 Readers skip sections that they do not know; all after `residuals` may be missing.
@@ -31,7 +33,7 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import IO
 
@@ -41,6 +43,7 @@ from pliant.solver import Mesh, Solution, Tracks
 from pliant.solver.evaluation.alignment import align
 from pliant.solver.evaluation.metrics import frame_errors
 from pliant.worker.artifacts.geometry import size_of
+from pliant.worker.formats.texture import Texture
 
 NAME = "preview.bin"
 MEDIA_TYPE = "application/octet-stream"
@@ -78,6 +81,50 @@ class Box:
         return np.rint((frame - self.origin) / self.step).clip(-LARGEST, LARGEST).astype("<i2")
 
 
+@dataclass(frozen=True, slots=True)
+class Rounding:
+    """What the whole numbers of the file are multiples of, the tracks' unit."""
+
+    box: Box
+    residual_step: float
+    spread_step: float
+    """0 without a posterior."""
+
+    @classmethod
+    def of(cls, tracks: Tracks, solution: Solution, facing: Floats | None) -> Rounding:
+        """Return the finest steps that reach every value; `facing` is the truth aligned with the result."""
+        std = solution.shapes_std
+        return cls(
+            Box.around(solution.shapes) if facing is None else Box.around(solution.shapes, facing),
+            residual_step=_largest_residual(tracks, solution) / LARGEST or 1.0,
+            spread_step=0.0 if std is None else float(std.max()) / LARGEST_COUNT or 1.0,
+        )
+
+    def header(self) -> dict[str, object]:
+        """Return the entries of the header that turn the numbers back."""
+        return {
+            "origin": self.box.origin.tolist(),
+            "step": self.box.step,
+            "residual_step": self.residual_step,
+            "spread_step": self.spread_step,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """One section of the file; its parts are generated while they are written."""
+
+    name: str
+    size: int
+    """Bytes, before padding."""
+    parts: Iterable[bytes]
+
+    @classmethod
+    def of(cls, name: str, array: NDArray[np.generic]) -> Section:
+        """Return a whole array as a section."""
+        return cls(name, array.nbytes, [array.tobytes()])
+
+
 def write_preview(
     file: IO[bytes],
     *,
@@ -89,6 +136,7 @@ def write_preview(
     fps: float = 25.0,
     image_size: str | None = None,
     point_names: Sequence[str] | None = None,
+    texture: Texture | None = None,
 ) -> None:
     """Write the file.
 
@@ -108,65 +156,76 @@ def write_preview(
         Width and height of the picture that the tracks refer to, pixels, as the option `image_size` has it.
     point_names : sequence of str, optional
         Name of every point.
+    texture : Texture, optional
+        The film's picture and where the points are in it.
     """
     stride = max(1, -(-solution.shapes[..., 0].size // MOST_OBSERVATIONS))
-    kept = range(0, len(solution.shapes), stride)
     facing, mirrored = (None, False) if truth is None else _onto(solution.shapes, truth)
-    box = Box.around(solution.shapes) if facing is None else Box.around(solution.shapes, facing)
-    residual_step = _largest_residual(tracks, solution) / LARGEST or 1.0
-    faces = triangles(mesh)
-    points = solution.shapes.shape[1]
-    seen = tracks.visible > 0
-    rejected = seen & (solution.weights == 0)
-    spread_step = 0.0 if solution.shapes_std is None else float(solution.shapes_std.max()) / LARGEST_COUNT or 1.0
-    names = "\n".join(point_names or ()).encode()
-    sizes = {
-        "faces": faces.nbytes,
-        "cameras": 40 * len(kept),
-        "positions": 6 * points * len(kept),
-        "residuals": 4 * points * len(kept),
-        **({} if facing is None else {"truth": 6 * points * len(kept)}),
-        "frames": 24 * len(kept),
-        "points": 8 * points,
-        **({} if solution.shapes_std is None else {"spread": 2 * points * len(kept)}),
-        "rejected": -(-points // 8) * len(kept),
-        **({} if point_names is None else {"names": len(names)}),
-    }
-    camera = solution.camera
+    rounding = Rounding.of(tracks, solution, facing)
+    kept, faces = range(0, len(solution.shapes), stride), triangles(mesh)
     header = {
         "version": VERSION,
         "num_frames": len(kept),
-        "num_points": points,
+        "num_points": solution.shapes.shape[1],
         "num_faces": len(faces),
         "fps": fps / stride,
         "frame_stride": stride,
         "y_axis": y_axis,
         "mirrored": mirrored,
-        "origin": box.origin.tolist(),
-        "step": box.step,
-        "residual_step": residual_step,
-        "spread_step": spread_step,
+        **rounding.header(),
         "size": size_of(solution.shapes),
         "all_frames": len(solution.shapes),
-        "focal": camera.focal,
-        "principal_point": camera.principal_point.tolist(),
+        "focal": solution.camera.focal,
+        "principal_point": solution.camera.principal_point.tolist(),
         "image_size": None if image_size is None else [float(side) for side in image_size.split("x")],
     }
-    _begin(file, header, sizes)
-    _section(file, faces.tobytes())
-    table = np.column_stack([camera.rotations.reshape(-1, 9), camera.scales])[kept]
-    _section(file, table.astype("<f4").tobytes())
-    _section(file, *(box.rounded(solution.shapes[frame]).tobytes() for frame in kept))
-    _section(file, *(_residuals(tracks, solution, frame, residual_step).tobytes() for frame in kept))
-    if facing is not None:
-        _section(file, *(box.rounded(facing[frame]).tobytes() for frame in kept))
-    _section(file, _frames_table(tracks, solution, truth)[kept].astype("<f4").tobytes())
-    _section(file, np.column_stack([seen.sum(axis=0), rejected.sum(axis=0)]).astype("<u4").tobytes())
-    if (std := solution.shapes_std) is not None:
-        _section(file, *(np.rint(std[frame] / spread_step).astype("<u2").tobytes() for frame in kept))
-    _section(file, np.packbits(rejected[kept], axis=1, bitorder="little").tobytes())
+    sections = [Section.of("faces", faces), *_sections(tracks, solution, truth, facing, kept, rounding)]
+    _write(file, header, [*sections, *_input_sections(point_names, texture)])
+
+
+def _input_sections(point_names: Sequence[str] | None, texture: Texture | None) -> list[Section]:
+    """Return the sections that only some inputs have: names of the points, and the picture with their places in it."""
+    sections = []
     if point_names is not None:
-        _section(file, names)
+        names = "\n".join(point_names).encode()
+        sections.append(Section("names", len(names), [names]))
+    if texture is not None:
+        sections.append(Section.of("places", texture.uv.astype("<f4")))
+        sections.append(Section("picture", len(texture.jpeg), [texture.jpeg]))
+    return sections
+
+
+def _sections(
+    tracks: Tracks,
+    solution: Solution,
+    truth: Floats | None,
+    facing: Floats | None,
+    kept: range,
+    rounding: Rounding,
+) -> list[Section]:
+    """Return the sections from `cameras` to `rejected`, of the frames kept; `facing` is the truth aligned with the result."""
+    shapes, std, camera = solution.shapes, solution.shapes_std, solution.camera
+    count, points = len(kept), shapes.shape[1]
+    box, step = rounding.box, rounding.residual_step
+    seen = tracks.visible > 0
+    rejected = seen & (solution.weights == 0)
+    table = np.column_stack([camera.rotations.reshape(-1, 9), camera.scales])[kept]
+    sections = [
+        Section.of("cameras", table.astype("<f4")),
+        Section("positions", 6 * points * count, (box.rounded(shapes[f]).tobytes() for f in kept)),
+        Section("residuals", 4 * points * count, (_residuals(tracks, solution, f, step).tobytes() for f in kept)),
+    ]
+    if facing is not None:
+        sections.append(Section("truth", 6 * points * count, (box.rounded(facing[f]).tobytes() for f in kept)))
+    sections += [
+        Section.of("frames", _frames_table(tracks, solution, truth)[kept].astype("<f4")),
+        Section.of("points", np.column_stack([seen.sum(axis=0), rejected.sum(axis=0)]).astype("<u4")),
+    ]
+    if std is not None:
+        rounded = (np.rint(std[f] / rounding.spread_step).astype("<u2").tobytes() for f in kept)
+        sections.append(Section("spread", 2 * points * count, rounded))
+    sections.append(Section.of("rejected", np.packbits(rejected[kept], axis=1, bitorder="little")))
+    return sections
 
 
 def _frames_table(tracks: Tracks, solution: Solution, truth: Floats | None) -> Floats:
@@ -229,26 +288,21 @@ def _residuals(tracks: Tracks, solution: Solution, frame: int, step: float) -> N
     return scaled
 
 
-def _begin(file: IO[bytes], header: dict[str, object], sizes: dict[str, int]) -> None:
-    """Write magic, version and header, padded to a fixed length because its offsets depend on its length."""
-    room = 2048
-    offset = 16 + room
-    sections = {}
-    for name, size in sizes.items():
-        sections[name] = {"offset": offset, "bytes": size}
-        offset += _padded(size)
-    text = json.dumps({**header, "sections": sections}, allow_nan=False).encode().ljust(room)
-    if len(text) > room:
-        raise AssertionError(f"the preview's header takes {len(text)} bytes, more than {room}")
-    file.write(MAGIC + struct.pack("<II", VERSION, room) + text)
-
-
-def _section(file: IO[bytes], *parts: bytes) -> None:
-    written = 0
-    for part in parts:
-        file.write(part)
-        written += len(part)
-    file.write(bytes(_padded(written) - written))
+def _write(file: IO[bytes], header: dict[str, object], sections: Sequence[Section]) -> None:
+    """Write magic, version, header and sections; the header has a fixed length because its offsets depend on its length."""
+    length = 2048
+    offset, places = 16 + length, {}
+    for section in sections:
+        places[section.name] = {"offset": offset, "bytes": section.size}
+        offset += _padded(section.size)
+    text = json.dumps({**header, "sections": places}, allow_nan=False).encode().ljust(length)
+    if len(text) > length:
+        raise AssertionError(f"the preview's header takes {len(text)} bytes, more than {length}")
+    file.write(MAGIC + struct.pack("<II", VERSION, length) + text)
+    for section in sections:
+        for part in section.parts:
+            file.write(part)
+        file.write(bytes(_padded(section.size) - section.size))
 
 
 def _padded(size: int) -> int:

@@ -113,7 +113,7 @@ def _camera_sentence(
 def _trust(trust: Trust | None) -> dict[str, Any]:
     """Return the verdict on the result with its reasons; nulls if the solver gave none."""
     if trust is None:
-        trust_fields = ("verdict", "expected_error", "expected_error_interval", "trust_sentence")
+        trust_fields = ("verdict", "expected_error", "expected_error_interval", "trust_sentence", *_TRUST_FIGURES)
         return {**dict.fromkeys(trust_fields), "verdict_reasons": []}
     return {
         "verdict": trust.verdict.value,
@@ -121,7 +121,12 @@ def _trust(trust: Trust | None) -> dict[str, Any]:
         "expected_error": trust.expected_error,
         "expected_error_interval": None if trust.interval is None else list(trust.interval),
         "trust_sentence": trust.sentence,
+        **{name: getattr(trust, name) for name in _TRUST_FIGURES},
     }
+
+
+_TRUST_FIGURES = ("turn_degrees", "degrees_per_frame", "deformation_per_frame", "held_out_error")
+"""Figures of `Trust` under their own names, beside those of the verdict; the others are in the report already."""
 
 
 def peak_memory() -> int | None:

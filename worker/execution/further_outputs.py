@@ -80,8 +80,8 @@ def write_further(
         halt.check()
 
     exported(0.0)
-    artifacts, told = write_kinds(result, kinds, directory, on_progress=exported)
-    report = {"outputs_of": job.outputs_of, "options": json.loads(options.model_dump_json()), "artifacts": told}
+    artifacts, described = write_kinds(result, kinds, directory, on_progress=exported)
+    report = {"outputs_of": job.outputs_of, "options": json.loads(options.model_dump_json()), "artifacts": described}
     artifacts.append(write_report(report, directory))
     exported(1.0)
     return Finished(

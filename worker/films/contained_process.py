@@ -29,7 +29,7 @@ OPEN_FILES = 256
 PROGRESS_EVERY = 0.2
 """Minimum seconds between two lines of progress."""
 
-SHOWN = 150
+FOLLOWED_POINTS = 150
 """Points that are shown while tracking runs: about 1.5 kB in a record that is rewritten twice a second."""
 
 SHARES = {"read": (0.0, 0.15), "locate": (0.15, 0.25), "track": (0.25, 1.0)}
@@ -178,11 +178,11 @@ def _reporter(target: int, size: tuple[int, int]) -> Callable[[TrackingStep], No
 
 
 def _followed(step: TrackingStep, size: tuple[int, int]) -> dict[str, Any] | None:
-    """Return at most `SHOWN` of the visible points of the frame just tracked, as the schema `FollowedPoints`."""
+    """Return at most `FOLLOWED_POINTS` of the visible points of the frame just tracked, as the schema `FollowedPoints`."""
     if step.followed is None:
         return None
     points = step.followed.points[step.followed.visible]
-    some = points[:: max(1, -(-len(points) // SHOWN))]
+    some = points[:: max(1, -(-len(points) // FOLLOWED_POINTS))]
     return {
         "frame": step.followed.index, "seconds": step.followed.time, "width": size[0], "height": size[1],
         "points": some.round().astype(int).ravel().tolist(),

@@ -16,8 +16,8 @@ from pliant.worker.formats.texture import Texture
 from pliant.worker.formats.tracks.decimation import thin
 from pliant.worker.formats.tracks.selection import hide_sparsely_observed
 
-NEEDED = frozenset(("tracks", "visibility", "confidence", "grid"))
-PICTURE = frozenset(("template_image", "uv"))
+REQUIRED = frozenset(("tracks", "visibility", "confidence", "grid"))
+TEXTURE_ARRAYS = frozenset(("template_image", "uv"))
 
 
 def read_tracked(file: Path, tracked: Tracked, options: Options) -> Inputs:
@@ -37,8 +37,8 @@ def read_tracked(file: Path, tracked: Tracked, options: Options) -> Inputs:
     InvalidInput
         The arrays do not fit together, or an option leaves too few points.
     """
-    arrays = read_file(file, field="film", limits=Limits(), wanted=NEEDED | PICTURE)
-    if not set(arrays) >= NEEDED or arrays["tracks"].shape[:2] != arrays["confidence"].shape:
+    arrays = read_file(file, field="film", limits=Limits(), wanted=REQUIRED | TEXTURE_ARRAYS)
+    if not set(arrays) >= REQUIRED or arrays["tracks"].shape[:2] != arrays["confidence"].shape:
         raise damaged("film", "tracks without confidence or grid")
     points = arrays["tracks"].astype(np.float64)
     visible = np.where(arrays["visibility"].astype(bool), arrays["confidence"], 0).astype(np.float64)
@@ -60,6 +60,6 @@ def read_tracked(file: Path, tracked: Tracked, options: Options) -> Inputs:
     frames = np.arange(checked.num_frames)
     selection = Selection(frames, kept, (len(frames), given))
     texture = None
-    if set(arrays) >= PICTURE:
+    if set(arrays) >= TEXTURE_ARRAYS:
         texture = Texture.from_tracked(arrays["template_image"], np.clip(arrays["uv"], 0, 1)).at_points(kept)
     return Inputs(checked, mesh, None, None, stated, selection if selection.narrows else None, texture=texture)

@@ -19,7 +19,7 @@ from pliant.worker.processes.contained import DONE, REFUSED, Ended, refusal_in, 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 MODULE = "pliant.worker.films.contained_process"
-NEEDED = {"frames", "template_frame", "grid_step", "longest_side", "region_frame", "region_polygon"}
+TRACKING_OPTIONS = {"frames", "template_frame", "grid_step", "longest_side", "region_frame", "region_polygon"}
 """Job options that the film process uses."""
 
 Count = Annotated[int, Field(ge=0, lt=2**40)]
@@ -187,7 +187,7 @@ def _run(
     request = {
         "action": action, "film": str(source.film.absolute()), "threads": max(1, min(threads, 64)), "estimate": estimate,
         "region": None if source.region is None else str(source.region.absolute()),
-        "options": options.model_dump(mode="json", include=NEEDED),
+        "options": options.model_dump(mode="json", include=TRACKING_OPTIONS),
         "bounds": asdict(bounds), "folder": str(scratch.absolute()),
     }  # fmt: skip
     return run_contained(

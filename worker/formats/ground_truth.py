@@ -16,19 +16,19 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.solver import InvalidInput, KnownCamera
 from pliant.worker.formats.reading.containers import read_arrays
-from pliant.worker.formats.records import FARTHEST, Arrays, Limits
+from pliant.worker.formats.records import MAX_COORDINATE, Arrays, Limits
 from pliant.worker.formats.tracks.interpretation import Understood
 from pliant.worker.formats.tracks.tracker_formats import TRUE_ROTATIONS, TRUE_SHAPES, short_names
 
 TRUTH_NAMES = frozenset([*TRUE_SHAPES, *TRUE_ROTATIONS])
 CAMERA_NAMES = frozenset([*TRUE_ROTATIONS, "scales"])
-DECISIVE = 1.3
+MIN_FIT_RATIO = 1.3
 """Factor by which another layout must fit the tracks better than the usual one."""
 
-SAMPLE = 24
+COMPARED_FRAMES = 24
 """Number of frames in which a layout is compared with the tracks."""
 
-FAR = 0.5
+MAX_UNEXPLAINED = 0.5
 """Unexplained share of the tracks' extent above which truth and tracks are considered not to match."""
 
 
@@ -129,20 +129,20 @@ def as_shapes(array: NDArray[np.generic], understood: Understood) -> tuple[NDArr
         return found[0][1], _far(unexplained(found[0][1], understood.points))
     costs = [unexplained(shapes, understood.points) for _, shapes in found]
     best = int(np.argmin(costs))
-    if costs[0] <= DECISIVE * costs[best]:
+    if costs[0] <= MIN_FIT_RATIO * costs[best]:
         best = 0
-    rival = min(cost for place, cost in enumerate(costs) if place != best)
-    evidence = f"True shapes read as {found[best][0]}: a camera leaves {costs[best]:.1%} of the tracks unexplained; next {rival:.1%}."
+    next_best = min(cost for place, cost in enumerate(costs) if place != best)
+    evidence = f"True shapes read as {found[best][0]}: a camera leaves {costs[best]:.1%} of the tracks unexplained; next {next_best:.1%}."
     return found[best][1], [evidence, *_far(costs[best])]
 
 
 def unexplained(shapes: NDArray[np.generic], points: NDArray[np.generic]) -> float:
     """Share of the tracks' extent that no affine camera of each frame explains from the shapes; the median over some frames."""
-    chosen = np.unique(np.linspace(0, len(points) - 1, SAMPLE).round().astype(int))
+    chosen = np.unique(np.linspace(0, len(points) - 1, COMPARED_FRAMES).round().astype(int))
     shares = []
     for frame in chosen:
         true, seen = np.asarray(shapes[frame], np.float64), np.asarray(points[frame], np.float64)
-        usable = (np.abs(true) <= FARTHEST).all(axis=1) & (np.abs(seen) <= FARTHEST).all(axis=1)
+        usable = (np.abs(true) <= MAX_COORDINATE).all(axis=1) & (np.abs(seen) <= MAX_COORDINATE).all(axis=1)
         if usable.sum() < 6:
             continue
         true, seen = true[usable] - true[usable].mean(axis=0), seen[usable] - seen[usable].mean(axis=0)
@@ -171,7 +171,7 @@ def _askew(rotations: NDArray[np.generic]) -> float:
 
 
 def _far(share: float) -> list[str]:
-    if share <= FAR:
+    if share <= MAX_UNEXPLAINED:
         return []
     return [
         f"The true shapes do not fit the tracks under any camera ({share:.0%} unexplained): check that both have the same order."

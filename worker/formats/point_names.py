@@ -5,18 +5,21 @@ Between processes and in stored inputs they are one array of bytes: UTF-8, one n
 
 from __future__ import annotations
 
+import sys
 import unicodedata
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from pliant.solver import InvalidInput
+from pliant.worker.formats.errors import damaged
 
 ARRAY = "point_names"
 
-LONGEST = 100
+MAX_POINT_NAME = 100
 """Characters of a name; longer ones are cut off."""
 
-SHOWN = 4
+LISTED_NAMES = 4
 """Names that a note lists."""
 
 POSE = (
@@ -30,8 +33,12 @@ HAND = (
     "wrist", "thumb_cmc", "thumb_mcp", "thumb_ip", "thumb_tip",
     *(f"{finger}_{joint}" for finger in _FINGERS for joint in ("mcp", "pip", "dip", "tip")),
 )  # fmt: skip
-MEDIAPIPE = {len(names): names for names in (POSE, HAND)}
-"""Names of MediaPipe's landmarks by their number, from its documentation: exports have none. Those of faces have numbers only."""
+FACE, IRISES = (tuple(f"face_{index}" for index in range(count)) for count in (468, 478))
+"""The vertices of MediaPipe's face mesh, without and with irises: it documents their numbers only, and groups of them such as the lips."""
+
+MEDIAPIPE = {len(names): names for names in (POSE, HAND, FACE, IRISES)}
+"""Names of MediaPipe's landmarks by their number, from its documentation: exports have none. The 543 of the holistic model have no
+documented order, and so no names."""
 
 
 def one_line(text: str) -> str:
@@ -50,6 +57,27 @@ def pack(names: Sequence[str]) -> NDArray[np.uint8]:
     return np.frombuffer("\n".join(names).encode(), dtype=np.uint8)
 
 
+def stated(array: NDArray[np.generic], count: int) -> tuple[str, ...]:
+    """Return the names that a NumPy array states, each on one line.
+
+    Raises
+    ------
+    InvalidInput
+        Codes wrong_shape, damaged_file: not one name for each of `count` points, or texts that are not Unicode.
+    """
+    field = f"tracks.{ARRAY}"
+    if array.shape != (count,):
+        raise InvalidInput(
+            "wrong_shape", field=field, expected=f"({count},), one name for each point", got=str(array.shape),
+            hint="Give as many names as the tracks have points, or leave them out.",
+        )  # fmt: skip
+    if array.dtype.kind == "U" and (np.ascontiguousarray(array).view(np.uint32) > sys.maxunicode).any():
+        raise damaged(field, "texts that are not Unicode")
+    return tuple(
+        _clean(each.decode("utf-8", "replace") if isinstance(each, bytes) else each) for each in array.tolist()
+    )
+
+
 def unpack(array: NDArray[np.generic] | None, count: int) -> tuple[str, ...] | None:
     """Return the names in an array; None where there is none, or it does not name so many points."""
     if array is None or array.dtype != np.uint8:
@@ -60,10 +88,10 @@ def unpack(array: NDArray[np.generic] | None, count: int) -> tuple[str, ...] | N
 
 def note(names: Sequence[str]) -> str:
     """Return a sentence that lists the first names."""
-    more = ", …" if len(names) > SHOWN else ""
-    return f"The file names its {len(names)} points: {', '.join(names[:SHOWN])}{more}."
+    more = ", …" if len(names) > LISTED_NAMES else ""
+    return f"The file names its {len(names)} points: {', '.join(names[:LISTED_NAMES])}{more}."
 
 
 def _clean(name: str) -> str:
     whole = unicodedata.normalize("NFC", name.encode("utf-8", "replace").decode())
-    return one_line(whole)[:LONGEST].strip()
+    return one_line(whole)[:MAX_POINT_NAME].strip()

@@ -17,7 +17,7 @@ from pliant.worker.formats.ground_truth import read_rotations, read_truth
 from pliant.worker.formats.meshes.surface import Surface, read_surface, whole_grid
 from pliant.worker.formats.meshes.triangulation import triangulate
 from pliant.worker.formats.reading.containers import read_arrays
-from pliant.worker.formats.records import FARTHEST, GroundTruth, Inputs, Limits, Selection
+from pliant.worker.formats.records import MAX_COORDINATE, GroundTruth, Inputs, Limits, Selection
 from pliant.worker.formats.tracks.decimation import thin
 from pliant.worker.formats.tracks.film_tracks import FilmTracks, read_film_tracks
 from pliant.worker.formats.tracks.interpretation import Understood, understand
@@ -158,13 +158,13 @@ def _check_size(points: NDArray[np.generic], limits: Limits) -> None:
 def _check_range(points: NDArray[np.generic], visible: NDArray[np.float64] | None) -> None:
     if points.dtype.itemsize <= 2:
         return  # such numbers end at 65,504
-    far = ((points > FARTHEST) | (points < -FARTHEST)).any(axis=2) & np.isfinite(points).all(axis=2)  # type: ignore[operator]
+    far = ((points > MAX_COORDINATE) | (points < -MAX_COORDINATE)).any(axis=2) & np.isfinite(points).all(axis=2)  # type: ignore[operator]
     if visible is not None:
         far &= visible > 0
     if far.any():
         raise InvalidInput(
-            "out_of_range", field="tracks", expected=f"visible coordinates within ±{FARTHEST:g}", got=f"{int(far.sum())} points beyond",
-            hint="Mark them as hidden, or set them to NaN.",
+            "out_of_range", field="tracks", expected=f"visible coordinates within ±{MAX_COORDINATE:g}",
+            got=f"{int(far.sum())} points beyond", hint="Mark them as hidden, or set them to NaN.",
         )  # fmt: skip
 
 

@@ -17,7 +17,7 @@ Arrays = dict[str, NDArray[np.generic]]
 """Named arrays of a file, not yet interpreted; members of nested structures have dotted names."""
 
 
-FARTHEST = 1e12
+MAX_COORDINATE = 1e12
 """Largest absolute coordinate that is accepted; squares of larger ones may overflow."""
 
 
@@ -84,37 +84,7 @@ class GroundTruth:
         InvalidInput
             Wrong type or shape, not finite, a frame without extent, or rows that are not orthonormal.
         """
-        given = np.asarray(shapes)
-        expected = f"({like[0]}, {like[1]}, 3)"
-        if given.dtype.kind not in "fiu":
-            raise InvalidInput(
-                "wrong_type", field="ground_truth.shapes", expected="real numbers", got=f"dtype {given.dtype}",
-                hint="Convert the array to float.",
-            )  # fmt: skip
-        if given.shape != (*like, 3):
-            raise InvalidInput(
-                "wrong_shape", field="ground_truth.shapes", expected=expected, got=str(given.shape),
-                hint="Ground truth is (frames, points, 3), with frames and points in the order of the tracks.",
-            )  # fmt: skip
-        points = np.array(given, dtype=np.float64, order="C")
-        if not np.isfinite(points).all():
-            raise InvalidInput(
-                "not_finite", field="ground_truth.shapes",
-                expected="finite coordinates", got=f"{int((~np.isfinite(points)).sum())} that are not",
-                hint="Give truth for every point and frame, or omit it.",
-            )  # fmt: skip
-        if np.abs(points).max() > FARTHEST:
-            raise InvalidInput(
-                "out_of_range", field="ground_truth.shapes",
-                expected=f"coordinates within ±{FARTHEST:g}", got=f"{np.abs(points).max():.3g}",
-                hint="Check the file, or choose a larger unit.",
-            )  # fmt: skip
-        if not (np.ptp(points, axis=1) > 0).any(axis=1).all():
-            raise InvalidInput(
-                "no_extent", field="ground_truth.shapes",
-                expected="points that differ in every frame", got="a frame whose points are all one",
-                hint="Omit the ground truth if it is not known.",
-            )  # fmt: skip
+        points = _true_points(shapes, like)
         points.flags.writeable = False
         if rotations is None:
             return cls(points)
@@ -125,6 +95,42 @@ class GroundTruth:
                 got=str(turned.shape), hint="Give one rotation a frame.",
             )  # fmt: skip
         return cls(points, KnownCamera.from_arrays(turned).rotations)
+
+
+def _true_points(shapes: ArrayLike, like: tuple[int, int]) -> NDArray[np.float64]:
+    """Check true points against `(F, P)` of the tracks; return a copy in double precision."""
+    given = np.asarray(shapes)
+    expected = f"({like[0]}, {like[1]}, 3)"
+    if given.dtype.kind not in "fiu":
+        raise InvalidInput(
+            "wrong_type", field="ground_truth.shapes", expected="real numbers", got=f"dtype {given.dtype}",
+            hint="Convert the array to float.",
+        )  # fmt: skip
+    if given.shape != (*like, 3):
+        raise InvalidInput(
+            "wrong_shape", field="ground_truth.shapes", expected=expected, got=str(given.shape),
+            hint="Ground truth is (frames, points, 3), with frames and points in the order of the tracks.",
+        )  # fmt: skip
+    points = np.array(given, dtype=np.float64, order="C")
+    if not np.isfinite(points).all():
+        raise InvalidInput(
+            "not_finite", field="ground_truth.shapes",
+            expected="finite coordinates", got=f"{int((~np.isfinite(points)).sum())} that are not",
+            hint="Give truth for every point and frame, or omit it.",
+        )  # fmt: skip
+    if np.abs(points).max() > MAX_COORDINATE:
+        raise InvalidInput(
+            "out_of_range", field="ground_truth.shapes",
+            expected=f"coordinates within ±{MAX_COORDINATE:g}", got=f"{np.abs(points).max():.3g}",
+            hint="Check the file, or choose a larger unit.",
+        )  # fmt: skip
+    if not (np.ptp(points, axis=1) > 0).any(axis=1).all():
+        raise InvalidInput(
+            "no_extent", field="ground_truth.shapes",
+            expected="points that differ in every frame", got="a frame whose points are all one",
+            hint="Omit the ground truth if it is not known.",
+        )  # fmt: skip
+    return points
 
 
 @dataclass(frozen=True, slots=True, eq=False)

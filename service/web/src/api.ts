@@ -63,7 +63,7 @@ function unreachable(): Refusal {
 }
 
 /** Read problem+json, or make a problem of an answer that is not. */
-export function problemOf(status: number, text: string): Problem {
+function problemOf(status: number, text: string): Problem {
   try {
     const given = JSON.parse(text) as Partial<Problem>;
     if (typeof given.detail === "string") {

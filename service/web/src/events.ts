@@ -19,7 +19,7 @@ interface Message {
 }
 
 /** Cut a text stream into its messages; comments (heartbeats) and fields that nobody reads are left out. */
-export async function* messages(body: ReadableStream<Uint8Array>): AsyncGenerator<Message> {
+async function* messages(body: ReadableStream<Uint8Array>): AsyncGenerator<Message> {
   const reader = body.pipeThrough(new TextDecoderStream() as unknown as TransformStream<Uint8Array, string>).getReader();
   let rest = "";
   let message: Message = { id: null, event: "message", data: "" };

@@ -9,12 +9,15 @@ import { bytes, number } from "./words";
 /** What people call a metric, and what exactly it is; the name of the record stands beside it. */
 const METRICS: Record<string, [string, string]> = {
   e3d_frame: ["3-D error", "distance from the ground truth, each frame turned to fit best; share of the object's size"],
-  e3d_sequence: ["3-D error, one alignment", "one orthogonal alignment for the whole sequence; share of the object's size"],
-  e3d_frame_similarity: ["Shape error", "after rotating, mirroring and scaling each frame to fit; share of the object's size"],
-  e3d_mocap: ["3-D error, motion capture", "as that literature defines it; share of the shape's spread"],
-  reprojection_median: ["Reprojection, median", "from a visible track to the projected shape; in the tracks' unit"],
-  reprojection_rms: ["Reprojection, root mean square", "sensitive to outliers; in the tracks' unit"],
+  e3d_frame_scaled: ["3-D error, one scale", "the same after one scale for the whole sequence"],
+  e3d_sequence: ["3-D error, one alignment", "the same after one orthogonal alignment for the whole sequence"],
+  e3d_frame_similarity: ["Shape error", "the same after rotating, mirroring and scaling each frame to fit"],
+  e3d_mocap: ["3-D error, motion capture", "as the motion capture literature defines it; share of the shape's spread"],
+  coverage: ["Coverage", "share of the positions within their 90 % interval"],
+  reprojection_median: ["Reprojection, median", "from a visible track to the projected shape, median; in the tracks' unit"],
+  reprojection_rms: ["Reprojection, root mean square", "the same, root mean square: sensitive to outliers"],
   rotation_degrees: ["Camera error", "mean angle between estimated and true cameras, in degrees"],
+  focal_error: ["Focal length", "of the focal length, share of the true one"],
 };
 
 /** The panel "Metrics". */

@@ -11,7 +11,7 @@ export function sharedToken(): string | null {
 }
 
 /** The job of a share link's token. */
-export function sharedJob(token: string): string {
+function sharedJob(token: string): string {
   return token.slice(token.indexOf(".") + 1, token.lastIndexOf("."));
 }
 

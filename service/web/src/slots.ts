@@ -212,7 +212,7 @@ const NAMED: [Part, RegExp][] = [
 ];
 
 /** Decide what a dropped file is: by the arrays in it, then by its name, then tracks first and a mesh second. */
-export function roleOf(name: string, entries: Entry[], haveTracks: boolean): Part {
+function roleOf(name: string, entries: Entry[], haveTracks: boolean): Part {
   for (const [part, pattern] of WITHIN) if (entries.some((entry) => pattern.test(entry.name))) return part;
   for (const [part, pattern] of NAMED) if (pattern.test(name)) return part;
   return haveTracks && !/track/i.test(name) ? "mesh" : "tracks";

@@ -85,7 +85,7 @@ function parts(job: Job): [string, string][] {
 const ofFilm = (job: Job): boolean => job.interpretation.mesh_source === "film";
 
 /** Write the job as a program. */
-export function snippet(job: Job, options: Given, language: Language, url: string): string {
+function snippet(job: Job, options: Given, language: Language, url: string): string {
   if (language === "Python") return python(job, options, url);
   if (language === "Shell") return shell(job, options, url);
   return curl(job, options, url);

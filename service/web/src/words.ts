@@ -34,7 +34,7 @@ export function bytes(value: number): string {
   return `${scaled < 9.95 ? scaled.toFixed(1) : Math.round(scaled)} ${units[unit]}`;
 }
 
-export function seconds(value: number): string {
+function seconds(value: number): string {
   if (value < 1) return "less than a second";
   if (value < 90) return count(Math.round(value), "second");
   if (value < 5400) return count(Math.round(value / 60), "minute");

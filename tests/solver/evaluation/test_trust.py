@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pliant.solver import Settings, Tracks, gallery, solve
 from pliant.solver.evaluation.metrics import e3d_frame
-from pliant.solver.evaluation.trust import Verdict, assess, turned
+from pliant.solver.evaluation.trust import Verdict, assess, per_frame, turned
 from scipy.spatial.transform import Rotation
 
 FRAMES, POINTS = 12, 30
@@ -16,7 +16,7 @@ FRAMES, POINTS = 12, 30
 
 def judged(**changed: Any) -> Any:
     rng = np.random.default_rng(0)
-    shapes = rng.normal(size=(FRAMES, POINTS, 3))
+    shapes = rng.normal(size=(POINTS, 3)) + changed.pop("bending", 0.001) * rng.normal(size=(FRAMES, POINTS, 3))
     turn = changed.pop("turn", 60.0)
     rotations = Rotation.from_euler("y", np.linspace(0, turn, FRAMES)[:, None], degrees=True).as_matrix()
     given: dict[str, Any] = {
@@ -48,13 +48,20 @@ def test_a_result_without_reasons_against_it_is_good() -> None:
         (
             {"shapes_std": np.full((FRAMES, POINTS), 0.2)},
             Verdict.WITH_CARE,
-            "may be as large as 43 % of the object's size",
+            "may be as large as 44 % of the object's size",
         ),
         ({"shapes_std": np.full((FRAMES, POINTS), 0.9)}, Verdict.DO_NOT_USE, "may be as large as the object itself"),
         ({"visible": np.eye(FRAMES, POINTS) + np.eye(FRAMES, POINTS, 12)}, Verdict.DO_NOT_USE, "are not seen"),
         ({"planar": True}, Verdict.WITH_CARE, "thin sheet"),
         ({"depth_is_typical": True}, Verdict.WITH_CARE, "Let it turn further"),
         ({"modes": 7}, Verdict.WITH_CARE, "7 modes of deformation in 12 frames"),
+        (
+            {"held_out_error": 0.09},
+            Verdict.WITH_CARE,
+            "left out are 9 % of the object's size from where the others predict",
+        ),
+        ({"held_out_error": 0.7}, Verdict.DO_NOT_USE, "left out are 70 %"),
+        ({"bending": 0.1}, Verdict.WITH_CARE, "turns by 5.5° in a frame, while the shape changes by 14 % of its size"),
     ],
 )
 def test_each_reason_alone_lowers_the_verdict(changed: dict[str, Any], verdict: Verdict, words: str) -> None:
@@ -76,6 +83,39 @@ def test_without_a_posterior_the_error_is_not_estimated() -> None:
     trust = judged(shapes_std=None)
     assert trust.expected_error is None
     assert trust.sentence.startswith("The error is not estimated")
+
+
+def test_the_figures_of_the_signs_are_stated() -> None:
+    trust = judged(held_out_error=0.01, turn=44.0)
+    assert trust.verdict is Verdict.GOOD
+    assert trust.held_out_error == 0.01
+    assert trust.degrees_per_frame == pytest.approx(4.0)
+    assert trust.deformation_per_frame == pytest.approx(0.001 * np.sqrt(2), rel=0.1)
+    unordered = judged(bending=0.1, ordered=False)
+    assert unordered.verdict is Verdict.GOOD
+    assert (unordered.held_out_error, unordered.degrees_per_frame, unordered.deformation_per_frame) == (None,) * 3
+
+
+def test_turn_and_deformation_per_frame_do_not_depend_on_size_translation_or_opposite_views() -> None:
+    rng = np.random.default_rng(1)
+    base = rng.normal(size=(POINTS, 3))
+    shapes = np.stack([base, 1.1 * base, base, 1.1 * base])
+    rotations = Rotation.from_euler("y", np.array([[0], [3], [6], [9]]), degrees=True).as_matrix()
+    rotations[1] = Rotation.from_euler("y", 180, degrees=True).as_matrix() @ rotations[1]
+    turning, deforming = per_frame(40 * shapes + rng.normal(size=(4, 1, 3)), rotations)
+    assert turning == pytest.approx(3.0)
+    assert deforming == pytest.approx(0.1 / np.sqrt((1 + 1.1**2) / 2))
+    assert per_frame(shapes[:1], rotations[:1]) == (None, None)
+
+
+def test_fewer_frames_a_second_do_not_change_what_can_be_told_apart() -> None:
+    angles = np.linspace(0, 1, 41)
+    base, moving = np.random.default_rng(2).normal(size=(2, POINTS, 3))
+    shapes = base + 0.5 * angles[:, None, None] * moving
+    rotations = Rotation.from_euler("y", 60 * angles[:, None], degrees=True).as_matrix()
+    one, other = per_frame(shapes, rotations), per_frame(shapes[::4], rotations[::4])
+    assert all(each is not None for each in (*one, *other))
+    assert np.divide(*other) == pytest.approx(np.divide(*one), rel=0.01)
 
 
 def test_opposite_viewing_directions_count_as_one() -> None:

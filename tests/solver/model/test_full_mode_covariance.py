@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pliant.solver.cameras import joint_refinement
+from pliant.solver.cameras import learned
 from pliant.solver.model.full_mode_covariance import (
     MAX_BASIS_FRAMES,
     MAX_NOISE_STD,
@@ -112,9 +112,7 @@ def test_modes_along_different_axes_determine_the_cameras() -> None:
     gram = tracks @ tracks.T / 600
     wander = 0.05 * np.stack([np.sin(5 * time + 1), np.cos(3 * time), np.sin(2 * time)], axis=1)
     wrong = exponential(wander) @ rotations
-    before = joint_refinement.refined(
-        gram, wrong, np.ones(FRAMES), with_scales=False, rounds=2, model_order=ModelOrder()
-    )
+    before = learned.refined(gram, wrong, np.ones(FRAMES), with_scales=False, rounds=2, model_order=ModelOrder())
     place = scene(gram, before.rotations, with_scales=False, prior_weight=0.01)
     found, scales = refined(place, np.ones(FRAMES), before.covariance)
 

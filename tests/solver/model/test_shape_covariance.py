@@ -9,11 +9,11 @@ import pytest
 from learning import learn
 from pliant.solver import KnownCamera, Settings, gallery, solve
 from pliant.solver.cameras.estimation import CameraEstimate
-from pliant.solver.cameras.joint_refinement import informative_frames
 from pliant.solver.evaluation import metrics
 from pliant.solver.model.expectation_maximisation import (
     MAX_DENSE_FRAMES,
     MAX_ITERATIONS,
+    MAX_MODES,
     MEAN_MODE_STD,
     WALK_VARIANCE_FLOOR,
     annealed,
@@ -25,6 +25,7 @@ from pliant.solver.model.expectation_maximisation import (
 from pliant.solver.model.random_walk import random_walk
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import exponential
+from pliant.solver.tracks.frame_selection import informative_frames
 
 FRAMES = 14
 
@@ -209,6 +210,7 @@ def test_a_long_rigid_film_without_modes_is_learned() -> None:
     rows = projections.reshape(-1, 3) @ rng.normal(size=(3, 50)) + 1e-4 * rng.normal(size=(2 * frames, 50))
     gram = rows @ rows.T / 50
     rigid = replace(begin(gram, projections), modes=np.zeros((frames, 0)), walk_variance=WALK_VARIANCE_FLOOR)
-    found = improve(rigid, gram, projections, iterations=2)
-    assert found.modes.shape == (frames, 0)
-    assert np.isfinite(found.nll)
+    for max_modes in (0, MAX_MODES):
+        found = improve(rigid, gram, projections, iterations=2, max_modes=max_modes)
+        assert found.modes.shape == (frames, 0)
+        assert np.isfinite(found.nll)

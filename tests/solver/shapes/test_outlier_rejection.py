@@ -26,7 +26,7 @@ def test_rejected_observations_are_the_corrupted_ones(cameras: KnownCamera | Non
     gross = np.linalg.norm(np.asarray(OUTLIER_SHARE.points) - np.asarray(MADE.tracks.points), axis=2) > 0.3 * size
     assert left_out[gross].mean() > 0.97
     assert left_out[~WRONG].mean() < 0.03
-    share = re.match(r"([\d.]+)% of what was seen", found.choices.reasons["outliers"])
+    share = re.match(r"([\d.]+)% of the visible observations", found.choices.reasons["outliers"])
     assert share is not None
     assert float(share.group(1)) == pytest.approx(100 * left_out.mean(), abs=0.06)
 

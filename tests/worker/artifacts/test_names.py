@@ -19,7 +19,7 @@ import trimesh
 from khronos import assert_valid
 from pliant.schemas.options import Options
 from pliant.worker.artifacts import build_report, write_artifacts
-from pliant.worker.artifacts.names import LONGEST
+from pliant.worker.artifacts.names import MAX_OBJECT_NAME
 from pliant.worker.execution import pipeline
 from pliant.worker.execution.further_outputs import read_solution
 from pxr import Usd
@@ -113,7 +113,7 @@ def test_a_texture_hangs_below_the_name(tmp_path: Path) -> None:
 def test_the_name_is_in_the_report_and_as_long_as_a_job_may_have(tmp_path: Path) -> None:
     write(tmp_path, "x" * 300)
     assert json.loads((tmp_path / "report.json").read_text())["name"] == "x" * 300
-    assert list(trimesh.load(tmp_path / "shapes.glb", process=False).geometry) == ["x" * LONGEST]
+    assert list(trimesh.load(tmp_path / "shapes.glb", process=False).geometry) == ["x" * MAX_OBJECT_NAME]
 
 
 def test_a_reconstruction_hands_its_name_to_the_files(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import struct
 from dataclasses import replace
@@ -11,10 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from PIL import Image
 from pliant.solver import Camera, Mesh, Solution, Tracks
 from pliant.solver.evaluation.alignment import align
 from pliant.solver.gallery import Sequence, corrupt, face
 from pliant.worker.artifacts import preview
+from pliant.worker.formats.texture import Texture
 
 F, P = 6, 60
 
@@ -60,6 +63,8 @@ def read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         "points": ("<u4", (points, 2)),
         "spread": ("<u2", (frames, points)),
         "rejected": ("u1", (frames, -1)),
+        "places": ("<f4", (points, 2)),
+        "picture": ("u1", (-1,)),
     }
     arrays = {}
     for name, section in header["sections"].items():
@@ -199,3 +204,15 @@ def test_a_perfect_fit_has_a_positive_residual_step(tmp_path: Path) -> None:
     header, arrays = read(path)
     assert header["residual_step"] > 0
     assert np.abs(header["residual_step"] * arrays["residuals"]).max() < 1e-9
+
+
+def test_a_films_picture_and_the_points_in_it_come_back(sequence: Sequence, tmp_path: Path) -> None:
+    places = np.random.default_rng(0).random((P, 2))
+    texture = Texture.from_tracked(np.full((8, 10, 3), (200, 90, 30), dtype=np.uint8), places)
+    path = tmp_path / preview.NAME
+    write(path, tracks=sequence.tracks, mesh=sequence.mesh, solution=solution_of(sequence), texture=texture)
+    _, arrays = read(path)
+    np.testing.assert_array_equal(arrays["places"], places.astype("<f4"))
+    with Image.open(io.BytesIO(arrays["picture"].tobytes())) as picture:
+        assert (picture.format, picture.size) == ("JPEG", (10, 8))
+        np.testing.assert_allclose(picture.getpixel((5, 4)), (200, 90, 30), atol=6)

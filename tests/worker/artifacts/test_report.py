@@ -93,11 +93,12 @@ def test_the_report_states_how_far_to_trust_the_result(tmp_path: Path) -> None:
     assert report["expected_error"] == trust.expected_error
     assert report["expected_error_interval"] == list(trust.interval)
     assert report["trust_sentence"] == trust.sentence
+    figures = ("turn_degrees", "degrees_per_frame", "deformation_per_frame", "held_out_error")
+    assert [report[name] for name in figures] == [getattr(trust, name) for name in figures]
     inputs, solution, options = made
     silent = build_report(inputs, replace(solution, trust=None), options, metrics={})
-    assert [silent[name] for name in ("verdict", "expected_error", "expected_error_interval", "trust_sentence")] == [
-        None
-    ] * 4
+    names = ("verdict", "expected_error", "expected_error_interval", "trust_sentence", *figures)
+    assert [silent[name] for name in names] == [None] * len(names)
     assert silent["verdict_reasons"] == []
 
 

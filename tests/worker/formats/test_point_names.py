@@ -12,12 +12,14 @@ import h5py
 import numpy as np
 import pytest
 from pliant.schemas.options import Options
+from pliant.solver import InvalidInput
 from pliant.worker.formats import Inputs, Limits, load_inputs, read_inputs, save_inputs
-from pliant.worker.formats.point_names import HAND, LONGEST, POSE, pack, unpack
+from pliant.worker.formats.point_names import FACE, HAND, IRISES, MAX_POINT_NAME, POSE, pack, unpack
 from pliant.worker.formats.reading import containers
 from pliant.worker.formats.reading.parsers import PARSERS
 from pliant.worker.formats.reading.pose_hdf5 import strings_of
 from pliant.worker.formats.records import Arrays
+from pliant.worker.formats.tracks.interpretation import understand
 
 F, P = 5, 6
 POINTS = np.round(np.random.default_rng(2).uniform(20, 500, (1, P, 2)) + np.arange(F)[:, None, None] * [1.5, 0.25], 2)
@@ -165,12 +167,15 @@ def landmarks(count: int, **more: str) -> list[list[dict[str, Any]]]:
     return [[{"x": x, "y": y, "visibility": 0.9, **more} for x, y in frame.tolist()] for frame in places]
 
 
-@pytest.mark.parametrize(("count", "names"), [(33, POSE), (21, HAND), (7, None)])
+@pytest.mark.parametrize(
+    ("count", "names"), [(33, POSE), (21, HAND), (468, FACE), (478, IRISES), (543, None), (7, None)]
+)
 def test_mediapipe_landmarks_are_known_by_their_number(
     here: None, count: int, names: tuple[str, ...] | None, tmp_path: Path
 ) -> None:
     assert len(set(POSE)) == 33
     assert len(set(HAND)) == 21
+    assert (FACE[0], FACE[-1], IRISES[-1]) == ("face_0", "face_467", "face_477")
     (tmp_path / "t.json").write_text(json.dumps([None, *landmarks(count)]))
     assert read(tmp_path / "t.json", image_size="640x480").point_names == names
     heads = [["frame", *(f"{axis}{index}" for index in range(count) for axis in "xyz")]]
@@ -187,6 +192,56 @@ def test_landmarks_with_names_of_their_own_keep_them(here: None, tmp_path: Path)
     del frames[0][5]["name"]
     (tmp_path / "t.json").write_text(json.dumps(frames))
     assert read(tmp_path / "t.json", image_size="640x480").point_names == POSE
+
+
+@pytest.mark.parametrize("order", ["frames", "points"])
+def test_an_npz_may_name_its_points(order: str, tmp_path: Path) -> None:
+    path = tmp_path / "t.npz"
+    tracks = POINTS if order == "frames" else POINTS.transpose(1, 0, 2)
+    layout = "frames_points" if order == "frames" else "points_frames"
+    odd = np.array(["a\tb", " c ", "x" * 300, "é", "🙂", ""])
+    np.savez(path, tracks=tracks, point_names=odd)
+    got = read(path, layout=layout)
+    assert got.point_names == ("a b", "c", "x" * MAX_POINT_NAME, "é", "🙂", "")
+    assert "The file names its 6 points: a b, c, " in " ".join(got.interpretation.notes)
+    np.savez(path, tracks=tracks, point_names=np.array([part.encode() for part in PARTS]))
+    assert read(path, layout=layout).point_names == PARTS
+    got = read(path, layout=layout, max_points=4)
+    assert got.selection is not None
+    assert got.point_names == tuple(PARTS[point] for point in got.selection.points)
+    np.savez(path, tracks=tracks)
+    assert read(path, layout=layout).point_names is None
+
+
+def test_the_file_of_pliant_track_may_name_its_points() -> None:
+    seen = {"visibility": np.ones((F, P)), "frame_indices": np.arange(F)}
+    named: Arrays = {"tracks": POINTS, "point_names": np.array(PARTS), **seen}
+    assert understand(named, Options()).point_names == PARTS
+    named["point_names"] = np.array(PARTS[:5])
+    with pytest.raises(InvalidInput, match="one name for each point"):
+        understand(named, Options())
+
+
+@pytest.mark.parametrize(
+    ("names", "code", "expected", "got"),
+    [
+        (np.array(PARTS[:5]), "wrong_shape", "(6,), one name for each point", "(5,)"),
+        (np.array([PARTS]), "wrong_shape", "(6,), one name for each point", "(1, 6)"),
+        (np.arange(6), "wrong_type", "an array of texts", "dtype int64"),
+        (np.array(PARTS, dtype=object), "object_array", "an array of texts", "an array of Python objects"),
+        (np.full(6, 0x110000, dtype="<u4").view("<U1"), "damaged_file", None, "texts that are not Unicode"),
+    ],
+    ids=["too few", "two axes", "numbers", "objects", "not Unicode"],
+)
+def test_names_that_do_not_fit_are_refused(
+    names: np.ndarray, code: str, expected: str | None, got: str, tmp_path: Path
+) -> None:
+    np.savez(tmp_path / "t.npz", tracks=POINTS, point_names=names)
+    with pytest.raises(InvalidInput) as refused:
+        read(tmp_path / "t.npz", layout="frames_points")
+    assert (refused.value.code, refused.value.field, refused.value.got) == (code, "tracks.point_names", got)
+    assert expected is None or refused.value.expected == expected
+    assert refused.value.hint
 
 
 def test_names_follow_the_selected_points_and_survive_storage(here: None, tmp_path: Path) -> None:
@@ -207,7 +262,7 @@ def test_names_are_lines_that_can_be_printed(here: None, tmp_path: Path) -> None
         for landmark, name in zip(frame, odd, strict=True):
             landmark["name"] = name
     (tmp_path / "t.json").write_text(json.dumps(frames))
-    clean = ("a b", "c d", "?", "x" * LONGEST, "é", "🙂")
+    clean = ("a b", "c d", "?", "x" * MAX_POINT_NAME, "é", "🙂")
     got = read(tmp_path / "t.json", image_size="640x480")
     assert got.point_names == clean
     assert unpack(pack(clean), P) == clean

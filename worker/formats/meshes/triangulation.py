@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from pliant.solver import Mesh, Tracks
 from scipy.spatial import Delaunay, QhullError
 
-LONGEST = 5.0
+MAX_EDGE_RATIO = 5.0
 """Ratio of an edge to the median edge above which its triangles are removed: they bridge gaps and concave parts of the outline."""
 
 
@@ -37,14 +37,14 @@ def triangulate(tracks: Tracks, *, y_axis: str) -> tuple[Mesh | None, list[str]]
         ]
     corners = points[triangles]
     longest = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)
-    limit = LONGEST * float(np.median(longest))
+    limit = MAX_EDGE_RATIO * float(np.median(longest))
     kept = (longest <= limit).all(axis=1)
     faces = seen[_facing_camera(triangles[kept], points, y_axis)]
     mesh = Mesh.from_faces(faces.astype(np.int32), tracks.num_points)
     alone = tracks.num_points - len(np.unique(faces))
     notes = [
         f"No mesh was given: Delaunay triangulation of frame {frame}, where {len(seen)} of {tracks.num_points} points are visible; "
-        f"{int((~kept).sum())} of {len(kept)} triangles with an edge over {LONGEST:g} × the median were removed."
+        f"{int((~kept).sum())} of {len(kept)} triangles with an edge over {MAX_EDGE_RATIO:g} × the median were removed."
     ]
     if alone:
         notes.append(f"{alone} points belong to no face of the generated mesh and have no smoothness in space.")

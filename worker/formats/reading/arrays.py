@@ -54,15 +54,15 @@ class Header:
     """Bytes of the data that must follow."""
 
 
-def read_npy(stream: IO[bytes], size: int, *, field: str, limits: Limits) -> NDArray[np.generic]:
-    """Read one array from a stream that holds `size` bytes.
+def read_npy(stream: IO[bytes], size: int, *, field: str, limits: Limits, texts: bool = False) -> NDArray[np.generic]:
+    """Read one array from a stream that holds `size` bytes: of numbers, or of texts.
 
     Raises
     ------
     InvalidInput
         Codes damaged_file, object_array, wrong_type, too_large.
     """
-    header, used = read_header(stream, field=field, limits=limits)
+    header, used = read_header(stream, field=field, limits=limits, texts=texts)
     if header.bytes != size - used:
         raise damaged(field, f"a header that announces {header.bytes} bytes over {size - used} bytes of data")
     flat = np.zeros(header.bytes, dtype=np.uint8)
@@ -78,8 +78,8 @@ def read_npy(stream: IO[bytes], size: int, *, field: str, limits: Limits) -> NDA
     return array.astype(header.dtype.newbyteorder("="), copy=False)
 
 
-def read_header(stream: IO[bytes], *, field: str, limits: Limits) -> tuple[Header, int]:
-    """Read and check the header alone; returns it and the number of bytes it took."""
+def read_header(stream: IO[bytes], *, field: str, limits: Limits, texts: bool = False) -> tuple[Header, int]:
+    """Read and check the header alone, of numbers or of texts; returns it and the number of bytes it took."""
     start = stream.read(8)
     if start[:6] != NPY_MAGIC or len(start) < 8:
         raise damaged(field, "no NumPy header")
@@ -92,13 +92,13 @@ def read_header(stream: IO[bytes], *, field: str, limits: Limits) -> tuple[Heade
     if len(text) != length:
         raise damaged(field, "a header that is cut off")
     described = _header_dictionary(text, field)
-    return _checked(described, field, limits), 8 + len(length_bytes) + length
+    return _checked(described, field, limits, texts=texts), 8 + len(length_bytes) + length
 
 
 def read_npz(
-    path: Path, *, field: str, limits: Limits, wanted: Collection[str] | None = None
+    path: Path, *, field: str, limits: Limits, wanted: Collection[str] | None = None, texts: Collection[str] = ()
 ) -> tuple[Arrays, dict[str, str]]:
-    """Read the wanted members of a zip of arrays.
+    """Read the wanted members of a zip of arrays: of numbers, but for those named in `texts`.
 
     Returns
     -------
@@ -123,7 +123,9 @@ def read_npz(
                     passed_over[name] = "not known"
                     continue
                 with archive.open(member) as stream:
-                    arrays[name] = read_npy(stream, member.file_size, field=f"{field}.{name}", limits=limits)
+                    arrays[name] = read_npy(
+                        stream, member.file_size, field=f"{field}.{name}", limits=limits, texts=name in texts
+                    )
     except UNREADABLE_ZIP as error:
         if (
             isinstance(error, OSError) and error.errno != errno.EINVAL
@@ -199,8 +201,10 @@ def pickle_refusal(field: str) -> InvalidInput:
     )  # fmt: skip
 
 
-def read_file(path: Path, *, field: str, limits: Limits, wanted: Collection[str] | None = None) -> Arrays:
-    """Read a file that starts as .npy (named `array`) or as a zip of them."""
+def read_file(
+    path: Path, *, field: str, limits: Limits, wanted: Collection[str] | None = None, texts: Collection[str] = ()
+) -> Arrays:
+    """Read a file that starts as .npy (named `array`) or as a zip of them; the arrays named in `texts` hold texts."""
     size = path.stat().st_size
     if size > limits.max_bytes:
         raise too_large(field, expected=f"a file of at most {limits.max_bytes} bytes", got=f"{size} bytes")
@@ -208,7 +212,7 @@ def read_file(path: Path, *, field: str, limits: Limits, wanted: Collection[str]
         if file.read(6) == NPY_MAGIC:
             file.seek(0, os.SEEK_SET)
             return {"array": read_npy(file, size, field=field, limits=limits)}
-    return read_npz(path, field=field, limits=limits, wanted=wanted)[0]
+    return read_npz(path, field=field, limits=limits, wanted=wanted, texts=texts)[0]
 
 
 def _header_dictionary(text: bytes, field: str) -> dict[str, object]:
@@ -221,7 +225,7 @@ def _header_dictionary(text: bytes, field: str) -> dict[str, object]:
     return described
 
 
-def _checked(described: dict[str, object], field: str, limits: Limits) -> Header:
+def _checked(described: dict[str, object], field: str, limits: Limits, *, texts: bool) -> Header:
     shape, fortran, spelled = described["shape"], described["fortran_order"], described["descr"]
     if not isinstance(shape, tuple) or not all(type(n) is int and n >= 0 for n in shape):
         raise damaged(field, "a NumPy header whose shape is not a tuple of whole numbers")
@@ -233,15 +237,21 @@ def _checked(described: dict[str, object], field: str, limits: Limits) -> Header
             hint="Give one plain array for each name.",
         )  # fmt: skip
     if spelled[1] == "O":
+        plain = "numpy.array(x, dtype=str)" if texts else "numpy.asarray(x, dtype=float)"
         raise InvalidInput(
-            "object_array", field=field, expected="an array of numbers", got="an array of Python objects",
-            hint="Reading objects can run code, so they are refused: save plain arrays, e.g. numpy.asarray(x, dtype=float).",
+            "object_array", field=field, expected=f"an array of {'texts' if texts else 'numbers'}", got="an array of Python objects",
+            hint=f"Reading objects can run code, so they are refused: save plain arrays, e.g. {plain}.",
         )  # fmt: skip
     try:
         dtype: np.dtype[np.generic] = np.dtype(spelled)
     except TypeError as error:
         raise damaged(field, f"an unknown dtype {spelled}") from error
-    if dtype.kind not in "fiub" or dtype.itemsize > 8:
+    if texts:
+        if dtype.kind not in "US" or dtype.itemsize == 0:
+            raise InvalidInput(
+                "wrong_type", field=field, expected="an array of texts", got=f"dtype {dtype}", hint="Save numpy.array(names, dtype=str).",
+            )  # fmt: skip
+    elif dtype.kind not in "fiub" or dtype.itemsize > 8:
         raise InvalidInput(
             "wrong_type", field=field, expected="real numbers or bool of at most 64 bits", got=f"dtype {dtype}",
             hint="Convert the array to float64.",

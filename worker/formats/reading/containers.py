@@ -7,6 +7,7 @@ from pathlib import Path
 
 from pliant.solver import InvalidInput
 from pliant.worker.formats.errors import too_large
+from pliant.worker.formats.point_names import ARRAY as NAMES
 from pliant.worker.formats.reading.arrays import NPY_MAGIC, read_file
 from pliant.worker.formats.reading.parsers import recognise
 from pliant.worker.formats.reading.sandbox import parse_in_sandbox
@@ -33,5 +34,5 @@ def read_arrays(path: Path, *, field: str, limits: Limits, wanted: Collection[st
             "empty_file", field=field, expected="a file with content", got="0 bytes", hint="Send the file again."
         )
     if head.startswith((NPY_MAGIC, *ZIP)):
-        return read_file(path, field=field, limits=limits, wanted=wanted)
+        return read_file(path, field=field, limits=limits, wanted=wanted, texts=(NAMES,))
     return parse_in_sandbox(recognise(head, field), path, field=field, limits=limits)

@@ -26,7 +26,7 @@ from pliant.worker.formats.records import Arrays, Limits
 COLUMNS = ("frame", "point", "x", "y")
 SEEN = ("visible", "visibility")
 WIDE = 8
-"""A table without names of this many columns is taken for one row a frame, which nothing says how to read."""
+"""A table without names of this many columns is taken for one row a frame, whose columns could mean anything."""
 
 
 def looks_like_csv(head: bytes) -> bool:

@@ -20,10 +20,10 @@ from pliant.solver.records import MIN_POINTS
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
-ROUNDS = 4
+SEED_MOVES = 4
 """Moves of the seeds; the spread hardly changes after these."""
 
-FRAMES = 8
+MEASURED_FRAMES = 8
 """Frames that lengths and places are measured in."""
 
 Indices = NDArray[np.intp]
@@ -105,7 +105,7 @@ def _thin_mesh(
     parts = np.unique(connected_components(graph, directed=False)[1][used], return_inverse=True)[1]
     seeds = used[spread(places[:, used], seen[:, used], limit, parts)]
     cluster = _nearest(graph, seeds)
-    for _ in range(ROUNDS):
+    for _ in range(SEED_MOVES):
         seeds = _middles(graph, mesh.edges, cluster, seeds, seen.mean(axis=0))
         cluster = _nearest(graph, seeds)
     order = np.argsort(seeds)
@@ -220,7 +220,7 @@ def _places(
     points: NDArray[np.generic], visible: NDArray[np.float64] | None
 ) -> tuple[NDArray[np.float64], NDArray[np.bool]]:
     """Return places in some frames, evenly chosen, and where they mean something; 0 elsewhere."""
-    chosen = np.unique(np.linspace(0, len(points) - 1, FRAMES).round().astype(int))
+    chosen = np.unique(np.linspace(0, len(points) - 1, MEASURED_FRAMES).round().astype(int))
     places = np.array(points[chosen], dtype=np.float64)
     seen: NDArray[np.bool] = np.asarray(np.isfinite(places).all(axis=2))
     if visible is not None:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.solver import InvalidInput
 
-STEADY = 0.95
+MIN_RISING_SHARE = 0.95
 """Share of neighbouring pixels whose coordinates must rise for two axes to count as rows and columns."""
 
 
@@ -92,4 +92,4 @@ def _is_picture(array: NDArray[np.generic]) -> bool:
     with np.errstate(invalid="ignore"):
         along_columns = np.diff(first[..., 0].astype(np.float64), axis=1)
         along_rows = np.diff(first[..., 1].astype(np.float64), axis=0)
-        return bool((along_columns > 0).mean() >= STEADY and (along_rows > 0).mean() >= STEADY)
+        return bool((along_columns > 0).mean() >= MIN_RISING_SHARE and (along_rows > 0).mean() >= MIN_RISING_SHARE)

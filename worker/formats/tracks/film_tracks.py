@@ -16,9 +16,9 @@ from pliant.worker.formats.reading.containers import read_arrays
 from pliant.worker.formats.records import Arrays, Limits
 from pliant.worker.formats.texture import Texture
 
-NEEDED = ("visibility", "confidence", "grid", "image_size", "fps")
-PICTURE = ("template_image", "uv")
-LONGEST = 10**5
+REQUIRED = ("visibility", "confidence", "grid", "image_size", "fps")
+TEXTURE_ARRAYS = ("template_image", "uv")
+MAX_PICTURE_SIDE = 10**5
 """Largest width or height of a picture, pixels."""
 
 
@@ -57,8 +57,8 @@ def read_film_tracks(path: Path, *, shape: tuple[int, int], limits: Limits) -> F
     InvalidInput
         Code damaged_file where an array is missing or does not fit the tracks, and the codes of `read_arrays` and `Mesh`.
     """
-    arrays = read_arrays(path, field="tracks", limits=limits, wanted=frozenset((*NEEDED, *PICTURE)))
-    missing = [name for name in NEEDED if name not in arrays]
+    arrays = read_arrays(path, field="tracks", limits=limits, wanted=frozenset((*REQUIRED, *TEXTURE_ARRAYS)))
+    missing = [name for name in REQUIRED if name not in arrays]
     if missing:
         raise damaged("tracks", f"tracks of a film without {', '.join(missing)}")
     for name in ("visibility", "confidence"):
@@ -72,7 +72,7 @@ def read_film_tracks(path: Path, *, shape: tuple[int, int], limits: Limits) -> F
         raise damaged("tracks", f"a grid of {mesh.num_points} points beside tracks of {shape[1]}")
     size, fps = _shot(arrays)
     texture = None
-    if all(name in arrays for name in PICTURE):
+    if all(name in arrays for name in TEXTURE_ARRAYS):
         texture = _texture(arrays, shape[1])
     return FilmTracks(np.where(arrays["visibility"].astype(bool), confidence, 0.0), mesh, size, fps, texture)
 
@@ -89,7 +89,7 @@ def tracks_options(options: Options, interpretation: Interpretation) -> Options:
 
 def _shot(arrays: Arrays) -> tuple[tuple[int, int], float]:
     size, rate = arrays["image_size"], arrays["fps"]
-    if size.shape != (2,) or size.dtype.kind not in "iu" or not ((size > 0) & (size <= LONGEST)).all():  # type: ignore[operator]
+    if size.shape != (2,) or size.dtype.kind not in "iu" or not ((size > 0) & (size <= MAX_PICTURE_SIDE)).all():  # type: ignore[operator]
         raise damaged("tracks", "an image_size that is not two positive integers, width and height")
     fps = float(rate) if rate.shape == () and rate.dtype.kind in "fiu" else np.nan
     if not 0 < fps <= 1000:

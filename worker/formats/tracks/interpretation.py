@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pliant.schemas.options import Options
 from pliant.solver import InvalidInput
 from pliant.worker.formats.point_names import ARRAY as NAMES
-from pliant.worker.formats.point_names import note, unpack
+from pliant.worker.formats.point_names import note, stated, unpack
 from pliant.worker.formats.records import Arrays
 from pliant.worker.formats.tracks.dense import flatten
 from pliant.worker.formats.tracks.layouts import Reading, choose
@@ -83,7 +83,7 @@ def understand(arrays: Arrays, options: Options) -> Understood:
     whose = [] if dialect.name in PLAIN else [f"Recognised as the output of {dialect.name} by the names in the file."]
     if dialect.note and options.coordinate_order == "auto":
         whose.append(dialect.note)
-    names = unpack(named.get(NAMES), placed.points.shape[1]) if reading.order == "frames_points" else None
+    names = _names(named, placed.points.shape[1], ordered=reading.order == "frames_points")
     if names is not None:
         whose.append(note(names))
     return Understood(
@@ -102,10 +102,20 @@ def _of_our_tracker(named: Arrays, name: str, options: Options) -> Understood:
             hint="Save the file of pliant track as it is, or leave frame_indices out.",
         )  # fmt: skip
     y_axis = "down" if options.y_axis == "auto" else options.y_axis
+    names = _names(named, points.shape[1], ordered=True)
     return Understood(
         points=points, visible=None, format=OWN, layout="tracks (F, P, 2)", coordinates="pixels", y_axis=y_axis, grid=None,
-        notes=["Recognised as the output of pliant track."], arrays=named,
+        notes=["Recognised as the output of pliant track.", *([] if names is None else [note(names)])], arrays=named,
+        point_names=names,
     )  # fmt: skip
+
+
+def _names(named: Arrays, count: int, *, ordered: bool) -> tuple[str, ...] | None:
+    """Return the names of `count` points: those that an npz states, else those of an export whose points come second (`ordered`)."""
+    given = named.get(NAMES)
+    if given is not None and given.dtype.kind in "US":
+        return stated(given, count)
+    return unpack(given, count) if ordered else None
 
 
 def upwards(points: NDArray[np.generic], options: Options) -> tuple[str, list[str]]:

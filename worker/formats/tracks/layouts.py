@@ -16,19 +16,19 @@ from pliant.schemas.options import Options
 from pliant.solver import InvalidInput
 from pliant.solver.records import MIN_FRAMES, MIN_POINTS
 from pliant.worker.formats.errors import AmbiguousInput
-from pliant.worker.formats.records import FARTHEST
+from pliant.worker.formats.records import MAX_COORDINATE
 from pliant.worker.formats.tracks.tracker_formats import Dialect
 
 CONTRADICTED = 5.0
 """Ratio of temporal smoothness above which another layout replaces the documented one."""
 
-DECISIVE = 1.3
+MIN_SMOOTHNESS_RATIO = 1.3
 """Ratio of temporal smoothness by which the best undocumented layout must exceed the next."""
 
 ALIKE = 0.98
 """Correlation of x and y over the points, in the median frame, above which both are the same coordinate."""
 
-SAMPLE = 96
+COMPARED_POINTS = 96
 
 MANY_FRAMES = 10_000
 """Maximum length of the frame axis. A longer axis lists pixels, whose neighbours are closer than consecutive frames."""
@@ -89,9 +89,9 @@ def readings(name: str, array: NDArray[np.generic]) -> list[Reading]:
 def roughness(points: NDArray[np.generic]) -> float:
     """Return the mean step in time over the spread of the coordinates, for a sample; infinite if x and y are the same."""
     count = points.shape[1]
-    chosen = np.unique(np.linspace(0, count - 1, SAMPLE).round().astype(int))
-    sample = np.asarray(points[: 4 * SAMPLE][:, chosen], dtype=np.float64)
-    sample = np.where(np.isfinite(sample) & (np.abs(sample) <= FARTHEST), sample, np.nan)
+    chosen = np.unique(np.linspace(0, count - 1, COMPARED_POINTS).round().astype(int))
+    sample = np.asarray(points[: 4 * COMPARED_POINTS][:, chosen], dtype=np.float64)
+    sample = np.where(np.isfinite(sample) & (np.abs(sample) <= MAX_COORDINATE), sample, np.nan)
     if np.isfinite(sample).all(axis=2).mean() < 0.01:
         return float("inf")
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -149,10 +149,10 @@ def choose(
     ranked = sorted(allowed, key=lambda one: costs[one.layout])
     order = None if array.ndim == 3 and dialect.name in OF_ANY_ORDER else dialect.order
     documented = [one for one in ranked if order in (None, one.order) or options.layout != "auto"] or ranked
-    best, rivals = documented[0], documented[1:]
-    clear = all(costs[rival.layout] >= DECISIVE * costs[best.layout] for rival in rivals)
+    best, others = documented[0], documented[1:]
+    clear = all(costs[other.layout] >= MIN_SMOOTHNESS_RATIO * costs[best.layout] for other in others)
     if clear and costs[best.layout] <= CONTRADICTED * costs[ranked[0].layout]:
-        return best, [_evidence(best, rivals[0], costs)] if rivals else []
+        return best, [_evidence(best, others[0], costs)] if others else []
     choices: list[dict[str, Any]] = [
         {"layout": one.layout, "options": one.options, "evidence": f"mean step in time: {_number(costs[one.layout])}"}
         for one in ranked
@@ -169,10 +169,10 @@ def _is_allowed(reading: Reading, options: Options) -> bool:
     )
 
 
-def _evidence(best: Reading, rival: Reading, costs: dict[str, float]) -> str:
+def _evidence(best: Reading, other: Reading, costs: dict[str, float]) -> str:
     return (
         f"Read as {best.layout}, where the mean step in time is {_number(costs[best.layout])}; "
-        f"as {rival.layout}: {_number(costs[rival.layout])}."
+        f"as {other.layout}: {_number(costs[other.layout])}."
     )
 
 

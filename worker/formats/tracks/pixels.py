@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from pliant.schemas.options import Options
 from pliant.solver import InvalidInput
 from pliant.worker.formats.errors import AmbiguousInput
-from pliant.worker.formats.records import FARTHEST
+from pliant.worker.formats.records import MAX_COORDINATE
 
-SAMPLE = 100_000
+MAX_COMPARED = 100_000
 SLACK = 0.02
-MOST = 0.9
+MIN_INSIDE_SHARE = 0.9
 """Share of points that must lie inside the picture for coordinates to be fractions of it; none may lie a picture size outside."""
 
 
@@ -121,8 +121,8 @@ def _size(text: str | None) -> tuple[int, int] | None:
 
 
 def _sampled(points: NDArray[np.generic]) -> NDArray[np.float64]:
-    flat = points.reshape(-1, 2)[:: max(1, points.shape[0] * points.shape[1] // SAMPLE)].astype(np.float64)
-    return flat[(np.abs(flat) <= FARTHEST).all(axis=1)]
+    flat = points.reshape(-1, 2)[:: max(1, points.shape[0] * points.shape[1] // MAX_COMPARED)].astype(np.float64)
+    return flat[(np.abs(flat) <= MAX_COORDINATE).all(axis=1)]
 
 
 def _ordered(
@@ -133,7 +133,7 @@ def _ordered(
         notes = ["Coordinates read as y, x, as set by coordinate_order."]
     elif options.coordinate_order == "auto" and size is not None and len(sample):
         inside = [(sample <= np.array(limits)).all(axis=1).mean() for limits in (size, size[::-1])]
-        turned = bool(inside[0] < MOST and inside[1] >= 0.99)
+        turned = bool(inside[0] < MIN_INSIDE_SHARE and inside[1] >= 0.99)
         if turned:
             notes = [
                 f"Coordinates read as y, x: {inside[1]:.0%} of them lie inside {size[0]} × {size[1]}, but only {inside[0]:.0%} as x, y."
@@ -148,7 +148,7 @@ def _kind(sample: NDArray[np.float64], options: Options, size: tuple[int, int] |
         return "pixels", []
     low, high = sample.min(axis=0), sample.max(axis=0)
     observed = f"values from {low.min():.3g} to {high.max():.3g}"
-    if low.min() >= -1 and high.max() <= 2 and _inside(sample, 0.0, 1.0) >= MOST:
+    if low.min() >= -1 and high.max() <= 2 and _inside(sample, 0.0, 1.0) >= MIN_INSIDE_SHARE:
         if size is None:
             raise _fractions_or_not(observed)
         return "unit", [f"Coordinates are fractions of the picture: {observed}."]
@@ -157,7 +157,7 @@ def _kind(sample: NDArray[np.float64], options: Options, size: tuple[int, int] |
         and min(size) > 4
         and low.min() >= -3
         and high.max() <= 3
-        and _inside(sample, -1.0, 1.0) >= MOST
+        and _inside(sample, -1.0, 1.0) >= MIN_INSIDE_SHARE
     ):
         return "signed", [f"Coordinates run from −1 to 1 over the picture: {observed}."]
     return "pixels", []

@@ -8,7 +8,7 @@ from pliant.schemas.options import Options
 from pliant.solver import InvalidInput, Mesh
 from pliant.solver.records import MIN_FRAMES
 
-SHOWN = 10
+LISTED_POINTS = 10
 """Maximum number of point indices listed in a note."""
 
 
@@ -77,7 +77,7 @@ def hide_sparsely_observed(
             got=f"none of {len(dropped)}", hint="Set min_seen lower.",
         )  # fmt: skip
     confidence[:, dropped] = 0.0
-    shown = ", ".join(str(index) for index in dropped[:SHOWN]) + (" …" if len(dropped) > SHOWN else "")
+    shown = ", ".join(str(index) for index in dropped[:LISTED_POINTS]) + (" …" if len(dropped) > LISTED_POINTS else "")
     notes = [
         f"{len(dropped)} points are visible in fewer than {options.min_seen} frames and excluded from the solve (points {shown}). They "
         "keep their index in the result."

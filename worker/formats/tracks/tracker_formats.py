@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from pliant.worker.formats.errors import AmbiguousInput
+from pliant.worker.formats.point_names import ARRAY as NAMES
 from pliant.worker.formats.records import Arrays
 
 Order = Literal["frames_points", "points_frames"]
@@ -89,7 +90,7 @@ TRUE_SHAPES = ("shapes", "S", "S_gt", "Shat_gt", "S_GT", "P3_gt", "GT", "gt")
 TRUE_ROTATIONS = ("rotations", "Rs", "R_gt", "Rs_gt", "R", "RO")
 
 TRACKS = frozenset(name for dialect in DIALECTS for name in dialect.tracks)
-KNOWN = TRACKS | {"frame_indices", *VISIBILITY, *INTRINSICS, *TRUE_SHAPES, *TRUE_ROTATIONS}
+KNOWN = TRACKS | {"frame_indices", NAMES, *VISIBILITY, *INTRINSICS, *TRUE_SHAPES, *TRUE_ROTATIONS}
 """All array names that the track reader uses; other members of an npz are never inflated."""
 
 

@@ -13,16 +13,19 @@ import {
   Mesh,
   Points,
   ShaderMaterial,
+  type Texture,
   Vector3,
 } from "three";
 import { SCALE, type Values } from "./colours";
+import type { Picture } from "./picture";
 import type { Preview } from "./preview";
 
 const VERTEX = `
-attribute vec4 a; attribute vec4 b; attribute vec4 na; attribute vec4 nb;
+attribute vec4 a; attribute vec4 b; attribute vec4 na; attribute vec4 nb; attribute vec2 spot;
 uniform float mixing; uniform vec3 origin; uniform float unit; uniform float dot_size;
-varying vec3 normal_; varying float value; varying float unknown;
+varying vec3 normal_; varying float value; varying float unknown; varying vec2 spot_;
 void main() {
+  spot_ = spot;
   vec4 p = mix(a, b, mixing);
   unknown = p.w < 0.0 ? 1.0 : 0.0;
   value = max(p.w, 0.0) / 32767.0;
@@ -33,16 +36,18 @@ void main() {
 
 // A warm light from the upper left, a weak cool one from the right, more sky than ground, and a rim: all fixed to the viewer.
 // Both sides of a surface are lit, the back less. Positions without a value are grey; towards them the colour of their
-// neighbours fades to grey and does not pass through the dark end of the scale.
+// neighbours fades to grey and does not pass through the dark end of the scale. The film's picture has its own light in it and is
+// shaded little.
 const FRAGMENT = `
 uniform vec3 plain; uniform vec3 scale[6]; uniform float coloured; uniform float lit; uniform float reversed;
-varying vec3 normal_; varying float value; varying float unknown;
+uniform sampler2D picture; uniform float pictured;
+varying vec3 normal_; varying float value; varying float unknown; varying vec2 spot_;
 void main() {
   float at = clamp(value / max(1.0 - unknown, 0.001), 0.0, 1.0) * 5.0;
   vec3 shade = scale[0];
   for (int i = 0; i < 5; i++) shade = mix(shade, scale[i + 1], clamp(at - float(i), 0.0, 1.0));
   shade = mix(shade, vec3(0.214), unknown);
-  vec3 base = mix(plain, shade, coloured);
+  vec3 base = mix(mix(plain, shade, coloured), texture2D(picture, spot_).rgb, pictured);
   bool back = gl_FrontFacing == (reversed > 0.5);
   vec3 n = normalize(normal_ + vec3(1e-9));
   if (n.z < 0.0) n = -n;
@@ -52,6 +57,8 @@ void main() {
   float shine = pow(max(dot(n, normalize(vec3(-0.27, 0.34, 0.9))), 0.0), 32.0) * 0.11;
   vec3 sky = mix(vec3(0.23, 0.25, 0.28), vec3(0.42, 0.41, 0.40), 0.5 + 0.5 * n.y);
   vec3 light = sky + 0.72 * key * vec3(1.0, 0.97, 0.93) + 0.20 * fill * vec3(0.86, 0.93, 1.0);
+  light = mix(light, vec3(1.0), 0.6 * pictured);
+  shine *= 1.0 - pictured;
   vec3 c = mix(base, base * light + shine + 0.10 * edge * vec3(0.9, 0.95, 1.0), lit);
   if (lit > 0.5 && back) c *= 0.55;
   gl_FragColor = vec4(c, 1.0);
@@ -71,6 +78,7 @@ export class Body {
   private readonly materials: ShaderMaterial[] = [];
   private readonly wire: LineSegments<BufferGeometry, ShaderMaterial>;
   private values: Values | null = null;
+  private texture: Texture | null = null;
   private readonly accumulated: Float32Array;
 
   constructor(
@@ -123,15 +131,20 @@ export class Body {
     for (const material of this.materials) material.uniforms["mixing"]!.value = second > first ? time - first : 0;
   }
 
-  /** Colour by values, or plainly. */
-  colour(values: Values | null): void {
+  /** Colour by values, by the film's picture, or plainly. */
+  colour(values: Values | null, picture: Picture | null = null): void {
     this.values = values;
+    this.texture?.dispose();
+    this.texture = picture?.texture ?? null;
+    if (picture) this.geometry.setAttribute("spot", new BufferAttribute(picture.places, 2));
     for (const slot of this.slots) slot.frame = -1;
     for (const material of this.materials) {
       material.uniforms["coloured"]!.value = values === null ? 0 : 1;
       material.uniforms["scale"]!.value = (values?.scale ?? SCALE).map((hex) => new Color(hex));
+      material.uniforms["picture"]!.value = this.texture;
+      material.uniforms["pictured"]!.value = picture === null ? 0 : 1;
     }
-    this.wire.material.uniforms["coloured"]!.value = 0;
+    for (const name of ["coloured", "pictured"]) this.wire.material.uniforms[name]!.value = 0;
   }
 
   /** The plain colour and that of the wires, from the page's theme. */
@@ -154,6 +167,7 @@ export class Body {
   }
 
   dispose(): void {
+    this.texture?.dispose();
     this.geometry.dispose();
     this.wire.geometry.dispose();
     for (const material of this.materials) material.dispose();
@@ -180,6 +194,8 @@ export class Body {
         coloured: { value: 0 },
         lit: { value: options.lit },
         reversed: { value: 0 },
+        picture: { value: null as Texture | null },
+        pictured: { value: 0 },
       },
     });
     this.materials.push(made);

@@ -2,14 +2,14 @@
 
 import { type Preview, isHidden, isRejected } from "./preview";
 
-export type Colouring = "plain" | "expected" | "seen" | "displacement" | "error" | "residual" | "difference";
+export type Colouring = "film" | "plain" | "expected" | "seen" | "displacement" | "error" | "residual" | "difference";
 
 /** Six colours, evenly spaced, rising in lightness all the way, so that they also read in grey and without red or green. */
 export const SCALE = ["#2b2f77", "#28608f", "#1f8f8a", "#58b96d", "#b5d44a", "#fbe94b"];
 /** From blue over light grey to red, for values of both signs. */
-export const DIVERGING = ["#2166ac", "#74add1", "#dfe6ea", "#f0e4dd", "#e08a66", "#b2182b"];
+const DIVERGING = ["#2166ac", "#74add1", "#dfe6ea", "#f0e4dd", "#e08a66", "#b2182b"];
 /** Positions without a value: hidden in the frame, or unknown. */
-export const UNKNOWN = -32767;
+const UNKNOWN = -32767;
 const TOP = 32767;
 
 export interface Values {
@@ -28,7 +28,7 @@ export interface Values {
 /** A value of a point in a frame; NaN where there is none. */
 type Value = (frame: number, point: number) => number;
 
-/** Prepare a colouring; null for plain. */
+/** Prepare a colouring; null for those without values: plain, and the film's picture. */
 export async function valuesFor(colouring: Colouring, preview: Preview, signal: AbortSignal): Promise<Values | null> {
   if (colouring === "displacement") return displacement(preview);
   if (colouring === "seen") return seen(preview);
@@ -47,6 +47,7 @@ export async function valuesFor(colouring: Colouring, preview: Preview, signal: 
 /** The colourings that a preview has data for, with people's names. */
 export function colourings(preview: Preview): [Colouring, string][] {
   const all: [Colouring, string, boolean][] = [
+    ["film", "film", preview.has("picture") && preview.faces.length > 0],
     ["plain", "plain", true],
     ["expected", "expected error", preview.has("spread")],
     ["error", "3-D error", preview.has("truth")],
@@ -75,7 +76,7 @@ export async function errorDifference(one: Preview, other: Preview, signal: Abor
 export const percent = (share: number): string => `${(100 * share).toPrecision(2)} % of the size`;
 
 /** Standard deviation of each position as a share of the object's size. */
-export function deviation(preview: Preview, spread: Uint16Array): Value {
+function deviation(preview: Preview, spread: Uint16Array): Value {
   const unit = (preview.header.spread_step ?? 0) / preview.size;
   return (frame, point) => unit * (spread[preview.points * frame + point] as number);
 }

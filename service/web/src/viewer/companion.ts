@@ -1,6 +1,7 @@
 // Another job's result beside this one: the same moment, the same direction.
 
 import { Body, seenFromBehind } from "./body";
+import { type Picture, pictureOf } from "./picture";
 import { Preview } from "./preview";
 import { Stage } from "./stage";
 
@@ -18,13 +19,17 @@ export class Companion {
   static async open(other: Other, signal: AbortSignal): Promise<Companion> {
     const preview = await Preview.open(other.preview, signal);
     if (preview.ready === 0) await new Promise<void>((resolve) => (preview.onFrames = resolve));
-    return new Companion(preview);
+    return new Companion(preview, preview.has("picture") ? await pictureOf(preview, signal) : null);
   }
 
-  private constructor(readonly preview: Preview) {
+  private constructor(
+    readonly preview: Preview,
+    picture: Picture | null,
+  ) {
     this.element.className = "view other";
     this.stage = new Stage(this.element, preview);
     this.body = new Body(preview, preview.positions);
+    this.body.colour(null, picture);
     this.body.reverse(seenFromBehind(preview, preview.clearest) !== preview.header.mirrored);
     this.stage.flip(preview.header.mirrored);
     this.stage.add(this.body.group);

@@ -16,7 +16,7 @@ export interface Compared {
   signal: AbortSignal;
   /** The choice of colours, once it is there. */
   colours: () => HTMLSelectElement | null;
-  paint: (values: Values | null) => void;
+  paint: (values: Values) => void;
   repaint: () => void;
   /** Runs what may fail and shows the failure. */
   guarded: (action: () => Promise<void>) => Promise<void>;
@@ -56,7 +56,7 @@ export class Comparison {
       timeline.compare(null);
       this.own.remove();
       say(this.summary, "");
-      if (this.offerDifference(false)) paint(null);
+      this.offerDifference(false);
       if (other === null) return;
       const companion = await Companion.open(other, signal);
       this.companion = companion;
@@ -74,16 +74,18 @@ export class Comparison {
     });
   }
 
-  /** Add the difference of errors to the colours, chosen, or remove it; returns true if it was the one shown. */
-  private offerDifference(on: boolean): boolean {
+  /** Add the difference of errors to the colours, chosen, or remove it; the first colours follow it where it was shown. */
+  private offerDifference(on: boolean): void {
     const select = this.parts.colours();
-    if (select === null) return false;
+    if (select === null) return;
     const shown = select.value === "difference";
     select.querySelector("option[value=difference]")?.remove();
     if (on) select.append(h("option", { value: "difference", selected: true }, "error difference"));
     if (on) select.value = "difference";
-    else if (shown) select.value = "plain";
-    return shown;
+    else if (shown) {
+      select.selectedIndex = 0;
+      select.dispatchEvent(new Event("change"));
+    }
   }
 
   private words(other: Other, theirs: Preview, sharesPoints: boolean): string {

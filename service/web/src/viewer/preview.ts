@@ -48,6 +48,8 @@ interface Header {
     spread?: Section;
     rejected?: Section;
     names?: Section;
+    places?: Section;
+    picture?: Section;
   };
 }
 
@@ -59,6 +61,10 @@ interface Fields {
   rejected: Uint8Array;
   /** Name of every point. */
   names: string[];
+  /** Where the points are in the picture, 2 a point, 0 … 1: u right, v down. */
+  places: Float32Array;
+  /** The film's template frame, JPEG. */
+  picture: ArrayBuffer;
 }
 export type Field = keyof Fields;
 
@@ -68,6 +74,8 @@ const READ: { [Name in Field]: (raw: ArrayBuffer) => Fields[Name] } = {
   spread: (raw) => new Uint16Array(raw),
   rejected: (raw) => new Uint8Array(raw),
   names: (raw) => new TextDecoder().decode(raw).split("\n"),
+  places: (raw) => new Float32Array(raw),
+  picture: (raw) => raw,
 };
 
 /** What is known of one frame; null where it is not. */
@@ -146,7 +154,7 @@ export class Preview {
     return preview;
   }
 
-  /** Fetch a further array once: residuals (2 a point), ground truth (3 a point), deviations (1 a point), rejections (bits) or names. */
+  /** Fetch a further section once. */
   field<Name extends Field>(name: Name, signal: AbortSignal): Promise<Fields[Name]> {
     const section = this.header.sections[name];
     if (section === undefined) return Promise.reject(new Error(`The preview has no ${name}.`));

@@ -11,6 +11,7 @@ import { FilmPane } from "./filmpane";
 import { openHelp } from "./help";
 import { control, timeSlider } from "./keys";
 import { showLegend } from "./legend";
+import { type Picture, pictureOf } from "./picture";
 import { Player, paceControls } from "./player";
 import { Preview } from "./preview";
 import { Probe } from "./probe";
@@ -41,6 +42,7 @@ export class Viewer {
   private readonly scrub: HTMLInputElement;
   private readonly comparison: Comparison;
   private truth: Body | null = null;
+  private colouring: Colouring = "plain";
   private dots: TrackDots | null = null;
   private pane: FilmPane | null = null;
   private following = false;
@@ -87,7 +89,10 @@ export class Viewer {
       panes: this.panes,
       signal: this.leaving.signal,
       colours: () => this.holder.querySelector<HTMLSelectElement>(".colouring select"),
-      paint: (values) => this.paint(values),
+      paint: (values) => {
+        this.colouring = "difference";
+        this.paint(values);
+      },
       repaint: this.repaint,
       guarded: (action) => this.guarded(action),
     });
@@ -103,6 +108,7 @@ export class Viewer {
     this.repaint();
     this.moved();
     if (film) void this.beside(true);
+    void this.colour(colourings(preview)[0]![0]);
     if (!matchMedia("(prefers-reduced-motion: reduce)").matches) this.player.play();
     this.showState();
   }
@@ -251,12 +257,16 @@ export class Viewer {
   private async colour(colouring: Colouring): Promise<void> {
     const [preview, { companion }] = [this.preview, this.comparison];
     const { signal } = this.leaving;
+    this.colouring = colouring;
     const values = colouring === "difference" && companion ? errorDifference(preview, companion.preview, signal) : valuesFor(colouring, preview, signal);
-    await this.guarded(async () => this.paint(await values));
+    await this.guarded(async () => {
+      const [found, picture] = await Promise.all([values, colouring === "film" ? pictureOf(preview, signal) : null]);
+      if (this.colouring === colouring) this.paint(found, picture);
+    });
   }
 
-  private paint(values: Values | null): void {
-    this.body.colour(values);
+  private paint(values: Values | null, picture: Picture | null = null): void {
+    this.body.colour(values, picture);
     showLegend(this.legend, values);
     this.stage.redraw();
   }

@@ -1,0 +1,155 @@
+"""Observations that were held out: how far cameras and prior miss images that they predict from the other images of a point.
+
+Given cameras Π and prior covariance Σ, the images w ∈ R^{2N} of a point in the N frames that show it are N(0, V), V = Π Σ Πᵀ + σ² W⁻¹. The
+prediction of a block B of them from all others is off by
+
+    e_B = [V⁻¹]_BB⁻¹ [V⁻¹ w]_B,    with covariance [V⁻¹]_BB⁻¹,
+
+which is the result of a solve without B at the cost of one with it (Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006,
+equations 5.10 to 5.12, here for blocks). A block is a tenth of the frames in a row, since one frame of a film follows from its neighbours
+even where the model is wrong. Residuals of the solve do not show this: a model with as many modes as frames fits anything, white noise to
+4 % of its size, and predicts none of it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from pliant.solver.energy.hyperparameters import noise_std
+from pliant.solver.evaluation.trust import size_of
+from pliant.solver.model.shape_covariance import ShapeCovariance
+from pliant.solver.records import Camera, Floats, Tracks
+from pliant.solver.shapes.sparsely_observed import WELL_OBSERVED_SHARE
+from pliant.solver.tracks.completion import ranks
+from pliant.solver.tracks.noise import weighted_median
+from scipy import linalg
+
+MAX_HELD_OUT_FRAMES, MAX_HELD_OUT_POINTS = 100, 40
+"""Maximum numbers of frames, evenly spread, and of points, spread by their distance from the centroid. The cost is cubic in frames: each
+pattern of visibility takes some 5 ms."""
+
+FOLDS = 10
+"""Blocks of frames that are held out in turn; fewer frames are held out one by one."""
+
+LEAST_CONFIDENCE = 1e-3
+"""Observations with less confidence count as hidden."""
+
+
+def held_out_errors(covariance: Floats, images: Floats, blocks: list[NDArray[np.intp]]) -> Floats:
+    """Return observed minus predicted images, each predicted without those of its block; 0 outside all blocks.
+
+    Parameters
+    ----------
+    covariance : ndarray, shape (2N, 2N)
+        V, the coordinates of an image side by side.
+    images : ndarray, shape (K, N, 2)
+        Of K points with the same V.
+    blocks : list of ndarray
+        Indices of images.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        V is not positive definite.
+    """
+    factor = linalg.cho_factor(covariance, lower=True, check_finite=False)
+    inverse = linalg.cho_solve(factor, np.eye(len(covariance)), check_finite=False)
+    weighted = inverse @ images.reshape(len(images), -1).T
+    errors = np.zeros_like(weighted)
+    for block in blocks:
+        rows = (2 * block[:, None] + [0, 1]).reshape(-1)
+        errors[rows] = np.linalg.solve(inverse[np.ix_(rows, rows)], weighted[rows])
+    return np.asarray(errors.T.reshape(images.shape))
+
+
+def held_out_error(
+    tracks: Tracks,
+    shapes: Floats,
+    camera: Camera,
+    confidence: Floats,
+    covariance: ShapeCovariance,
+    *,
+    unit: float,
+) -> float | None:
+    """Return the median distance of held-out observations from their prediction, share of the size of the shapes.
+
+    Parameters
+    ----------
+    tracks : Tracks
+        F frames of P points.
+    shapes : ndarray, shape (F, P, 3)
+        The tracks' unit. They serve to correct the tracks for perspective, and as the unit of the result.
+    camera : Camera
+        That sees them.
+    confidence : ndarray, shape (F, P)
+        Of the observations that were used; 0 where hidden or rejected.
+    covariance : ShapeCovariance
+        The prior, F frames, normalized units.
+    unit : float
+        The tracks' unit per normalized unit.
+
+    Returns
+    -------
+    float or None
+        None where no point is seen in three frames, or rounding leaves V indefinite.
+    """
+    frames = len(shapes)
+    used = np.unique(np.linspace(0, frames - 1, min(frames, MAX_HELD_OUT_FRAMES)).round().astype(int))
+    chosen = _spread(shapes, (confidence[used] >= LEAST_CONFIDENCE).sum(axis=0), len(used))
+    weights = confidence[np.ix_(used, chosen)]
+    weights = np.where(weights < LEAST_CONFIDENCE, 0.0, weights)
+    images = _corrected(tracks.points[:, chosen], shapes[:, chosen], camera)[used] / unit
+    try:
+        errors = _errors(_image_covariance(covariance, camera, used), noise_std(covariance) ** 2, images, weights)
+    except np.linalg.LinAlgError:
+        return None
+    seen = weights > 0
+    distances = np.where(seen, np.linalg.norm(errors, axis=2), 0.0) / camera.scales[used, None]
+    if not seen.any():
+        return None
+    return unit * weighted_median(distances[seen], weights[seen]) / size_of(shapes)
+
+
+def _errors(image: Floats, noise: float, images: Floats, weights: Floats) -> Floats:
+    """Return the errors of held-out images `(F', K, 2)`; points with the same confidences share V."""
+    errors = np.zeros_like(images)
+    patterns, pattern_of = np.unique(weights, axis=1, return_inverse=True)
+    for index, pattern in enumerate(patterns.T):
+        seen, points = np.flatnonzero(pattern), np.flatnonzero(pattern_of.reshape(-1) == index)
+        rows = (2 * seen[:, None] + [0, 1]).reshape(-1)
+        own = image[np.ix_(rows, rows)]
+        own[np.diag_indices(len(rows))] += noise / np.repeat(pattern[seen], 2)
+        found = held_out_errors(own, images[np.ix_(seen, points)].transpose(1, 0, 2), _blocks(seen, len(weights)))
+        errors[np.ix_(seen, points)] = found.transpose(1, 0, 2)
+    return errors
+
+
+def _spread(shapes: Floats, counts: NDArray[np.intp], frames: int) -> NDArray[np.intp]:
+    """Return points that are observed often, and in three frames at least; the order of the points does not matter."""
+    often = np.flatnonzero(counts >= max(3, WELL_OBSERVED_SHARE * frames))
+    ordered = often[np.argsort(ranks(shapes[:, often].mean(axis=0)[None]))]
+    places = np.unique(np.linspace(0, len(often) - 1, min(len(often), MAX_HELD_OUT_POINTS)).round().astype(int))
+    return np.asarray(ordered[places])
+
+
+def _corrected(points: Floats, shapes: Floats, camera: Camera) -> Floats:
+    """Return tracks `(F, K, 2)` without translation as an orthographic camera would have seen them."""
+    flat = camera.scales[:, None, None] * (shapes @ camera.rotations[:, :2].transpose(0, 2, 1))
+    off = points - camera.project(shapes)
+    if camera.focal is not None:
+        off *= (1 + camera.depths(shapes) / camera.focal)[..., None]
+    return np.asarray(flat + off)
+
+
+def _image_covariance(covariance: ShapeCovariance, camera: Camera, used: NDArray[np.intp]) -> Floats:
+    """Return Π Σ Πᵀ of the frames used, shape `(2F', 2F')`."""
+    rows = (camera.scales[:, None, None] * camera.rotations[:, :2])[used].reshape(-1, 3)
+    wide = np.repeat(np.repeat(covariance.over_frames_at(used), 2, axis=0), 2, axis=1)
+    return np.asarray(rows @ covariance.mean_covariance @ rows.T + (rows @ covariance.axis_covariance @ rows.T) * wide)
+
+
+def _blocks(seen: NDArray[np.intp], frames: int) -> list[NDArray[np.intp]]:
+    """Return the indices into `seen` of the images in each tenth of the frames; none where it has all of them."""
+    fold = seen * min(FOLDS, frames) // frames
+    blocks = [np.flatnonzero(fold == each) for each in np.unique(fold)]
+    return [block for block in blocks if len(block) < len(seen)]

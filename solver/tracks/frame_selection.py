@@ -1,0 +1,31 @@
+"""Which frames something is learned from, and how what they give is carried to the others."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from pliant.solver.records import Floats
+
+
+def informative_frames(visible: Floats) -> NDArray[np.bool_]:
+    """Return which frames show at least a tenth of the median number of points, shape `(F,)`; all if fewer than three do."""
+    seen = (visible > 0).sum(axis=1)
+    is_identifiable = np.asarray(seen >= max(3.0, 0.1 * float(np.median(seen[seen > 0]))))
+    return is_identifiable if is_identifiable.sum() >= 3 else np.ones(len(seen), dtype=bool)
+
+
+def evenly_spread(places: NDArray[np.intp], count: int) -> NDArray[np.intp]:
+    """Return at most `count` of the places, evenly spread."""
+    chosen = np.linspace(0, len(places) - 1, min(len(places), count)).round().astype(np.intp)
+    return np.asarray(places[np.unique(chosen)])
+
+
+def of_frames(gram: Floats, used: NDArray[np.intp]) -> Floats:
+    """Return the Gram matrix of some frames, shape `(2F', 2F')`."""
+    rows = np.stack([2 * used, 2 * used + 1], axis=1).ravel()
+    return gram[np.ix_(rows, rows)]
+
+
+def between(used: NDArray[np.intp], values: Floats, frames: int) -> Floats:
+    """Return values of all frames, interpolated between those of the frames used, shape `(F, n)`."""
+    return np.stack([np.interp(np.arange(frames), used, each) for each in values.T], axis=1)
