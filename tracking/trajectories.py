@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
 
 import numpy as np
 from pliant.solver import Tracks
@@ -64,7 +63,6 @@ def track_again(
     if should_stop():
         raise TrackingStopped
     paths = expected(chained)
-    others = [t for t in range(len(paths)) if t != template]
 
     def again(t: int) -> tuple[Floats, Bools, Floats]:
         frame = read(t)
@@ -73,10 +71,15 @@ def track_again(
         return points, appearance.agrees(frame, points, like | chained.visible[t]), variance
 
     result = Chain(chained.points.copy(), chained.visible.copy(), chained.variance.copy())
-    with closing(pool.map(again, others)) as found:  # closing cancels what has not begun
-        for t, (points, visible, variance) in zip(others, found, strict=True):
+    found = {t: pool.submit(again, t) for t in range(len(paths)) if t != template}
+    try:
+        for t, future in found.items():
             if should_stop():
                 raise TrackingStopped
+            points, visible, variance = future.result()
             result.points[t], result.visible[t], result.variance[t] = points, visible, variance
             on_frame(t, points, visible)
+    finally:
+        for future in found.values():
+            future.cancel()
     return result
