@@ -36,10 +36,11 @@ class TrackingStep:
     """Progress of one stage."""
 
     stage: Stage
-    """"read": decode the film; "locate": find the region in the template; "track": follow the points."""
+    """"read": decode the film; "locate": find the region in the template; "track": follow the points, then once more from where
+    all frames lead to expect them."""
 
     done: int
-    """Frames of this stage that are done."""
+    """Frames of this stage that are done; "track" counts those that are tracked again as well."""
 
     total: int | None
     """Frames of this stage; None while the film's length is not known."""

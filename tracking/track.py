@@ -18,13 +18,14 @@ from pliant.tracking.chaining import Chain, chain
 from pliant.tracking.decoding.film import Film, open_film
 from pliant.tracking.decoding.limits import FilmLimits
 from pliant.tracking.errors import FilmError, TrackingStopped
-from pliant.tracking.flow import Bools, Floats, opencv_serial
+from pliant.tracking.flow import Bools, Floats, Grey, opencv_serial
 from pliant.tracking.frame_store import FrameStore
 from pliant.tracking.records import FilmInfo, Followed, OnStep, TrackedFilm, TrackingStep
 from pliant.tracking.region import Region, read_region, transport
 from pliant.tracking.registration import Registration
 from pliant.tracking.seeding import default_step, keep, neighbours, place, quads
 from pliant.tracking.survey import Survey, sharpest, survey
+from pliant.tracking.trajectories import track_again
 
 LONGEST_SIDE = 960
 """Default longest side of the tracker's frames, pixels: full HD is halved, which its compression hardly notices."""
@@ -193,10 +194,17 @@ def _track(run: _Run, found: Survey, plan: _Plan, step: float | None, *, whole: 
         done += 1
         row = plan.start + t
         followed = Followed(int(found.indices[row]), float(found.times[row]), _in_film(points, found.scale), visible)
-        run.on_step(TrackingStep("track", done, length, followed))
+        run.on_step(TrackingStep("track", done, 2 * length - 1, followed))
+
+    def read(t: int) -> Grey:
+        return run.store.read(plan.start + t)
 
     chained = chain(
-        lambda row: run.store.read(plan.start + row), length, plan.template - plan.start, appearance, registration,
+        read, length, plan.template - plan.start, appearance, registration,
+        pool=run.pool, on_frame=on_frame, should_stop=run.should_stop,
+    )  # fmt: skip
+    chained = track_again(
+        read, chained, plan.template - plan.start, appearance, registration,
         pool=run.pool, on_frame=on_frame, should_stop=run.should_stop,
     )  # fmt: skip
     kept_grid, kept = keep(seeds.grid, chained.visible.mean(axis=0) >= LEAST_SEEN)
@@ -225,9 +233,7 @@ def _assemble(
     indices, times = found.indices[rows], found.times[rows]
     visible = chained.visible[:, kept]
     tracks = _in_film(chained.points[:, kept], found.scale)
-    variance = chained.variance[:, kept]
-    usual = np.median(variance[visible])
-    confidence = np.where(visible, usual / np.maximum(variance, usual), 0).astype(np.float32)
+    confidence = chained.confidence[:, kept]
     template = plan.template - plan.start
     picked = np.unique(np.linspace(0, len(indices) - 1, THUMBNAILS).round().astype(np.int64))
     image, thumbnails = _pictures(run, indices, template, picked)

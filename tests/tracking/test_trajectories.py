@@ -1,0 +1,93 @@
+"""Tracking once more from the paths of all points."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+from pliant.tracking.appearance import Appearance, noise_variance
+from pliant.tracking.chaining import Chain
+from pliant.tracking.errors import TrackingStopped
+from pliant.tracking.registration import Registration
+from pliant.tracking.seeding import neighbours, place
+from pliant.tracking.trajectories import expected, track_again
+
+FRAMES = 12
+
+
+def turning(points: np.ndarray) -> np.ndarray:
+    """Return paths `(F, P, 2)` of a bent sheet that turns."""
+    depth = 0.004 * (points - points.mean(axis=0)) ** 2
+    angle = np.linspace(-0.4, 0.4, FRAMES)[:, None]
+    across = (points[:, 0] - 80) * np.cos(angle) + depth.sum(axis=1) * np.sin(angle) + 80
+    return np.stack([across, np.broadcast_to(points[:, 1], across.shape)], axis=2).astype(np.float32)
+
+
+def test_expected_places_overrule_uncertain_ones_and_fill_hidden_ones() -> None:
+    points = np.random.default_rng(0).uniform(20, 140, (200, 2)).astype(np.float32)
+    true = turning(points)
+    tracked, variance, visible = true.copy(), np.full((FRAMES, 200), 0.01, np.float32), np.ones((FRAMES, 200), bool)
+    tracked[8:11, :20] += 2
+    variance[8:11, :20] = 1
+    tracked[2:6, 20:40], visible[2:6, 20:40] = 0, False
+    error = np.linalg.norm(expected(Chain(tracked, visible, variance)) - true, axis=2)
+    assert error[8:11, :20].mean() < 0.5
+    assert error[2:6, 20:40].mean() < 0.2
+    assert np.median(error) < 0.02
+
+
+def film() -> tuple[np.ndarray, np.ndarray, Appearance, Registration]:
+    """Return frames of a texture that drifts, the true paths, and what a tracker compares with the first frame."""
+    cv2 = pytest.importorskip("cv2")
+    noise = np.random.default_rng(1).standard_normal((120, 160)).astype(np.float32)
+    texture = cv2.GaussianBlur(noise, (0, 0), 2.0)
+    texture = 128 + 45 * texture / texture.std()
+    frames = [
+        cv2.warpAffine(texture, np.array([[1, 0, 0.8 * t], [0, 1, 0]], np.float32), (160, 120)) for t in range(FRAMES)
+    ]
+    grey = np.clip(frames, 0, 255).astype(np.uint8)
+    region = np.zeros((120, 160), bool)
+    region[20:100, 20:120] = True
+    seeds, _ = place(grey[0], region, step=5)
+    drift = np.stack([0.8 * np.arange(FRAMES), np.zeros(FRAMES)], axis=1).astype(np.float32)
+    appearance = Appearance.of(grey[0], seeds.points, neighbours(seeds.grid, len(seeds.points)))
+    registration = Registration.of(grey[0], seeds.points, seeds.grid, noise=noise_variance(grey[0]))
+    return grey, seeds.points + drift[:, None], appearance, registration
+
+
+def again(chained: Chain, *, stop: bool = False) -> tuple[Chain, np.ndarray, list[int]]:
+    """Track the film again from given tracks; return the result, the true paths, and the frames that were reported."""
+    grey, true, appearance, registration = film()
+    seen: list[int] = []
+    with ThreadPoolExecutor(2) as pool:
+        result = track_again(
+            lambda t: grey[t], chained, 0, appearance, registration,
+            pool=pool, on_frame=lambda t, points, visible: seen.append(t), should_stop=lambda: stop and len(seen) == 2,
+        )  # fmt: skip
+    return result, true, seen
+
+
+def spoiled() -> Chain:
+    """Return tracks of the film of which some lost their way, and some were lost."""
+    true = film()[1]
+    variance = np.full(true.shape[:2], 0.01, np.float32)
+    points, visible = true.copy(), np.ones(true.shape[:2], bool)
+    points[6:9, 60:90] += 3
+    variance[6:9, 60:90] = 2
+    visible[3:5, 100:140] = False
+    return Chain(points, visible, variance)
+
+
+def test_lost_points_are_found_again_and_wrong_ones_put_right() -> None:
+    result, true, seen = again(spoiled())
+    error = np.linalg.norm(result.points - true, axis=2)
+    assert error[6:9, 60:90].max() < 0.3
+    assert result.visible[3:5, 100:140].mean() > 0.95
+    assert np.percentile(error[result.visible], 99) < 0.3
+    assert seen == list(range(1, FRAMES))
+
+
+def test_a_stop_ends_the_second_round() -> None:
+    with pytest.raises(TrackingStopped):
+        again(spoiled(), stop=True)
