@@ -47,7 +47,11 @@ def tables(rows: list[Row], calibration: Sequence[str]) -> str:
     """Return the tables in Markdown."""
     chosen = [row for row in rows if is_of(row, calibration)]
     held = [row for row in rows if not is_of(row, calibration)]
-    parts = [confusion("Sequences that constants were chosen on", chosen), confusion("Other sequences", held), missed(rows)]
+    parts = [
+        confusion("Sequences that constants were chosen on", chosen),
+        confusion("Other sequences", held),
+        missed(rows),
+    ]
     parts += [separated(chosen, held), covered(chosen, held), by_sequence(rows, calibration)]
     return "\n\n".join(part for part in parts if part)
 
