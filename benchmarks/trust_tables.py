@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from pliant.solver.evaluation.metrics import NINETY
+from pliant.solver.evaluation.trust import LOOSE_HELD_OUT, UNTOLD
 
 BEGIN, END = "<!-- trust tables -->", "<!-- end of trust tables -->"
 """Lines of the page between which the tables stand."""
@@ -47,7 +48,7 @@ def tables(rows: list[Row], calibration: Sequence[str]) -> str:
     chosen = [row for row in rows if is_of(row, calibration)]
     held = [row for row in rows if not is_of(row, calibration)]
     parts = [confusion("Sequences that constants were chosen on", chosen), confusion("Held out", held), missed(rows)]
-    parts += [covered(chosen, held), by_sequence(rows, calibration)]
+    parts += [separated(chosen, held), covered(chosen, held), by_sequence(rows, calibration)]
     return "\n\n".join(part for part in parts if part)
 
 
@@ -68,6 +69,51 @@ def confusion(title: str, rows: list[Row]) -> str:
         counts = [sum(row["verdict"] == verdict for row in blind) for verdict in VERDICTS]
         lines.append("| white noise, no truth | " + " | ".join(map(str, counts)) + " |")
     return "\n".join(lines)
+
+
+def separated(chosen: list[Row], held: list[Row]) -> str:
+    """Return how many solves of each class of true error have the signs of held-out observations and of turn per frame."""
+    names = [name for _, _, name in CLASSES]
+    lines = [
+        "| sign | sequences | " + " | ".join(f"true error {name}" for name in names) + " | white noise |",
+        "|---|---|---|---|---|---|",
+    ]
+    for sign, has in SIGNS.items():
+        for title, rows in (("chosen on", chosen), ("held out", held)):
+            stated = [(row, found) for row in rows if (found := has(row)) is not None]
+            cells = [f"{sum(found for _, found in part)} of {len(part)}" for part in _by_class(stated)]
+            lines.append(f"| {sign} | {title} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) if any(has(row) is not None for has in SIGNS.values() for row in [*chosen, *held]) else ""
+
+
+def _by_class(stated: list[tuple[Row, bool]]) -> list[list[tuple[Row, bool]]]:
+    known = [each for each in stated if each[0]["true"] is not None]
+    classes = [[each for each in known if low <= each[0]["true"] < high] for low, high, _ in CLASSES]
+    return [*classes, [each for each in stated if each[0]["true"] is None]]
+
+
+def misses_held_out(row: Row) -> bool | None:
+    """Whether held-out observations are far from their prediction; None where none were held out."""
+    error = row.get("held_out")
+    return None if error is None else error >= LOOSE_HELD_OUT
+
+
+def turn_over_deformation(row: Row) -> float | None:
+    """Return radians of turn per frame over the share of the size by which the shape changes; None for photographs in no order."""
+    turn, change = row.get("degrees_per_frame"), row.get("deformation_per_frame")
+    return None if turn is None or change is None else float(np.radians(turn) / max(change, np.finfo(float).tiny))
+
+
+def turns_slowly(row: Row) -> bool | None:
+    """Whether the shape changes by more in a frame than the camera turns; None for photographs in no order."""
+    found = turn_over_deformation(row)
+    return None if found is None else found < UNTOLD
+
+
+SIGNS = {
+    f"held-out observations {LOOSE_HELD_OUT:.0%} of the size and more from their prediction": misses_held_out,
+    f"turn over deformation per frame below {UNTOLD:g}": turns_slowly,
+}
 
 
 def missed(rows: list[Row]) -> str:
@@ -157,15 +203,16 @@ def exceptions(rows: list[Row]) -> str:
 def by_sequence(rows: list[Row], calibration: Sequence[str]) -> str:
     """Return one line a solve; * marks sequences that constants were chosen on."""
     lines = [
-        "| sequence | tracks | verdict | first reason | expected | true | coverage | mean σ / RMS error |",
-        "|---|---|---|---|---|---|---|---|",
+        "| sequence | tracks | verdict | first reason | expected | true | coverage | mean σ / RMS error | held out | turn over "
+        "deformation |",
+        "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for row in sorted(rows, key=lambda row: row["sequence"]):
         star = "*" if is_of(row, calibration) else ""
         reason = row["reasons"][0] if row["reasons"] else ""
         cells = (
             f"{row['sequence']}{star}", row["kind"], VERDICTS[row["verdict"]], reason, figure(row["expected"]), figure(row["true"]),
-            percent(within(row)), ratio(row.get("std_over_error")),
+            percent(within(row)), ratio(row.get("std_over_error")), figure(row.get("held_out")), ratio(turn_over_deformation(row)),
         )  # fmt: skip
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)

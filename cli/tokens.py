@@ -70,11 +70,11 @@ def create(
 
     input_file(source, "--from")
 
-    lasting = None if expires is None else parse_duration(expires)
+    lasting, scopes = None if expires is None else parse_duration(expires), scopes_of(scope or ["read", "submit"])
     with store(data) as tokens:
         token, text = tokens.create(
             name,
-            scopes=scopes_of(scope or ["read", "submit"]),
+            scopes=scopes,
             expires=lasting,
             sharing=sharing,
             max_body_bytes=None if max_body_mb is None else max_body_mb * MB,

@@ -10,13 +10,12 @@ import time
 from anyio import to_thread
 from fastapi.responses import Response
 from pliant.schemas.problems import ProblemCode
-from pliant.service.middleware.share_links import authorize_share, share_of
+from pliant.service.middleware.share_links import authorize_share, bearer_of, share_of
 from pliant.service.problems import ProblemResponse, answer, from_error
 from pliant.service.settings import ServiceSettings
 from pliant.worker.errors import StoreUnavailable, UnknownToken
 from pliant.worker.records import Records, utc_now
 from pliant.worker.tokens import Scope, Token, Tokens
-from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Send
 from starlette.types import Scope as AsgiScope
 
@@ -115,12 +114,11 @@ class Authentication:
 
     async def _authorize(self, scope: AsgiScope) -> Token | Response:
         """Return the token of a request, or the answer that refuses it."""
-        given = Headers(scope=scope).getlist("authorization")
-        scheme, _, text = given[0].partition(" ") if len(given) == 1 else ("", "", "")
-        if scheme.lower() != "bearer":
+        text = bearer_of(scope)
+        if text is None:
             detail = "This service requires a token. Send it as `Authorization: Bearer …`."
             return _unauthorized(ProblemCode.UNAUTHORIZED, detail)
-        token = await to_thread.run_sync(self._tokens.recognise, text.strip())
+        token = await to_thread.run_sync(self._tokens.recognise, text)
         if token is None:
             detail = "The token is not known; it may have been revoked. Ask the operator for a new one."
             return _unauthorized(ProblemCode.INVALID_TOKEN, detail)

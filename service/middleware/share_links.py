@@ -18,12 +18,17 @@ from starlette.types import Scope
 _READABLE = re.compile(r"/v1/jobs/(?P<id>[^/]+)(/events|/shares|/artifacts(/[^/]+)?)?")
 
 
-def share_of(scope: Scope) -> str | None:
-    """Return the token of a request's share link, None if the request carries no such token."""
+def bearer_of(scope: Scope) -> str | None:
+    """Return the bearer token of a request; None if it carries none, or several."""
     given = Headers(scope=scope).getlist("authorization")
     scheme, _, text = given[0].partition(" ") if len(given) == 1 else ("", "", "")
-    token = text.strip()
-    return token if scheme.lower() == "bearer" and token.startswith(SHARE_PREFIX) else None
+    return text.strip() if scheme.lower() == "bearer" else None
+
+
+def share_of(scope: Scope) -> str | None:
+    """Return the token of a request's share link, None if the request carries no such token."""
+    token = bearer_of(scope)
+    return token if token is not None and token.startswith(SHARE_PREFIX) else None
 
 
 async def authorize_share(scope: Scope, token: str, records: Records) -> Response | None:

@@ -21,6 +21,7 @@ from pliant.solver.model.expectation_maximisation import annealed
 from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.so3 import MIRROR, nearest
 from pliant.solver.records import Floats
+from pliant.solver.tracks.frame_selection import evenly_spread
 
 ALTERNATION_ROUNDS = 3
 """Updates of depths, covariance, cameras and κ every time that cameras were found or refined."""
@@ -87,7 +88,7 @@ def factorized_again(
     view, found, used, model_order, should_stop
         As for `alternated`. The factorizations get the world axes and the sign of depth of `found`.
     """
-    places = np.unique(np.linspace(0, len(used) - 1, min(len(used), COMPARED_FRAMES)).round().astype(np.intp))
+    places = evenly_spread(len(used), COMPARED_FRAMES)
     some = used[places]
     part = replace(
         found, rotations=found.rotations[places], scales=found.scales[places],

@@ -36,6 +36,7 @@ from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.resection import MIN_RELATIVE_DISTANCE
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.records import Floats
+from pliant.solver.tracks.frame_selection import evenly_spread
 from scipy.optimize import minimize
 
 CURVATURES = (0.02, 0.035, 0.06, 0.1, 0.16, 0.25, 0.38)
@@ -104,7 +105,7 @@ def search(
         Called between values of κ; once it returns True, the best so far counts.
     """
     count = max(min(SEARCH_FRAMES, len(views), views.shape[1] // 2), 3)
-    used = np.unique(np.linspace(0, len(views) - 1, min(count, len(views))).round().astype(np.intp))
+    used = evenly_spread(len(views), count)
     some, projections = views[used], rotations[used, :2] * scales[used, None, None]
     flat = _learn(some, np.zeros(some.shape[:2]), 0.0, projections, model_order)
     trials = {0.0: _Trial(0.0, flat.nll, np.zeros(some.shape[:2]), flat)}

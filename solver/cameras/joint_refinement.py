@@ -280,7 +280,7 @@ def _best_start(
     moves them back, because every mode would have to move along. The unrefined cameras of a factorization can
     therefore be the better start.
     """
-    some = evenly_spread(np.arange(len(used)), START_FRAMES)
+    some = evenly_spread(len(used), START_FRAMES)
     part, ones = of_frames(gram, some), np.ones(len(some))
     best, lowest = estimate, np.inf
     for start in (estimate, *(restarted(estimate, size, rotations) for size, rotations in estimate.hypotheses)):

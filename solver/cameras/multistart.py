@@ -19,6 +19,7 @@ from pliant.solver.cameras.factorization import Upgrade
 from pliant.solver.model.marginal_likelihood import CAMERA_PRIOR_WEIGHT, Motion, Scene, cameras_of, fit, start
 from pliant.solver.model.so3 import exponential, logarithm, nearest
 from pliant.solver.records import Floats
+from pliant.solver.tracks.frame_selection import between
 from pliant.solver.tracks.noise import white_noise
 from scipy.linalg import solveh_banded
 
@@ -178,11 +179,10 @@ def carried(rotations: Floats, best: Floats, used: slice) -> Floats:
     used : slice
         Which frames they are.
     """
-    between = np.swapaxes(rotations[used], 1, 2) @ best
-    common = nearest(between.sum(axis=0))
-    corrections = logarithm(between @ common.T)
-    frames = np.arange(len(rotations))
-    blended = np.stack([np.interp(frames, frames[used], corrections[:, axis]) for axis in range(3)], axis=1)
+    turns = np.swapaxes(rotations[used], 1, 2) @ best
+    common = nearest(turns.sum(axis=0))
+    corrections = logarithm(turns @ common.T)
+    blended = between(np.arange(len(rotations))[used], corrections, len(rotations))
     return np.asarray(rotations @ exponential(blended) @ common)
 
 

@@ -115,7 +115,7 @@ def try_free_scales(
     Scales are free from two starts, 1 and those of a rigid shape. Deformation that is mistaken for scale ends in a worse
     minimum than fixed scales, or in one with nearly constant scales.
     """
-    used = evenly_spread(np.arange(len(rotations)), SCALE_FRAMES)
+    used = evenly_spread(len(rotations), SCALE_FRAMES)
     part, given, none = of_frames(gram, used), rotations[used], np.ones(len(used))
 
     def turned_some(start: Learned, *, with_scales: bool) -> Learned:

@@ -24,8 +24,8 @@ POOR, BAD = 0.2, 1.8
 solve of `benchmarks.trust` with an error above .15 is `good`; the second is an expected error of half the size, and white noise has 7."""
 
 LOOSE, LOST = 0.08, 0.25
-"""Median distance of visible observations from the projected shapes, share of the size: the same two degrees. White noise that has no
-shape leaves .6 and more; tracker noise of 5 % leaves .06."""
+"""Median distance of visible observations from the projected shapes, share of the size: the same two degrees. Tracker noise of 5 % leaves
+.06. Where the prior has as many modes as frames, anything is fitted: `LOST_HELD_OUT` recognises that."""
 
 NARROW, STILL = 20.0, 5.0
 """Degrees of turn between the two most different views: the same two degrees. Depth error grows as the inverse of the turn."""
@@ -36,7 +36,8 @@ rotation and deformation are hard to tell apart. With fewer frames a second both
 of `benchmarks.trust` below 1 have errors of .05 and more."""
 
 LOOSE_HELD_OUT, LOST_HELD_OUT = 0.08, 0.25
-"""Median distance of held-out observations from their prediction, share of the size: the same two degrees."""
+"""Median distance of held-out observations from their prediction, share of the size: the same two degrees. White noise, which is fitted to
+.04, has .7; tracks with noise of 2 % of the largest coordinate have .03 to .06, ten face scans with 10 % outliers and 30 % hidden .08."""
 
 FLEXIBLE = 0.5
 """Modes of deformation per frame from which the motion hardly determines depth: every second frame has a shape of its own."""
@@ -202,8 +203,10 @@ def _doubts(modes: int, frames: int, *, planar: bool, depth_is_typical: bool) ->
 
 def size_of(shapes: Floats) -> float:
     """Return the root mean square distance of the points from their frame's mean point; positive."""
-    centred = shapes - shapes.mean(axis=1, keepdims=True)
-    return max(float(np.sqrt(np.square(centred).sum(axis=2).mean())), np.finfo(float).tiny)
+    squares = [
+        float(np.square(frame - frame.mean(axis=0)).sum()) for frame in shapes
+    ]  # a frame at a time, for its memory
+    return max(float(np.sqrt(np.sum(squares) / max(shapes.shape[0] * shapes.shape[1], 1))), np.finfo(float).tiny)
 
 
 def per_frame(shapes: Floats, rotations: Floats) -> tuple[float | None, float | None]:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.isometry.inextensible import Indices
 from pliant.solver.records import Floats
+from pliant.solver.tracks.frame_selection import evenly_spread
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
@@ -146,7 +147,7 @@ def _pool(seen: NDArray[np.bool_]) -> Indices:
     """Return at most `POOL` points, evenly among those seen at least half as often as the one seen most."""
     often = seen.sum(axis=0)
     usable = np.flatnonzero(2 * often >= often.max())
-    return np.asarray(usable[np.unique(np.linspace(0, len(usable) - 1, min(POOL, len(usable))).round().astype(int))])
+    return np.asarray(usable[evenly_spread(len(usable), POOL)])
 
 
 def unlike_frames(points: Floats, seen: NDArray[np.bool_], count: int) -> Indices:

@@ -183,8 +183,9 @@ def _estimated(
             y_up=settings.y_up, should_stop=monitor,
         )  # fmt: skip
     elif observations.lens is not None:
+        used = np.flatnonzero(shown)
         estimate = settled(
-            estimate, normalized, evenly_spread(np.flatnonzero(shown), LEARNED_FRAMES), model_order=ModelOrder(ordered=estimate.ordered),
+            estimate, normalized, used[evenly_spread(len(used), LEARNED_FRAMES)], model_order=ModelOrder(ordered=estimate.ordered),
             turning=observations.turning, should_stop=monitor,
         )  # fmt: skip
     return estimate, data

@@ -71,6 +71,7 @@ def assessed(
         learning = unit * learning_std(
             estimate, covariance, solution.shapes / unit, turning=turning, should_stop=should_stop
         )
+        tick()
         std = INFLATION * np.hypot(posterior, learning)
         held_out = held_out_error(tracks, solution.shapes, solution.camera, confidence, covariance, unit=unit)
         modes = covariance.modes.shape[1]

@@ -21,6 +21,7 @@ from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.records import Camera, Floats, Tracks
 from pliant.solver.shapes.sparsely_observed import WELL_OBSERVED_SHARE
 from pliant.solver.tracks.completion import ranks
+from pliant.solver.tracks.frame_selection import evenly_spread
 from pliant.solver.tracks.noise import weighted_median
 from scipy import linalg
 
@@ -94,8 +95,8 @@ def held_out_error(
         None where no point is seen in three frames, or rounding leaves V indefinite.
     """
     frames = len(shapes)
-    used = np.unique(np.linspace(0, frames - 1, min(frames, MAX_HELD_OUT_FRAMES)).round().astype(int))
-    chosen = _spread(shapes, (confidence[used] >= LEAST_CONFIDENCE).sum(axis=0), len(used))
+    used = evenly_spread(frames, MAX_HELD_OUT_FRAMES)
+    chosen = _spread(shapes[frames // 2], (confidence[used] >= LEAST_CONFIDENCE).sum(axis=0), len(used))
     weights = confidence[np.ix_(used, chosen)]
     weights = np.where(weights < LEAST_CONFIDENCE, 0.0, weights)
     images = _corrected(tracks.points[:, chosen], shapes[:, chosen], camera)[used] / unit
@@ -124,12 +125,11 @@ def _errors(image: Floats, noise: float, images: Floats, weights: Floats) -> Flo
     return errors
 
 
-def _spread(shapes: Floats, counts: NDArray[np.intp], frames: int) -> NDArray[np.intp]:
-    """Return points that are observed often, and in three frames at least; the order of the points does not matter."""
+def _spread(shape: Floats, counts: NDArray[np.intp], frames: int) -> NDArray[np.intp]:
+    """Return points that are observed often, and in three frames at least, spread by their distance from the middle of a frame `(P, 3)`."""
     often = np.flatnonzero(counts >= max(3, WELL_OBSERVED_SHARE * frames))
-    ordered = often[np.argsort(ranks(shapes[:, often].mean(axis=0)[None]))]
-    places = np.unique(np.linspace(0, len(often) - 1, min(len(often), MAX_HELD_OUT_POINTS)).round().astype(int))
-    return np.asarray(ordered[places])
+    ordered = often[np.argsort(ranks(shape[None, often] - shape.mean(axis=0)))]
+    return np.asarray(ordered[evenly_spread(len(often), MAX_HELD_OUT_POINTS)])
 
 
 def _corrected(points: Floats, shapes: Floats, camera: Camera) -> Floats:

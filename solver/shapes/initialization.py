@@ -46,16 +46,22 @@ def uniform_solution(problem: Problem, translations: Floats, *, should_stop: Cal
         problem.projections, weights, problem.bands, problem.laplacian, problem.weights.spatial, None, problem.quadratic
     )
     target = problem.points - translations[:, :, None].astype(problem.points.dtype)
-    asked = count()
+    asked, tick = count(), should_stop if should_stop is not None else bool
+    tick()
 
     def stops() -> bool:
         return should_stop is not None and should_stop() and next(asked) > 0
 
     reduction = EXACT if problem.loss == "l2" else ROUGH
     operator = operator.rounded(inner_precision(operator, reduction))
+    tick()
+    right_hand_side = operator.right_hand_side(target.astype(operator.weights.dtype))
+    tick()
+    precondition = build_preconditioner(operator)
+    tick()
     solved = conjugate_gradient(
-        operator.apply, operator.right_hand_side(target.astype(operator.weights.dtype)),
-        precondition=build_preconditioner(operator), reduction=reduction, max_iterations=MAX_START_ITERATIONS,
+        operator.apply, right_hand_side, precondition=precondition, reduction=reduction, max_iterations=MAX_START_ITERATIONS,
         should_stop=stops,
     )  # fmt: skip
+    tick()
     return solved.x.astype(problem.points.dtype, copy=False)

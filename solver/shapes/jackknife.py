@@ -29,6 +29,7 @@ from pliant.solver.model.expectation_maximisation import improve
 from pliant.solver.model.marginal_likelihood import fit
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.records import Floats
+from pliant.solver.tracks.frame_selection import between, evenly_spread
 from scipy.spatial import cKDTree
 
 PARTS = 6
@@ -77,7 +78,7 @@ def learning_std(
         Normalized units.
     """
     frames = len(shapes)
-    used = np.unique(np.linspace(0, frames - 1, min(frames, MAX_JACKKNIFE_FRAMES)).round().astype(int))
+    used = evenly_spread(frames, MAX_JACKKNIFE_FRAMES)
     start = Learned(
         np.asarray(estimate.rotations)[used],
         np.asarray(estimate.scales)[used],
@@ -102,8 +103,7 @@ def learning_std(
         return np.asarray(np.linalg.norm(centred(shapes), axis=2))
     if len(without) < 2:
         return np.zeros(shapes.shape[:2])
-    squared = _mean_squared_change(np.stack(without), everything)
-    squared = np.stack([np.interp(np.arange(frames), used, column) for column in squared.T], axis=1)
+    squared = between(used, _mean_squared_change(np.stack(without), everything), frames)
     squared /= np.square(np.asarray(estimate.scales))[:, None]
     world = np.einsum("fij,fpi->pj", start.rotations / start.scales[:, None, None], everything) / len(used)
     return np.asarray(np.sqrt(squared)[:, cKDTree(world).query(centred(shapes).mean(axis=0))[1]])

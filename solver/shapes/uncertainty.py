@@ -27,6 +27,7 @@ from pliant.solver.model.resection import MIN_RELATIVE_DISTANCE
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.records import Camera, Floats
 from pliant.solver.shapes.sparsely_observed import WELL_OBSERVED_SHARE
+from pliant.solver.tracks.frame_selection import between, evenly_spread
 from scipy import linalg
 from scipy.spatial import cKDTree
 
@@ -113,7 +114,7 @@ def position_std(
         In the unit of the covariance.
     """
     frames = len(projections)
-    used = np.unique(np.linspace(0, frames - 1, min(frames, MAX_POSTERIOR_FRAMES)).round().astype(int))
+    used = evenly_spread(frames, MAX_POSTERIOR_FRAMES)
     noise, weights = noise_std**2, confidence[used]
     nearest, chosen = _representatives(pinhole, used, confidence.shape[1])
     moments = [_moments(covariance, _rows(projections, pinhole, point), used) for point in chosen]
@@ -126,8 +127,7 @@ def position_std(
         exact = [_variance(*moments[int(nearest[point])], weights[:, point], noise) for point in sample]
         found = _predicted(everything, weights, sample, np.stack(exact, axis=1))
     if len(used) < frames:
-        at = np.arange(frames)
-        found = np.stack([np.interp(at, used, column) for column in found.T], axis=1)
+        found = between(used, found, frames)
     return np.asarray(np.sqrt(np.maximum(found, 0.0)))
 
 

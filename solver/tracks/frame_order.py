@@ -21,6 +21,7 @@ from pliant.solver.errors import InvalidSettings
 from pliant.solver.records import Camera, Floats, KnownCamera, Tracks, read_only
 from pliant.solver.settings import Settings
 from pliant.solver.solution import Solution
+from pliant.solver.tracks.frame_selection import evenly_spread
 from pliant.solver.tracks.noise import weighted_median
 
 WALK_SHARE = 0.5
@@ -92,16 +93,11 @@ def step_share(tracks: Tracks) -> float:
     every = -(-tracks.num_points // MAX_POINTS)
     points, weight = tracks.points[:, ::every], tracks.visible[:, ::every]
     first, second = np.triu_indices(tracks.num_frames, 1)
-    some, steps = _spread(len(first)), _spread(tracks.num_frames - 1)
+    some, steps = evenly_spread(len(first), MAX_PAIRS), evenly_spread(tracks.num_frames - 1, MAX_PAIRS)
     any_two = _typical(points, weight, zip(first[some], second[some], strict=True))
     neighbours = _typical(points, weight, zip(steps, steps + 1, strict=True))
     shares = [near / far for near, far in zip(neighbours, any_two, strict=True) if far > 0]
     return min(shares, default=float("nan"))
-
-
-def _spread(count: int) -> NDArray[np.intp]:
-    """Return at most `MAX_PAIRS` of the numbers below count, evenly spread."""
-    return np.unique(np.linspace(0, count - 1, min(count, MAX_PAIRS)).round().astype(np.intp))
 
 
 def _typical(points: Floats, weight: Floats, pairs: Iterable[tuple[int, int]]) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""Which frames something is learned from, and how what they give is carried to the others."""
+"""Selection of the frames that something is learned from, and interpolation between them."""
 
 from __future__ import annotations
 
@@ -14,10 +14,9 @@ def informative_frames(visible: Floats) -> NDArray[np.bool_]:
     return is_identifiable if is_identifiable.sum() >= 3 else np.ones(len(seen), dtype=bool)
 
 
-def evenly_spread(places: NDArray[np.intp], count: int) -> NDArray[np.intp]:
-    """Return at most `count` of the places, evenly spread."""
-    chosen = np.linspace(0, len(places) - 1, min(len(places), count)).round().astype(np.intp)
-    return np.asarray(places[np.unique(chosen)])
+def evenly_spread(total: int, count: int) -> NDArray[np.intp]:
+    """Return at most `count` of the numbers below `total`, evenly spread from the first to the last."""
+    return np.unique(np.linspace(0, total - 1, min(total, count)).round().astype(np.intp))
 
 
 def of_frames(gram: Floats, used: NDArray[np.intp]) -> Floats:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.errors import InvalidInput
 from pliant.solver.records import Floats, Tracks, read_only
+from pliant.solver.tracks.frame_selection import between
 
 MAX_MEDIAN_RADII = 10.0
 """Distance from the frame's median, in median radii, beyond which an observation is ignored for centre and size."""
@@ -48,8 +49,7 @@ def normalize(tracks: Tracks) -> Normalized:
     shown = total > 0
     mean = np.einsum("fp,fpc->fc", weight, tracks.points)
     mean[shown] /= total[shown, None]
-    frames = np.arange(tracks.num_frames)
-    centroid = np.stack([np.interp(frames, frames[shown], mean[shown, axis]) for axis in (0, 1)], axis=1)
+    centroid = between(np.flatnonzero(shown), mean[shown], tracks.num_frames)
     points = np.where(seen[..., None], tracks.points - centroid[:, None], 0.0)
     unit = float(np.sqrt(np.einsum("fp,fpc,fpc->", weight, points, points) / total.sum()))
     if not unit > 1e-12 * max(float(np.abs(centroid).max()), np.finfo(float).tiny):

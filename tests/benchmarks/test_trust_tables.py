@@ -54,6 +54,23 @@ def test_sequences_count_equally_however_often_they_were_solved(bench) -> None:
     assert "no solve" in tables.exceptions(often)
 
 
+def test_the_table_of_signs_counts_solves_by_their_true_error(bench) -> None:
+    tables = bench("trust_tables")
+    turns = {"degrees_per_frame": 1.0, "deformation_per_frame": 0.1}
+    rows = [
+        {"sequence": "a", "true": 0.01, "held_out": 0.01, "degrees_per_frame": 9.0, "deformation_per_frame": 0.1},
+        {"sequence": "b", "true": 0.2, "held_out": 0.09, **turns},
+        {"sequence": "b", "true": 0.1, "held_out": None, **turns},
+        {"sequence": "noise", "true": None, "held_out": 0.7, "degrees_per_frame": None, "deformation_per_frame": None},
+    ]
+    assert [tables.misses_held_out(row) for row in rows] == [False, True, None, True]
+    assert [tables.turns_slowly(row) for row in rows] == [False, True, True, None]
+    held_out, turn = tables.separated(rows[:0], rows).splitlines()[3::2]
+    assert held_out.endswith("| held out | 0 of 1 | 0 of 0 | 1 of 1 | 1 of 1 |")
+    assert turn.endswith("| held out | 0 of 1 | 1 of 1 | 1 of 1 | 0 of 0 |")
+    assert tables.separated([], [{"sequence": "of an older solver", "true": 0.1}]) == ""
+
+
 def test_the_committed_solves_keep_the_rule_of_the_verdict() -> None:
     """A true error above .15 is never good, and one below .03 never do_not_use."""
     file = Path(__file__).parents[2] / "benchmarks" / "results" / "trust.jsonl"

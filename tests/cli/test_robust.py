@@ -238,6 +238,13 @@ def test_no_installation_is_refused_and_nothing_is_created(
     assert [each.name for each in tmp_path.rglob("*")] == ["empty"]
 
 
+def test_an_unknown_scope_is_refused_before_the_installation_is_opened(run: Run, tmp_path: Path) -> None:
+    ran = run("token", "create", "ada", "--scope", "root", "--data", str(tmp_path / "data"))
+    assert ran.exit_code == Exit.REFUSED
+    assert words(ran) == "error --scope: expected read, submit, admin, got 'root'."
+    assert not (tmp_path / "data").exists()
+
+
 def test_a_module_of_the_server_that_is_missing_elsewhere(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*_: object, **__: object) -> None:
         raise ModuleNotFoundError("No module named 'redis'", name="redis")

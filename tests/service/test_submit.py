@@ -57,6 +57,7 @@ BAD: dict[str, tuple[dict[str, Any], int, str, str]] = {
     "unknown option": ({"options": {"metod": "robust"}}, 422, "unknown_option", "options.metod"),
     "option out of range": ({"options": {"fps": -1}}, 422, "invalid_option", "options.fps"),
     "option not finite": ({"options": '{"fps": NaN}'}, 422, "invalid_option", "options.fps"),
+    "priority": ({"priority": "urgent"}, 422, "invalid_priority", "priority"),
     "long name": ({"name": "n" * 201}, 422, "name_too_long", "name"),
     "long text": ({"name": "n" * (2**20 + 1)}, 413, "text_too_large", "name"),
     "not UTF-8": ({"name": ("", b"\xff\xfe")}, 422, "not_utf8", "name"),

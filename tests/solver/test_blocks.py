@@ -53,6 +53,11 @@ def test_blocks_give_the_shapes_of_a_solve_at_once(film: gallery.Sequence, setti
     assert solution.trust is not None
     assert whole.trust is not None
     assert solution.trust.verdict == whole.trust.verdict
+    assert solution.trust.degrees_per_frame == pytest.approx(whole.trust.degrees_per_frame)
+    if settings.gaussian:
+        assert solution.trust.held_out_error == pytest.approx(whole.trust.held_out_error, rel=0.5)
+    else:
+        assert solution.trust.held_out_error is None
     fractions = [step.fraction for step in steps]
     assert fractions == sorted(fractions)
     assert fractions[-1] == 1

@@ -128,7 +128,7 @@ def test_slow_units_are_reported_however_little_they_add() -> None:
     now = [0.0]
     monitor = Monitor(steps.append, plan=[Stage("shapes", 1.0, 10**6)], clock=lambda: now[0])
     for _ in range(10):
-        now[0] += 0.6
+        now[0] += 0.3
         monitor()
     assert len(steps) == 5
 

@@ -42,7 +42,7 @@ from numpy.typing import NDArray
 from pliant.solver import Mesh, Solution, Tracks
 from pliant.solver.evaluation.alignment import align
 from pliant.solver.evaluation.metrics import frame_errors
-from pliant.worker.artifacts.geometry import size_of
+from pliant.worker.artifacts.geometry import size_of, triangles_of
 from pliant.worker.formats.texture import Texture
 
 NAME = "preview.bin"
@@ -247,11 +247,7 @@ def _frames_table(tracks: Tracks, solution: Solution, truth: Floats | None) -> F
 
 def triangles(mesh: Mesh | None) -> NDArray[np.uint32]:
     """Return faces as triangles `(T, 3)`; quads are split, keeping their orientation."""
-    if mesh is None or len(mesh.faces) == 0:
-        return np.zeros((0, 3), dtype="<u4")
-    faces = mesh.faces
-    if faces.shape[1] == 4:
-        faces = np.stack([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]], axis=1).reshape(-1, 3)
+    faces = np.zeros((0, 3), dtype=np.int32) if mesh is None else triangles_of(mesh.faces)
     return faces.astype("<u4")
 
 

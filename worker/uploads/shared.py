@@ -18,19 +18,17 @@ from pathlib import Path
 from pliant.schemas.job import Upload
 from pliant.worker.errors import (
     Conflict,
-    InvalidRequest,
     OffsetMismatch,
     QuotaExceeded,
     TooManyUploads,
     UnknownUpload,
-    UploadTooLarge,
 )
 from pliant.worker.ids import check_id, is_id
 from pliant.worker.settings import Settings
 from pliant.worker.store.blobs import Blobs
 from pliant.worker.uploads.service import LATE, MAX_UPLOADS, Uploads
 from pliant.worker.uploads.states import State, UploadStates, open_states
-from pliant.worker.uploads.writer import RESERVED_AT_A_TIME, Capacity, Writer, inconsistent
+from pliant.worker.uploads.writer import Capacity, Writer, inconsistent
 
 FOLDER = "uploads/"
 """Beginning of the blob keys."""
@@ -225,17 +223,8 @@ class SharedWriter(Writer):
                 self._discard()
             raise
 
-    def write(self, piece: bytes) -> None:
-        """See `Writer.write`.
-
-        Raises
-        ------
-        Conflict
-            A newer request writes to this upload, or it was deleted.
-        """
-        if self.length is not None and self.offset + len(piece) > self.length:
-            raise inconsistent(f"{self.length} bytes in all", "more")
-        self._check(self.offset + len(piece))
+    def _append(self, piece: bytes) -> None:
+        """Keep bytes in memory until they are a piece. Raises Conflict if a newer request writes to this upload, or it was deleted."""
         self._unsent += piece
         self.offset += len(piece)
         if self._began == 0:
@@ -243,22 +232,16 @@ class SharedWriter(Writer):
         if len(self._unsent) >= PIECE:
             self._store()
 
-    def finish(self, *, sha256: str | None) -> None:
-        """See `Writer.finish`."""
-        if self.length is not None and self.offset != self.length:
-            raise inconsistent(f"{self.length} bytes in all", str(self.offset))
+    def _sha256(self) -> str:
+        """Store what is in memory; return the digest of the whole."""
         self._store()
         assert self._state is not None
         if self._began > 0:
             for chunk in self.uploads.read(self.id, self._state):
                 self._digest.update(chunk)
-        found = self._digest.hexdigest()
-        if sha256 is not None and sha256 != found:
-            self._discard()
-            raise InvalidRequest(
-                "digest_mismatch", field="Repr-Digest", expected=sha256, got=found,
-                hint="The bytes changed in transit; the upload was removed, send it again.",
-            )  # fmt: skip
+        return self._digest.hexdigest()
+
+    def _complete(self, found: str) -> None:
         self._swap(sha256=found, length=self.offset, reserved=0)
         self._state = None
 
@@ -307,17 +290,9 @@ class SharedWriter(Writer):
             self.uploads.discard(self._name, self._state)
             self._state = None
 
-    def _check(self, size: int) -> None:
-        """See `Writer._check`."""
-        capacity = self.capacity
-        if size > capacity.max_bytes:
-            self._discard()
-            raise UploadTooLarge(capacity.max_bytes, size)
-        if self._state is None or capacity.quota == 0 or size <= self._state.reserved:
+    def _reserve(self, size: int) -> None:
+        if self._state is None or self.capacity.quota == 0 or size <= self._state.reserved:
             return
         with self.uploads.states.counting():
             others = self.uploads.used() - self._state.taken(time.time())
-            free = capacity.quota - capacity.used - others
-            if size > free:
-                raise QuotaExceeded(used=capacity.used + others + self.offset, quota=capacity.quota)
-            self._swap(reserved=size if self.length is not None else min(size + RESERVED_AT_A_TIME, free))
+            self._swap(reserved=self._share(size, others))

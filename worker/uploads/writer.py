@@ -84,10 +84,13 @@ class Writer:
         OSError
             The disk is full; the bytes of this request are removed to free the space.
         """
-        assert self._file is not None
         if self.length is not None and self.offset + len(piece) > self.length:
             raise inconsistent(f"{self.length} bytes in all", "more")
         self._check(self.offset + len(piece))
+        self._append(piece)
+
+    def _append(self, piece: bytes) -> None:
+        assert self._file is not None
         rest = memoryview(piece)
         try:
             while rest:
@@ -117,12 +120,15 @@ class Writer:
             raise inconsistent(f"{self.length} bytes in all", str(self.offset))
         found = self._sha256()
         if sha256 is not None and sha256 != found:
-            self.close()
-            shutil.rmtree(self.folder)
+            self._discard()
             raise InvalidRequest(
                 "digest_mismatch", field="Repr-Digest", expected=sha256, got=found,
                 hint="The bytes changed in transit; the upload was removed, send it again.",
             )  # fmt: skip
+        self._complete(found)
+
+    def _complete(self, found: str) -> None:
+        """Mark the upload as complete, with its digest."""
         self.close()
         (self.folder / PART).rename(self.folder / f"{WHOLE}{found}")
         folder = os.open(self.folder, os.O_RDONLY)
@@ -155,21 +161,32 @@ class Writer:
         Bytes are reserved before they are written, all at once for a declared length and otherwise in steps, so that
         concurrent uploads cannot exceed the quota together.
         """
-        capacity = self.capacity
-        if size > capacity.max_bytes:
-            self.close()
-            shutil.rmtree(self.folder)
-            raise UploadTooLarge(capacity.max_bytes, size)
+        if size > self.capacity.max_bytes:
+            self._discard()
+            raise UploadTooLarge(self.capacity.max_bytes, size)
+        self._reserve(size)
+
+    def _discard(self) -> None:
+        """Remove the upload."""
+        self.close()
+        shutil.rmtree(self.folder)
+
+    def _reserve(self, size: int) -> None:
         if self._reservation is None or size <= self._reserved:
             return
         uploads = self.folder.parent.parent
         with counting(uploads):
             others = sum(taken(each) for each in uploads.glob("*/*") if each != self.folder)
-            free = capacity.quota - capacity.used - others
-            if size > free:
-                raise QuotaExceeded(used=capacity.used + others + self.offset, quota=capacity.quota)
-            self._reserved = size if self.length is not None else min(size + RESERVED_AT_A_TIME, free)
+            self._reserved = self._share(size, others)
             os.pwrite(self._reservation, f"{self._reserved:<20}".encode(), 0)
+
+    def _share(self, size: int, others: int) -> int:
+        """Return the bytes to reserve for a size, while other uploads hold `others` bytes."""
+        capacity = self.capacity
+        free = capacity.quota - capacity.used - others
+        if size > free:
+            raise QuotaExceeded(used=capacity.used + others + self.offset, quota=capacity.quota)
+        return size if self.length is not None else min(size + RESERVED_AT_A_TIME, free)
 
 
 def inconsistent(expected: str, got: str) -> InvalidRequest:

@@ -10,7 +10,7 @@ import httpx
 import numpy as np
 import pytest
 from pliant.client import BadArgument, Client, NotLoaded, Options
-from pliant.client.multipart import Form, array_part, checked_options, mesh_part, tracks_file
+from pliant.client.multipart import Form, array_part, checked_options, existing_file, mesh_part, tracks_file
 from pliant.service.testing import InMemoryService
 
 POINTS = np.arange(4 * 9 * 2, dtype=np.float32).reshape(4, 9, 2)
@@ -160,3 +160,8 @@ def test_a_plot_shows_the_requested_frames(tmp_path: Path) -> None:
     picture = io.BytesIO()
     figure.savefig(picture)
     assert picture.getvalue()[:4] == b"\x89PNG"
+
+
+def test_a_folder_is_not_an_input(tmp_path: Path) -> None:
+    with pytest.raises(BadArgument, match="got the folder"):
+        existing_file(tmp_path, "mesh")

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from pliant.solver import InvalidInput, InvalidSettings, KnownCamera, Outcome, Settings, Tracks, gallery, solve
 from pliant.solver.evaluation.metrics import reprojection
+from pliant.solver.evaluation.trust import per_frame
 from pliant.solver.isometry.anchors import Anchors, connected, nearest_neighbours
 from pliant.solver.isometry.extension import complete_anchors, flatten, spline
 from pliant.solver.isometry.inextensible import SurfaceGraph, maximum_depth
@@ -162,7 +163,7 @@ def test_a_stopped_solve_does_not_assume_isometry() -> None:
 
 def test_the_solution_projects_back_onto_the_tracks_and_turns_a_camera_around_one_world() -> None:
     sheet = rolled()
-    solution = solve(sheet.tracks, settings=Settings(focal=FOCAL, image_size=SIZE))
+    solution = solve(sheet.tracks, settings=Settings(focal=FOCAL, image_size=SIZE, order="film"))
     assert solution.outcome is Outcome.CONVERGED
     assert solution.camera.focal == FOCAL
     assert tuple(solution.camera.principal_point) == CENTRE
@@ -177,6 +178,10 @@ def test_the_solution_projects_back_onto_the_tracks_and_turns_a_camera_around_on
     assert "isometric" in solution.choices.reasons["surface"]
     assert len(solution.choices.focal_lengths) >= 3
     assert solution.weights[solution.residuals > 5].max(initial=0.0) == 0.0
+    trust = solution.trust
+    assert trust is not None
+    assert (trust.degrees_per_frame, trust.deformation_per_frame) == per_frame(solution.shapes, rotations)
+    assert trust.held_out_error is None
 
 
 def test_a_wrong_focal_length_is_reported_as_improbable() -> None:

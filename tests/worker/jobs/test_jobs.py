@@ -192,6 +192,13 @@ def test_only_the_owning_attempt_writes(jobs: Jobs, submit) -> None:  # type: ig
     assert jobs.records.get(id) == before
 
 
+def test_an_attempt_stops_only_for_a_cancellation(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
+    own = claim(jobs, submit().id)
+    with pytest.raises(StaleAttempt):
+        jobs.records.update(own.job.id, partial(lifecycle.stop, attempt_id=own.attempt_id, now=NOW, retention=0))
+    assert jobs.get(own.job.id).status is Status.RUNNING
+
+
 def test_a_job_that_keeps_losing_workers_fails_at_last(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
     id = submit().id
     for attempt in (1, 2):

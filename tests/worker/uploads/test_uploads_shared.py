@@ -16,7 +16,7 @@ from pliant.worker.maintenance.reconciler import Reconciler
 from pliant.worker.settings import Settings
 from pliant.worker.store.blobs import Blobs
 from pliant.worker.store.connection import connect
-from pliant.worker.uploads import shared
+from pliant.worker.uploads import shared, states
 from pliant.worker.uploads.service import MAX_UPLOADS, Capacity, Uploads
 from pliant.worker.uploads.shared import SharedUploads, open_uploads
 from pliant.worker.uploads.states import RESERVED_FOR, UploadStates
@@ -125,6 +125,26 @@ def test_two_that_begin_at_once_do_not_mix(hosts: list[SharedUploads], monkeypat
         send(one, "again", DATA)
     monkeypatch.undo()
     assert two.get("again").sha256 == DIGEST
+
+
+def test_unknown_uploads_are_errors(hosts: list[SharedUploads], tmp_path: Path) -> None:
+    for act in (
+        lambda: hosts[0].take("none", tmp_path / "x"),
+        lambda: hosts[0].get("../x"),
+        lambda: hosts[0].get("none"),
+    ):
+        with pytest.raises(errors.UnknownUpload):
+            act()
+
+
+def test_space_that_another_request_counts_for_long_is_unavailable(
+    hosts: list[SharedUploads], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one, two = hosts
+    with one.states.counting():
+        monkeypatch.setattr(states, "COUNTING_WITHIN", 0.01)
+        with pytest.raises(errors.StoreUnavailable, match="being counted"), two.states.counting():
+            pass
 
 
 def test_wrong_offsets_lengths_and_digests_are_refused(hosts: list[SharedUploads]) -> None:

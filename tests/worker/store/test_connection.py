@@ -1,0 +1,29 @@
+"""Faults of the store's server become one error; faults of commands stay what they are."""
+
+from __future__ import annotations
+
+import pytest
+import redis
+from pliant.worker.errors import StoreUnavailable
+from pliant.worker.store.connection import reachable
+
+
+@pytest.mark.parametrize(
+    ("fault", "reason"),
+    [
+        (redis.AuthenticationError("WRONGPASS"), "it refuses the password"),
+        (redis.ConnectionError("refused"), "ConnectionError"),
+        (redis.TimeoutError("late"), "TimeoutError"),
+        (redis.OutOfMemoryError("OOM"), "its memory limit is reached"),
+        (redis.ResponseError("MISCONF cannot persist"), "MISCONF cannot persist"),
+        (redis.ResponseError("LOADING the dataset"), "LOADING the dataset"),
+    ],
+)
+def test_a_server_that_cannot_serve_is_unavailable(fault: redis.RedisError, reason: str) -> None:
+    with pytest.raises(StoreUnavailable, match=reason), reachable():
+        raise fault
+
+
+def test_the_error_of_a_command_passes() -> None:
+    with pytest.raises(redis.ResponseError, match="WRONGTYPE"), reachable():
+        raise redis.ResponseError("WRONGTYPE of a key")
