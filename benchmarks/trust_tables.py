@@ -47,7 +47,11 @@ def tables(rows: list[Row], calibration: Sequence[str]) -> str:
     """Return the tables in Markdown."""
     chosen = [row for row in rows if is_of(row, calibration)]
     held = [row for row in rows if not is_of(row, calibration)]
-    parts = [confusion("Sequences that constants were chosen on", chosen), confusion("Held out", held), missed(rows)]
+    parts = [
+        confusion("Sequences that constants were chosen on", chosen),
+        confusion("Other sequences", held),
+        missed(rows),
+    ]
     parts += [separated(chosen, held), covered(chosen, held), by_sequence(rows, calibration)]
     return "\n\n".join(part for part in parts if part)
 
@@ -79,7 +83,7 @@ def separated(chosen: list[Row], held: list[Row]) -> str:
         "|---|---|---|---|---|---|",
     ]
     for sign, has in SIGNS.items():
-        for title, rows in (("chosen on", chosen), ("held out", held)):
+        for title, rows in (("chosen on", chosen), ("others", held)):
             stated = [(row, found) for row in rows if (found := has(row)) is not None]
             cells = [f"{sum(found for _, found in part)} of {len(part)}" for part in _by_class(stated)]
             lines.append(f"| {sign} | {title} | " + " | ".join(cells) + " |")
@@ -172,7 +176,7 @@ def covered(chosen: list[Row], held: list[Row]) -> str:
         "true error within `interval` |",
         "|---|---|---|---|---|---|---|",
     ]
-    for name, rows in (("chosen on", chosen), ("held out", held), ("all", [*chosen, *held])):
+    for name, rows in (("chosen on", chosen), ("others", held), ("all", [*chosen, *held])):
         values = np.array([share for row in rows if (share := within(row)) is not None])
         if not len(values):
             continue
@@ -203,7 +207,7 @@ def exceptions(rows: list[Row]) -> str:
 def by_sequence(rows: list[Row], calibration: Sequence[str]) -> str:
     """Return one line a solve; * marks sequences that constants were chosen on."""
     lines = [
-        "| sequence | tracks | verdict | first reason | expected | true | coverage | mean σ / RMS error | held out | turn over "
+        "| sequence | tracks | verdict | first reason | expected | true | coverage | mean σ / RMS error | held-out error | turn over "
         "deformation |",
         "|---|---|---|---|---|---|---|---|---|---|",
     ]

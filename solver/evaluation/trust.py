@@ -16,12 +16,13 @@ import numpy as np
 from pliant.solver.records import Floats
 
 INTERVAL = (0.35, 3.6)
-"""Factors around the expected error: 5 and 95 % quantiles of true over expected error on the sequences for calibration of
-`benchmarks.trust`, of which they hold 21 in 28; they hold 27 in 40 of the others, where the expected error is more often too large."""
+"""Factors around the expected error: about the 10 and 90 % quantiles of true over expected error on the sequences for calibration of
+`benchmarks.trust`, of which they hold 30 in 38; they hold 41 in 53 of the others, where the expected error is more often too large."""
 
 POOR, BAD = 0.2, 1.8
 """Upper end of the expected error, share of the size, from which a result is to be used with care, and not to be used. With the first no
-solve of `benchmarks.trust` with an error above .15 is `good`; the second is an expected error of half the size, and white noise has 7."""
+solve of `benchmarks.trust` with an error above .15 is `good`; the second is an expected error of half the size, and white noise has 3 to
+4."""
 
 LOOSE, LOST = 0.08, 0.25
 """Median distance of visible observations from the projected shapes, share of the size: the same two degrees. Tracker noise of 5 % leaves

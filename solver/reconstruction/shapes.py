@@ -197,7 +197,7 @@ def _finished(start: Start, history: list[State], outcome: Outcome, monitor: Mon
     enter(monitor, "trust")
     confidence = np.asarray(problem.confidence, dtype=np.float64)
     monitor()
-    solution = with_inlier_probability(solution, tracks, confidence, loss=problem.loss)
+    solution = with_inlier_probability(solution, tracks, confidence, loss=problem.loss, should_stop=monitor)
     solution = assessed(
         solution, tracks, confidence, estimate, start.covariance, normalized.unit,
         turning=observations.turning, seed=start.settings.seed, should_stop=monitor,

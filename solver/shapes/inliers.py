@@ -14,6 +14,7 @@ observations rejected, the mean under a uniform prior (Laplace's rule of success
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -26,7 +27,14 @@ MEDIAN_LENGTH = float(np.sqrt(2 * np.log(2)))
 """Median length of a vector with two standard normal coordinates."""
 
 
-def with_inlier_probability(solution: Solution, tracks: Tracks, confidence: Floats, *, loss: str) -> Solution:
+def with_inlier_probability(
+    solution: Solution,
+    tracks: Tracks,
+    confidence: Floats,
+    *,
+    loss: str,
+    should_stop: Callable[[], bool] | None = None,
+) -> Solution:
     """Return the solution with the probability of every observation.
 
     Parameters
@@ -39,11 +47,16 @@ def with_inlier_probability(solution: Solution, tracks: Tracks, confidence: Floa
         Of the observations that were used; 0 where rejected.
     loss : {"l1", "l2", "huber"}
         Of the data term.
+    should_stop : callable, optional
+        Called between units of work, for their progress; the result is complete whatever it returns.
     """
+    tick = should_stop if should_stop is not None else bool
     left = tracks.points - solution.camera.project(solution.shapes)
+    tick()
     seen = tracks.visible > 0
     rejected = seen & (confidence == 0)
     extent = np.ptp((tracks.points - solution.camera.translations[:, None])[seen], axis=0)
+    tick()
     probability = inlier_probability(
         left, np.where(seen, tracks.visible, 0.0), rejected, noise_std=solution.choices.noise, extent=extent, loss=loss
     )

@@ -64,11 +64,11 @@ def step(
     tick()
     inner = operator.rounded(inner_precision(operator, reduction))
     precondition = build_preconditioner(inner)
+    downhill = np.negative(gradient).astype(inner.weights.dtype, copy=False)
     tick()
     solved = conjugate_gradient(
-        inner.apply, np.negative(gradient).astype(inner.weights.dtype, copy=False), precondition=precondition,
-        reduction=reduction, max_iterations=max_inner, negligible=NEGLIGIBLE * tolerance * abs(state.objective),
-        should_stop=should_stop,
+        inner.apply, downhill, precondition=precondition, reduction=reduction, max_iterations=max_inner,
+        negligible=NEGLIGIBLE * tolerance * abs(state.objective), should_stop=should_stop,
     )  # fmt: skip
     shapes = np.add(state.shapes, solved.x, out=gradient)
     tick()

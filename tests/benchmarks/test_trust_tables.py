@@ -66,8 +66,8 @@ def test_the_table_of_signs_counts_solves_by_their_true_error(bench) -> None:
     assert [tables.misses_held_out(row) for row in rows] == [False, True, None, True]
     assert [tables.turns_slowly(row) for row in rows] == [False, True, True, None]
     held_out, turn = tables.separated(rows[:0], rows).splitlines()[3::2]
-    assert held_out.endswith("| held out | 0 of 1 | 0 of 0 | 1 of 1 | 1 of 1 |")
-    assert turn.endswith("| held out | 0 of 1 | 1 of 1 | 1 of 1 | 0 of 0 |")
+    assert held_out.endswith("| others | 0 of 1 | 0 of 0 | 1 of 1 | 1 of 1 |")
+    assert turn.endswith("| others | 0 of 1 | 1 of 1 | 1 of 1 | 0 of 0 |")
     assert tables.separated([], [{"sequence": "of an older solver", "true": 0.1}]) == ""
 
 
