@@ -17,9 +17,9 @@ from pliant.tracking.errors import TrackingStopped
 from pliant.tracking.flow import Bools, Floats, Grey, Match, match
 from pliant.tracking.registration import Registration
 
-DELTAS = (1, 4, 16)
-"""Frames back from t of the candidates beside the template itself: the set of MFT without its duplicates. On 177 frames of a
-real film, {∞, 1, 2, 4, 8, 16, 32} takes 1.7 times the flows and changes the median error by less than 2 %."""
+DELTAS = (1, 8)
+"""Frames back from t of the candidates beside the template itself; MFT has 1, 2, 4, 8, 16, 32. On four rendered films and 177 frames of a
+real one, {∞, 1, 4, 16} has the same median error to 2 % and takes a third more flows."""
 
 STEP_VARIANCE = 0.01
 """Variance of one flow whose cycle closes exactly, square pixels: 0.1 px, the accuracy of DIS on textured surfaces."""

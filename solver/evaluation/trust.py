@@ -21,7 +21,8 @@ INTERVAL = (0.35, 3.6)
 
 POOR, BAD = 0.2, 1.8
 """Upper end of the expected error, share of the size, from which a result is to be used with care, and not to be used. With the first no
-solve of `benchmarks.trust` with an error above .15 is `good`; the second is an expected error of half the size, and white noise has 3 to 4."""
+solve of `benchmarks.trust` with an error above .15 is `good`; the second is an expected error of half the size, and white noise has 3 to
+4."""
 
 LOOSE, LOST = 0.08, 0.25
 """Median distance of visible observations from the projected shapes, share of the size: the same two degrees. Tracker noise of 5 % leaves
