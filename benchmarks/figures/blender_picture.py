@@ -39,7 +39,7 @@ def main() -> None:
     shape = next(each for each in scene.objects if each.type == "MESH")
     for polygon in shape.data.polygons:
         polygon.use_smooth = True
-    last = int(max(curve.range()[1] for action in bpy.data.actions for curve in action.fcurves))
+    last = int(max(action.frame_range[1] for action in bpy.data.actions))
     print(
         f"{shape.name}: {len(shape.data.vertices)} vertices, {len(shape.data.shape_keys.key_blocks)} shape keys, {last} frames"
     )
