@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Iterator
@@ -60,7 +61,7 @@ def describe(progress: Progress) -> str:
     if progress.residual is not None:
         words.append(f"residual {progress.residual:.3g}")
     if progress.seconds_left is not None:
-        words.append(f"{progress.seconds_left:.0f} s left")
+        words.append(f"{math.ceil(progress.seconds_left)} s left")  # rounded up: 0 is shown at the end only
     return ", ".join(words)
 
 

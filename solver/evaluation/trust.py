@@ -38,7 +38,7 @@ of `benchmarks.trust` below 1 have errors of .05 and more."""
 
 LOOSE_HELD_OUT, LOST_HELD_OUT = 0.08, 0.25
 """Median distance of held-out observations from their prediction, share of the size: the same two degrees. White noise, which is fitted to
-.04, has .7; tracks with noise of 2 % of the largest coordinate have .03 to .06, ten face scans with 10 % outliers and 30 % hidden .08."""
+.04, has .7; tracks with noise of 2 % of the largest coordinate have .03 to .07, ten face scans with 10 % outliers and 30 % hidden .08."""
 
 FLEXIBLE = 0.5
 """Modes of deformation per frame from which the motion hardly determines depth: every second frame has a shape of its own."""

@@ -46,13 +46,16 @@ def conjugate_gradient(
 
     Every iteration decreases ½ xᵀ𝒜x − bᵀx, so majorise–minimise descends even when the inner solve is stopped early.
     Stops when √(rᵀM⁻¹r) has fallen to `reduction` times its initial value, or to rounding level relative to √(bᵀM⁻¹b),
-    or when rᵀM⁻¹r, about what is left to gain of xᵀ𝒜x − 2bᵀx, is at most `negligible`.
+    or when rᵀM⁻¹r, about what is left to gain of xᵀ𝒜x − 2bᵀx, is at most `negligible`. `should_stop` is called at the start and in every
+    iteration; once it returns True in an iteration, x so far is returned.
     Saad, Iterative Methods for Sparse Linear Systems (2003), algorithm 9.1.
 
     Five arrays of the size of x are allocated once and reused; allocating them in every iteration would cost more in
     page faults than in arithmetic.
     """
     x, residual, image = np.zeros_like(b), b.copy(), np.empty_like(b)
+    if should_stop is not None:
+        should_stop()  # for its progress: first touching gigabytes of memory takes as long as an iteration
     z = precondition(residual)
     direction = np.empty_like(b)
     direction[...] = z

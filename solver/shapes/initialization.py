@@ -50,7 +50,8 @@ def uniform_solution(problem: Problem, translations: Floats, *, should_stop: Cal
     tick()
 
     def stops() -> bool:
-        return should_stop is not None and should_stop() and next(asked) > 0
+        before = next(asked)  # asked twice before the first iteration ends
+        return should_stop is not None and should_stop() and before > 1
 
     reduction = EXACT if problem.loss == "l2" else ROUGH
     operator = operator.rounded(inner_precision(operator, reduction))

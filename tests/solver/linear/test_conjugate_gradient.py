@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
-from pliant.solver.linear.conjugate_gradient import conjugate_gradient
+from pliant.solver.linear.conjugate_gradient import Solved, conjugate_gradient
 
 SHAPE = (4, 3, 5)
 RANDOM = np.random.default_rng(0)
@@ -38,3 +40,22 @@ def test_it_ends_where_little_is_left_to_gain() -> None:
             product, B, precondition=inverse, reduction=1e-9, max_iterations=1, negligible=share * whole
         )
         assert found.iterations == expected
+
+
+def test_a_stop_is_asked_for_before_the_first_product_and_in_every_iteration() -> None:
+    asked: list[int] = []
+
+    def going_on() -> bool:
+        asked.append(len(asked))
+        return False
+
+    def solved(should_stop: Callable[[], bool]) -> Solved:
+        return conjugate_gradient(
+            product, B, precondition=same, reduction=1e-9, max_iterations=4, should_stop=should_stop
+        )
+
+    assert solved(going_on).iterations == 4
+    assert len(asked) == 5
+    stopped = solved(lambda: True)
+    assert stopped.iterations == 0
+    assert (stopped.x == 0).all()
