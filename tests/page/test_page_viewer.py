@@ -27,6 +27,8 @@ pytestmark = [
 
 AXE = Path(__file__).parents[2] / "service" / "web" / "node_modules" / "axe-core" / "axe.min.js"
 FRAMES, POINTS = 10, 300
+HALF_TURN = 24
+"""Presses of an arrow key that turn the view by 180°."""
 
 
 @pytest.fixture(scope="module")
@@ -259,6 +261,26 @@ def test_a_films_picture_is_on_the_mesh_first_and_after_a_comparison(
     until(lambda: colour.input_value() == "difference")
     page.get_by_label("Compare with").select_option("")
     until(lambda: min(halves()) > 0.1)
+
+
+def test_the_back_of_a_surface_is_darker_and_the_view_fills_the_screen(viewer: Page) -> None:
+    def brightness() -> float:
+        """Of the middle of the picture, which the mesh covers."""
+        with Image.open(io.BytesIO(canvas(viewer).screenshot())) as shot:
+            pixels = np.asarray(shot.convert("L"), dtype=float)
+        (height, width), tenth = pixels.shape, min(pixels.shape) // 10
+        middle = pixels[height // 2 - tenth : height // 2 + tenth, width // 2 - tenth : width // 2 + tenth]
+        return float(np.median(middle))
+
+    seen = brightness()
+    for _ in range(HALF_TURN):
+        canvas(viewer).press("ArrowRight")
+    until(lambda: brightness() < 0.85 * seen)
+    viewer.get_by_role("button", name="Front").click()
+    until(lambda: brightness() == pytest.approx(seen, abs=2))
+    for filling in (True, False):
+        canvas(viewer).press("f")
+        until(lambda filling=filling: viewer.evaluate("document.fullscreenElement !== null") == filling)  # type: ignore[misc]
 
 
 def test_help_opens_and_closes_by_keyboard(viewer: Page) -> None:
