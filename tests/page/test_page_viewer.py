@@ -316,6 +316,17 @@ def test_picture_film_and_page_are_saved(viewer: Page, tmp_path: Path) -> None:
     context.close()
 
 
+def test_a_turntable_turns_the_mesh_and_can_be_stopped(viewer: Page) -> None:
+    canvas(viewer).focus()
+    before = canvas(viewer).screenshot()
+    viewer.get_by_role("button", name="Turntable").click()
+    until(lambda: differing_pixels(viewer, before, canvas(viewer).screenshot()) > 0.02)
+    viewer.get_by_role("button", name="Stop recording").click()
+    expect(viewer.get_by_text("Stopped. Nothing was saved.")).to_be_visible()
+    canvas(viewer).focus()
+    until(lambda: differing_pixels(viewer, before, canvas(viewer).screenshot()) == 0)
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_no_accessibility_finding_with_every_part_open(viewer: Page, scheme: str) -> None:
     if not AXE.is_file() and not os.environ.get("CI"):
