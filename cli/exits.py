@@ -27,7 +27,7 @@ class Exit(IntEnum):
     UNREACHABLE = 4
     """No service answered, or the service failed."""
     NOT_FOUND = 5
-    """There is no such job, file or token."""
+    """The service has no such job or file, or there is no such token."""
     NOT_NOW = 6
     """The job's status, the token, or another Pliant on the same data does not allow the command."""
     TIMEOUT = 7

@@ -51,12 +51,13 @@ def solve(
 ) -> None:
     """Reconstruct tracks or a film in this process, without a service: the same code, the same files."""
     ctx.obj.json = as_json
-    check_inputs(tracks, ground_truth, rotations)
-    input_file(region, "region")
     from pliant.worker.settings import NUMERICAL_THREADS
 
-    # Read by the numerical libraries when they are imported, below; the solver has its own threads.
+    # Read by the numerical libraries when they are imported, which the first check of a path does; the solver has its
+    # own threads.
     os.environ.update(dict.fromkeys(NUMERICAL_THREADS, "1"))
+    check_inputs(tracks, ground_truth, rotations)
+    input_file(region, "region")
     with results_folder(output, force=force):
         options, name = parse_options(option), name_of(name, tracks)
         if is_film(tracks, region):

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from pliant.cli.extras import require_server
+from pliant.cli.paths import installation
 from pliant.cli.session import Json
 from pliant.cli.show import err, out, print_json
 from pliant.cli.up import Data, chosen
@@ -71,7 +72,7 @@ def create(
     input_file(source, "--from")
 
     lasting, scopes = None if expires is None else parse_duration(expires), scopes_of(scope or ["read", "submit"])
-    with store(data) as tokens:
+    with store(data, new=True) as tokens:
         token, text = tokens.create(
             name,
             scopes=scopes,
@@ -163,12 +164,27 @@ def scopes_of(words: list[str]) -> list[Any]:
 
 
 @contextmanager
-def store(data: Path | None) -> Iterator[Tokens]:
-    """Open the tokens of an installation, whether its service is running or not."""
+def store(data: Path | None, *, new: bool = False) -> Iterator[Tokens]:
+    """Open the tokens of an installation, whether its service is running or not.
+
+    Parameters
+    ----------
+    data : Path, optional
+        Data directory; by default that of the settings.
+    new : bool
+        Whether an installation may be created: its first token is made before its service runs.
+
+    Raises
+    ------
+    BadArgument
+        There is no installation, and none may be created.
+    """
     require_server("pliant token")
     from pliant.worker.processes.valkey import attended
     from pliant.worker.tokens import Tokens
 
     settings = chosen(data, None)
+    if not new:
+        installation(settings)
     with attended(settings):
         yield Tokens.open(settings)

@@ -120,7 +120,7 @@ class NotAllowedNow(WorkerError):
     code = "not_allowed_now"
 
     def __init__(self, id: str, status: Status, *, wanted: str, hint: str) -> None:
-        super().__init__(f"Job {id!r} is {status.value}; it cannot be {wanted} now. {hint}")
+        super().__init__(f"Job {id!r} has the status {status.value}: it cannot be {wanted} now. {hint}")
         self.id, self.status, self.hint = id, status, hint
 
 

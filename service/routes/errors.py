@@ -70,5 +70,6 @@ def page_of(error: ErrorCode) -> str:
         f'<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
         f"<title>{escape(error.code)}: {escape(error.title)}</title>"
         f"<h1>{escape(error.title)}</h1><p><code>{escape(error.code)}</code></p>{status}"
-        f"<h2>Cause</h2><p>{escape(error.cause)}</p><h2>Remedy</h2><p>{escape(error.remedy)}</p></html>\n"
+        f"<h2>Cause</h2><p>{escape(error.cause)}</p><h2>Remedy</h2><p>{escape(error.remedy)}</p>"
+        '<p><a href="../guide">Guide: what can be sent, and what comes back</a></p></html>\n'
     )

@@ -138,13 +138,18 @@ def test_what_is_no_result_is_refused(run: Run, folder: Path, tmp_path: Path) ->
         busy.bind(("127.0.0.1", 0))
         busy.listen()
         port = busy.getsockname()[1]
+        no_result = (
+            f"error {tmp_path}: expected the folder of a result, as `pliant solve -o` or `pliant result -o` writes it, got a folder "
+            "without report.json and preview.bin. Name the folder that holds report.json and preview.bin."
+        )
         for arguments, words in (
-            ((tmp_path / "none",), "does not exist"), ((tmp_path,), "a folder without report.json and preview.bin"),
-            ((folder, "--port", port), f"cannot listen on {port}"),
+            ((tmp_path / "none",), f"error result: {tmp_path / 'none'} does not exist. Name the folder that `pliant solve -o` wrote."),
+            ((tmp_path,), no_result),
+            ((folder, "--port", port), f"error --port: cannot listen on {port}: Address already in use. Choose another, or 0."),
         ):  # fmt: skip
             ran = run("view", "--no-browser", *arguments)
             assert ran.exit_code == Exit.REFUSED, ran.output
-            assert words in ran.stderr
+            assert " ".join(ran.stderr.split()) == words
     for text in ("{", "[]", '{"options": 1}'):
         (tmp_path / "report.json").write_text(text)
         (tmp_path / "preview.bin").write_bytes(b"")

@@ -20,6 +20,7 @@ from pliant.cli.paths import output_file, output_folder
 from pliant.cli.session import Session
 from pliant.client import BadArgument
 from pliant.service.testing import InMemoryService
+from pliant.worker.settings import NUMERICAL_THREADS
 from typer.testing import CliRunner, Result
 
 Run = Callable[..., Result]
@@ -184,7 +185,7 @@ def test_jobs_are_named_by_prefix_or_as_the_last_one(run: Run, tracks: Path) -> 
     assert words(run("delete", "apple-1")) == "Deleted: apple-1"
     empty = CliRunner().invoke(app, ["status", "@last"], obj=Session(transport=InMemoryService()))
     assert empty.exit_code == Exit.REFUSED
-    assert "the service has no jobs" in words(empty)
+    assert words(empty) == "error @last: the service has no jobs. Submit one with `pliant submit TRACKS`."
 
 
 def test_the_id_is_printed_before_waiting(run: Run, tracks: Path, service: InMemoryService) -> None:
@@ -222,7 +223,9 @@ def test_commands_of_the_server_name_what_to_install(
     assert words(ran) == f"error {name} needs the service, which is not installed: pip install 'pliant[server]'"
 
 
-@pytest.mark.parametrize("command", [["fsck"], ["backup", "copy"]], ids=" ".join)
+@pytest.mark.parametrize(
+    "command", [["fsck"], ["backup", "copy"], ["token", "list"], ["token", "revoke", "t1"]], ids=" ".join
+)
 def test_no_installation_is_refused_and_nothing_is_created(
     command: list[str], run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -275,6 +278,28 @@ def interrupted(command: list[str], after: str, *, cwd: Path) -> tuple[int, str]
     printed += started.stdout.read()
     started.stdout.close()
     return started.wait(30), " ".join(printed.split())
+
+
+LOADED = """
+import os, sys
+class Watch:
+    def find_spec(self, name, path=None, target=None):
+        if name == "numpy":
+            print(os.environ.get("OPENBLAS_NUM_THREADS"))
+sys.meta_path.insert(0, Watch())
+sys.argv = ["pliant", "solve", "none.npz", "-o", "out"]
+from pliant.cli import main
+main()
+"""
+
+
+def test_numerical_libraries_are_loaded_after_their_threads_are_limited(tmp_path: Path) -> None:
+    """They read their variables once: more threads than the solver's own slow down a busy machine many times."""
+    environment = {name: value for name, value in os.environ.items() if name not in NUMERICAL_THREADS}
+    ran = subprocess.run(
+        [sys.executable, "-c", LOADED], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=60, check=False
+    )  # fmt: skip
+    assert (ran.returncode, ran.stdout) == (Exit.REFUSED, "1\n"), ran.stderr
 
 
 def test_ctrl_c_while_solving(tmp_path: Path) -> None:

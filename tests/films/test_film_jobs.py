@@ -22,6 +22,7 @@ import pytest
 from PIL import Image
 from pliant.schemas.job import Progress
 from pliant.schemas.options import Options
+from pliant.service.routes.local_result import read_result
 from pliant.solver.errors import InvalidInput
 from pliant.tracking import open_film
 from pliant.tracking.contact_sheet import small_jpeg
@@ -184,6 +185,11 @@ def test_a_film_becomes_shapes_tracks_and_a_contact_sheet(film: Path, region: Pa
     assert done.interpretation.num_points == shapes_count(tmp_path / "out")
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert report["seconds"]["track"] > 0
+    assert {name: each["sha256"] for name, each in report["artifacts"].items()} == {
+        each.name: each.sha256 for each in done.artifacts if each.name != "report.json"
+    }
+    assert report["warnings"] == list(done.warnings)
+    assert "film_frames.bin" in {each.name for each in read_result(tmp_path / "out").artifacts}
     with Image.open(tmp_path / "out" / "contact_sheet.jpg") as sheet:
         assert sheet.format == "JPEG"
     check_followed(steps, tmp_path / "out")

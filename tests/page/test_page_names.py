@@ -14,11 +14,14 @@ from datetime import datetime
 from pathlib import Path
 
 import httpx
+import numpy as np
 import pytest
 from browsing import why_not
-from paging import DONE
+from paging import DONE, seek, until
 from playwright.sync_api import Browser, Page, expect
+from pliant.tracking.contact_sheet import small_jpeg
 from pliant.worker.artifacts import build_report, write_artifacts
+from pliant.worker.films.frame_strip import packed
 from results import make_result
 
 pytestmark = [
@@ -27,6 +30,9 @@ pytestmark = [
 ]
 
 POINT_NAMES = tuple(f"Lid {number} ü" for number in range(21 * 31))
+GREYS = (20, 50, 80, 110, 140, 170, 200)
+"""Of the pictures of the film, frame by frame."""
+AXE = Path(__file__).parents[2] / "service" / "web" / "node_modules" / "axe-core" / "axe.min.js"
 QUICK_LOOK = """const supports = DOMTokenList.prototype.supports;
 DOMTokenList.prototype.supports = function (word) { return word === "ar" || supports.call(this, word); };"""
 
@@ -38,6 +44,9 @@ def viewed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     inputs, solution, options = make_result(rows=21, columns=31, texture=True, outputs="glb,usd")
     inputs = replace(inputs, point_names=POINT_NAMES)
     report = build_report(inputs, solution, options, metrics={}, name="Take 3/Büro")
+    greys = [small_jpeg(np.full((240, 320, 3), level, np.uint8), longest_side=320, quality=90) for level in GREYS]
+    (folder / "film_frames.bin").write_bytes(packed(greys, (320, 240)))
+    report["artifacts"] = {"film_frames.bin": {}}
     write_artifacts(inputs, solution, options, report, folder, name="Take 3/Büro")
     command = [sys.executable, "-m", "pliant.cli", "view", str(folder), "--no-browser", "--json"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as viewing:
@@ -90,6 +99,32 @@ def test_ar_is_offered_where_it_plays(browser: Browser, viewed: str) -> None:
         "ar", 1, "IMG", False,
     ]  # fmt: skip
     assert httpx.get(link.evaluate("(it) => it.href")).content[:2] == b"PK"
+    page.context.close()
+
+
+def test_the_film_stands_beside_the_mesh_in_step(browser: Browser, viewed: str) -> None:
+    page = visitor(browser)
+    page.goto(viewed)
+    film = page.get_by_role("img", name="The film at the same moment, with its tracks")
+    film.wait_for(timeout=DONE)
+    expect(page.get_by_role("checkbox", name="Film beside")).to_be_checked()
+    corner = """(it) => {
+      const [across, down] = [it.width / 2, it.height / 2];
+      const shown = Math.min(it.width / 320, it.height / 240);
+      return it.getContext('2d').getImageData(Math.round(across + 150 * shown), Math.round(down + 110 * shown), 1, 1).data[0];
+    }"""
+    for frame in (1, 5):
+        seek(page, frame)
+        until(lambda frame=frame: abs(film.evaluate(corner) - GREYS[frame]) < 8)  # type: ignore[misc]
+    if AXE.is_file() or os.environ.get("CI"):
+        for width in (1280, 390):
+            page.set_viewport_size({"width": width, "height": 844})
+            page.evaluate(AXE.read_text())
+            found = page.evaluate(
+                "axe.run({rules: {'target-size': {enabled: true}}}).then((found) => found.violations)"
+            )
+            assert [(one["id"], [node["html"][:200] for node in one["nodes"]][:3]) for one in found] == [], width
+            assert page.evaluate("document.documentElement.scrollWidth") <= width
     page.context.close()
 
 

@@ -80,7 +80,8 @@ def test_while_a_job_runs(page: Page, url: str, long_job: Callable[[str], str], 
     expect(page.get_by_text("Next in the queue.")).to_be_visible()
     check("queued")
     page.get_by_role("button", name="Cancel").click()
-    expect(page.get_by_text("This job was cancelled before it was done")).to_be_visible()
+    words = "This job was cancelled before it was done, so it has no results. “Try again” runs it from the same files."
+    expect(page.get_by_text(words, exact=True)).to_be_visible()
     check("cancelled")
 
 

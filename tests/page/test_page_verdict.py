@@ -55,7 +55,7 @@ def test_the_verdict_is_above_the_viewer_and_in_the_list(
     box = page.get_by_role("region", name="Verdict")
     expect(box).to_contain_text(words)
     expect(box).to_contain_text(TRUST)
-    expect(box).to_contain_text("In about seven of ten sequences the true error is between 2.0 % and 5.1 %.")
+    expect(box).to_contain_text("In nearly eight of ten sequences the true error is between 2.0 % and 5.1 %.")
     expect(box.locator("svg")).to_be_visible()
     assert box.get_by_role("listitem").all_inner_texts() == reasons
     expect(box).to_contain_text("Solver: Converged.")
@@ -92,6 +92,7 @@ def test_every_badge_can_be_read_in_both_themes(page: Page, url: str, finished: 
         page.goto(f"{url}/#job={finished}")
         page.reload()
         page.get_by_role("region", name="Verdict").wait_for()
+        expect(page.locator(".verdict .badge")).to_be_in_viewport(ratio=1)
         if width == 390:
             page.get_by_role("heading", name="Jobs").click()
         page.evaluate(AXE.read_text())

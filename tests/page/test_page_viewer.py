@@ -27,6 +27,8 @@ pytestmark = [
 
 AXE = Path(__file__).parents[2] / "service" / "web" / "node_modules" / "axe-core" / "axe.min.js"
 FRAMES, POINTS = 10, 300
+HALF_TURN = 24
+"""Presses of an arrow key that turn the view by 180°."""
 
 
 @pytest.fixture(scope="module")
@@ -261,6 +263,26 @@ def test_a_films_picture_is_on_the_mesh_first_and_after_a_comparison(
     until(lambda: min(halves()) > 0.1)
 
 
+def test_the_back_of_a_surface_is_darker_and_the_view_fills_the_screen(viewer: Page) -> None:
+    def brightness() -> float:
+        """Of the middle of the picture, which the mesh covers."""
+        with Image.open(io.BytesIO(canvas(viewer).screenshot())) as shot:
+            pixels = np.asarray(shot.convert("L"), dtype=float)
+        (height, width), tenth = pixels.shape, min(pixels.shape) // 10
+        middle = pixels[height // 2 - tenth : height // 2 + tenth, width // 2 - tenth : width // 2 + tenth]
+        return float(np.median(middle))
+
+    seen = brightness()
+    for _ in range(HALF_TURN):
+        canvas(viewer).press("ArrowRight")
+    until(lambda: brightness() < 0.85 * seen)
+    viewer.get_by_role("button", name="Front").click()
+    until(lambda: brightness() == pytest.approx(seen, abs=2))
+    for filling in (True, False):
+        canvas(viewer).press("f")
+        until(lambda filling=filling: viewer.evaluate("document.fullscreenElement !== null") == filling)  # type: ignore[misc]
+
+
 def test_help_opens_and_closes_by_keyboard(viewer: Page) -> None:
     canvas(viewer).press("?")
     help_ = viewer.get_by_role("dialog", name="Keys and gestures")
@@ -292,6 +314,17 @@ def test_picture_film_and_page_are_saved(viewer: Page, tmp_path: Path) -> None:
     alone.get_by_role("button", name="Side").click()
     until(lambda: differing_pixels(alone, before, canvas(alone).screenshot()) > 0.02)
     context.close()
+
+
+def test_a_turntable_turns_the_mesh_and_can_be_stopped(viewer: Page) -> None:
+    canvas(viewer).focus()
+    before = canvas(viewer).screenshot()
+    viewer.get_by_role("button", name="Turntable").click()
+    until(lambda: differing_pixels(viewer, before, canvas(viewer).screenshot()) > 0.02)
+    viewer.get_by_role("button", name="Stop recording").click()
+    expect(viewer.get_by_text("Stopped. Nothing was saved.")).to_be_visible()
+    canvas(viewer).focus()
+    until(lambda: differing_pixels(viewer, before, canvas(viewer).screenshot()) == 0)
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

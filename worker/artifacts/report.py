@@ -104,10 +104,10 @@ def _camera_sentence(
     name = model.replace("_", " ").capitalize()
     if focal is None:
         return f"{name} camera."
-    known = " (given)" if focal_std == 0 else "" if focal_std is None else f" ± {focal_std:.2g}"
+    known = " (given)" if focal_std == 0 else "" if focal_std is None else f" ± {_two_digits(focal_std)}"
     view = "" if angle is None else f", horizontal field of view {angle:.1f}°"
-    view += "" if angle is None or not angle_std else f" ± {angle_std:.2g}°"
-    return f"{name} camera, focal length {focal:.4g} px{known}{view}."
+    view += "" if angle is None or not angle_std else f" ± {_two_digits(angle_std)}°"
+    return f"{name} camera, focal length {float(f'{focal:.4g}'):g} px{known}{view}."
 
 
 def _trust(trust: Trust | None) -> dict[str, Any]:
@@ -154,3 +154,8 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value.item() if hasattr(value, "item") else value
+
+
+def _two_digits(value: float) -> str:
+    """Round to two digits and write them without an exponent below a million."""
+    return f"{float(f'{value:.2g}'):g}"

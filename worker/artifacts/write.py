@@ -32,7 +32,7 @@ def write_artifacts(
     inputs, solution, options
         Of the job.
     report : dict
-        From `build_report`; `artifacts` and `seconds.exporting` are added to it.
+        From `build_report`; `artifacts` and `seconds.exporting` are added to it. `artifacts` may list files that are there already.
     directory : Path
         Where the files go; files of the same names are replaced.
     name : str
@@ -56,7 +56,8 @@ def write_artifacts(
     kinds = kinds_for(options, textured=result.texture is not None)
     written, entries = write_kinds(result, kinds, directory, on_progress=report_share)
     seconds = {**report.get("seconds", {}), "exporting": time.perf_counter() - began}
-    written.append(write_report({**report, "seconds": seconds, "artifacts": entries}, directory))
+    listed = {**report.get("artifacts", {}), **entries}
+    written.append(write_report({**report, "seconds": seconds, "artifacts": listed}, directory))
     report_share(1.0)
     return written
 

@@ -90,7 +90,10 @@ def reconstruct_film(
         spent = {"track": time.perf_counter() - began}
         directory.mkdir(parents=True, exist_ok=True)
         artifacts = [_moved(scratch / name, directory) for name in FILES if (scratch / name).exists()]
-        finished = solve_and_write(inputs, options, directory, reporter=reporter, halt=halt, name=name, spent=spent)
+        finished = solve_and_write(
+            inputs, options, directory, reporter=reporter, halt=halt, name=name, spent=spent,
+            earlier=artifacts, warnings=tracked.warnings,
+        )  # fmt: skip
     return replace(
         finished,
         artifacts=(*artifacts, *finished.artifacts),

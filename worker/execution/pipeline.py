@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -93,6 +93,8 @@ def solve_and_write(
     halt: Halt,
     name: str = "",
     spent: Mapping[str, float] | None = None,
+    earlier: Sequence[Artifact] = (),
+    warnings: Sequence[str] = (),
     solver: Callable[..., Solution] | None = None,
 ) -> Finished:
     """Run `reconstruct` as part of a longer job.
@@ -109,6 +111,10 @@ def solve_and_write(
         As in `reconstruct`.
     spent : mapping, optional
         Seconds of earlier parts, for the report.
+    earlier : sequence of Artifact
+        Files of earlier parts, in the same directory, for the report.
+    warnings : sequence of str
+        Of earlier parts, for the report.
     solver : callable, optional
         As in `reconstruct`.
     """
@@ -132,6 +138,8 @@ def solve_and_write(
     metrics = _metrics(inputs, solution)
     seconds = {**(spent or {}), "solve": solved - began, "metrics": time.perf_counter() - solved}
     report = build_report(inputs, solution, options, metrics=metrics, seconds=seconds, name=name)
+    report["warnings"] = [*warnings, *report["warnings"]]
+    report["artifacts"] = {each.name: {"bytes": each.bytes, "sha256": each.sha256} for each in earlier}
 
     def exported(done: float) -> None:
         reporter.part("exporting", done)

@@ -67,7 +67,7 @@ export class VerdictBox {
     if (!Array.isArray(interval)) return;
     const [low, high] = interval.map(Number);
     if (low === undefined || high === undefined) return;
-    const words = `In about seven of ten sequences the true error is between ${percent(low)} and ${percent(high)}.`;
+    const words = `In nearly eight of ten sequences the true error is between ${percent(low)} and ${percent(high)}.`;
     fill(this.interval, words, () => [words]);
   }
 }

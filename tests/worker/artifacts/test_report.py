@@ -48,6 +48,12 @@ def test_a_perspective_camera_is_in_the_arrays_and_the_report(tmp_path: Path) ->
             "1280x720",
             "Perspective camera, focal length 900 px ± 12, horizontal field of view 70.8° ± 0.72°.",
         ),
+        (
+            900.0,
+            168.0,
+            "1280x720",
+            "Perspective camera, focal length 900 px ± 170, horizontal field of view 70.8° ± 10°.",
+        ),
         (900.0, 0.0, "1280x720", "Perspective camera, focal length 900 px (given), horizontal field of view 70.8°."),
         (None, None, "1280x720", "Scaled orthographic camera."),
     ],

@@ -257,8 +257,12 @@ def test_a_refusal_says_what_was_seen_and_what_to_do(case: str, tmp_path: Path) 
 def test_a_table_that_is_not_deeplabcuts_is_refused(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "dlc.h5", "w") as file:
         file.create_group("df")["block0_values"] = np.full((F, 7), 3.0)
-    with pytest.raises(InvalidInput, match="expected a DeepLabCut table: x, y and likelihood"):
+    with pytest.raises(InvalidInput) as caught:
         read_inputs(tracks=tmp_path / "dlc.h5", mesh=None, options=Options())
+    assert str(caught.value) == (
+        "tracks: expected a DeepLabCut table: x, y and likelihood from 0 to 1 for each body part, got a table of shape (5, 7). "
+        "Export it as csv: deeplabcut.analyze_videos_converth5_to_csv(folder)."
+    )
 
 
 @pytest.mark.parametrize("kind", ["virtual", "external", "link", "claimed", "claimed table"])

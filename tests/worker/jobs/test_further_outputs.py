@@ -106,8 +106,12 @@ def test_who_and_what_is_refused(jobs: Jobs, solved: Job, tmp_path: Path) -> Non
     with pytest.raises(UnknownJob):
         make_outputs(jobs.of("stranger"), solved.id, WANTED)
     more, _ = make_outputs(jobs, solved.id, WANTED)
-    with pytest.raises(NotAllowedNow, match="make them from that one"):
+    with pytest.raises(NotAllowedNow) as caught:
         make_outputs(jobs, more.id, WANTED)
+    assert str(caught.value) == (
+        f"Job {more.id!r} has the status queued: it cannot be written in further files now. "
+        f"It holds further files of job {solved.id!r}: make them from that one."
+    )
     with pytest.raises(NotAllowedNow, match="name that one"):
         jobs.kept_inputs(more.id, tmp_path / "kept.npz")
 
