@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -109,3 +110,13 @@ def parse_options(pairs: list[str] | None) -> dict[str, Any]:
         except ValueError:
             options[name.strip()] = value
     return options
+
+
+def one_numerical_thread() -> None:
+    """Limit the numerical libraries to one thread: solver and tracker have threads of their own.
+
+    The libraries read these variables when they are imported, so call it before anything that imports NumPy.
+    """
+    from pliant.worker.settings import NUMERICAL_THREADS
+
+    os.environ.update(dict.fromkeys(NUMERICAL_THREADS, "1"))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -21,6 +20,7 @@ from pliant.cli.session import (
     Rotations,
     Tracks,
     name_of,
+    one_numerical_thread,
     parse_options,
 )
 from pliant.cli.show import err, metrics_table, out, print_json, understood, verdict_lines
@@ -51,11 +51,7 @@ def solve(
 ) -> None:
     """Reconstruct tracks or a film in this process, without a service: the same code, the same files."""
     ctx.obj.json = as_json
-    from pliant.worker.settings import NUMERICAL_THREADS
-
-    # Read by the numerical libraries when they are imported, which the first check of a path does; the solver has its
-    # own threads.
-    os.environ.update(dict.fromkeys(NUMERICAL_THREADS, "1"))
+    one_numerical_thread()  # the first check of a path imports NumPy
     check_inputs(tracks, ground_truth, rotations)
     input_file(region, "region")
     with results_folder(output, force=force):

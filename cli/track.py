@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from pliant.cli.paths import input_file, output_file
-from pliant.cli.session import Force, Json
+from pliant.cli.session import Force, Json, one_numerical_thread
 from pliant.cli.show import err, out, print_json
 
 if TYPE_CHECKING:
@@ -49,6 +49,7 @@ def track(
 ) -> None:
     """Track the surface that a film shows. Needs OpenCV, which the extra `film` installs."""
     ctx.obj.json = as_json
+    one_numerical_thread()
     input_file(region, "--region")
     output_file(output, "--output", force=force)
     output_file(preview, "--preview", force=force)

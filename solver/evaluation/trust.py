@@ -67,7 +67,7 @@ class Trust:
     """Expected `e3d_frame`, share of the object's size; None where the prior has no posterior."""
 
     interval: tuple[float, float] | None
-    """Holds the true error in about seven of ten solves; None where the model behind it is not believed."""
+    """Holds the true error in nearly eight of ten solves; None where the model behind it is not believed."""
 
     turn_degrees: float
     """Angle between the two most different viewing directions, degrees; above 90 they may be opposite."""

@@ -287,17 +287,22 @@ class Watch:
         if name == "numpy":
             print(os.environ.get("OPENBLAS_NUM_THREADS"))
 sys.meta_path.insert(0, Watch())
-sys.argv = ["pliant", "solve", "none.npz", "-o", "out"]
+sys.argv = ["pliant", *sys.argv[1:]]
 from pliant.cli import main
 main()
 """
 
 
-def test_numerical_libraries_are_loaded_after_their_threads_are_limited(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "command", [("solve", "none.npz", "-o", "out"), ("track", "none.mp4", "-o", "tracks.npz", "--region", "none.png")]
+)
+def test_numerical_libraries_are_loaded_after_their_threads_are_limited(
+    tmp_path: Path, command: tuple[str, ...]
+) -> None:
     """They read their variables once: more threads than the solver's own slow down a busy machine many times."""
     environment = {name: value for name, value in os.environ.items() if name not in NUMERICAL_THREADS}
     ran = subprocess.run(
-        [sys.executable, "-c", LOADED], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=60, check=False
+        [sys.executable, "-c", LOADED, *command], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=60, check=False
     )  # fmt: skip
     assert (ran.returncode, ran.stdout) == (Exit.REFUSED, "1\n"), ran.stderr
 
