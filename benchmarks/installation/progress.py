@@ -1,4 +1,4 @@
-"""Seconds left, as shown while a job runs, against the true ones: ten runs over HTTP and on the command line.
+"""Seconds left, as shown while a job runs, against the true ones: twelve runs over HTTP and on the command line.
 
     python -m benchmarks.installation.progress --results benchmarks/results/progress.jsonl
     python -m benchmarks.installation.progress --only flag,sphere
@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 from pliant.client import Client
-from pliant.solver.gallery import Sequence, corrupt, face, flag, sphere
+from pliant.solver.gallery import Sequence, corrupt, face, flag, sphere, talk
 
 from benchmarks.installation.instance import Instance
 from benchmarks.rows import append_row
@@ -60,6 +60,8 @@ RUNS = (
     Run("smooth prior", lambda: face(60, 10_000, degrees=40), line=True, options={"prior": "smooth"}),
     Run("known cameras", lambda: face(99, 6000, degrees=40), cameras=True),
     Run("size of the picture", lambda: face(40, 600, degrees=40), line=True, options={"image_size": "640x480"}),
+    Run("many points", lambda: face(50, 100_000, degrees=40)),
+    Run("many frames", lambda: talk(3000, 300), line=True),
 )
 
 
