@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pliant.client.errors import BadArgument
 from pliant.schemas.options import Options
+from pliant.schemas.validation import expectation
 from pydantic import ValidationError
 
 if TYPE_CHECKING:
@@ -279,7 +280,7 @@ def _option_fault(error: ErrorDetails) -> str:
     """Describe one invalid option, with the closest name if the option does not exist."""
     name = ".".join(map(str, error["loc"]))
     if error["type"] != "extra_forbidden":
-        return f"{name}: {error['msg']}, got {error['input']!r}"
+        return f"{name}: expected {expectation(error)}, got {error['input']!r}"
     close = difflib.get_close_matches(name, Options.model_fields, n=1)
     return f"{name}: there is no such option" + (f" (did you mean {close[0]}?)" if close else "")
 

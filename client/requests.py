@@ -8,6 +8,7 @@ from typing import Any
 from pliant.client.errors import BadArgument
 from pliant.schemas.outputs import OutputRequest
 from pliant.schemas.shares import DAY, ShareRequest
+from pliant.schemas.validation import expectation
 from pydantic import ValidationError
 
 
@@ -25,7 +26,7 @@ def further(outputs: Iterable[str] | str, options: Mapping[str, Any]) -> OutputR
     except ValidationError as fault:
         first = fault.errors()[0]
         field = ".".join(str(part) for part in first["loc"])
-        raise BadArgument(f"{field}: {first['msg']}, got {first['input']!r}.") from fault
+        raise BadArgument(f"{field}: expected {expectation(first)}, got {first['input']!r}.") from fault
 
 
 def sharing(days: float) -> ShareRequest:

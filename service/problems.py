@@ -18,6 +18,7 @@ from fastapi.responses import Response
 from pliant.schemas.invalid import Invalid, members_of
 from pliant.schemas.job import Problem
 from pliant.schemas.problems import ProblemCode
+from pliant.schemas.validation import expectation
 from pydantic import ValidationError
 from starlette.exceptions import HTTPException
 from starlette.types import Receive, Scope, Send
@@ -164,7 +165,7 @@ def from_validation(errors: Sequence[Any], *, options: bool = False) -> Refusal:
     return wrong_input(
         code,
         field=field,
-        expected="a name listed at /v1/options" if unknown else first["msg"],
+        expected="a name listed at /v1/options" if unknown else expectation(first),
         got=(f"the unknown name {where[-1]!r}" if unknown else _short(first.get("input"))),
         hint=f"Compare with the schema at {source}.{others}",
     )

@@ -69,7 +69,11 @@ def test_further_files_are_made_and_downloaded(run: Run, job: str, tmp_path: Pat
         "metrics_frames.csv",
         "metrics_points.csv",
     }
-    assert run("result", job, "--make", "fbx", "-o", tmp_path / "no").exit_code == Exit.REFUSED
+    wrong = run("result", job, "--make", "fbx", "-o", tmp_path / "no")
+    assert (wrong.exit_code, " ".join(wrong.stderr.split())) == (
+        Exit.REFUSED,
+        "error outputs.0: expected 'glb', 'ply', 'obj', 'usd', 'abc', 'mdd', 'mat' or 'csv', got 'fbx'.",
+    )
 
 
 def test_the_inputs_run_again_with_other_options(run: Run, job: str) -> None:
@@ -98,7 +102,11 @@ def test_a_link_is_made_listed_and_revoked(run: Run, job: str, service: InMemory
         assert guest.get(f"/v1/jobs/{job}").status_code == 401
     assert run("share", job, "--revoke", listed["id"]).exit_code == Exit.NOT_FOUND
     assert json.loads(run("share", job, "--json").stdout)["url"].startswith("http://127.0.0.1:8000/#share=")
-    assert run("share", job, "--days", "0").exit_code == Exit.REFUSED
+    wrong = run("share", job, "--days", "0")
+    assert (wrong.exit_code, " ".join(wrong.stderr.split())) == (
+        Exit.REFUSED,
+        "error days: expected a minute (0.0007) to 366 days, got 0.0.",
+    )
 
 
 def test_both_roads_name_the_object_after_the_file(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -104,6 +104,8 @@ def test_a_result_holds_arrays_report_and_job(client: Client, tmp_path: Path) ->
     assert result.report["interpretation"]["estimate"] == job.record.interpretation.estimate.model_dump(mode="json")
     assert result.job.name == "one"
     assert updates[-1].status is Status.SUCCEEDED
+    assert job.status is Status.SUCCEEDED
+    assert repr(job).endswith(f"RemoteJob {job.id} succeeded>")
     assert sent[-1][0] == sent[-1][1] > 0
     assert result.job.status is Status.SUCCEEDED
     assert len(client.log(result.job.id).splitlines()) >= 2

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import io
+import re
 import socket
 import threading
 import time
@@ -207,6 +208,11 @@ def test_a_quota_counts_uploads(serve: Serve) -> None:
         assert http.put("/v1/uploads/first", content=b"x" * 100_000).status_code == 201
         answer = http.put("/v1/uploads/second", content=b"x" * 100_000)
         assert (answer.status_code, answer.json()["code"], answer.json()["retryable"]) == (507, "quota_exceeded", True)
+        assert re.fullmatch(
+            r"Disk quota reached: 1\d\d,\d{3} of 150,000 bytes are used\. "
+            r"Delete jobs, wait until they expire, or raise PLIANT_DISK_QUOTA\.",
+            answer.json()["detail"],
+        ), answer.json()["detail"]
         http.delete("/v1/uploads/first")
         assert http.put("/v1/uploads/second", content=b"x" * 100_000).status_code == 201
         assert http.put("/v1/uploads/second", content=b"x" * 100_000).status_code == 409

@@ -102,6 +102,10 @@ def test_mediapipe_landmarks_are_fractions_of_the_picture(tmp_path: Path) -> Non
     with pytest.raises(InvalidInput) as caught:
         read_inputs(tracks=tmp_path / "pose.csv", mesh="none", options=Options())
     assert caught.value.code == "ambiguous_coordinates"
+    assert str(caught.value) == (
+        f"tracks: expected coordinates whose unit is certain, got values from {places[..., :2].min():.3g} to {places[..., :2].max():.3g}. "
+        "Give the option image_size=WIDTHxHEIGHT if they are fractions of the picture, else coordinates=pixels."
+    )
     read = read_inputs(tracks=tmp_path / "pose.csv", mesh="none", options=Options(image_size="641x481"))
     assert (read.interpretation.format, read.interpretation.coordinates) == ("MediaPipe", "unit")
     seen = read.tracks.visible > 0
