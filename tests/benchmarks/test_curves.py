@@ -11,6 +11,7 @@ import pytest
 from benchmarks.accuracy import curves
 
 
+@pytest.mark.slow
 def test_every_draw_is_solved_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(curves, "LEVELS", {"outliers": (0.1,), "noise": (0.05,)})
     out = tmp_path / "curves.jsonl"
