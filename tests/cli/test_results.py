@@ -61,6 +61,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return held
 
 
+TAKEN = "Address already in use"
+
+
 def test_further_files_are_made_and_downloaded(run: Run, job: str, tmp_path: Path) -> None:
     ran = run("result", job, "--make", "mdd", "--make", "csv", "--fps", "50", "-o", tmp_path / "more")
     assert ran.exit_code == 0, ran.output
@@ -151,11 +154,11 @@ def test_what_is_no_result_is_refused(run: Run, folder: Path, tmp_path: Path) ->
             f"error {tmp_path}: expected the folder of a result, as `pliant solve -o` or `pliant result -o` writes it, got a folder "
             "without report.json and preview.bin. Name the folder that holds report.json and preview.bin."
         )
-        usage = "invalid_argument"
+        usage, none = "invalid_argument", tmp_path / "none"
         for arguments, code, words in (
-            ((tmp_path / "none",), usage, f"error result: {tmp_path / 'none'} does not exist. Name the folder that `pliant solve -o` wrote."),
+            ((none,), usage, f"error result: {none} does not exist. Name the folder that `pliant solve -o` wrote."),
             ((tmp_path,), "not_a_result", no_result),
-            ((folder, "--port", port), usage, f"error --port: cannot listen on {port}: Address already in use. Choose another, or 0."),
+            ((folder, "--port", port), usage, f"error --port: cannot listen on {port}: {TAKEN}. Choose another, or 0."),
         ):  # fmt: skip
             ran = run("view", "--no-browser", *arguments)
             assert ran.exit_code == Exit.REFUSED, ran.output
