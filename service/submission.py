@@ -11,7 +11,7 @@ from typing import Any, get_args
 from pliant.schemas.job import Interpretation, Job, Priority
 from pliant.schemas.options import Options
 from pliant.schemas.problems import ProblemCode
-from pliant.service.multipart import File, Form, FormRules
+from pliant.service.multipart import File, Form, FormRules, own_name
 from pliant.service.problems import Refusal, from_validation, wrong_input
 from pliant.service.settings import ServiceSettings
 from pliant.worker.artifacts import kinds_for
@@ -212,7 +212,7 @@ def with_uploads(form: Form, folder: Path, uploads: Uploads) -> Form:
             raise wrong_input(
                 code, field=name, status=422, expected="a complete upload", got="a part of it", hint=hint
             ) from error
-        files[part] = File(path, path.stat().st_size, digest)
+        files[part] = File(path, path.stat().st_size, digest, own_name(texts.get("name", "")) if part == "film" else "")
     return Form(files=files, texts=texts)
 
 
@@ -267,7 +267,10 @@ def _check_film_parts(form: Form) -> None:
 
 def _read_film(form: Form, options: Options, bounds: FilmBounds, target: Path | None) -> tuple[Interpretation, Options]:
     region = form.files.get("region")
-    source = FilmSource(form.files["film"].path, None if region is None else region.path)
+    source = FilmSource(
+        form.files["film"].path, None if region is None else region.path, film_name=form.files["film"].name or "the film",
+        region_name="the region" if region is None else region.name or "the region",
+    )  # fmt: skip
     facts = check_film(source, options, bounds)
     options = film_options(options, facts)
     interpretation = described(facts, options)

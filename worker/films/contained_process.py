@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 import resource
 import sys
 import time
@@ -190,14 +191,17 @@ def _followed(step: TrackingStep, size: tuple[int, int]) -> dict[str, Any] | Non
 
 
 def _refused(error: FilmError, request: dict[str, Any]) -> InvalidInput:
-    """Return the error with the job's field names and without paths."""
+    """Return the error with the job's field names, and with the user's names of the files instead of paths."""
     field = f"options.{error.field}" if error.field in OPTIONS else error.field
     if field == "region" and request["region"] is None and request["options"]["region_polygon"] is not None:
         field = "options.region_polygon"
     got = error.got
     for name in ("film", "region"):
         if request[name] is not None:
-            got = got.replace(f"{Path(request[name]).parent}{os.sep}", "")
+            path = Path(request[name])
+            own = re.escape(path.name)
+            got = got.replace(f"{path.parent}{os.sep}", "")
+            got = re.sub(rf"(?:^|(?<= in )){own}(?!\w)", lambda _, name=name: request["names"][name], got)
     return InvalidInput(error.code, field=field, expected=error.expected, got=got, hint=error.hint)
 
 
