@@ -198,11 +198,15 @@ def _refused(error: FilmError, request: dict[str, Any]) -> InvalidInput:
     got = error.got
     for name in ("film", "region"):
         if request[name] is not None:
-            path = Path(request[name])
-            own = re.escape(path.name)
-            got = got.replace(f"{path.parent}{os.sep}", "")
-            got = re.sub(rf"(?:^|(?<= in )){own}(?!\w)", lambda _, name=name: request["names"][name], got)
+            got = _renamed(got, Path(request[name]), str(request["names"][name]))
     return InvalidInput(error.code, field=field, expected=error.expected, got=got, hint=error.hint)
+
+
+def _renamed(got: str, path: Path, name: str) -> str:
+    """Return what was given, with the user's name of a file where its path, or the name of that, begins it or follows "in"."""
+    start, own, rest = got.replace(f"{path.parent}{os.sep}", "").partition(path.name)
+    named = own != "" and (start == "" or start.endswith(" in ")) and re.match(r"\w", rest) is None
+    return f"{start}{name}{rest}" if named else f"{start}{own}{rest}"
 
 
 def _for_want_of_memory(error: Exception) -> bool:
