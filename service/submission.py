@@ -161,7 +161,9 @@ def kept_inputs(form: Form, options: Options, folder: Path, jobs: Jobs) -> Kept 
     if is_source(file):
         source = open_source(file, folder / "kept")
         files = {
-            part: File(path, path.stat().st_size, hashlib.sha256(f"{id} {part}".encode()).hexdigest())
+            part: File(
+                path, path.stat().st_size, hashlib.sha256(f"{id} {part}".encode()).hexdigest(), source.names[part]
+            )
             for part, path in (("film", source.film), ("region", source.region))
             if path is not None
         }
@@ -169,8 +171,9 @@ def kept_inputs(form: Form, options: Options, folder: Path, jobs: Jobs) -> Kept 
     for name in READING:
         wanted, had = getattr(options, name), getattr(job.options, name)
         if name in options.model_fields_set and wanted != had:
+            kept = "no value" if had is None else repr(had)
             raise wrong_input(
-                ProblemCode.CONFLICTING_PARTS, field=f"options.{name}", expected=f"{had!r}, as the inputs of job {id!r} were read",
+                ProblemCode.CONFLICTING_PARTS, field=f"options.{name}", expected=f"{kept}, as the inputs of job {id!r} were read",
                 got=repr(wanted), hint="Send the files again to read them in another way.",
             )  # fmt: skip
     had = {name: getattr(job.options, name) for name in READING}

@@ -99,6 +99,19 @@ LISTED = "`pliant options` lists every option."
             "--preview: TRACKS exists already. Choose another name, or replace it with --force.",
         ),
         ("track FILM -o t.npz --region no.png", f"--region: {NO_FILE} no.png. Check the path."),
+        (
+            "submit TRACKS -m no.obj",
+            "mesh: expected a mesh file, ROWSxCOLUMNS or none, got no file at no.obj. "
+            "Check the path, or give a grid size such as 48x64.",
+        ),
+        ("submit TRACKS -g no.npz", f"ground_truth: {NO_FILE} no.npz. Check the path."),
+        ("submit TRACKS -r no.npz", f"rotations: {NO_FILE} no.npz. Check the path."),
+        ("submit FOLDER/*.npz", "FOLDER/*.npz: expected files that match, got none. Check the pattern and its quotes."),
+        (
+            "list -s done",
+            "--status: expected one of queued, running, cancelling, succeeded, failed, cancelled, got 'done'.",
+        ),
+        ("submit TRACKS -O loss", f"--option: expected NAME=VALUE, got 'loss'. {LISTED}"),
         ("solve TRACKS -o OUT -O frobnicate=1", f"options: frobnicate: there is no such option. {LISTED}"),
         ("submit TRACKS -O los=l1", f"options: los: there is no such option (did you mean loss?). {LISTED}"),
     ],
