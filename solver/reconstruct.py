@@ -92,19 +92,37 @@ def _solved(
         return solution_of(tracks, verdict, settings, monitor, began=began)
     cameras, prior = _learned(observations, monitor)
     monitor.report(Step("cameras", 0.0, max_reweightings=settings.max_reweightings))
-    learning, began = time.perf_counter() - began, time.perf_counter()
+    learning = time.perf_counter() - began
     if needs_blocks(tracks, settings):
+        observations = observations.without_points()
+        cameras = replace(cameras, observations=observations)  # blocks take their points from the tracks
         solution = shapes_in_blocks(tracks, cameras, prior, mesh, settings, monitor, seconds={"cameras": learning})
         return solution if verdict is None else _with_verdict(solution, verdict, settings)
+    seconds = {"cameras": learning, "initialise": 0.0}
+    solution = shapes_from(_started(tracks, cameras, prior, mesh, settings, monitor, seconds), monitor, seconds=seconds)
+    return solution if verdict is None else _with_verdict(solution, verdict, settings)
+
+
+def _started(
+    tracks: Tracks,
+    cameras: Cameras,
+    prior: Prior | None,
+    mesh: Mesh | None,
+    settings: Settings,
+    monitor: Monitor,
+    seconds: dict[str, float],
+) -> Start:
+    """Return the start of the shapes, without gross outliers; its time is added to `seconds`."""
+    began, learning = time.perf_counter(), 0.0
     start = with_outliers_rejected(prepared(tracks, cameras, prior, mesh, settings, should_stop=monitor), monitor)
     if start.rejected().any() and not monitor():
         again = time.perf_counter()
         start = _started_again(start, cameras, monitor)
-        learning, began = learning + time.perf_counter() - again, began + time.perf_counter() - again
+        learning = time.perf_counter() - again
     start = with_outlier_reason(start)
-    seconds = {"cameras": learning, "initialise": time.perf_counter() - began}
-    solution = shapes_from(start, monitor, seconds=seconds)
-    return solution if verdict is None else _with_verdict(solution, verdict, settings)
+    seconds["cameras"] += learning
+    seconds["initialise"] += time.perf_counter() - began - learning
+    return start
 
 
 def _with_verdict(solution: Solution, verdict: IsometricVerdict, settings: Settings) -> Solution:

@@ -3,7 +3,8 @@
 Given cameras, prior and translations, points are coupled by the bending of the surface alone, whose influence decays over some rings of
 the mesh. A block therefore needs its surroundings only: overlapping blocks solved once (Toselli and Widlund, Domain
 Decomposition Methods, 2005, chapter 1). Memory beyond the tracks and the result is that of one block. Frames are not centred within
-blocks but at the end, over all points, and translations are those of the cameras.
+blocks but at the end, over all points, and translations are those of the cameras. What belongs to the whole object is computed once: the
+weight of bending from patches all over the surface, and the changes by what cameras and prior were learned from.
 """
 
 from __future__ import annotations
@@ -19,13 +20,15 @@ from pliant.solver.mesh import Mesh
 from pliant.solver.monitor import Monitor
 from pliant.solver.reconstruction.cameras import Cameras
 from pliant.solver.reconstruction.observations import monitored
-from pliant.solver.reconstruction.prior import Prior
+from pliant.solver.reconstruction.prior import Prior, estimate_with
 from pliant.solver.reconstruction.shapes import shapes_from
-from pliant.solver.reconstruction.start import prepared, with_outlier_reason, with_outliers_rejected
+from pliant.solver.reconstruction.start import Start, prepared, with_outlier_reason, with_outliers_rejected
 from pliant.solver.records import Floats, Ints, Step, Tracks, read_only
 from pliant.solver.settings import Settings
+from pliant.solver.shapes.jackknife import Changes, learning_changes
 from pliant.solver.shapes.sparsely_observed import mesh_of
 from pliant.solver.solution import Outcome, Solution, Trace
+from pliant.solver.tracks.frame_selection import evenly_spread
 
 MARGIN = 16
 """Rings of neighbours around a block. Shapes of a face of 4,000 points in four blocks differ from those solved at once by .0034, .0019 and
@@ -33,6 +36,10 @@ MARGIN = 16
 
 JUDGED_POINTS = 20_000
 """Points, evenly spread, by which the whole result is judged."""
+
+PATCHES, PATCH_RINGS = 64, 8
+"""Number of patches that the weight of bending is taken from, evenly spread over the points, and rings of neighbours in each: about
+18,000 points. The starting shapes, which it is computed from, depend on single points alone, so patches have those of the whole."""
 
 
 def needs_blocks(tracks: Tracks, settings: Settings) -> bool:
@@ -54,46 +61,96 @@ def shapes_in_blocks(
     """Return the solution of all points; `seconds` are those of the stages so far."""
     began, whole = time.perf_counter(), _Whole(tracks)
     groups = blocks(tracks, -(-tracks.num_frames * tracks.num_points // BLOCK_OBSERVATIONS))
+    edges = np.zeros((0, 2), dtype=np.int32) if mesh is None else mesh.edges
+    bending = _bending(tracks, cameras, prior, mesh, edges, settings, monitor)
+    changes = _changes(cameras, prior, monitor)
     for number, own in enumerate(groups):
-        kept = with_margin(own, mesh, tracks.num_points)
-        part = Tracks.from_arrays(tracks.points[:, kept], tracks.visible[:, kept])
+        kept = with_margin(own, edges, tracks.num_points)
+        part, surface = _part(tracks, kept), None if mesh is None else mesh_of(mesh, kept)
         inner = _monitor_of(part, settings, monitor, number, len(groups))
-        start = prepared(
-            part,
-            cameras,
-            prior,
-            None if mesh is None else mesh_of(mesh, kept),
-            settings,
-            moving=False,
-            should_stop=inner,
+        solution = shapes_from(
+            _start_of(part, cameras, prior, surface, settings, inner, bending), inner, seconds={}, changes=changes
         )
-        start = with_outlier_reason(with_outliers_rejected(start, inner))
-        solution = shapes_from(start, inner, seconds={})
-        if settings.spatial_weight is None:  # one bending weight for all blocks
-            settings = replace(settings, spatial_weight=solution.choices.spatial_weight)
         whole.add(solution, own, np.searchsorted(kept, own))
+        del part, surface, solution  # before the next block
     solution = whole.solution(seconds={**seconds, "shapes": time.perf_counter() - began, "finish": 0.0})
     monitor.report(Step("finish", 1.0, objective=float(solution.trace.objective[-1])))
     return solution
 
 
+def _part(tracks: Tracks, kept: NDArray[np.intp]) -> Tracks:
+    return Tracks.from_arrays(tracks.points[:, kept], tracks.visible[:, kept])
+
+
+def _start_of(
+    part: Tracks,
+    cameras: Cameras,
+    prior: Prior | None,
+    mesh: Mesh | None,
+    settings: Settings,
+    monitor: Monitor,
+    bending: float | None,
+) -> Start:
+    """Return the start of some of the points, without gross outliers."""
+    start = prepared(part, cameras, prior, mesh, settings, moving=False, bending=bending, should_stop=monitor)
+    return with_outlier_reason(with_outliers_rejected(start, monitor))
+
+
+def _bending(
+    tracks: Tracks,
+    cameras: Cameras,
+    prior: Prior | None,
+    mesh: Mesh | None,
+    edges: Ints,
+    settings: Settings,
+    monitor: Monitor,
+) -> float | None:
+    """Return λ2 for all blocks, from patches of the surface; None where no block estimates it."""
+    if mesh is None or prior is None or settings.spatial_weight is not None:
+        return None
+    seeds = evenly_spread(tracks.num_points, PATCHES)
+    kept = with_margin(seeds, edges, tracks.num_points, rings=PATCH_RINGS)
+    patches = _part(tracks, kept)
+    start = prepared(patches, cameras, prior, mesh_of(mesh, kept), settings, moving=False, should_stop=monitor)
+    return start.choices.spatial_weight
+
+
+def _changes(cameras: Cameras, prior: Prior | None, monitor: Monitor) -> Changes | None:
+    """Return the changes that every block takes its own from; None without a learned prior."""
+    if prior is None:
+        return None
+    turning = cameras.observations.turning
+    return learning_changes(estimate_with(cameras, prior), prior.normalized, turning=turning, should_stop=monitor)
+
+
 def blocks(tracks: Tracks, count: int) -> list[NDArray[np.intp]]:
-    """Return the sorted indices of the points of each block: strips of equal numbers of points across the longer side of the picture."""
+    """Return the sorted indices of the points of each block, as many in each as in the others but for one.
+
+    The points are divided across the longer side of their mean positions in the picture, then each part again, so that blocks are about as
+    wide as high and have short borders.
+    """
     total = np.maximum(tracks.visible.sum(axis=0), np.finfo(float).tiny)
     mean = np.einsum("fp,fpc->pc", tracks.visible, tracks.points) / total[:, None]
-    along = mean[:, int(np.argmax(np.ptp(mean, axis=0)))]
-    return [np.sort(part) for part in np.array_split(np.argsort(along, kind="stable"), count)]
+    return [np.sort(part) for part in _divided(np.arange(tracks.num_points), mean, count)]
 
 
-def with_margin(own: NDArray[np.intp], mesh: Mesh | None, num_points: int) -> NDArray[np.intp]:
-    """Return the points of a block and of `MARGIN` rings around it, sorted."""
+def _divided(points: NDArray[np.intp], mean: Floats, count: int) -> list[NDArray[np.intp]]:
+    if count <= 1:
+        return [points]
+    own, first = mean[points], count // 2
+    along = own[:, int(np.argmax(np.ptp(own, axis=0)))]
+    ordered, cut = points[np.argsort(along, kind="stable")], round(len(points) * first / count)
+    return _divided(ordered[:cut], mean, first) + _divided(ordered[cut:], mean, count - first)
+
+
+def with_margin(own: NDArray[np.intp], edges: Ints, num_points: int, *, rings: int | None = None) -> NDArray[np.intp]:
+    """Return the points of a block and of `rings`, by default `MARGIN`, rings of neighbours around it, sorted."""
     inside = np.zeros(num_points, dtype=bool)
     inside[own] = True
-    if mesh is not None:
-        one, two = mesh.edges.T
-        for _ in range(MARGIN):
-            reached = one[inside[two]], two[inside[one]]
-            inside[reached[0]] = inside[reached[1]] = True
+    one, two = edges.T
+    for _ in range(MARGIN if rings is None else rings):
+        reached = one[inside[two]], two[inside[one]]
+        inside[reached[0]] = inside[reached[1]] = True
     return np.flatnonzero(inside)
 
 

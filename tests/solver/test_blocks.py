@@ -78,7 +78,7 @@ def test_a_stop_between_blocks_leaves_a_result(film: gallery.Sequence) -> None:
     assert np.isfinite(solution.shapes).all()
 
 
-def test_blocks_are_equal_strips_of_all_points(film: gallery.Sequence) -> None:
+def test_blocks_are_equal_parts_of_all_points(film: gallery.Sequence) -> None:
     parts = blocks.blocks(film.tracks, 4)
     assert np.array_equal(np.sort(np.concatenate(parts)), np.arange(POINTS))
     assert {len(part) for part in parts} == {POINTS // 4}
@@ -87,10 +87,10 @@ def test_blocks_are_equal_strips_of_all_points(film: gallery.Sequence) -> None:
 def test_a_margin_has_as_many_rings_as_asked(monkeypatch: pytest.MonkeyPatch, film: gallery.Sequence) -> None:
     own = np.array([450])
     monkeypatch.setattr(blocks, "MARGIN", 1)
-    near = blocks.with_margin(own, film.mesh, POINTS)
+    near = blocks.with_margin(own, film.mesh.edges, POINTS)
     beside = film.mesh.edges[(film.mesh.edges == 450).any(axis=1)]
     assert set(near.tolist()) == set(beside.ravel().tolist())
-    assert blocks.with_margin(own, None, POINTS).tolist() == [450]
+    assert blocks.with_margin(own, np.zeros((0, 2), dtype=np.int32), POINTS).tolist() == [450]
     assert mesh_of(film.mesh, near).num_points == len(near)
 
 
