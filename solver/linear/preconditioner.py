@@ -75,7 +75,6 @@ def build_preconditioner(operator: Operator) -> Linear:
 
 def _in_single_precision(inverse: Linear) -> Linear:
     """Return the inverse for residuals of any precision: a preconditioner needs few digits, and half the memory traffic."""
-
     spare: list[Array] = []  # allocated once: touching new memory takes as long as the conversion
 
     def apply(r: Array, /, out: Array | None = None) -> Array:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,7 @@ from pliant.solver.settings import Settings
 from pliant.solver.shapes.jackknife import Changes, learning_changes
 from pliant.solver.shapes.sparsely_observed import mesh_of
 from pliant.solver.solution import Outcome, Solution, Trace
+from pliant.solver.storage import allocated, let_go
 from pliant.solver.tracks.frame_selection import evenly_spread
 
 MARGIN = 16
@@ -57,9 +59,10 @@ def shapes_in_blocks(
     monitor: Monitor,
     *,
     seconds: dict[str, float],
+    scratch: str | Path | None = None,
 ) -> Solution:
-    """Return the solution of all points; `seconds` are those of the stages so far."""
-    began, whole = time.perf_counter(), _Whole(tracks)
+    """Return the solution of all points; `seconds` are those of the stages so far, `scratch` as for `solve`."""
+    began, whole = time.perf_counter(), _Whole(tracks, scratch)
     groups = blocks(tracks, -(-tracks.num_frames * tracks.num_points // BLOCK_OBSERVATIONS))
     edges = np.zeros((0, 2), dtype=np.int32) if mesh is None else mesh.edges
     bending = _bending(tracks, cameras, prior, mesh, edges, settings, monitor)
@@ -158,6 +161,8 @@ def _monitor_of(part: Tracks, settings: Settings, monitor: Monitor, number: int,
     """Return the monitor of one block, whose steps are reported as those of the whole."""
 
     def on_step(step: Step) -> None:
+        if step.stage == "cameras":  # those of all blocks are known
+            step = replace(step, stage="initialise")
         if step.stage != "finish" or step.fraction < 1:
             monitor.report_block(step, (number + step.fraction) / count)
 
@@ -167,10 +172,10 @@ def _monitor_of(part: Tracks, settings: Settings, monitor: Monitor, number: int,
 class _Whole:
     """The result, filled block by block."""
 
-    def __init__(self, tracks: Tracks) -> None:
+    def __init__(self, tracks: Tracks, scratch: str | Path | None) -> None:
         frames, points = tracks.num_frames, tracks.num_points
-        self._tracks = tracks
-        self._shapes = np.zeros((frames, points, 3))
+        self._tracks, self._scratch = tracks, scratch
+        self._shapes = allocated((frames, points, 3), scratch)
         self._others: dict[str, Floats] = {}
         self._parts: list[Solution] = []
 
@@ -180,8 +185,10 @@ class _Whole:
         for name in ("residuals", "weights", "shapes_std", "inlier_probability"):
             array = getattr(solution, name)
             if array is not None:
-                target = self._others.setdefault(name, np.zeros(self._shapes.shape[:2]))
-                target[:, own] = array[:, places]
+                if name not in self._others:
+                    self._others[name] = allocated(self._shapes.shape[:2], self._scratch)
+                self._others[name][:, own] = array[:, places]
+        let_go(self._shapes, *self._others.values(), self._tracks.points, self._tracks.visible)
         none = np.zeros((0, 0))
         self._parts.append(
             replace(
@@ -198,12 +205,14 @@ class _Whole:
         """Return the solution of all points, centred per frame where the cameras are orthographic."""
         first, camera = self._parts[0], self._parts[0].camera
         if camera.focal is None:
-            middle = self._shapes.mean(axis=1)
-            self._shapes -= middle[:, None]
+            middle = np.stack([shape.mean(axis=0) for shape in self._shapes])
+            for shape, mean in zip(self._shapes, middle, strict=True):
+                shape -= mean
             moved = camera.scales[:, None] * np.einsum("fij,fj->fi", camera.rotations[:, :2], middle)
             camera = replace(camera, translations=camera.translations + moved)
         for array in (self._shapes, camera.translations, *self._others.values()):
             read_only(array)
+        let_go(self._shapes)
         order = (Outcome.STOPPED, Outcome.REJECTED, Outcome.MAX_REWEIGHTINGS, Outcome.CONVERGED)
         found = {part.outcome for part in self._parts}
         solution = replace(

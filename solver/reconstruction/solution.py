@@ -27,7 +27,7 @@ def finish(
     state, unit = history[-1], normalized.unit
     top = largest_weight(problem.loss, problem.weights.robust_scale)
     frames, _, points = state.shapes.shape
-    shapes, residual, trust = np.empty((frames, points, 3)), np.empty((frames, points)), np.empty((frames, points))
+    shapes, residual, trust = np.zeros((frames, points, 3)), np.zeros((frames, points)), np.zeros((frames, points))
     for some in frame_chunks(frames, points):
         seen = normalized.visible[some] > 0
         left = np.stack([residuals_of(problem, state.shapes, state.translations, f) for f in range(frames)[some]])
