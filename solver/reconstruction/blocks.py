@@ -32,9 +32,10 @@ from pliant.solver.solution import Outcome, Solution, Trace
 from pliant.solver.storage import allocated, let_go
 from pliant.solver.tracks.frame_selection import evenly_spread
 
-MARGIN = 16
-"""Rings of neighbours around a block. Shapes of a face of 4,000 points in four blocks differ from those solved at once by .0034, .0019 and
-.0020 of its size (RMS) with 2, 8 and 16 rings, with the smooth prior by .0052, .0035 and .0018."""
+MARGIN = 4
+"""Rings of neighbours around a block. Shapes of a face of 20 × 4,000 in four blocks differ from those solved at once by .0011, .0010, .0010
+and .0010 of its size (RMS) with 2, 4, 8 and 16 rings, with the smooth prior by .0032, .0031, .0032 and .0033; of 20 × 20,000 by .0003 and
+.0033 with any of them. What is left comes from where the reweightings end."""
 
 JUDGED_POINTS = 20_000
 """Points, evenly spread, by which the whole result is judged."""
