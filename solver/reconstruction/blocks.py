@@ -4,7 +4,7 @@ Given cameras, prior and translations, points are coupled by the bending of the 
 the mesh. A block therefore needs its surroundings only: overlapping blocks solved once (Toselli and Widlund, Domain
 Decomposition Methods, 2005, chapter 1). Memory beyond the tracks and the result is that of one block. Frames are not centred within
 blocks but at the end, over all points, and translations are those of the cameras. What belongs to the whole object is computed once: the
-weight of bending from patches all over the surface, and the changes by what cameras and prior were learned from.
+weight of bending, and the changes by what cameras and prior were learned from.
 """
 
 from __future__ import annotations
@@ -30,7 +30,6 @@ from pliant.solver.shapes.jackknife import Changes, learning_changes
 from pliant.solver.shapes.sparsely_observed import mesh_of
 from pliant.solver.solution import Outcome, Solution, Trace
 from pliant.solver.storage import allocated, let_go
-from pliant.solver.tracks.frame_selection import evenly_spread
 
 MARGIN = 4
 """Rings of neighbours around a block. Shapes of a face of 20 × 4,000 in four blocks differ from those solved at once by .0011, .0010, .0010
@@ -40,9 +39,8 @@ and .0010 of its size (RMS) with 2, 4, 8 and 16 rings, with the smooth prior by 
 JUDGED_POINTS = 20_000
 """Points, evenly spread, by which the whole result is judged."""
 
-PATCHES, PATCH_RINGS = 64, 8
-"""Number of patches that the weight of bending is taken from, evenly spread over the points, and rings of neighbours in each: about
-18,000 points. The starting shapes, which it is computed from, depend on single points alone, so patches have those of the whole."""
+START_SHARE = 0.07
+"""Share of the time that the starts take from which the weight of bending is computed; measured on 50 × 200,000."""
 
 
 def needs_blocks(tracks: Tracks, settings: Settings) -> bool:
@@ -66,7 +64,7 @@ def shapes_in_blocks(
     began, whole = time.perf_counter(), _Whole(tracks, scratch)
     groups = blocks(tracks, -(-tracks.num_frames * tracks.num_points // BLOCK_OBSERVATIONS))
     edges = np.zeros((0, 2), dtype=np.int32) if mesh is None else mesh.edges
-    bending = _bending(tracks, cameras, prior, mesh, edges, settings, monitor)
+    bending = _bending(tracks, cameras, prior, mesh, groups, settings, monitor)
     changes = _changes(cameras, prior, monitor)
     for number, own in enumerate(groups):
         kept = with_margin(own, edges, tracks.num_points)
@@ -105,18 +103,28 @@ def _bending(
     cameras: Cameras,
     prior: Prior | None,
     mesh: Mesh | None,
-    edges: Ints,
+    groups: list[NDArray[np.intp]],
     settings: Settings,
     monitor: Monitor,
 ) -> float | None:
-    """Return λ2 for all blocks, from patches of the surface; None where no block estimates it."""
+    """Return λ2 of the whole surface, from the starts of all blocks; None where no block estimates it.
+
+    It is the inverse of a mean over the points, to which few sharp features contribute most: a sample of them would not do.
+    """
     if mesh is None or prior is None or settings.spatial_weight is not None:
         return None
-    seeds = evenly_spread(tracks.num_points, PATCHES)
-    kept = with_margin(seeds, edges, tracks.num_points, rings=PATCH_RINGS)
-    patches = _part(tracks, kept)
-    start = prepared(patches, cameras, prior, mesh_of(mesh, kept), settings, moving=False, should_stop=monitor)
-    return start.choices.spatial_weight
+    total = 0.0
+    for number, own in enumerate(groups):
+        part, surface = _part(tracks, own), mesh_of(mesh, own)
+        weight = prepared(
+            part, cameras, prior, surface, settings, moving=False, should_stop=monitor
+        ).problem.weights.spatial
+        if monitor.stopped or not weight > 0:
+            return None
+        total += len(own) / weight
+        monitor.report_block(Step("initialise", 0.0), START_SHARE * (number + 1) / len(groups))
+        let_go(tracks.points, tracks.visible)
+    return tracks.num_points / total
 
 
 def _changes(cameras: Cameras, prior: Prior | None, monitor: Monitor) -> Changes | None:
@@ -147,12 +155,12 @@ def _divided(points: NDArray[np.intp], mean: Floats, count: int) -> list[NDArray
     return _divided(ordered[:cut], mean, first) + _divided(ordered[cut:], mean, count - first)
 
 
-def with_margin(own: NDArray[np.intp], edges: Ints, num_points: int, *, rings: int | None = None) -> NDArray[np.intp]:
-    """Return the points of a block and of `rings`, by default `MARGIN`, rings of neighbours around it, sorted."""
+def with_margin(own: NDArray[np.intp], edges: Ints, num_points: int) -> NDArray[np.intp]:
+    """Return the points of a block and of `MARGIN` rings of neighbours around it, sorted."""
     inside = np.zeros(num_points, dtype=bool)
     inside[own] = True
     one, two = edges.T
-    for _ in range(MARGIN if rings is None else rings):
+    for _ in range(MARGIN):
         reached = one[inside[two]], two[inside[one]]
         inside[reached[0]] = inside[reached[1]] = True
     return np.flatnonzero(inside)
@@ -165,7 +173,7 @@ def _monitor_of(part: Tracks, settings: Settings, monitor: Monitor, number: int,
         if step.stage == "cameras":  # those of all blocks are known
             step = replace(step, stage="initialise")
         if step.stage != "finish" or step.fraction < 1:
-            monitor.report_block(step, (number + step.fraction) / count)
+            monitor.report_block(step, START_SHARE + (1 - START_SHARE) * (number + step.fraction) / count)
 
     return monitored(part, None, settings, on_step, monitor, only=("shapes", "trust"))
 
