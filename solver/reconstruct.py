@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +38,7 @@ def solve(
     settings: Settings | None = None,
     on_step: Callable[[Step], None] | None = None,
     should_stop: Callable[[], bool] | None = None,
+    scratch: str | Path | None = None,
 ) -> Solution:
     """Reconstruct a shape for every frame.
 
@@ -54,6 +56,9 @@ def solve(
         Called after every unit of work.
     should_stop : callable, optional
         Called between units of work; once it returns True, the solve ends with `Outcome.STOPPED` and the last shapes.
+    scratch : path, optional
+        Folder for a temporary file that holds the result where the shapes are solved in blocks of points, beyond
+        `limits.BLOCK_OBSERVATIONS`; None holds it in memory. The file vanishes with the result.
 
     Raises
     ------
@@ -63,6 +68,8 @@ def solve(
         The settings ask for what the mesh does not have.
     NotFinite
         The arithmetic overflowed.
+    OSError
+        The folder `scratch` is missing, cannot be written to, or has too little space.
     """
     settings = settings if settings is not None else Settings()
     check_fit(tracks, mesh, cameras)
@@ -70,10 +77,10 @@ def solve(
     sheet = tries_isometry(cameras, settings)
     monitor = monitored(tracks, cameras, settings, on_step, should_stop, sheet=sheet)
     if settings.order == "film":
-        return _with_reason(_solved(tracks, mesh, cameras, settings, monitor), why)
+        return _with_reason(_solved(tracks, mesh, cameras, settings, monitor, scratch), why)
     order = content_order(differences(tracks))
     moved, cameras = in_order(tracks, cameras, order)
-    return _with_reason(as_they_came(_solved(moved, mesh, cameras, settings, monitor), order), why)
+    return _with_reason(as_they_came(_solved(moved, mesh, cameras, settings, monitor, scratch), order), why)
 
 
 def _with_reason(solution: Solution, why: str) -> Solution:
@@ -82,7 +89,12 @@ def _with_reason(solution: Solution, why: str) -> Solution:
 
 
 def _solved(
-    tracks: Tracks, mesh: Mesh | None, known: KnownCamera | None, settings: Settings, monitor: Monitor
+    tracks: Tracks,
+    mesh: Mesh | None,
+    known: KnownCamera | None,
+    settings: Settings,
+    monitor: Monitor,
+    scratch: str | Path | None,
 ) -> Solution:
     """Solve frames in the order that they have; with `order` `any` no prior compares neighbours."""
     began = time.perf_counter()
@@ -92,20 +104,40 @@ def _solved(
         return solution_of(tracks, verdict, settings, monitor, began=began)
     cameras, prior = _learned(observations, monitor)
     monitor.report(Step("cameras", 0.0, max_reweightings=settings.max_reweightings))
-    learning, began = time.perf_counter() - began, time.perf_counter()
+    learning = time.perf_counter() - began
     if needs_blocks(tracks, settings):
-        solution = shapes_in_blocks(tracks, cameras, prior, mesh, settings, monitor, seconds={"cameras": learning})
+        observations = observations.without_points()
+        cameras = replace(cameras, observations=observations)  # blocks take their points from the tracks
+        solution = shapes_in_blocks(
+            tracks, cameras, prior, mesh, settings, monitor, seconds={"cameras": learning}, scratch=scratch
+        )
         return solution if verdict is None else _with_verdict(solution, verdict, settings)
+    seconds = {"cameras": learning, "initialise": 0.0}
+    solution = shapes_from(_started(tracks, cameras, prior, mesh, settings, monitor, seconds), monitor, seconds=seconds)
+    return solution if verdict is None else _with_verdict(solution, verdict, settings)
+
+
+def _started(
+    tracks: Tracks,
+    cameras: Cameras,
+    prior: Prior | None,
+    mesh: Mesh | None,
+    settings: Settings,
+    monitor: Monitor,
+    seconds: dict[str, float],
+) -> Start:
+    """Return the start of the shapes, without gross outliers; its time is added to `seconds`."""
     monitor.enter("start")
+    began, learning = time.perf_counter(), 0.0
     start = with_outliers_rejected(prepared(tracks, cameras, prior, mesh, settings, should_stop=monitor), monitor)
     if start.rejected().any() and not monitor():
         again = time.perf_counter()
         start = _started_again(start, cameras, monitor)
-        learning, began = learning + time.perf_counter() - again, began + time.perf_counter() - again
+        learning = time.perf_counter() - again
     start = with_outlier_reason(start)
-    seconds = {"cameras": learning, "initialise": time.perf_counter() - began}
-    solution = shapes_from(start, monitor, seconds=seconds)
-    return solution if verdict is None else _with_verdict(solution, verdict, settings)
+    seconds["cameras"] += learning
+    seconds["initialise"] += time.perf_counter() - began - learning
+    return start
 
 
 def _with_verdict(solution: Solution, verdict: IsometricVerdict, settings: Settings) -> Solution:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pliant.solver.errors import shape_text, wrong_input
+from pliant.solver.limits import frame_chunks
+from pliant.solver.storage import allocated, let_go
 
 MIN_FRAMES = 3
 MIN_POINTS = 4
@@ -33,7 +36,9 @@ class Tracks:
     """Confidence in [0, 1] that the point is visible, shape `(F, P)`; 0 means hidden."""
 
     @classmethod
-    def from_arrays(cls, points: ArrayLike, visible: ArrayLike | None = None) -> Tracks:
+    def from_arrays(
+        cls, points: ArrayLike, visible: ArrayLike | None = None, *, scratch: str | Path | None = None
+    ) -> Tracks:
         """Validate and copy arrays.
 
         Parameters
@@ -42,9 +47,14 @@ class Tracks:
             NaN or infinity in either coordinate marks the observation as hidden.
         visible : array_like, shape (F, P), optional
             Bool or confidence in [0, 1].
+        scratch : path, optional
+            Folder for temporary files that hold the copies; None holds them in memory. With it, and with arrays that are
+            memory-mapped themselves (`numpy.load(path, mmap_mode="r")`), tracks may be larger than the memory.
 
         Raises
         ------
+        OSError
+            The folder `scratch` is missing, cannot be written to, or has too little space.
         InvalidInput
             Wrong shape or type, F < 3, P < 4, confidence outside [0, 1], or nothing visible.
         """
@@ -66,15 +76,18 @@ class Tracks:
             raise wrong_input(
                 "tracks", "too_few_points", f"at least {MIN_POINTS} points", f"{count}", "Track more points."
             )
-        positions = np.array(given, dtype=np.float64, order="C")  # results must not depend on the memory layout
-        confidence = _confidence(visible, (frames, count))
-        confidence[~np.isfinite(positions).all(axis=2)] = 0.0
-        if not confidence.any():
+        positions = allocated((frames, count, 2), scratch)  # in C order: results must not depend on the memory layout
+        confidence = _confidence(visible, (frames, count), scratch)
+        for some in frame_chunks(frames, count):
+            positions[some] = given[some]
+            confidence[some][~np.isfinite(positions[some]).all(axis=2)] = 0.0
+            positions[some][confidence[some] == 0] = 0.0
+        if not any(confidence[some].any() for some in frame_chunks(frames, count)):
             raise wrong_input(
                 "tracks", "nothing_visible", "at least one finite, visible observation", "none",
                 "Check for NaN everywhere, or a visibility array that is inverted.",
             )  # fmt: skip
-        positions[confidence == 0] = 0.0
+        let_go(positions, confidence)
         read_only(positions)
         read_only(confidence)
         return cls(positions, confidence)
@@ -295,9 +308,11 @@ def _positive_scales(scales: ArrayLike, frames: int) -> Floats:
     return factors
 
 
-def _confidence(visible: ArrayLike | None, shape: tuple[int, int]) -> Floats:
+def _confidence(visible: ArrayLike | None, shape: tuple[int, int], scratch: str | Path | None) -> Floats:
+    confidence = allocated(shape, scratch)
     if visible is None:
-        return np.ones(shape)
+        confidence[...] = 1.0
+        return confidence
     given = np.asarray(visible)
     if given.dtype.kind not in "bfiu":
         raise wrong_input(
@@ -307,7 +322,7 @@ def _confidence(visible: ArrayLike | None, shape: tuple[int, int]) -> Floats:
         raise wrong_input(
             "visibility", "wrong_shape", str(shape), shape_text(given), "Visibility is (frames, points), as the tracks."
         )
-    confidence = np.array(given, dtype=np.float64, order="C")
+    confidence[...] = given
     if not np.isfinite(confidence).all() or confidence.min() < 0 or confidence.max() > 1:
         raise wrong_input(
             "visibility", "out_of_range", "values from 0 to 1", f"values from {confidence.min():.3g} to {confidence.max():.3g}",

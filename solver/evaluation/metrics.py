@@ -31,6 +31,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pliant.solver.errors import InvalidInput
 from pliant.solver.evaluation.alignment import Aligned, Kind, align, procrustes
+from pliant.solver.limits import frame_chunks
 from pliant.solver.model.so3 import MIRROR
 from pliant.solver.records import Camera, Floats, Tracks
 from pliant.solver.solution import Solution
@@ -132,7 +133,10 @@ def reprojection(tracks: Tracks, solution: Solution) -> Reprojection:
     Recomputed from shapes and camera, independently of `Solution.residuals`. Frames and points that are never visible do
     not count; `Tracks` guarantees at least one visible observation.
     """
-    squared = np.square(tracks.points - solution.camera.project(solution.shapes)).sum(axis=2)
+    squared = np.zeros_like(tracks.visible)
+    for some in frame_chunks(*squared.shape):
+        image = solution.camera.at(some).project(solution.shapes[some])
+        squared[some] = np.square(tracks.points[some] - image).sum(axis=2)
     median = np.median(np.sqrt(squared[tracks.visible > 0]))
     return Reprojection(float(median), float(np.sqrt(np.average(squared, weights=tracks.visible))))
 

@@ -41,6 +41,7 @@ def conjugate_gradient(
     max_iterations: int,
     negligible: float = 0.0,
     should_stop: Callable[[], bool] | None = None,
+    overwrite_b: bool = False,
 ) -> Solved:
     """Solve 𝒜 x = b, starting from 0, for a symmetric positive (semi)definite 𝒜.
 
@@ -50,13 +51,14 @@ def conjugate_gradient(
     iteration; once it returns True in an iteration, x so far is returned.
     Saad, Iterative Methods for Sparse Linear Systems (2003), algorithm 9.1.
 
-    Five arrays of the size of x are allocated once and reused; allocating them in every iteration would cost more in
-    page faults than in arithmetic.
+    Four arrays of the size of x are allocated once and reused; allocating them in every iteration would cost more in
+    page faults than in arithmetic. With `overwrite_b` b itself becomes one of them. 𝒜 times the direction and the
+    preconditioned residual are never needed at once, so they share one.
     """
-    x, residual, image = np.zeros_like(b), b.copy(), np.empty_like(b)
+    x, residual, spare = np.zeros_like(b), b if overwrite_b else b.copy(), np.empty_like(b)
     if should_stop is not None:
         should_stop()  # for its progress: first touching gigabytes of memory takes as long as an iteration
-    z = precondition(residual)
+    z = precondition(residual, out=spare)
     direction = np.empty_like(b)
     direction[...] = z
     first = rz = dot(residual, z)
@@ -65,13 +67,13 @@ def conjugate_gradient(
     while done < max_iterations and rz > enough:
         if should_stop is not None and should_stop():
             break
-        image = apply(direction, out=image)
+        image = apply(direction, out=spare)
         curvature = dot(direction, image)
         if not curvature > 0:  # null direction: no further decrease along it
             break
         decrease += rz * (rz / curvature)
         _advance(rz / curvature, direction, image, x=x, residual=residual)
-        z = precondition(residual, out=z)
+        z = precondition(residual, out=spare)
         before, rz = rz, dot(residual, z)
         _turn(rz / before, z, direction)
         done += 1

@@ -75,10 +75,15 @@ def build_preconditioner(operator: Operator) -> Linear:
 
 def _in_single_precision(inverse: Linear) -> Linear:
     """Return the inverse for residuals of any precision: a preconditioner needs few digits, and half the memory traffic."""
+    spare: list[Array] = []  # allocated once: touching new memory takes as long as the conversion
 
     def apply(r: Array, /, out: Array | None = None) -> Array:
         result = np.empty_like(r) if out is None else out
-        result[...] = inverse(r.astype(np.float32))
+        if not spare:
+            spare.extend(np.empty_like(r, dtype=np.float32) for _ in range(2))
+        rounded, found = spare
+        np.copyto(rounded, r, casting="same_kind")
+        result[...] = inverse(rounded, out=found)
         return result
 
     return apply

@@ -3,13 +3,15 @@
 Given cameras, prior and translations, points are coupled by the bending of the surface alone, whose influence decays over some rings of
 the mesh. A block therefore needs its surroundings only: overlapping blocks solved once (Toselli and Widlund, Domain
 Decomposition Methods, 2005, chapter 1). Memory beyond the tracks and the result is that of one block. Frames are not centred within
-blocks but at the end, over all points, and translations are those of the cameras.
+blocks but at the end, over all points, and translations are those of the cameras. What belongs to the whole object is computed once: the
+weight of bending, and the changes by what cameras and prior were learned from.
 """
 
 from __future__ import annotations
 
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,20 +21,26 @@ from pliant.solver.mesh import Mesh
 from pliant.solver.monitor import Monitor
 from pliant.solver.reconstruction.cameras import Cameras
 from pliant.solver.reconstruction.observations import monitored
-from pliant.solver.reconstruction.prior import Prior
+from pliant.solver.reconstruction.prior import Prior, estimate_with
 from pliant.solver.reconstruction.shapes import shapes_from
-from pliant.solver.reconstruction.start import prepared, with_outlier_reason, with_outliers_rejected
+from pliant.solver.reconstruction.start import Start, prepared, with_outlier_reason, with_outliers_rejected
 from pliant.solver.records import Floats, Ints, Step, Tracks, read_only
 from pliant.solver.settings import Settings
+from pliant.solver.shapes.jackknife import Changes, learning_changes
 from pliant.solver.shapes.sparsely_observed import mesh_of
 from pliant.solver.solution import Outcome, Solution, Trace
+from pliant.solver.storage import allocated, let_go
 
-MARGIN = 16
-"""Rings of neighbours around a block. Shapes of a face of 4,000 points in four blocks differ from those solved at once by .0034, .0019 and
-.0020 of its size (RMS) with 2, 8 and 16 rings, with the smooth prior by .0052, .0035 and .0018."""
+MARGIN = 4
+"""Rings of neighbours around a block. Shapes of a face of 20 × 4,000 in four blocks differ from those solved at once by .0011, .0010, .0010
+and .0010 of its size (RMS) with 2, 4, 8 and 16 rings, with the smooth prior by .0032, .0031, .0032 and .0033; of 20 × 20,000 by .0003 and
+.0033 with any of them. What is left comes from where the reweightings end."""
 
 JUDGED_POINTS = 20_000
 """Points, evenly spread, by which the whole result is judged."""
+
+START_SHARE = 0.07
+"""Share of the time that the starts take from which the weight of bending is computed; measured on 50 × 200,000."""
 
 
 def needs_blocks(tracks: Tracks, settings: Settings) -> bool:
@@ -50,50 +58,111 @@ def shapes_in_blocks(
     monitor: Monitor,
     *,
     seconds: dict[str, float],
+    scratch: str | Path | None = None,
 ) -> Solution:
-    """Return the solution of all points; `seconds` are those of the stages so far."""
-    began, whole = time.perf_counter(), _Whole(tracks)
+    """Return the solution of all points; `seconds` are those of the stages so far, `scratch` as for `solve`."""
+    began, whole = time.perf_counter(), _Whole(tracks, scratch)
     groups = blocks(tracks, -(-tracks.num_frames * tracks.num_points // BLOCK_OBSERVATIONS))
+    edges = np.zeros((0, 2), dtype=np.int32) if mesh is None else mesh.edges
+    bending = _bending(tracks, cameras, prior, mesh, groups, settings, monitor)
+    changes = _changes(cameras, prior, monitor)
     for number, own in enumerate(groups):
-        kept = with_margin(own, mesh, tracks.num_points)
-        part = Tracks.from_arrays(tracks.points[:, kept], tracks.visible[:, kept])
+        kept = with_margin(own, edges, tracks.num_points)
+        part, surface = _part(tracks, kept), None if mesh is None else mesh_of(mesh, kept)
         inner = _monitor_of(part, settings, monitor, number, len(groups))
-        start = prepared(
-            part,
-            cameras,
-            prior,
-            None if mesh is None else mesh_of(mesh, kept),
-            settings,
-            moving=False,
-            should_stop=inner,
+        solution = shapes_from(
+            _start_of(part, cameras, prior, surface, settings, inner, bending), inner, seconds={}, changes=changes
         )
-        start = with_outlier_reason(with_outliers_rejected(start, inner))
-        solution = shapes_from(start, inner, seconds={})
-        if settings.spatial_weight is None:  # one bending weight for all blocks
-            settings = replace(settings, spatial_weight=solution.choices.spatial_weight)
         whole.add(solution, own, np.searchsorted(kept, own))
+        del part, surface, solution  # before the next block
     solution = whole.solution(seconds={**seconds, "shapes": time.perf_counter() - began, "finish": 0.0})
     monitor.report(Step("finish", 1.0, objective=float(solution.trace.objective[-1])))
     return solution
 
 
+def _part(tracks: Tracks, kept: NDArray[np.intp]) -> Tracks:
+    return Tracks.from_arrays(tracks.points[:, kept], tracks.visible[:, kept])
+
+
+def _start_of(
+    part: Tracks,
+    cameras: Cameras,
+    prior: Prior | None,
+    mesh: Mesh | None,
+    settings: Settings,
+    monitor: Monitor,
+    bending: float | None,
+) -> Start:
+    """Return the start of some of the points, without gross outliers."""
+    start = prepared(part, cameras, prior, mesh, settings, moving=False, bending=bending, should_stop=monitor)
+    return with_outlier_reason(with_outliers_rejected(start, monitor))
+
+
+def _bending(
+    tracks: Tracks,
+    cameras: Cameras,
+    prior: Prior | None,
+    mesh: Mesh | None,
+    groups: list[NDArray[np.intp]],
+    settings: Settings,
+    monitor: Monitor,
+) -> float | None:
+    """Return λ2 of the whole surface, from the starts of all blocks; None where no block estimates it.
+
+    It is the inverse of a mean over the points, to which few sharp features contribute most: a sample of them would not do.
+    """
+    if mesh is None or prior is None or settings.spatial_weight is not None:
+        return None
+    total = 0.0
+    for number, own in enumerate(groups):
+        part, surface = _part(tracks, own), mesh_of(mesh, own)
+        weight = prepared(
+            part, cameras, prior, surface, settings, moving=False, should_stop=monitor
+        ).problem.weights.spatial
+        if monitor.stopped or not weight > 0:
+            return None
+        total += len(own) / weight
+        monitor.report_block(Step("initialise", 0.0), START_SHARE * (number + 1) / len(groups))
+        let_go(tracks.points, tracks.visible)
+    return tracks.num_points / total
+
+
+def _changes(cameras: Cameras, prior: Prior | None, monitor: Monitor) -> Changes | None:
+    """Return the changes that every block takes its own from; None without a learned prior."""
+    if prior is None:
+        return None
+    turning = cameras.observations.turning
+    return learning_changes(estimate_with(cameras, prior), prior.normalized, turning=turning, should_stop=monitor)
+
+
 def blocks(tracks: Tracks, count: int) -> list[NDArray[np.intp]]:
-    """Return the sorted indices of the points of each block: strips of equal numbers of points across the longer side of the picture."""
+    """Return the sorted indices of the points of each block, as many in each as in the others but for one.
+
+    The points are divided across the longer side of their mean positions in the picture, then each part again, so that blocks are about as
+    wide as high and have short borders.
+    """
     total = np.maximum(tracks.visible.sum(axis=0), np.finfo(float).tiny)
     mean = np.einsum("fp,fpc->pc", tracks.visible, tracks.points) / total[:, None]
-    along = mean[:, int(np.argmax(np.ptp(mean, axis=0)))]
-    return [np.sort(part) for part in np.array_split(np.argsort(along, kind="stable"), count)]
+    return [np.sort(part) for part in _divided(np.arange(tracks.num_points), mean, count)]
 
 
-def with_margin(own: NDArray[np.intp], mesh: Mesh | None, num_points: int) -> NDArray[np.intp]:
-    """Return the points of a block and of `MARGIN` rings around it, sorted."""
+def _divided(points: NDArray[np.intp], mean: Floats, count: int) -> list[NDArray[np.intp]]:
+    if count <= 1:
+        return [points]
+    own, first = mean[points], count // 2
+    along = own[:, int(np.argmax(np.ptp(own, axis=0)))]
+    ordered, cut = points[np.argsort(along, kind="stable")], round(len(points) * first / count)
+    return _divided(ordered[:cut], mean, first) + _divided(ordered[cut:], mean, count - first)
+
+
+def with_margin(own: NDArray[np.intp], edges: Ints, num_points: int) -> NDArray[np.intp]:
+    """Return the points of a block and of `MARGIN` rings of neighbours around it, sorted."""
     inside = np.zeros(num_points, dtype=bool)
     inside[own] = True
-    if mesh is not None:
-        one, two = mesh.edges.T
-        for _ in range(MARGIN):
-            reached = one[inside[two]], two[inside[one]]
-            inside[reached[0]] = inside[reached[1]] = True
+    one, two = edges.T
+    for _ in range(MARGIN):
+        reached = one[inside[two]], two[inside[one]]
+        inside[reached[0]] = inside[reached[1]] = True
     return np.flatnonzero(inside)
 
 
@@ -101,8 +170,10 @@ def _monitor_of(part: Tracks, settings: Settings, monitor: Monitor, number: int,
     """Return the monitor of one block, whose steps are reported as those of the whole."""
 
     def on_step(step: Step) -> None:
+        if step.stage == "cameras":  # those of all blocks are known
+            step = replace(step, stage="initialise")
         if step.stage != "finish" or step.fraction < 1:
-            monitor.report_block(step, (number + step.fraction) / count)
+            monitor.report_block(step, START_SHARE + (1 - START_SHARE) * (number + step.fraction) / count)
 
     return monitored(part, None, settings, on_step, monitor, only=("shapes", "finish", "trust"))
 
@@ -110,10 +181,10 @@ def _monitor_of(part: Tracks, settings: Settings, monitor: Monitor, number: int,
 class _Whole:
     """The result, filled block by block."""
 
-    def __init__(self, tracks: Tracks) -> None:
+    def __init__(self, tracks: Tracks, scratch: str | Path | None) -> None:
         frames, points = tracks.num_frames, tracks.num_points
-        self._tracks = tracks
-        self._shapes = np.zeros((frames, points, 3))
+        self._tracks, self._scratch = tracks, scratch
+        self._shapes = allocated((frames, points, 3), scratch)
         self._others: dict[str, Floats] = {}
         self._parts: list[Solution] = []
 
@@ -123,8 +194,10 @@ class _Whole:
         for name in ("residuals", "weights", "shapes_std", "inlier_probability"):
             array = getattr(solution, name)
             if array is not None:
-                target = self._others.setdefault(name, np.zeros(self._shapes.shape[:2]))
-                target[:, own] = array[:, places]
+                if name not in self._others:
+                    self._others[name] = allocated(self._shapes.shape[:2], self._scratch)
+                self._others[name][:, own] = array[:, places]
+        let_go(self._shapes, *self._others.values(), self._tracks.points, self._tracks.visible)
         none = np.zeros((0, 0))
         self._parts.append(
             replace(
@@ -141,12 +214,14 @@ class _Whole:
         """Return the solution of all points, centred per frame where the cameras are orthographic."""
         first, camera = self._parts[0], self._parts[0].camera
         if camera.focal is None:
-            middle = self._shapes.mean(axis=1)
-            self._shapes -= middle[:, None]
+            middle = np.stack([shape.mean(axis=0) for shape in self._shapes])
+            for shape, mean in zip(self._shapes, middle, strict=True):
+                shape -= mean
             moved = camera.scales[:, None] * np.einsum("fij,fj->fi", camera.rotations[:, :2], middle)
             camera = replace(camera, translations=camera.translations + moved)
         for array in (self._shapes, camera.translations, *self._others.values()):
             read_only(array)
+        let_go(self._shapes)
         order = (Outcome.STOPPED, Outcome.REJECTED, Outcome.MAX_REWEIGHTINGS, Outcome.CONVERGED)
         found = {part.outcome for part in self._parts}
         solution = replace(

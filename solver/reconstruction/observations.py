@@ -63,6 +63,13 @@ class Observations:
         normalized = normalize(kept)
         return replace(self, normalized=normalized, lens=given_lens(self.tracks, normalized, self.settings, self.known))
 
+    def without_points(self) -> Observations:
+        """Return what the same tracks, or others of their frames, are normalized with, without the points themselves."""
+        frames = self.tracks.num_frames
+        return replace(
+            self, normalized=replace(self.normalized, points=np.zeros((frames, 0, 2)), visible=np.zeros((frames, 0)))
+        )
+
     def at(self, used: NDArray[np.intp]) -> Observations:
         """Return some of the frames, in the unit of all."""
         tracks = Tracks.from_arrays(self.tracks.points[used], self.tracks.visible[used])

@@ -21,6 +21,7 @@ from pliant.solver.settings import Settings
 from pliant.solver.shapes.assessment import assessed
 from pliant.solver.shapes.inliers import with_inlier_probability
 from pliant.solver.shapes.irls import init, no_higher, step, terminate
+from pliant.solver.shapes.jackknife import Changes
 from pliant.solver.shapes.perspective_shapes import corrected_again, seen_in_perspective
 from pliant.solver.shapes.setup import build_problem
 from pliant.solver.shapes.sparsely_observed import WELL_OBSERVED_SHARE, place_the_rest
@@ -82,7 +83,9 @@ def solve_shapes(
     begun = with_outlier_reason(with_outliers_rejected(begun, monitor))
     if start is not None:
         begun = _warm(begun, np.asarray(start.shapes if isinstance(start, Solution) else start, dtype=np.float64))
-    return shapes_from(begun, monitor, seconds={"initialise": time.perf_counter() - began})
+    seconds, starts = {"initialise": time.perf_counter() - began}, [begun]
+    del begun  # `shapes_from` has the only reference, and lets go of the first state
+    return shapes_from(starts.pop(), monitor, seconds=seconds)
 
 
 def _warm(start: Start, shapes: Floats) -> Start:
@@ -106,25 +109,28 @@ def _warm(start: Start, shapes: Floats) -> Start:
     return replace(start, state=init(problem, there, start.state.translations))
 
 
-def shapes_from(start: Start, monitor: Monitor, *, seconds: dict[str, float]) -> Solution:
-    """Return the solution that a start leads to; `seconds` are those of the stages so far."""
+def shapes_from(
+    start: Start, monitor: Monitor, *, seconds: dict[str, float], changes: Changes | None = None
+) -> Solution:
+    """Return the solution that a start leads to; `seconds` are those of the stages so far, `changes` as for `assessed`."""
     monitor.report(_step_of("initialise", start.state, start))
     began = time.perf_counter()
-    start, history, outcome = _minimised(start, monitor)
+    history, start = [start.state], replace(start, state=start.state.summary())  # no step keeps the arrays of the first
+    start, history, outcome = _minimised(start, history, monitor)
     start, history[-1] = _with_the_rest(start, history[-1])
     seconds = {**seconds, "shapes": time.perf_counter() - began}
     began = time.perf_counter()
-    solution = _finished(start, history, outcome, monitor)
+    solution = _finished(start, history, outcome, monitor, changes)
     monitor.report(_step_of("finish", history[-1], start, fraction=1.0))
     return replace(solution, seconds={**seconds, "finish": time.perf_counter() - began})
 
 
-def _minimised(start: Start, monitor: Monitor) -> tuple[Start, list[State], Outcome]:
+def _minimised(start: Start, history: list[State], monitor: Monitor) -> tuple[Start, list[State], Outcome]:
     """Return the start with its tracks corrected for perspective by the shapes found, the history, and how it ended."""
     view = start.estimate.perspective
     corrections = DEPTH_ROUNDS if view is not None and view.bends else 0
     monitor.expect_corrections(corrections)
-    history, outcome = _loop(start, [start.state], monitor)
+    history, outcome = _loop(start, history, monitor)
     for ahead in reversed(range(corrections)):
         if outcome is Outcome.STOPPED:
             break
@@ -179,7 +185,9 @@ def _with_the_rest(start: Start, state: State) -> tuple[Start, State]:
     return replace(start, problem=whole, choices=choices), state
 
 
-def _finished(start: Start, history: list[State], outcome: Outcome, monitor: Monitor) -> Solution:
+def _finished(
+    start: Start, history: list[State], outcome: Outcome, monitor: Monitor, changes: Changes | None
+) -> Solution:
     """Return the solution in the tracks' unit, with its standard deviations, probabilities and verdict."""
     observations, estimate, problem = start.observations, start.estimate, start.problem
     tracks, normalized = observations.tracks, observations.normalized
@@ -193,6 +201,7 @@ def _finished(start: Start, history: list[State], outcome: Outcome, monitor: Mon
     monitor.enter("finish")
     monitor()
     solution = finish(problem, history, outcome, normalized=normalized, estimate=estimate, choices=choices)
+    history[-1] = history[-1].summary()
     if estimate.perspective is not None:
         solution = seen_in_perspective(solution, tracks, estimate.perspective, normalized.unit, start.kept)
     confidence = np.asarray(problem.confidence, dtype=np.float64)
@@ -201,7 +210,7 @@ def _finished(start: Start, history: list[State], outcome: Outcome, monitor: Mon
     monitor.enter("trust")
     solution = assessed(
         solution, tracks, confidence, estimate, start.covariance, normalized.unit,
-        turning=observations.turning, seed=start.settings.seed, should_stop=monitor,
+        turning=observations.turning, seed=start.settings.seed, changes=changes, centred=problem.moving, should_stop=monitor,
     )  # fmt: skip
     return replace(solution, outcome=Outcome.STOPPED) if monitor.stopped else solution
 

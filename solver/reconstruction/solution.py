@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 from pliant.solver.cameras.estimation import CameraEstimate
-from pliant.solver.energy.objective import residuals
+from pliant.solver.energy.objective import residuals_of
 from pliant.solver.energy.problem import Problem
 from pliant.solver.energy.robust_loss import largest_weight
+from pliant.solver.limits import frame_chunks
 from pliant.solver.records import Camera, Choices, Floats, read_only
 from pliant.solver.shapes.state import State
 from pliant.solver.solution import Outcome, Solution, Trace
@@ -24,12 +25,16 @@ def finish(
 ) -> Solution:
     """Turn the last state into a Solution in the tracks' unit, with orthographic cameras."""
     state, unit = history[-1], normalized.unit
-    left = residuals(problem, state.shapes, state.translations).astype(np.float64)
-    seen = normalized.visible > 0
-    length = np.where(seen, np.hypot(left[:, 0], left[:, 1]), 0.0)
     top = largest_weight(problem.loss, problem.weights.robust_scale)
-    trust = np.where(seen, state.omega.mean(axis=1, dtype=np.float64) / top, 0.0)
-    shapes = (state.shapes.transpose(0, 2, 1).astype(np.float64) @ problem.axes.T) * unit
+    frames, _, points = state.shapes.shape
+    shapes, residual, trust = np.zeros((frames, points, 3)), np.zeros((frames, points)), np.zeros((frames, points))
+    for some in frame_chunks(frames, points):
+        seen = normalized.visible[some] > 0
+        left = np.stack([residuals_of(problem, state.shapes, state.translations, f) for f in range(frames)[some]])
+        left = left.astype(np.float64, copy=False)
+        residual[some] = unit * np.where(seen, np.hypot(left[:, 0], left[:, 1]), 0.0)
+        trust[some] = np.clip(np.where(seen, state.omega[some].mean(axis=1, dtype=np.float64) / top, 0.0), 0.0, 1.0)
+        shapes[some] = (state.shapes[some].transpose(0, 2, 1).astype(np.float64) @ problem.axes.T) * unit
     camera = Camera(
         np.array(estimate.rotations, dtype=np.float64),
         np.array(estimate.scales, dtype=np.float64),
@@ -40,8 +45,7 @@ def finish(
         unit * np.array([s.residual for s in history]),
         np.array([s.iterations for s in history], dtype=np.int32),
     )
-    residual = unit * length
     arrays: list[Floats] = [shapes, camera.rotations, camera.scales, camera.translations, residual, trust]
     for array in arrays:
         read_only(array)
-    return Solution(shapes, camera, residual, np.clip(trust, 0.0, 1.0), trace, outcome, choices, {})
+    return Solution(shapes, camera, residual, trust, trace, outcome, choices, {})

@@ -119,11 +119,12 @@ def prepared(
     settings: Settings | None,
     *,
     moving: bool = True,
+    bending: float | None = None,
     should_stop: ShouldStop | None = None,
 ) -> Start:
     """Return the start of the minimisation, with nothing rejected; once `should_stop` returns True, shapes that are less converged.
 
-    `moving` as in `Problem`.
+    `moving` as in `Problem`; `bending` is λ2 where the settings leave it automatic, None: from the first shapes.
 
     Raises
     ------
@@ -154,7 +155,10 @@ def prepared(
             got=f"{0 if covariance is None else len(covariance.modes)}", hint="Learn the prior from tracks of the same frames.",
         )  # fmt: skip
     flat = orthographic(observations.normalized, estimate.perspective)
-    return _begun(observations, mesh, settings, flat, estimate, covariance, cameras.outliers, moving, should_stop)
+    return _begun(
+        observations, mesh, settings, flat, estimate, covariance, cameras.outliers,
+        moving=moving, bending=bending, should_stop=should_stop,
+    )  # fmt: skip
 
 
 def _begun(
@@ -165,7 +169,9 @@ def _begun(
     estimate: CameraEstimate,
     covariance: ShapeCovariance | None,
     outliers: float,
+    *,
     moving: bool,
+    bending: float | None,
     should_stop: ShouldStop | None,
 ) -> Start:
     tick = should_stop if should_stop is not None else bool
@@ -181,7 +187,7 @@ def _begun(
     tick()
     return Start(
         observations, mesh, settings, flat, estimate, covariance, outliers, part,
-        *with_bending(problem, choices, state, settings),
+        *with_bending(problem, choices, state, settings, bending=bending),
     )  # fmt: skip
 
 

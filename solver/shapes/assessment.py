@@ -13,7 +13,7 @@ from pliant.solver.evaluation.trust import assess
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.records import Floats, Tracks, read_only
 from pliant.solver.shapes.held_out import held_out_error
-from pliant.solver.shapes.jackknife import learning_std
+from pliant.solver.shapes.jackknife import Changes, learning_changes
 from pliant.solver.shapes.uncertainty import Pinhole, bounded_by_neighbours, position_std
 from pliant.solver.solution import Solution
 
@@ -33,6 +33,8 @@ def assessed(
     *,
     turning: bool,
     seed: int,
+    changes: Changes | None = None,
+    centred: bool = True,
     should_stop: Callable[[], bool] | None = None,
 ) -> Solution:
     """Return the solution with the standard deviation of its positions and how far to trust it.
@@ -53,6 +55,10 @@ def assessed(
         Whether the cameras were estimated.
     seed : int
         Of the sample of patterns of visibility.
+    changes : Changes, optional
+        Of these cameras and this covariance; None computes them.
+    centred : bool
+        Whether the shapes are all points of the object, so that their mean is its centre; otherwise that is the origin.
     should_stop : callable, optional
         Called between units of work; once it returns True, what is left is not computed.
     """
@@ -63,16 +69,18 @@ def assessed(
     if covariance is not None:
         projections = np.asarray(estimate.scales)[:, None, None] * np.asarray(estimate.rotations)[:, :2]
         pinhole = Pinhole.of(solution.camera, solution.shapes, unit)
-        posterior = unit * position_std(
+        std = position_std(
             covariance, projections, confidence, noise_std=noise_std(covariance), pinhole=pinhole, seed=seed
         )
+        del pinhole
+        std *= unit
         tick()
-        posterior = bounded_by_neighbours(posterior, solution.shapes, confidence)
-        learning = unit * learning_std(
-            estimate, covariance, solution.shapes / unit, turning=turning, should_stop=should_stop
-        )
+        std = bounded_by_neighbours(std, solution.shapes, confidence)
+        if changes is None:
+            changes = learning_changes(estimate, covariance, turning=turning, should_stop=should_stop)
         tick()
-        std = INFLATION * np.hypot(posterior, learning)
+        np.hypot(std, changes.std_of(solution.shapes, unit, centred=centred), out=std)
+        std *= INFLATION
         held_out = held_out_error(tracks, solution.shapes, solution.camera, confidence, covariance, unit=unit)
         modes = covariance.modes.shape[1]
         read_only(std)

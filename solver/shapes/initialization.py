@@ -39,13 +39,6 @@ def uniform_solution(problem: Problem, translations: Floats, *, should_stop: Cal
     outlier would give it full weight and the reweighting would be slow to reject it. `should_stop` is called in every iteration; once it
     returns True, the shapes so far are returned, those of one iteration at least.
     """
-    weights = np.array(np.broadcast_to(problem.confidence[:, None, :], problem.points.shape))
-    if problem.quadratic is not None and problem.weights.temporal > 0:
-        weights *= weights.dtype.type(problem.weights.temporal / START_NOISE_STD**2)
-    operator = Operator(
-        problem.projections, weights, problem.bands, problem.laplacian, problem.weights.spatial, None, problem.quadratic
-    )
-    target = problem.points - translations[:, :, None].astype(problem.points.dtype)
     asked, tick = count(), should_stop if should_stop is not None else bool
     tick()
 
@@ -54,15 +47,31 @@ def uniform_solution(problem: Problem, translations: Floats, *, should_stop: Cal
         return should_stop is not None and should_stop() and before > 1
 
     reduction = EXACT if problem.loss == "l2" else ROUGH
-    operator = operator.rounded(inner_precision(operator, reduction))
+    operator = _uniform(problem, reduction)
     tick()
-    right_hand_side = operator.right_hand_side(target.astype(operator.weights.dtype))
+    right_hand_side = _right_hand_side(problem, translations, operator)
     tick()
     precondition = build_preconditioner(operator)
     tick()
     solved = conjugate_gradient(
         operator.apply, right_hand_side, precondition=precondition, reduction=reduction, max_iterations=MAX_START_ITERATIONS,
-        should_stop=stops,
+        should_stop=stops, overwrite_b=True,
     )  # fmt: skip
     tick()
     return solved.x.astype(problem.points.dtype, copy=False)
+
+
+def _uniform(problem: Problem, reduction: float) -> Operator:
+    """Return the normal equations with equal weights, in the precision that attains the reduction."""
+    weights = np.array(np.broadcast_to(problem.confidence[:, None, :], problem.points.shape))
+    if problem.quadratic is not None and problem.weights.temporal > 0:
+        weights *= weights.dtype.type(problem.weights.temporal / START_NOISE_STD**2)
+    operator = Operator(
+        problem.projections, weights, problem.bands, problem.laplacian, problem.weights.spatial, None, problem.quadratic
+    )
+    return operator.rounded(inner_precision(operator, reduction))
+
+
+def _right_hand_side(problem: Problem, translations: Floats, operator: Operator) -> Array:
+    target = problem.points - translations[:, :, None].astype(problem.points.dtype)
+    return operator.right_hand_side(target.astype(operator.weights.dtype, copy=False))

@@ -18,6 +18,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from pliant.solver.limits import frame_chunks
 from pliant.solver.records import Floats, Tracks, read_only
 from pliant.solver.solution import Solution
 from pliant.solver.tracks.noise import weighted_median
@@ -51,14 +52,18 @@ def with_inlier_probability(
         Called between units of work, for their progress; the result is complete whatever it returns.
     """
     tick = should_stop if should_stop is not None else bool
-    left = tracks.points - solution.camera.project(solution.shapes)
-    tick()
     seen = tracks.visible > 0
     rejected = seen & (confidence == 0)
-    extent = np.ptp((tracks.points - solution.camera.translations[:, None])[seen], axis=0)
-    tick()
+    left, low, high = np.empty_like(tracks.points), np.full(2, np.inf), np.full(2, -np.inf)
+    for some in frame_chunks(*seen.shape):
+        camera = solution.camera.at(some)
+        np.subtract(tracks.points[some], camera.project(solution.shapes[some]), out=left[some])
+        placed = (tracks.points[some] - camera.translations[:, None])[seen[some]]
+        low = np.minimum(low, placed.min(axis=0, initial=np.inf))
+        high = np.maximum(high, placed.max(axis=0, initial=-np.inf))
+        tick()
     probability = inlier_probability(
-        left, np.where(seen, tracks.visible, 0.0), rejected, noise_std=solution.choices.noise, extent=extent, loss=loss
+        left, tracks.visible, rejected, noise_std=solution.choices.noise, extent=high - low, loss=loss
     )
     read_only(probability)
     return replace(solution, inlier_probability=probability)
@@ -89,14 +94,23 @@ def inlier_probability(
     found[rejected] = 0.0
     if not used.any():
         return found
-    residual, weight = left[used], confidence[used]
-    typical = weighted_median(np.hypot(residual[:, 0], residual[:, 1]), weight) / MEDIAN_LENGTH
+    lengths = np.hypot(left[..., 0], left[..., 1])[used]
+    typical = weighted_median(lengths, confidence[used]) / MEDIAN_LENGTH
+    del lengths
     scale = max(noise_std, typical, float(np.finfo(float).tiny) ** 0.25)
-    if loss == "l1":
-        logs = 2 * np.log(weight) - np.log(2) - np.sqrt(2) * weight * np.abs(residual / scale).sum(axis=1)
-    else:
-        logs = np.log(weight / (2 * np.pi)) - weight * np.square(residual / scale).sum(axis=1) / 2
     area = float(np.prod(np.asarray(extent) / scale + 1))  # in units of s²; an extent of 0 has the size of the noise
     odds = (seen.sum() - rejected.sum() + 1) / (rejected.sum() + 1)
-    found[used] = expit(logs + np.log(area) + np.log(odds))
+    for some in frame_chunks(*used.shape):
+        chosen = used[some]
+        logs = _log_density(left[some][chosen] / scale, confidence[some][chosen], loss)
+        found[some][chosen] = expit(logs + np.log(area) + np.log(odds))
     return found
+
+
+def _log_density(residual: Floats, weight: Floats, loss: str) -> Floats:
+    """Return the logarithm of the density of residuals `(N, 2)`, units of s, with confidences `(N,)`."""
+    if loss == "l1":
+        logs = 2 * np.log(weight) - np.log(2) - np.sqrt(2) * weight * np.abs(residual).sum(axis=1)
+    else:
+        logs = np.log(weight / (2 * np.pi)) - weight * np.square(residual).sum(axis=1) / 2
+    return np.asarray(logs)

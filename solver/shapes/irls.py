@@ -58,25 +58,32 @@ def step(
     """
     reduction = state.reduction if reduction is None else reduction
     operator = operator_at(problem, state)
-    target = problem.points - state.translations[:, :, None].astype(problem.points.dtype)
-    gradient = operator.gradient(state.shapes, target)
+    downhill = _downhill(problem, state, operator)
     tick = should_stop if should_stop is not None else bool
     tick()
     inner = operator.rounded(inner_precision(operator, reduction))
     precondition = build_preconditioner(inner)
-    downhill = np.negative(gradient).astype(inner.weights.dtype, copy=False)
+    downhill = downhill.astype(inner.weights.dtype, copy=False)
     tick()
     solved = conjugate_gradient(
         inner.apply, downhill, precondition=precondition, reduction=reduction, max_iterations=max_inner,
-        negligible=NEGLIGIBLE * tolerance * abs(state.objective), should_stop=should_stop,
+        negligible=NEGLIGIBLE * tolerance * abs(state.objective), should_stop=should_stop, overwrite_b=True,
     )  # fmt: skip
-    shapes = np.add(state.shapes, solved.x, out=gradient)
+    del downhill, precondition, inner  # before the next weights are allocated
+    shapes = np.add(state.shapes, solved.x, out=solved.x if solved.x.dtype == state.shapes.dtype else None)
     tick()
     after = _evaluated(problem, shapes, state.translations, state.omega, reweighting=state.reweighting + 1)
     gained = state.objective - after.objective
     unforeseen = abs(gained - solved.decrease) / gained if gained > 0 else INNER_REDUCTION
     reduction = float(np.clip(unforeseen, SINGLE_REDUCTION, INNER_REDUCTION))
     return replace(after, iterations=solved.iterations, reduction=reduction)
+
+
+def _downhill(problem: Problem, state: State, operator: Operator) -> Array:
+    """Return minus half the gradient of the majorised energy, shape `(F, 3, P)`."""
+    target = problem.points - state.translations[:, :, None].astype(problem.points.dtype)
+    gradient = operator.gradient(state.shapes, target)
+    return np.negative(gradient, out=gradient)
 
 
 def inner_precision(operator: Operator, reduction: float) -> np.dtype[np.floating]:

@@ -17,7 +17,7 @@ Bayes confidence intervals based on bootstrap samples").
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,15 +49,48 @@ CLUSTERING = 5
 """Rounds of k-means for the parts."""
 
 
-def learning_std(
+@dataclass(frozen=True, slots=True, eq=False)
+class Changes:
+    """How far positions change by what cameras and prior were learned from, at some points of the object."""
+
+    std: Floats | None
+    """Root mean squared change of the points, shape `(F, S)`, normalized units; None: 0 everywhere."""
+
+    points: Floats
+    """Their mean positions, shape `(S, 3)`, world axes, normalized units."""
+
+    bounded: bool = True
+    """False: nothing is known about depth, so every position is as uncertain as the object is large."""
+
+    def std_of(self, shapes: Floats, unit: float, *, centred: bool = True) -> Floats:
+        """Return that of every position, shape `(F, P)`; each point takes the value of the nearest one.
+
+        Parameters
+        ----------
+        shapes : ndarray, shape (F, P, 3)
+            World axes.
+        unit : float
+            One normalized unit, the unit of the shapes and of the result.
+        centred : bool
+            False: the object's centre is the origin, and not the mean of these points.
+        """
+        middle = shapes.mean(axis=1) if centred else np.zeros((len(shapes), 3))
+        if not self.bounded:
+            return np.asarray(np.linalg.norm(shapes - middle[:, None], axis=2))
+        if self.std is None:
+            return np.zeros(shapes.shape[:2])
+        mean = (shapes.mean(axis=0) - middle.mean(axis=0)) / unit
+        return np.asarray((unit * self.std)[:, cKDTree(self.points).query(mean)[1]])
+
+
+def learning_changes(
     estimate: CameraEstimate,
     covariance: ShapeCovariance,
-    shapes: Floats,
     *,
     turning: bool,
     should_stop: Callable[[], bool] | None = None,
-) -> Floats:
-    """Return the root mean squared change of every position by what cameras and prior were learned from, shape `(F, P)`.
+) -> Changes:
+    """Return how far positions change by what cameras and prior were learned from.
 
     Parameters
     ----------
@@ -65,19 +98,12 @@ def learning_std(
         With the sample of the (corrected) tracks.
     covariance : ShapeCovariance
         Of all F frames, in the axes of the estimate.
-    shapes : ndarray, shape (F, P, 3)
-        World axes, normalized units; each point takes the value of the nearest sampled one.
     turning : bool
         False keeps the cameras.
     should_stop : callable, optional
-        Called between refinements; once it returns True, the result is 0.
-
-    Returns
-    -------
-    ndarray, shape (F, P)
-        Normalized units.
+        Called between refinements; once it returns True, the changes are 0.
     """
-    frames = len(shapes)
+    frames, nothing = len(estimate.rotations), Changes(None, np.zeros((0, 3)))
     used = evenly_spread(frames, MAX_JACKKNIFE_FRAMES)
     start = Learned(
         np.asarray(estimate.rotations)[used],
@@ -87,26 +113,24 @@ def learning_std(
     )
     sample = centred(np.asarray(estimate.sample)[used])
     if sample.shape[1] <= MIN_LEARNED_POINTS:
-        return np.zeros(shapes.shape[:2])
+        return nothing
     part_of = parts(sample)
     without = []
     try:
         everything = _shapes_from(sample, np.ones(len(part_of), dtype=bool), start, turning)
         for part in np.unique(part_of):
             if should_stop is not None and should_stop():
-                return np.zeros(shapes.shape[:2])
+                return nothing
             if (part_of != part).sum() >= MIN_LEARNED_POINTS:
                 without.append(_onto(_shapes_from(sample, part_of != part, start, turning), everything))
-    except (
-        np.linalg.LinAlgError
-    ):  # depth without bounds: nothing is known, so every position is as uncertain as the object is large
-        return np.asarray(np.linalg.norm(centred(shapes), axis=2))
+    except np.linalg.LinAlgError:  # depth without bounds
+        return replace(nothing, bounded=False)
     if len(without) < 2:
-        return np.zeros(shapes.shape[:2])
+        return nothing
     squared = between(used, _mean_squared_change(np.stack(without), everything), frames)
     squared /= np.square(np.asarray(estimate.scales))[:, None]
     world = np.einsum("fij,fpi->pj", start.rotations / start.scales[:, None, None], everything) / len(used)
-    return np.asarray(np.sqrt(squared)[:, cKDTree(world).query(centred(shapes).mean(axis=0))[1]])
+    return Changes(np.sqrt(squared), world)
 
 
 def parts(sample: Floats) -> NDArray[np.intp]:

@@ -59,13 +59,16 @@ def build_problem(
 
 
 def with_bending(
-    problem: Problem, choices: Choices, state: State, settings: Settings
+    problem: Problem, choices: Choices, state: State, settings: Settings, *, bending: float | None = None
 ) -> tuple[Problem, Choices, State]:
-    """Return problem and choices with λ2 from the current shapes, if the prior is Gaussian and λ2 is automatic."""
+    """Return problem and choices with λ2, if the prior is Gaussian and λ2 is automatic: `bending`, or from the current shapes."""
     if problem.quadratic is None or problem.laplacian is None or settings.spatial_weight is not None:
         return problem, choices, state
     modes = problem.quadratic.modes[0].shape[1]
-    weight = bending_weight(problem.weights.temporal, problem.laplacian, state.shapes, modes)
+    if bending is None:
+        weight = bending_weight(problem.weights.temporal, problem.laplacian, state.shapes, modes)
+    else:
+        weight = bending
     problem = replace(problem, weights=replace(problem.weights, spatial=weight))
     reason = f"{choices.reasons['weights']} λ2 = {weight:.2g} as the surface bends."
     choices = replace(choices, spatial_weight=weight, reasons={**choices.reasons, "weights": reason})

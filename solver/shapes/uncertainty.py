@@ -157,7 +157,7 @@ def _representatives(
 
 
 def bounded_by_neighbours(std: Floats, shapes: Floats, visible: Floats) -> Floats:
-    """Return the standard deviations with those of sparsely observed points bounded by their surroundings.
+    """Bound the standard deviations of sparsely observed points by their surroundings, in place, and return them.
 
     Such points are drawn along the surface (`shapes.sparsely_observed`), which the prior of a single path does not know. The
     nearest point that is observed often lies on the same surface, so its distance bounds how far off the position can be.
@@ -174,9 +174,8 @@ def bounded_by_neighbours(std: Floats, shapes: Floats, visible: Floats) -> Float
     mean = shapes.mean(axis=0)
     nearest = often[cKDTree(mean[often]).query(mean[rarely])[1]]
     away = np.linalg.norm(shapes[:, rarely] - shapes[:, nearest], axis=2)
-    bounded = std.copy()
-    bounded[:, rarely] = np.minimum(std[:, rarely], np.hypot(std[:, nearest], away))
-    return bounded
+    std[:, rarely] = np.minimum(std[:, rarely], np.hypot(std[:, nearest], away))
+    return std
 
 
 def _moments(covariance: ShapeCovariance, projections: Floats, used: NDArray[np.intp]) -> tuple[Floats, Floats, Floats]:

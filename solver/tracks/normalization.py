@@ -50,7 +50,8 @@ def normalize(tracks: Tracks) -> Normalized:
     mean = np.einsum("fp,fpc->fc", weight, tracks.points)
     mean[shown] /= total[shown, None]
     centroid = between(np.flatnonzero(shown), mean[shown], tracks.num_frames)
-    points = np.where(seen[..., None], tracks.points - centroid[:, None], 0.0)
+    points = tracks.points - centroid[:, None]
+    points[~seen] = 0.0
     unit = float(np.sqrt(np.einsum("fp,fpc,fpc->", weight, points, points) / total.sum()))
     if not unit > 1e-12 * max(float(np.abs(centroid).max()), np.finfo(float).tiny):
         raise InvalidInput(

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 from pliant.solver import KnownCamera, Outcome, Settings, Solution, Step, Tracks, gallery, solve
@@ -58,6 +62,8 @@ def test_blocks_give_the_shapes_of_a_solve_at_once(film: gallery.Sequence, setti
         assert solution.trust.held_out_error == pytest.approx(whole.trust.held_out_error, rel=0.5)
     else:
         assert solution.trust.held_out_error is None
+    assert solution.choices.spatial_weight == pytest.approx(whole.choices.spatial_weight, rel=0.6)
+    assert {step.stage for step in steps[3:]} <= {"cameras", "initialise", "reweight", "finish"}
     fractions = [step.fraction for step in steps]
     assert fractions == sorted(fractions)
     assert fractions[-1] == 1
@@ -78,19 +84,25 @@ def test_a_stop_between_blocks_leaves_a_result(film: gallery.Sequence) -> None:
     assert np.isfinite(solution.shapes).all()
 
 
-def test_blocks_are_equal_strips_of_all_points(film: gallery.Sequence) -> None:
+def test_blocks_are_equal_parts_of_all_points(film: gallery.Sequence) -> None:
     parts = blocks.blocks(film.tracks, 4)
     assert np.array_equal(np.sort(np.concatenate(parts)), np.arange(POINTS))
     assert {len(part) for part in parts} == {POINTS // 4}
+    middle = film.tracks.points.mean(axis=0)
+    wide, high = (np.ptp(middle, axis=0) / 2).tolist()
+    for part in parts:  # a quarter of an oval, not a strip
+        assert np.ptp(middle[part, 0]) < 1.2 * wide
+        assert np.ptp(middle[part, 1]) < 1.2 * high
+    assert sorted(len(part) for part in blocks.blocks(film.tracks, 7)) == pytest.approx(np.full(7, POINTS / 7), abs=1)
 
 
 def test_a_margin_has_as_many_rings_as_asked(monkeypatch: pytest.MonkeyPatch, film: gallery.Sequence) -> None:
     own = np.array([450])
     monkeypatch.setattr(blocks, "MARGIN", 1)
-    near = blocks.with_margin(own, film.mesh, POINTS)
+    near = blocks.with_margin(own, film.mesh.edges, POINTS)
     beside = film.mesh.edges[(film.mesh.edges == 450).any(axis=1)]
     assert set(near.tolist()) == set(beside.ravel().tolist())
-    assert blocks.with_margin(own, None, POINTS).tolist() == [450]
+    assert blocks.with_margin(own, np.zeros((0, 2), dtype=np.int32), POINTS).tolist() == [450]
     assert mesh_of(film.mesh, near).num_points == len(near)
 
 
@@ -99,3 +111,59 @@ def test_only_priors_of_single_points_are_solved_in_blocks() -> None:
     assert not blocks.needs_blocks(tracks, Settings())
     big = gallery.face(3, 50).tracks
     assert not blocks.needs_blocks(big, Settings(prior="smooth+low_rank"))
+
+
+@pytest.mark.usefixtures("limited")
+def test_a_result_in_a_file_is_that_in_memory(film: gallery.Sequence, tmp_path: Path) -> None:
+    settings = Settings(max_reweightings=2)
+    np.save(tmp_path / "tracks.npy", film.tracks.points)
+    folder = tmp_path / "scratch"
+    folder.mkdir()
+    mapped = Tracks.from_arrays(np.load(tmp_path / "tracks.npy", mmap_mode="r"), scratch=folder)
+    inside = solve(film.tracks, film.mesh, cameras=given(film), settings=settings)
+    outside = solve(mapped, film.mesh, cameras=given(film), settings=settings, scratch=folder)
+    for name in ("shapes", "residuals", "weights", "shapes_std", "inlier_probability"):
+        array = getattr(outside, name)
+        assert np.array_equal(array, getattr(inside, name))
+        assert isinstance(array.base, np.memmap)
+        assert not array.flags.writeable
+    assert list(folder.iterdir()) == []
+
+
+MEASURED = """
+import sys
+from pathlib import Path
+from pliant.solver import KnownCamera, Settings, gallery, solve
+from pliant.solver.reconstruction import blocks
+
+def memory(name):
+    lines = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
+    return int(lines[name].split()[0]) * 1024
+
+blocks.BLOCK_OBSERVATIONS = int(sys.argv[1])
+film = gallery.face(40, 15_000)
+cameras, settings = KnownCamera.from_arrays(film.rotations, film.scales), Settings(max_reweightings=2)
+solve(gallery.face(4, 50).tracks)
+Path("/proc/self/clear_refs").write_text("5")  # the peak so far
+before = memory("VmRSS")
+solve(film.tracks, film.mesh, cameras=cameras, settings=settings)
+print((memory("VmHWM") - before) / film.tracks.visible.size)
+"""
+
+
+def bytes_per_observation(block: int) -> float:
+    ran = subprocess.run(
+        [sys.executable, "-c", MEASURED, str(block)], capture_output=True, text=True, timeout=250, check=False
+    )
+    assert ran.returncode == 0, ran.stderr
+    return float(ran.stdout)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="only Linux resets the peak of a process")
+def test_memory_of_an_observation_solved_at_once_and_in_blocks() -> None:
+    """Besides the tracks, 24 bytes: 310 at once; in many small blocks what is held of all points, 56, and a block."""
+    at_once, in_blocks = bytes_per_observation(10_000_000), bytes_per_observation(60_000)
+
+    assert at_once < 360
+    assert in_blocks < 180

@@ -366,3 +366,12 @@ def test_a_stop_at_every_single_question_of_a_small_solve_is_reported() -> None:
     )
     for number in range(1, questions(tracks, settings) + 1):
         stopped_at(tracks, settings, number)
+
+
+def test_the_plan_counts_the_gram_matrix_of_many_points() -> None:
+    few, many = (
+        planned(100, points, gaussian=True, known_cameras=False, sheet=False)[0] for points in (1_000, 1_000_000)
+    )
+    assert few.name == many.name == "completion"
+    assert few.seconds < 0.2
+    assert 5 < many.seconds < 20  # 100 × 1,000,000 took 15 s with the normalization

@@ -7,14 +7,15 @@ Basis: whole jobs with the default options and outputs on one core, gallery face
 were chosen on the first three sizes; the others check them:
 
     frames × points   peak, MB   estimate   processor, s   estimate
-    10 × 500               111        113            2.4        1.8
-    50 × 500               135        125            8.5        7.2
-    100 × 500              164        140           12.4       13.9
-    20 × 1,000             126        122            3.3        3.3
-    30 × 5,000             182        200            5.1        5.6
-    50 × 2,000             161        170            9.9        7.8
-    80 × 300               135        124            9.5       11.1
-    10 × 20,000            210        230            3.3        3.4
+    10 × 500               111        112            2.4        1.8
+    50 × 500               133        119            8.5        7.2
+    100 × 500              159        128           12.4       13.9
+    20 × 1,000             127        117            3.3        3.3
+    30 × 5,000             162        163            5.1        5.6
+    50 × 2,000             152        145            9.9        7.8
+    80 × 300               133        118            9.5       11.1
+    10 × 20,000            185        180            3.3        3.4
+    50 × 20,000            448        460           14.2       15.0
 
 With other options the solver alone, processor s (estimate), the first size chosen on:
 
@@ -24,8 +25,8 @@ With other options the solver alone, processor s (estimate), the first size chos
     100 × 500            5.2 (5.4)         4.4 (5.4)
     30 × 5,000           2.1 (3.1)         2.2 (3.1)   .8 (1.9)
 
-The peaks of the solver alone at 10 × 300,000 and 800 × 2,000 (benchmarks/results/growth.jsonl) lie below the estimate by at most a
-third. Not covered: points seen in few frames, which take 80 bytes times the square of their number; and time with other options.
+The solver alone took 11.6 GB and 520 processor seconds for 100 × 1,000,000, estimated at 17 GB and
+814 s. Not covered: points seen in few frames, which take 80 bytes times the square of their number; and time with other options.
 """
 
 from __future__ import annotations
@@ -37,12 +38,12 @@ from pliant.solver.limits import BLOCK_OBSERVATIONS, LEARNED_FRAMES
 LIBRARIES = 110_000_000
 """Bytes of a job process before it has read its inputs."""
 
-BYTES = {"gaussian": 600, "smooth": 500, "smooth+low_rank": 500}
-"""Bytes for each observation, by prior: up to 510 were measured for the solver alone, 520 with exports."""
+BYTES = {"gaussian": 350, "smooth": 250, "smooth+low_rank": 350}
+"""Bytes for each observation, by prior: 230 to 340, 150 to 220 and 330 were measured in whole jobs of 200,000 to 1.2 million."""
 
-BEYOND = 250
-"""Bytes for each observation beyond those solved at once, of which only tracks and results are held: about 120 in the solver by the sizes
-of its arrays, the rest for the exports, not measured."""
+BEYOND = 150
+"""Bytes for each observation beyond those solved at once, of which only tracks and results are held: 80 in the solver, 140 while files are
+written, measured in a job whose blocks were made small."""
 
 SECONDS = 0.5
 """Processor seconds of a job that is as small as can be."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,8 @@ from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.cameras.perspective import centred, columns
 from pliant.solver.model.expectation_maximisation import annealed
 from pliant.solver.model.shape_covariance import ShapeCovariance
-from pliant.solver.shapes.jackknife import MIN_LEARNED_POINTS, PARTS, learning_std, parts
+from pliant.solver.records import Floats
+from pliant.solver.shapes.jackknife import MIN_LEARNED_POINTS, PARTS, learning_changes, parts
 from scipy.spatial.transform import Rotation
 
 FRAMES = 12
@@ -30,6 +32,17 @@ def seen(points: int, *, degrees: float = 50.0, seed: int = 0) -> tuple[CameraEs
     covariance = annealed(gram, rotations[:, :2], iterations=40)
     estimate = CameraEstimate(rotations, np.ones(FRAMES), np.zeros((FRAMES, 2)), 0, gram, sample)
     return estimate, covariance, shapes
+
+
+def learning_std(
+    estimate: CameraEstimate,
+    covariance: ShapeCovariance,
+    shapes: np.ndarray,
+    *,
+    turning: bool,
+    should_stop: Callable[[], bool] | None = None,
+) -> Floats:
+    return learning_changes(estimate, covariance, turning=turning, should_stop=should_stop).std_of(shapes, 1.0)
 
 
 def rms(values: np.ndarray) -> float:

@@ -92,6 +92,23 @@ def test_the_time_is_within_a_factor_of_two_of_what_was_measured(
     assert seconds / 2 < estimate.seconds < 2 * seconds
 
 
+MEMORY = ((50, 20_000, "gaussian", 0.34e9), (10, 60_000, "smooth", 0.24e9), (30, 20_000, "smooth+low_rank", 0.31e9),
+          (50, 200_000, "gaussian", 2.9e9), (100, 1_000_000, "gaussian", 11.6e9))  # fmt: skip
+"""Frames, points, prior, and the largest memory that was measured, bytes: of the first three in jobs, of the others in the solver."""
+
+
+@pytest.mark.parametrize(("frames", "points", "prior", "peak"), MEMORY)
+def test_the_memory_is_within_a_factor_of_two_of_what_was_measured(
+    frames: int, points: int, prior: str, peak: float
+) -> None:
+    estimate = estimated(frames, points, Options(prior=prior)).memory_bytes  # type: ignore[arg-type]
+    assert peak / 2 < estimate < 2 * peak
+
+
+def test_the_time_of_a_hundred_million_observations_is_within_a_factor_of_two_of_what_was_measured() -> None:
+    assert 520 / 2 < estimated(100, 1_000_000, Options()).seconds < 2 * 520
+
+
 def interpretation(frames: int, points: int) -> Interpretation:
     return Interpretation(
         num_frames=frames, num_points=points, num_faces=0, hidden_fraction=0.0, mesh_source="none", has_ground_truth=False,

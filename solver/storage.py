@@ -1,0 +1,41 @@
+"""Arrays in memory, or in a temporary file that the system reads and writes as memory is short."""
+
+from __future__ import annotations
+
+import mmap
+import os
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+def allocated(shape: tuple[int, ...], scratch: str | Path | None) -> Floats:
+    """Return zeros in memory, or mapped to a temporary file in the folder `scratch`.
+
+    The file has no name, where the system allows it, and vanishes with the array. Its space is reserved at once, so that a full disk is
+    an error here and not a crash at the first write beyond it.
+
+    Raises
+    ------
+    OSError
+        The folder is missing, cannot be written to, or has too little space.
+    """
+    if scratch is None:
+        return np.zeros(shape)
+    size = int(np.prod(shape)) * np.dtype(np.float64).itemsize
+    with tempfile.TemporaryFile(dir=scratch, prefix="pliant-") as file:
+        if hasattr(os, "posix_fallocate"):
+            os.posix_fallocate(file.fileno(), 0, size)
+        return np.asarray(np.memmap(file, dtype=np.float64, mode="w+", shape=shape))
+
+
+def let_go(*arrays: Floats | None) -> None:
+    """Take mapped arrays out of this process's memory; they are read from their file when they are used again."""
+    for array in arrays:
+        mapped = None if array is None else getattr(array.base, "_mmap", None)
+        if isinstance(mapped, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED"):
+            mapped.madvise(mmap.MADV_DONTNEED)
