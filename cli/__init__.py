@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 from pliant.cli import jobs, tokens
 from pliant.cli.commands.backup import backup, restore
+from pliant.cli.commands.explain import explain
 from pliant.cli.commands.results import rerun, share, view
 from pliant.cli.commands.top import top
 from pliant.cli.demo import demo
@@ -51,7 +52,10 @@ def _begin(
 
 
 _COMMANDS: dict[str, dict[str, Callable[..., None]]] = {
-    "On this machine": {"solve": solve, "track": track, "inspect": inspect, "view": view, "demo": demo, "doctor": doctor},
+    "On this machine": {
+        "solve": solve, "track": track, "inspect": inspect, "view": view, "demo": demo, "doctor": doctor,
+        "explain": explain,
+    },
     "Run a service": {"up": up, "work": work, "fsck": fsck, "backup": backup, "restore": restore, "top": top},
     "Use a service": {
         "submit": jobs.submit, "status": jobs.status, "watch": jobs.watch, "result": jobs.result, "list": jobs.list_jobs,

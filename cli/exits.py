@@ -112,5 +112,7 @@ class Guarded(TyperGroup):
 
             session = ctx.obj
             sentence = sentence_of(fault, getattr(session, "following", None))
-            show_fault(fault, sentence, code, as_json=bool(session is not None and session.json))
+            show_fault(
+                fault, sentence, code, as_json=bool(session is not None and session.json), url=getattr(session, "url", None),
+            )  # fmt: skip
             ctx.exit(code)

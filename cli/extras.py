@@ -11,6 +11,8 @@ SERVER_MODULES = ("fastapi", "obstore", "pydantic_settings", "python_multipart",
 class MissingExtra(Exception):
     """A command needs an extra that is not installed."""
 
+    code = "missing_extra"
+
     def __init__(self, command: str, missing: str) -> None:
         super().__init__(f"{command} needs the service, which is not installed: pip install 'pliant[server]'")
         self.missing = missing

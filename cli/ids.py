@@ -26,16 +26,23 @@ def find_job(client: Client, text: str) -> RemoteJob:
     Raises
     ------
     NotFound
-        No job fits.
+        No job fits, or ``@last`` was given and there is no job yet.
     BadArgument
         The text is malformed, or more than one job fits.
     """
     from pliant.client import BadArgument, NotFound
+    from pliant.schemas.job import Problem
+    from pliant.schemas.problems import ProblemCode
 
     if text == LAST:
         for job in client.list(page_size=1):
             return job
-        raise BadArgument("@last: the service has no jobs. Submit one with `pliant submit TRACKS`.")
+        raise NotFound(
+            Problem.of(
+                ProblemCode.UNKNOWN_JOB,
+                detail="@last: there are no jobs yet. Submit one with `pliant submit FILE`, a track file or a film.",
+            )
+        )
     try:
         return client.get(text)
     except NotFound:

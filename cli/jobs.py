@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 from pliant.cli.films import is_film
 from pliant.cli.ids import find_job
-from pliant.cli.paths import output_folder, tracks_or_film
+from pliant.cli.paths import check_inputs, output_folder
 from pliant.cli.session import (
     HOME,
     LINE_EVERY,
@@ -77,8 +77,10 @@ def submit(
     options, chosen, waits = parse_options(option), expanded(files, region), wait or output is not None
     parts = {"mesh": mesh, "ground_truth": ground_truth, "rotations": rotations, "webhook": webhook}
     if chosen != files or len(chosen) > 1:
+        check_inputs(None, mesh=mesh, ground_truth=ground_truth, rotations=rotations, region=None)
         batch = Batch(
             files=chosen, shared=parts, options=options, key=key or "", priority=priority, timeout=timeout, output=output, wait=waits,
+            url=url,
         )  # fmt: skip
         batch.check(name=name, job_id=job_id, region=region, force=force)
         with session.client(url, as_json=as_json) as client:
@@ -86,7 +88,7 @@ def submit(
         batch.show(as_json=as_json)
         raise typer.Exit(batch.exit_code)
     tracks = chosen[0]
-    tracks_or_film(tracks)
+    check_inputs(tracks, mesh=mesh, ground_truth=ground_truth, rotations=rotations, region=region)
     if output is not None:
         output_folder(output, force=force)
     given = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -33,6 +34,26 @@ def input_file(path: Path | None, name: str) -> None:
     existing_file(path, name)
 
 
+def mesh_file(mesh: str | None) -> None:
+    """Check that a mesh is a grid size, `none`, or a file that can be read.
+
+    Raises
+    ------
+    BadArgument
+        It is none of them.
+    """
+    from pliant.client.errors import BadArgument
+
+    if mesh is None or re.fullmatch(r"none|\s*\d{1,6}\s*x\s*\d{1,6}\s*", mesh.lower()) is not None:
+        return
+    if not Path(mesh).expanduser().exists():
+        raise BadArgument(
+            f"mesh: expected a mesh file, ROWSxCOLUMNS or none, got no file at {mesh}. "
+            "Check the path, or give a grid size such as 48x64."
+        )
+    input_file(Path(mesh), "mesh")
+
+
 def tracks_or_film(path: Path, name: str = "tracks") -> None:
     """Check that a path is a file that can be read, or a folder with the pictures of a film.
 
@@ -51,6 +72,23 @@ def tracks_or_film(path: Path, name: str = "tracks") -> None:
             f"{name}: expected a file or a folder of pictures, got the folder {path}, which has no pictures. "
             "Give the path of a file in it."
         )
+
+
+def check_inputs(
+    tracks: Path | None, *, mesh: str | None, ground_truth: Path | None, rotations: Path | None, region: Path | None
+) -> None:
+    """Check the paths of all inputs of a job; those that are None are not given.
+
+    Raises
+    ------
+    BadArgument
+        One of them cannot be read.
+    """
+    if tracks is not None:
+        tracks_or_film(tracks)
+    mesh_file(mesh)
+    for path, name in ((ground_truth, "ground_truth"), (rotations, "rotations"), (region, "region")):
+        input_file(path, name)
 
 
 def installation(settings: Settings) -> None:

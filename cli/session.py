@@ -71,6 +71,8 @@ class Session:
     json: bool = False
     transport: httpx.BaseTransport | None = None
     """Replaces the network in tests."""
+    url: str | None = None
+    """Address of the service that the command talks to; it explains the errors of its answers."""
     following: str | None = None
     """Id of the job that the command waits for; Ctrl-C prints how to return to it."""
 
@@ -79,7 +81,7 @@ class Session:
         from pliant.client import Client
         from pliant.client.retry import Retry
 
-        self.json = as_json
+        self.json, self.url = as_json, url
         retries = Retry() if first_contact is None else Retry(first_contact=first_contact)
         return Client(url, transport=self.transport, retries=retries)
 

@@ -52,13 +52,13 @@ def print_json(value: object) -> None:
     print(json.dumps(value, indent=2, ensure_ascii=False))
 
 
-def show_fault(fault: BaseException, sentence: str, code: Exit, *, as_json: bool) -> None:
-    """Print an error on standard error."""
+def show_fault(fault: BaseException, sentence: str, code: Exit, *, as_json: bool, url: str | None = None) -> None:
+    """Print an error on standard error, and where its code is explained; `url` is the service that the command used."""
     details = details_of(fault)
+    more = explained_at(details, url)
     if as_json:
-        err().print_json(
-            json.dumps({"exit_code": int(code), "detail": sentence, "code": type(fault).__name__, **details})
-        )
+        document = {"exit_code": int(code), "detail": sentence, "code": type(fault).__name__, **details}
+        err().print_json(json.dumps(document if more is None else {**document, "explained_at": more}))
         return
     screen = err()
     screen.print(Text.assemble(("error ", "bold red"), sentence))
@@ -66,6 +66,31 @@ def show_fault(fault: BaseException, sentence: str, code: Exit, *, as_json: bool
         options = " ".join(f"-O {name}={value}" for name, value in choice.get("options", {}).items())
         evidence = f" ({choice['evidence']})" if "evidence" in choice else ""
         screen.print(f"  {choice.get('layout', '')}{evidence}: {options}", markup=False)
+    if more is not None:
+        screen.print(f"More about this error: {more}", markup=False)
+
+
+def explained_at(details: Mapping[str, Any], url: str | None) -> str | None:
+    """Return where the code of an error is explained.
+
+    Parameters
+    ----------
+    details : mapping
+        Of the error, as `details_of` returns them.
+    url : str or None
+        Address of the service that the command used.
+
+    Returns
+    -------
+    str or None
+        The service's page if the error is one of its answers, else the command that prints the same text; None without a known code.
+    """
+    from pliant.schemas.problems import find_code, type_of
+
+    code = str(details.get("code", ""))
+    if "type" in details and url is not None:
+        return url.rstrip("/") + type_of(code)
+    return None if find_code(code) is None else f"pliant explain {code}"
 
 
 def details_of(fault: BaseException) -> dict[str, Any]:
@@ -74,6 +99,10 @@ def details_of(fault: BaseException) -> dict[str, Any]:
     if problem is not None:
         details: dict[str, Any] = problem.model_dump(exclude_none=True)
         return details
+    from pliant.schemas.problems import ProblemCode
+
+    if isinstance(fault, OSError) and type(fault).__module__ == "builtins":
+        return {"code": ProblemCode.UNUSABLE_PATH.value}
     names = ("code", "field", "expected", "got", "hint", "choices")
     return {name: getattr(fault, name) for name in names if getattr(fault, name, None) is not None}
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from pliant.cli.films import inspect_film, is_film, refuse_parts_of_tracks, solve_film
-from pliant.cli.paths import input_file, results_folder, tracks_or_film
+from pliant.cli.paths import check_inputs, results_folder
 from pliant.cli.session import (
     LINE_EVERY,
     Force,
@@ -52,8 +52,7 @@ def solve(
     """Reconstruct tracks or a film in this process, without a service: the same code, the same files."""
     ctx.obj.json = as_json
     one_numerical_thread()  # the first check of a path imports NumPy
-    check_inputs(tracks, ground_truth, rotations)
-    input_file(region, "region")
+    check_inputs(tracks, mesh=mesh, ground_truth=ground_truth, rotations=rotations, region=region)
     with results_folder(output, force=force):
         options, name = parse_options(option), name_of(name, tracks)
         if is_film(tracks, region):
@@ -108,8 +107,7 @@ def inspect(
 ) -> None:
     """Show how a track file is read, or what a film holds and what tracking it would take, without solving."""
     ctx.obj.json = as_json
-    check_inputs(file, ground_truth, rotations)
-    input_file(region, "region")
+    check_inputs(file, mesh=mesh, ground_truth=ground_truth, rotations=rotations, region=region)
     options = parse_options(option)
     if url == "" and is_film(file, region):
         refuse_parts_of_tracks(mesh=mesh, ground_truth=ground_truth, rotations=rotations)
@@ -132,13 +130,6 @@ def inspect(
         print_json(interpretation.model_dump(mode="json"))
     else:
         show_understood(interpretation)
-
-
-def check_inputs(tracks: Path, ground_truth: Path | None, rotations: Path | None) -> None:
-    """Check the paths of the inputs; a mesh may be a word, so its reader checks it."""
-    tracks_or_film(tracks)
-    for path, name in ((ground_truth, "ground_truth"), (rotations, "rotations")):
-        input_file(path, name)
 
 
 def show_finished(done: Finished, output: Path, *, as_json: bool) -> None:

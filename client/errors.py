@@ -42,6 +42,8 @@ class PliantError(Exception):
 class Unreachable(PliantError):
     """No answer from the service, despite retries."""
 
+    code = "unreachable"
+
 
 class WaitTimeout(PliantError, TimeoutError):
     """The caller's `timeout` passed. Nothing was cancelled: the job continues and can be waited for again."""
@@ -50,13 +52,27 @@ class WaitTimeout(PliantError, TimeoutError):
 class UnexpectedAnswer(PliantError):
     """The answer is not from a Pliant service: a proxy's error page, for example."""
 
+    code = "unexpected_answer"
+
 
 class CorruptDownload(PliantError):
     """A file was downloaded twice and does not have the SHA-256 of the job's record."""
 
+    code = "corrupt_download"
+
 
 class BadArgument(PliantError, ValueError):
-    """An argument is invalid; nothing was sent."""
+    """An argument is invalid; nothing was sent.
+
+    Attributes
+    ----------
+    code : str
+        Stable machine-readable name: ``"invalid_argument"``, or ``"invalid_option"`` for the options of a job.
+    """
+
+    def __init__(self, sentence: str, *, code: str = "invalid_argument") -> None:
+        super().__init__(sentence)
+        self.code = code
 
 
 class NotLoaded(PliantError):

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pliant.client.errors import BadArgument
 from pliant.schemas.options import Options
+from pliant.schemas.problems import ProblemCode
 from pliant.schemas.validation import expectation
 from pydantic import ValidationError
 
@@ -248,7 +249,9 @@ def checked_options(options: Options | Mapping[str, Any] | None) -> Options:
         return Options.model_validate(dict(options or {}))
     except ValidationError as fault:
         faults = "; ".join(map(_option_fault, fault.errors()))
-        raise BadArgument(f"options: {faults}. `pliant options` lists every option.") from fault
+        raise BadArgument(
+            f"options: {faults}. `pliant options` lists every option.", code=ProblemCode.INVALID_OPTION.value
+        ) from fault
 
 
 def _alone(visible: ArrayLike | None) -> None:

@@ -228,6 +228,12 @@ class ProblemCode(StrEnum):
     CAMERA_MISMATCH = auto()
 
     # Command line and start-up
+    INVALID_ARGUMENT = auto()
+    UNUSABLE_PATH = auto()
+    MISSING_EXTRA = auto()
+    UNREACHABLE = auto()
+    UNEXPECTED_ANSWER = auto()
+    CORRUPT_DOWNLOAD = auto()
     INVALID_SETTING = auto()
     DATA_DIRECTORY_IN_USE = auto()
     NEWER_DATA = auto()

@@ -5,11 +5,23 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+_LENGTHS = {
+    "too_short": ("at least", "min_length", "item"),
+    "too_long": ("at most", "max_length", "item"),
+    "string_too_short": ("at least", "min_length", "character"),
+    "string_too_long": ("at most", "max_length", "character"),
+}
+"""Kinds of errors about a length: the words before it, its name in the error's context, and its unit."""
+
 
 def expectation(error: Mapping[str, Any]) -> str:
     """Return what one of `ValidationError.errors()` expected, such as ``'l1', 'l2' or 'huber'`` or ``greater than 0``."""
     if error["type"] == "missing":
         return "a value"
+    if error["type"] in _LENGTHS:
+        words, limit, unit = _LENGTHS[error["type"]]
+        count = int(error["ctx"][limit])
+        return f"{words} {count:,} {unit}{'' if count == 1 else 's'}"
     message = str(error["msg"])
     for introduction in ("Input should be ", "Value error, "):
         message = message.removeprefix(introduction)

@@ -22,6 +22,9 @@ from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 from starlette.requests import ClientDisconnect, Request
 
+LONGEST_FILE_NAME = 200
+"""Characters of a file's name that are kept, as many as of a job's name."""
+
 BATCH = 2**18
 """Bytes gathered before a thread parses and writes them: a hop costs some 50 µs, so smaller batches would be mostly hops."""
 _SUFFIX = re.compile(r"\.[a-z0-9]{1,8}")
@@ -57,6 +60,8 @@ class File:
     path: Path
     bytes: int
     sha256: str
+    name: str = ""
+    """The user's name of the file, without its folder; empty where the request has none."""
 
 
 @dataclass(frozen=True)
@@ -171,6 +176,7 @@ class _Part:
     header_value: bytearray = field(default_factory=bytearray)
     disposition: bytes = b""
     name: str = ""
+    file_name: str = ""
     path: Path | None = None
     sink: BinaryIO | None = None
     text: bytearray = field(default_factory=bytearray)
@@ -250,7 +256,8 @@ class _Reader:
             raise wrong_input(code, field=part.name, expected="the part once", got="it twice", hint="Send it once.")
         # A part that can only be text is text even if the client gave it a file name, as several HTTP libraries do.
         if part.name in rules.files and b"filename" in options:
-            suffix = Path(options[b"filename"].decode("utf-8", "replace")).suffix.lower()
+            part.file_name = own_name(options[b"filename"].decode("utf-8", "replace"))
+            suffix = Path(part.file_name).suffix.lower()
             part.path = self._folder / f"{part.name}{suffix if _SUFFIX.fullmatch(suffix) else ''}"
             part.sink = part.path.open("xb")
         elif part.name not in rules.texts:
@@ -288,11 +295,17 @@ class _Reader:
             return
         part.sink.close()
         assert part.path is not None
-        self._files[part.name] = File(part.path, part.size, part.digest.hexdigest())
+        self._files[part.name] = File(part.path, part.size, part.digest.hexdigest(), part.file_name)
         part.sink = None
 
     def _all(self) -> None:
         self._ended = True
+
+
+def own_name(given: str) -> str:
+    """Return the last component of a file name that a client sent, on one line and not longer than file systems allow."""
+    last = given.replace("\\", "/").rpartition("/")[2]
+    return "".join(each if each.isprintable() else " " for each in last)[:LONGEST_FILE_NAME].strip()
 
 
 def _malformed(why: str) -> Refusal:

@@ -11,7 +11,7 @@ from typing import Any, get_args
 from pliant.schemas.job import Interpretation, Job, Priority
 from pliant.schemas.options import Options
 from pliant.schemas.problems import ProblemCode
-from pliant.service.multipart import File, Form, FormRules
+from pliant.service.multipart import File, Form, FormRules, own_name
 from pliant.service.problems import Refusal, from_validation, wrong_input
 from pliant.service.settings import ServiceSettings
 from pliant.worker.artifacts import kinds_for
@@ -161,7 +161,9 @@ def kept_inputs(form: Form, options: Options, folder: Path, jobs: Jobs) -> Kept 
     if is_source(file):
         source = open_source(file, folder / "kept")
         files = {
-            part: File(path, path.stat().st_size, hashlib.sha256(f"{id} {part}".encode()).hexdigest())
+            part: File(
+                path, path.stat().st_size, hashlib.sha256(f"{id} {part}".encode()).hexdigest(), source.names[part]
+            )
             for part, path in (("film", source.film), ("region", source.region))
             if path is not None
         }
@@ -169,8 +171,9 @@ def kept_inputs(form: Form, options: Options, folder: Path, jobs: Jobs) -> Kept 
     for name in READING:
         wanted, had = getattr(options, name), getattr(job.options, name)
         if name in options.model_fields_set and wanted != had:
+            kept = "no value" if had is None else repr(had)
             raise wrong_input(
-                ProblemCode.CONFLICTING_PARTS, field=f"options.{name}", expected=f"{had!r}, as the inputs of job {id!r} were read",
+                ProblemCode.CONFLICTING_PARTS, field=f"options.{name}", expected=f"{kept}, as the inputs of job {id!r} were read",
                 got=repr(wanted), hint="Send the files again to read them in another way.",
             )  # fmt: skip
     had = {name: getattr(job.options, name) for name in READING}
@@ -212,7 +215,7 @@ def with_uploads(form: Form, folder: Path, uploads: Uploads) -> Form:
             raise wrong_input(
                 code, field=name, status=422, expected="a complete upload", got="a part of it", hint=hint
             ) from error
-        files[part] = File(path, path.stat().st_size, digest)
+        files[part] = File(path, path.stat().st_size, digest, own_name(texts.get("name", "")) if part == "film" else "")
     return Form(files=files, texts=texts)
 
 
@@ -267,7 +270,10 @@ def _check_film_parts(form: Form) -> None:
 
 def _read_film(form: Form, options: Options, bounds: FilmBounds, target: Path | None) -> tuple[Interpretation, Options]:
     region = form.files.get("region")
-    source = FilmSource(form.files["film"].path, None if region is None else region.path)
+    source = FilmSource(
+        form.files["film"].path, None if region is None else region.path, film_name=form.files["film"].name or "the film",
+        region_name="the region" if region is None else region.name or "the region",
+    )  # fmt: skip
     facts = check_film(source, options, bounds)
     options = film_options(options, facts)
     interpretation = described(facts, options)

@@ -96,6 +96,7 @@ def _solved(
     if needs_blocks(tracks, settings):
         solution = shapes_in_blocks(tracks, cameras, prior, mesh, settings, monitor, seconds={"cameras": learning})
         return solution if verdict is None else _with_verdict(solution, verdict, settings)
+    monitor.enter("start")
     start = with_outliers_rejected(prepared(tracks, cameras, prior, mesh, settings, should_stop=monitor), monitor)
     if start.rejected().any() and not monitor():
         again = time.perf_counter()

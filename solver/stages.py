@@ -22,8 +22,12 @@ ITERATION_SECONDS = {True: 1.2e-7, False: 1e-7}
 """Seconds per iteration of conjugate gradients, frame and point, with and without a learned prior; measured 0.9e-7 to 1.1e-7
 for 60 × 4,000, 50 × 9,000 and 99 × 6,000."""
 
-SETUP_SECONDS = 0.1
-"""Of the shapes."""
+SETUP_SECONDS, START_SECONDS, START_UNITS = 0.1, 8e-7, 9
+"""Of the start of the shapes: seconds of any, further ones per frame and point, and its units. Measured for 10 × 20,000, 60 × 4,000,
+50 × 30,000 and 50 × 100,000: 7e-7 to 1.1e-6 seconds, 9 units."""
+
+FINISH_SECONDS = 3e-7
+"""Seconds per frame and point of the solution in the tracks' unit and of the probabilities; measured for 50 × 30,000 and 50 × 100,000."""
 
 SURFACE_SECONDS, SURFACE_SETUP = 0.7, 40
 """Seconds per frame of the search for an isometric surface, on at most 24 frames, and the units that its preparation takes as long as."""
@@ -60,7 +64,7 @@ UNITS = {
     "refinement": (1500, 360, 1.1),
     "covariance": (380, 360, 1.0),
     "extension": (80, 1_000_000, 3.0),
-    "trust": (6, 100, 130.0),
+    "trust": (10, 100, 78.0),
 }
 """Stages of the default prior: typical number of units, maximum number of frames used, and cost of a unit against that of an iteration.
 Measured on sequences of 10 to 80 frames, clean and spoiled."""
@@ -102,13 +106,14 @@ def planned(
     """
     iterations = expected_iterations(unseen)
     work = expected_reweightings(unseen) * (1 + iterations)
-    shapes = Stage("shapes", SETUP_SECONDS + ITERATION_SECONDS[gaussian] * work * frames * points, 100)
-    last = [stage_of("trust", frames)] if gaussian else []
+    start = Stage("start", SETUP_SECONDS + START_SECONDS * frames * points, START_UNITS)
+    shapes = Stage("shapes", ITERATION_SECONDS[gaussian] * work * frames * points, 100)
+    last = [Stage("finish", FINISH_SECONDS * frames * points, 3), *([stage_of("trust", frames)] if gaussian else [])]
     first = [Stage("surface", SURFACE_SECONDS * min(frames, 24), 280, setup=SURFACE_SETUP)] if sheet else []
     most_frames, most_points = MOST_COMPLETED
     filled = COMPLETION_SECONDS * frames * min(frames, most_frames) * min(points, most_points) if unseen > 0 else 0.0
     first.append(Stage("completion", 0.1 + filled, 6, growth=RANK_GROWTH))
-    return (*first, *learning(frames, gaussian=gaussian, known_cameras=known_cameras), shapes, *last)
+    return (*first, *learning(frames, gaussian=gaussian, known_cameras=known_cameras), start, shapes, *last)
 
 
 def unseen_frames(visible: Floats) -> float:
@@ -143,7 +148,8 @@ def stage_of(name: str, frames: int) -> Stage:
 class Pace:
     """Remaining time of a plan, from the durations of the stages so far.
 
-    The pace is the measured time of the finished stages over their planned time: it covers machines of other speed and with other load.
+    The pace is the measured time of the finished stages over the planned time of the work that they did: it covers machines of other speed
+    and with other load. A stage that ended after fewer units than planned counts by these, or it would pass for a fast machine.
     The shapes stay out of it, because `Descent` extrapolates them by themselves.
     """
 
@@ -154,10 +160,10 @@ class Pace:
     planned: float = PACE_PRIOR
 
     def next(self, stage: Stage, share: float, now: float) -> None:
-        """Count a finished stage; `share` of it is done, 0 if it was skipped."""
+        """Count a finished stage; `share` of its units was done, 0 if it was skipped."""
         if share > 0 and stage.name != "shapes":
             self.measured += now - self.began
-            self.planned += stage.seconds
+            self.planned += share * stage.seconds
         self.began = now
 
     @property

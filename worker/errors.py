@@ -153,7 +153,7 @@ class UploadTooLarge(InvalidRequest):
 
     def __init__(self, most: int, got: int) -> None:
         super().__init__(
-            "upload_too_large", field="body", expected=f"at most {most} bytes", got=f"{got} or more",
+            "upload_too_large", field="body", expected=f"at most {most:,} bytes", got=f"{got:,} or more",
             hint="Send fewer frames or points, or store float32; see /v1/limits.",
         )  # fmt: skip
 

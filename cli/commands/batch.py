@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from pliant.cli.exits import Exit
 from pliant.cli.films import is_film
 from pliant.cli.paths import output_folder
-from pliant.cli.show import COLOURS, err, out, print_json
+from pliant.cli.show import COLOURS, details_of, err, explained_at, out, print_json
 
 if TYPE_CHECKING:
     from pliant.client import Client, RemoteJob
@@ -81,6 +81,8 @@ class Batch:
     timeout: float | None
     output: Path | None
     wait: bool
+    url: str
+    """Address of the service."""
     rows: list[Row] = field(default_factory=list)
 
     def check(self, *, name: str, job_id: str | None, region: Path | None, force: bool) -> None:
@@ -152,7 +154,7 @@ class Batch:
     def show(self, *, as_json: bool) -> None:
         """Print the table."""
         if as_json:
-            print_json([{"file": str(row.file), **_outcome(row)} for row in self.rows])
+            print_json([{"file": str(row.file), **self._outcome(row)} for row in self.rows])
             return
         from rich.table import Column, Table
         from rich.text import Text
@@ -171,9 +173,22 @@ class Batch:
             table.add_row(
                 Text(str(row.file)), "" if job is None else job.id, Text(status, COLOURS.get(status, "red")),
                 "" if job is None else job.verdict or "", "" if took is None else f"{took.total_seconds():.1f}",
-                Text("" if row.error is None else str(row.error)),
+                Text("" if row.error is None else self._refusal(row.error)),
             )  # fmt: skip
         out().print(table)
+
+    def _refusal(self, error: Exception) -> str:
+        """Return the message of an error, and where it is explained."""
+        more = explained_at(details_of(error), self.url)
+        return str(error) if more is None else f"{error} More about this error: {more}"
+
+    def _outcome(self, row: Row) -> dict[str, Any]:
+        """Return what became of a file, as JSON."""
+        return {
+            "job": None if row.job is None else row.job.model_dump(mode="json"),
+            "error": None if row.error is None else str(row.error),
+            "explained_at": None if row.error is None else explained_at(details_of(row.error), self.url),
+        }
 
     def _key_of(self, file: Path) -> str:
         """Return the idempotency key of a file: of its content, the options and everything that goes with it."""
@@ -184,10 +199,3 @@ class Batch:
             [self.key, self.options, {name: str(each) for name, each in self.shared.items()}], sort_keys=True
         )
         return f"batch/{hashlib.sha256(f'{content} {file.stem} {rest}'.encode()).hexdigest()}"
-
-
-def _outcome(row: Row) -> dict[str, Any]:
-    return {
-        "job": None if row.job is None else row.job.model_dump(mode="json"),
-        "error": None if row.error is None else str(row.error),
-    }

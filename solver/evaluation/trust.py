@@ -93,7 +93,7 @@ class Trust:
         """The expected error and what depth rests on, in words."""
         rests = f"depth rests on {self.turn_degrees:.0f}° of turn"
         if self.expected_error is None:
-            return f"The error is not estimated with this prior; {rests}."
+            return f"The error is not estimated; {rests}."
         if self.interval is None:
             return f"Expected error at least {_at_most(self.expected_error)}; {rests}."
         return f"Expected error about {_at_most(self.expected_error)}; {rests}."

@@ -104,7 +104,7 @@ def _monitor_of(part: Tracks, settings: Settings, monitor: Monitor, number: int,
         if step.stage != "finish" or step.fraction < 1:
             monitor.report_block(step, (number + step.fraction) / count)
 
-    return monitored(part, None, settings, on_step, monitor, only=("shapes", "trust"))
+    return monitored(part, None, settings, on_step, monitor, only=("shapes", "finish", "trust"))
 
 
 class _Whole:

@@ -10,7 +10,7 @@ from pliant.solver.cameras.camera_choice import with_camera_choice
 from pliant.solver.energy.problem import Problem
 from pliant.solver.errors import InvalidInput
 from pliant.solver.mesh import Mesh
-from pliant.solver.monitor import Monitor, enter
+from pliant.solver.monitor import Monitor
 from pliant.solver.reconstruction.cameras import Cameras
 from pliant.solver.reconstruction.observations import OnStep, ShouldStop, in_units_of, monitored
 from pliant.solver.reconstruction.prior import Prior
@@ -78,7 +78,7 @@ def solve_shapes(
     """
     began = time.perf_counter()
     begun = prepared(tracks, cameras, prior, mesh, settings)
-    monitor = monitored(tracks, None, begun.settings, on_step, should_stop, only=("shapes", "trust"))
+    monitor = monitored(tracks, None, begun.settings, on_step, should_stop, only=("shapes", "finish", "trust"))
     begun = with_outlier_reason(with_outliers_rejected(begun, monitor))
     if start is not None:
         begun = _warm(begun, np.asarray(start.shapes if isinstance(start, Solution) else start, dtype=np.float64))
@@ -190,14 +190,15 @@ def _finished(start: Start, history: list[State], outcome: Outcome, monitor: Mon
     choices = with_camera_choice(
         start.choices, estimate.perspective, start.settings, unit=normalized.unit, given=observations.known is not None
     )
+    monitor.enter("finish")
     monitor()
     solution = finish(problem, history, outcome, normalized=normalized, estimate=estimate, choices=choices)
     if estimate.perspective is not None:
         solution = seen_in_perspective(solution, tracks, estimate.perspective, normalized.unit, start.kept)
-    enter(monitor, "trust")
     confidence = np.asarray(problem.confidence, dtype=np.float64)
     monitor()
     solution = with_inlier_probability(solution, tracks, confidence, loss=problem.loss, should_stop=monitor)
+    monitor.enter("trust")
     solution = assessed(
         solution, tracks, confidence, estimate, start.covariance, normalized.unit,
         turning=observations.turning, seed=start.settings.seed, should_stop=monitor,

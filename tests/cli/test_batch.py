@@ -78,7 +78,14 @@ def test_a_file_that_is_refused_has_its_row_and_stops_nothing(run: Run, takes: P
     np.savez(takes / "take-1.npz", tracks=np.ones((2, 9, 2)))
     ran = run("submit", takes, "--mesh", "none", "--wait")
     assert ran.exit_code == Exit.FAILED
-    assert (ran.stdout.count("succeeded"), ran.stdout.count("too_few_frames") + ran.stdout.count("│ refused")) == (2, 1)
+    assert (ran.stdout.count("succeeded"), ran.stdout.count("│ refused")) == (2, 1)
+    rows = json.loads(run("submit", takes, "--mesh", "none", "--wait", "--json").stdout)
+    assert [(row["error"], row["explained_at"]) for row in rows if row["error"] is not None] == [
+        (
+            "tracks: expected at least 3 frames, got 2. Track a longer clip.",
+            "http://127.0.0.1:8000/errors/too_few_frames",
+        )
+    ]
     assert len(jobs_of(run)) == 2
 
 

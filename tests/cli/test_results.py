@@ -61,6 +61,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return held
 
 
+TAKEN = "Address already in use"
+
+
 def test_further_files_are_made_and_downloaded(run: Run, job: str, tmp_path: Path) -> None:
     ran = run("result", job, "--make", "mdd", "--make", "csv", "--fps", "50", "-o", tmp_path / "more")
     assert ran.exit_code == 0, ran.output
@@ -72,7 +75,8 @@ def test_further_files_are_made_and_downloaded(run: Run, job: str, tmp_path: Pat
     wrong = run("result", job, "--make", "fbx", "-o", tmp_path / "no")
     assert (wrong.exit_code, " ".join(wrong.stderr.split())) == (
         Exit.REFUSED,
-        "error outputs.0: expected 'glb', 'ply', 'obj', 'usd', 'abc', 'mdd', 'mat' or 'csv', got 'fbx'.",
+        "error outputs.0: expected 'glb', 'ply', 'obj', 'usd', 'abc', 'mdd', 'mat' or 'csv', got 'fbx'. "
+        "More about this error: pliant explain invalid_argument",
     )
 
 
@@ -105,7 +109,7 @@ def test_a_link_is_made_listed_and_revoked(run: Run, job: str, service: InMemory
     wrong = run("share", job, "--days", "0")
     assert (wrong.exit_code, " ".join(wrong.stderr.split())) == (
         Exit.REFUSED,
-        "error days: expected a minute (0.0007) to 366 days, got 0.0.",
+        "error days: expected a minute (0.0007) to 366 days, got 0.0. More about this error: pliant explain invalid_argument",
     )
 
 
@@ -150,14 +154,15 @@ def test_what_is_no_result_is_refused(run: Run, folder: Path, tmp_path: Path) ->
             f"error {tmp_path}: expected the folder of a result, as `pliant solve -o` or `pliant result -o` writes it, got a folder "
             "without report.json and preview.bin. Name the folder that holds report.json and preview.bin."
         )
-        for arguments, words in (
-            ((tmp_path / "none",), f"error result: {tmp_path / 'none'} does not exist. Name the folder that `pliant solve -o` wrote."),
-            ((tmp_path,), no_result),
-            ((folder, "--port", port), f"error --port: cannot listen on {port}: Address already in use. Choose another, or 0."),
+        usage, none = "invalid_argument", tmp_path / "none"
+        for arguments, code, words in (
+            ((none,), usage, f"error result: {none} does not exist. Name the folder that `pliant solve -o` wrote."),
+            ((tmp_path,), "not_a_result", no_result),
+            ((folder, "--port", port), usage, f"error --port: cannot listen on {port}: {TAKEN}. Choose another, or 0."),
         ):  # fmt: skip
             ran = run("view", "--no-browser", *arguments)
             assert ran.exit_code == Exit.REFUSED, ran.output
-            assert " ".join(ran.stderr.split()) == words
+            assert " ".join(ran.stderr.split()) == f"{words} More about this error: pliant explain {code}"
     for text in ("{", "[]", '{"options": 1}'):
         (tmp_path / "report.json").write_text(text)
         (tmp_path / "preview.bin").write_bytes(b"")

@@ -18,7 +18,9 @@ from pliant.cli import app
 from pliant.cli.exits import Exit, code_of, sentence_of
 from pliant.cli.paths import output_file, output_folder
 from pliant.cli.session import Session
+from pliant.cli.show import details_of, explained_at
 from pliant.client import BadArgument
+from pliant.schemas.problems import ProblemCode
 from pliant.service.testing import InMemoryService
 from pliant.worker.settings import NUMERICAL_THREADS
 from typer.testing import CliRunner, Result
@@ -58,6 +60,11 @@ def words(ran: Result) -> str:
     return " ".join(ran.stderr.split())
 
 
+def refusal(sentence: str, code: str = "invalid_argument") -> str:
+    """What the command line prints: the sentence, and where its code is explained."""
+    return f"error {sentence} More about this error: pliant explain {code}"
+
+
 NO_FILE = "expected a file, got no file at"
 NO_TRACKS = (
     "FOLDER: expected track files (.csv, .h5, .hdf5, .mat, .npy, .npz, .txt), got an empty folder. Name the files."
@@ -92,6 +99,19 @@ LISTED = "`pliant options` lists every option."
             "--preview: TRACKS exists already. Choose another name, or replace it with --force.",
         ),
         ("track FILM -o t.npz --region no.png", f"--region: {NO_FILE} no.png. Check the path."),
+        (
+            "submit TRACKS -m no.obj",
+            "mesh: expected a mesh file, ROWSxCOLUMNS or none, got no file at no.obj. "
+            "Check the path, or give a grid size such as 48x64.",
+        ),
+        ("submit TRACKS -g no.npz", f"ground_truth: {NO_FILE} no.npz. Check the path."),
+        ("submit TRACKS -r no.npz", f"rotations: {NO_FILE} no.npz. Check the path."),
+        ("submit FOLDER/*.npz", "FOLDER/*.npz: expected files that match, got none. Check the pattern and its quotes."),
+        (
+            "list -s done",
+            "--status: expected one of queued, running, cancelling, succeeded, failed, cancelled, got 'done'.",
+        ),
+        ("submit TRACKS -O loss", f"--option: expected NAME=VALUE, got 'loss'. {LISTED}"),
         ("solve TRACKS -o OUT -O frobnicate=1", f"options: frobnicate: there is no such option. {LISTED}"),
         ("submit TRACKS -O los=l1", f"options: los: there is no such option (did you mean loss?). {LISTED}"),
     ],
@@ -112,7 +132,8 @@ def test_wrong_paths_and_options(run: Run, tracks: Path, tmp_path: Path, argumen
 
     ran = run(*map(filled, arguments.split()))
     assert (ran.exit_code, ran.stdout) == (Exit.REFUSED, "")
-    assert words(ran) == f"error {filled(sentence)}"
+    code = "invalid_option" if sentence.startswith("options:") else "invalid_argument"
+    assert words(ran) == refusal(filled(sentence), code)
 
 
 def test_a_path_that_the_system_rejects(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -133,7 +154,7 @@ def test_an_unreadable_file(run: Run, tracks: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr("pliant.client.multipart.os.access", lambda *_: False)
     ran = run("solve", tracks, "-o", tmp_path / "out")
     assert ran.exit_code == Exit.REFUSED
-    assert words(ran) == f"error tracks: the file {tracks} cannot be read. Change its permissions."
+    assert words(ran) == refusal(f"tracks: the file {tracks} cannot be read. Change its permissions.")
 
 
 def test_system_errors_have_a_message_and_defects_a_traceback(tmp_path: Path) -> None:
@@ -151,8 +172,8 @@ def test_existing_results_are_kept_unless_forced(run: Run, tracks: Path, tmp_pat
     out = tmp_path / "out"
     out.mkdir()
     (out / "report.json").write_text("mine")
-    sentence = (
-        f"error --output: {out} already holds report.json. Choose another folder, or replace the files with --force."
+    sentence = refusal(
+        f"--output: {out} already holds report.json. Choose another folder, or replace the files with --force."
     )
     for command in (("solve", tracks, "-o", out), ("submit", tracks, "-o", out)):
         ran = run(*command)
@@ -176,7 +197,7 @@ def test_jobs_are_named_by_prefix_or_as_the_last_one(run: Run, tracks: Path) -> 
     assert json.loads(run("watch", "@last", "--json").stdout)["id"] == "banana-1"
     ran = run("status", "apple")
     assert ran.exit_code == Exit.REFUSED
-    assert words(ran) == "error apple: 2 jobs begin with it (apple-2, apple-1). Give more characters."
+    assert words(ran) == refusal("apple: 2 jobs begin with it (apple-2, apple-1). Give more characters.")
     assert run("log", "cherry").exit_code == Exit.NOT_FOUND
     run("watch", "apple-1")
     ran = run("delete", "apple-1", "cherry")
@@ -184,8 +205,11 @@ def test_jobs_are_named_by_prefix_or_as_the_last_one(run: Run, tracks: Path) -> 
     assert run("status", "apple-1").exit_code == 0, "nothing is deleted unless every id is valid"
     assert words(run("delete", "apple-1")) == "Deleted: apple-1"
     empty = CliRunner().invoke(app, ["status", "@last"], obj=Session(transport=InMemoryService()))
-    assert empty.exit_code == Exit.REFUSED
-    assert words(empty) == "error @last: the service has no jobs. Submit one with `pliant submit TRACKS`."
+    assert empty.exit_code == Exit.NOT_FOUND
+    assert words(empty) == (
+        "error @last: there are no jobs yet. Submit one with `pliant submit FILE`, a track file or a film. "
+        "More about this error: http://127.0.0.1:8000/errors/unknown_job"
+    )
 
 
 def test_the_id_is_printed_before_waiting(run: Run, tracks: Path, service: InMemoryService) -> None:
@@ -220,7 +244,9 @@ def test_commands_of_the_server_name_what_to_install(
     ran = CliRunner().invoke(app, command)
     name = {"token": "pliant token"}.get(command[0], f"pliant {' '.join(command)}")
     assert ran.exit_code == Exit.UNHEALTHY
-    assert words(ran) == f"error {name} needs the service, which is not installed: pip install 'pliant[server]'"
+    assert words(ran) == refusal(
+        f"{name} needs the service, which is not installed: pip install 'pliant[server]'", "missing_extra"
+    )
 
 
 @pytest.mark.parametrize(
@@ -235,8 +261,8 @@ def test_no_installation_is_refused_and_nothing_is_created(
     for name, what in (("new", "which does not exist"), ("empty", "which has none of its folders")):
         ran = run(*command, "--data", name)
         assert ran.exit_code == Exit.REFUSED
-        assert words(ran) == (
-            f"error --data: expected the directory of an installation, got {name}, {what}. Give the one that `pliant up` uses."
+        assert words(ran) == refusal(
+            f"--data: expected the directory of an installation, got {name}, {what}. Give the one that `pliant up` uses."
         )
     assert [each.name for each in tmp_path.rglob("*")] == ["empty"]
 
@@ -244,7 +270,7 @@ def test_no_installation_is_refused_and_nothing_is_created(
 def test_an_unknown_scope_is_refused_before_the_installation_is_opened(run: Run, tmp_path: Path) -> None:
     ran = run("token", "create", "ada", "--scope", "root", "--data", str(tmp_path / "data"))
     assert ran.exit_code == Exit.REFUSED
-    assert words(ran) == "error --scope: expected read, submit, admin, got 'root'."
+    assert words(ran) == refusal("--scope: expected read, submit, admin, got 'root'.")
     assert not (tmp_path / "data").exists()
 
 
@@ -333,3 +359,40 @@ def test_ctrl_c_while_waiting_prints_how_to_resume(
         == "error Interrupted. Job slow continues: `pliant watch slow` follows it, `pliant cancel slow` stops it."
     )
     run("cancel", "slow")
+
+
+def test_an_error_code_is_explained(run: Run) -> None:
+    code = ProblemCode.TOO_FEW_FRAMES
+    assert run("explain", "too_few_frames").stdout == (
+        f"{code.heading}: too_few_frames (HTTP status 422)\n{code.cause}\nWhat to do: {code.remedy}\n"
+    )
+    assert run("explain", "unusable_path").stdout.startswith("Unusable path: unusable_path\n")
+    assert json.loads(run("explain", "too_few_frames", "--json").stdout) == [
+        {"code": code, "status": 422, "title": code.heading, "cause": code.cause, "remedy": code.remedy}
+    ]
+    assert [line.split()[0] for line in run("explain").stdout.splitlines()] == list(ProblemCode)
+    ran = run("explain", "too_few_frame")
+    assert (ran.exit_code, words(ran)) == (
+        Exit.REFUSED,
+        refusal(
+            "CODE: there is no error code 'too_few_frame'. Did you mean too_few_frames? `pliant explain` lists all codes."
+        ),
+    )
+
+
+def test_every_refusal_ends_with_where_it_is_explained(run: Run, tracks: Path, tmp_path: Path) -> None:
+    """From this machine the command that explains it, from a service its page, which answers; JSON has a member for it."""
+    np.savez(tmp_path / "short.npz", tracks=np.ones((2, 9, 2)))
+    sentence = "error tracks: expected at least 3 frames, got 2. Track a longer clip. More about this error: "
+    ran = run("inspect", tmp_path / "short.npz")
+    assert words(ran) == f"{sentence}pliant explain too_few_frames"
+    ran = run("submit", tmp_path / "short.npz", "--url", "http://pliant.test/")
+    assert words(ran) == f"{sentence}http://pliant.test/errors/too_few_frames"
+    document = json.loads(run("submit", tmp_path / "short.npz", "--json").stderr)
+    assert document["explained_at"] == "http://127.0.0.1:8000/errors/too_few_frames"
+    full = OSError(28, "No space left on device")
+    assert explained_at(details_of(full), None) == "pliant explain unusable_path"
+    assert explained_at(details_of(KeyboardInterrupt()), None) is None, "no refusal"
+    ran = run("solve", tracks, "--frobnicate")
+    assert ran.exit_code == Exit.USAGE
+    assert "Try 'pliant solve --help' for help." in words(ran), "usage errors lead to the reference of the command"

@@ -121,7 +121,17 @@ def test_ids_are_whole_on_a_narrow_terminal(
     known = job(id="e2efed37cfcf5352891c", name="a name that is long", verdict="with_care")
     show_jobs([known], as_json=False)
     assert known.id in capsys.readouterr().out
-    batch = Batch(files=[], shared={}, options={}, key="", priority="normal", timeout=None, output=None, wait=True)
+    batch = Batch(
+        files=[],
+        shared={},
+        options={},
+        key="",
+        priority="normal",
+        timeout=None,
+        output=None,
+        wait=True,
+        url="http://pliant.test",
+    )
     batch.rows = [Row(Path("a file with a long name.npz"), known)]
     batch.show(as_json=False)
     assert known.id in capsys.readouterr().out

@@ -136,6 +136,7 @@ def test_a_film_and_its_region_are_stored_byte_for_byte(film: Path, region: Path
     assert back.film.read_bytes() == film.read_bytes()
     assert back.region is not None
     assert back.region.read_bytes() == region.read_bytes()
+    assert back.names == {"film": film.name, "region": region.name}
     np.savez(tmp_path / "tracks.npz", tracks=np.zeros(3))
     (tmp_path / "text").write_text("no zip")
     assert not is_source(tmp_path / "tracks.npz")

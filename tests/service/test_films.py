@@ -18,6 +18,7 @@ from pliant.cli import app
 from pliant.cli.session import Session
 from pliant.client import BadArgument, Client
 from pliant.schemas.job import Job, Status
+from pliant.service.multipart import own_name
 from pliant.service.submission import FILES
 from pliant.worker.execution import attempt
 from serving import Running, tracks, until
@@ -111,6 +112,27 @@ def test_inspection_opens_a_film_and_tracks_nothing(running: Running, http: http
     assert answer.status_code == 200, answer.text
     assert (answer.json()["num_frames"], answer.json()["num_points"], answer.json()["sample"]) == (10, 0, [])
     assert running.waiting == before
+
+
+KINDS = "an mp4, mov, webm, mkv or avi film, an animated GIF, a zip of pictures, or a folder of pictures"
+
+
+def test_a_refused_film_has_the_users_name(http: httpx.Client, film: bytes) -> None:
+    """As given in the form, without its folder; for an upload, whose file has no name, that of the job."""
+    sentence = f"film: expected {KINDS}, got {{}}, which is none of these. Convert it: ffmpeg -i FILM film.mp4"
+    answer = http.post("/v1/inspect", files={"film": ("../films/my take 3.mp4", b"%PDF-1.7")})
+    assert answer.json()["detail"] == sentence.format("my take 3.mp4")
+    assert http.put("/v1/uploads/no-film", content=b"%PDF-1.7").is_success
+    named = {"film_upload": (None, "no-film"), "name": (None, "my take")}
+    assert http.post("/v1/inspect", files=named).json()["detail"] == sentence.format("my take")
+    wrong = {"film": ("take.mp4", film), "region": ("my mask.png", b"no picture")}
+    assert "got my mask.png: " in http.post("/v1/inspect", files=wrong).json()["detail"]
+
+
+def test_the_users_name_is_one_component_on_one_line() -> None:
+    assert own_name("C:\\films\\my take 3.mp4") == "my take 3.mp4"
+    assert own_name("../two\tlines\u2028.mp4") == "two lines .mp4"
+    assert len(own_name("a" * 5000)) == 200
 
 
 def huge(path: Path) -> bytes:

@@ -10,7 +10,7 @@ import pytest
 from pliant.solver import Outcome, Settings, Step, Tracks, gallery, solve
 from pliant.solver.descent import Descent, expected_iterations, steps_left
 from pliant.solver.monitor import Monitor
-from pliant.solver.stages import Stage, planned, unseen_frames
+from pliant.solver.stages import Pace, Stage, planned, unseen_frames
 
 
 def small(*, noisy: bool = False) -> Tracks:
@@ -165,17 +165,45 @@ def test_points_hidden_for_long_make_more_and_longer_reweightings() -> None:
     assert expected_iterations(0) < expected_iterations(20) < expected_iterations(1000) == 60
     seen, hidden = descended([1.0, 0.5]), descended([1.0, 0.5], unseen=20.0, iterations=15)
     assert hidden.reweightings_left() > 1.5 * seen.reweightings_left()
-    assert hidden.iterations_ahead() > 2 * seen.iterations_ahead()
-    assert hidden.iterations_ahead() == 10, "fewer than in the first"
+    assert hidden.units_ahead() > 2 * seen.units_ahead()
+    assert descended([1.0, 0.5], unseen=20.0, iterations=30).units_ahead() == 15, "fewer than in the first"
     first = Descent()
+    assert first.units_ahead() == 10, "five iterations, and what a reweighting does besides"
     first.current = 58
-    assert first.iterations_ahead() == 58, "the reweighting under way already has more"
+    assert first.units_ahead() == 58, "the reweighting under way already has more"
     size = {"gaussian": True, "known_cameras": False, "sheet": False}
     seconds = [
         {stage.name: stage.seconds for stage in planned(40, 10_000, unseen=each, **size)}["shapes"]
         for each in (0.0, 20.0)
     ]
     assert seconds[1] > 4 * seconds[0]
+
+
+def test_where_nothing_is_hidden_the_end_comes_early_and_costs_little() -> None:
+    """Objectives and units of a flag of 40 frames: iterations fall from 34 to 3 in the last reweighting."""
+    objectives, units = [382.36, 14.423, 2.2499, 1.9998, 1.99246, 1.99241], [12, 10, 12, 39, 8]
+    descent = Descent(0.0, tolerance=1e-4)
+    descent.begin(objectives[0], 0.0)
+    left = []
+    for objective, count in zip(objectives[1:], units, strict=True):
+        descent.current = count
+        descent.reweighted(objective)
+        left.append((round(descent.reweightings_left(), 1), round(descent.units_ahead(), 1)))
+    assert left[2] == (3.0, 12.0), "a decrease of 11 % says nothing about the end"
+    assert left[3] == (1.6, 18.6), "one of .4 % is followed by a smaller and shorter step"
+    assert left[4][0] == 0
+    hidden = descended(objectives[:5], unseen=2.0)
+    assert hidden.reweightings_left() > descended(objectives[:5]).reweightings_left() + 1, "hidden points settle slowly"
+
+
+def test_a_stage_that_ends_early_is_no_sign_of_a_fast_machine() -> None:
+    pace = Pace(0.0)
+    pace.next(Stage("refinement", 10.0, 1000), 0.1, 1.0)  # a tenth of the units in a tenth of the time
+    assert pace.known == 1.0
+    pace.next(Stage("scales", 2.0, 100), 1.0, 5.0)  # twice as long as planned
+    assert pace.known == pytest.approx(5.5 / 3.5)
+    pace.next(Stage("starts", 2.0, 100), 0.0, 6.0)  # skipped
+    assert pace.known == pytest.approx(5.5 / 3.5)
 
 
 def test_corrections_for_perspective_are_expected_and_counted_down() -> None:

@@ -219,7 +219,7 @@ def _square(size: tuple[int, int], aspect: float) -> tuple[int, int]:
 def _selection(film: Film, frames: int | slice | str | None) -> tuple[int, int | None, int]:
     if frames is None:
         return 0, None, 1
-    text = isinstance(frames, str)
+    given = f"'{frames}'" if isinstance(frames, str) else repr(frames)
     try:
         if isinstance(frames, str):
             parts = [int(part) if part.strip() else None for part in frames.split(":")]
@@ -235,7 +235,7 @@ def _selection(film: Film, frames: int | slice | str | None) -> tuple[int, int |
     raise FilmError(
         "wrong_selection", field="frames",
         expected="a number of frames from 1, or start:stop:step with start ≥ 0, stop > start and step ≥ 1",
-        got=repr(frames) if not text else f"'{frames}'", hint="For example '0:300:2', every second of the first 300 frames.",
+        got=given, hint="For example '0:300:2', every second of the first 300 frames.",
     )  # fmt: skip
 
 

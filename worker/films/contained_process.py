@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 import resource
 import sys
 import time
@@ -190,15 +191,22 @@ def _followed(step: TrackingStep, size: tuple[int, int]) -> dict[str, Any] | Non
 
 
 def _refused(error: FilmError, request: dict[str, Any]) -> InvalidInput:
-    """Return the error with the job's field names and without paths."""
+    """Return the error with the job's field names, and with the user's names of the files instead of paths."""
     field = f"options.{error.field}" if error.field in OPTIONS else error.field
     if field == "region" and request["region"] is None and request["options"]["region_polygon"] is not None:
         field = "options.region_polygon"
     got = error.got
     for name in ("film", "region"):
         if request[name] is not None:
-            got = got.replace(f"{Path(request[name]).parent}{os.sep}", "")
+            got = _renamed(got, Path(request[name]), str(request["names"][name]))
     return InvalidInput(error.code, field=field, expected=error.expected, got=got, hint=error.hint)
+
+
+def _renamed(got: str, path: Path, name: str) -> str:
+    """Return what was given, with the user's name of a file where its path, or the name of that, begins it or follows "in"."""
+    start, own, rest = got.replace(f"{path.parent}{os.sep}", "").partition(path.name)
+    named = own != "" and (start == "" or start.endswith(" in ")) and re.match(r"\w", rest) is None
+    return f"{start}{name}{rest}" if named else f"{start}{own}{rest}"
 
 
 def _for_want_of_memory(error: Exception) -> bool:

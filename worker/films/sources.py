@@ -30,6 +30,18 @@ class FilmSource:
     region: Path | None = None
     """Mask picture of the film's size; None: the option `region_polygon`, or the whole picture."""
 
+    film_name: str = ""
+    """The user's name of the film, for messages; empty: that of its path."""
+
+    region_name: str = ""
+    """The user's name of the mask picture, likewise."""
+
+    @property
+    def names(self) -> dict[str, str]:
+        """Name of each file in messages."""
+        region = "" if self.region is None else self.region_name or self.region.name
+        return {"film": self.film_name or self.film.name, "region": region}
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FilmBounds:
@@ -101,6 +113,7 @@ def save_source(source: FilmSource, interpretation: Interpretation, target: Path
         "version": VERSION,
         "film": source.film.suffix.lower(),
         "region": None if source.region is None else source.region.suffix.lower(),
+        "names": source.names,
         "interpretation": interpretation.model_dump(mode="json"),
     }
     with zipfile.ZipFile(target, "w", zipfile.ZIP_STORED) as archive:
@@ -135,8 +148,12 @@ def open_source(path: Path, folder: Path) -> FilmSource:
                 raise damaged("inputs", f"a stored film of version {stated['version']} instead of {VERSION}")
             film = _unpacked(archive, _FILM, folder / f"film{stated['film']}")
             region = stated["region"]
-            return FilmSource(film, None if region is None else _unpacked(archive, _REGION, folder / f"region{region}"))
-    except (zipfile.BadZipFile, KeyError, ValueError, TypeError) as error:
+            names = stated.get("names", {})  # sources stored by earlier versions have none
+            return FilmSource(
+                film, None if region is None else _unpacked(archive, _REGION, folder / f"region{region}"),
+                film_name=str(names.get("film", "")), region_name=str(names.get("region", "")),
+            )  # fmt: skip
+    except (zipfile.BadZipFile, KeyError, ValueError, TypeError, AttributeError) as error:
         raise damaged("inputs", "a stored film that cannot be read back") from error
 
 

@@ -187,7 +187,7 @@ def _run(
     request = {
         "action": action, "film": str(source.film.absolute()), "threads": max(1, min(threads, 64)), "estimate": estimate,
         "region": None if source.region is None else str(source.region.absolute()),
-        "options": options.model_dump(mode="json", include=TRACKING_OPTIONS),
+        "names": source.names, "options": options.model_dump(mode="json", include=TRACKING_OPTIONS),
         "bounds": asdict(bounds), "folder": str(scratch.absolute()),
     }  # fmt: skip
     return run_contained(

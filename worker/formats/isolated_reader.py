@@ -151,7 +151,7 @@ def _in_process(parts: dict[str, Any], options: Options, limits: Limits, target:
 
 
 def _too_much_memory(limits: Limits) -> InvalidInput:
-    return too_large("tracks", expected=f"inputs that are read within {limits.read_memory} bytes", got="more")
+    return too_large("tracks", expected=f"inputs that are read within {limits.read_memory:,} bytes", got="more")
 
 
 def main() -> int:

@@ -150,8 +150,8 @@ def _check_size(points: NDArray[np.generic], limits: Limits) -> None:
     if frames > limits.max_frames or count > limits.max_points or frames * count > limits.max_observations:
         raise too_large(
             "tracks",
-            expected=f"at most {limits.max_frames} frames, {limits.max_points} points and {limits.max_observations} observations",
-            got=f"{frames} frames × {count} points",
+            expected=f"at most {limits.max_frames:,} frames, {limits.max_points:,} points and {limits.max_observations:,} observations",
+            got=f"{frames:,} frames × {count:,} points",
         )
 
 
@@ -164,7 +164,7 @@ def _check_range(points: NDArray[np.generic], visible: NDArray[np.float64] | Non
     if far.any():
         raise InvalidInput(
             "out_of_range", field="tracks", expected=f"visible coordinates within ±{MAX_COORDINATE:g}",
-            got=f"{int(far.sum())} points beyond", hint="Mark them as hidden, or set them to NaN.",
+            got=f"{int(far.sum()):,} of them beyond", hint="Mark them as hidden, or set them to NaN.",
         )  # fmt: skip
 
 

@@ -36,6 +36,7 @@ export class VerdictBox {
   private readonly badge = h("p", {});
   private readonly trust = h("p", { class: "trust" });
   private readonly interval = h("p", {});
+  private readonly evidence = h("dl", { class: "evidence" });
   private readonly reasons = h("ul", { class: "reasons" });
   private readonly outcome = h("p", { class: "outcome" });
   readonly element = h(
@@ -45,6 +46,7 @@ export class VerdictBox {
     this.badge,
     this.trust,
     this.interval,
+    this.evidence,
     this.reasons,
     this.outcome,
   );
@@ -61,13 +63,30 @@ export class VerdictBox {
     fill(this.outcome, job.sentence ?? "", () => [job.sentence && `Solver: ${job.sentence}`]);
   }
 
-  /** Show what only the report has: the interval of the expected error, as shares of the object's size. */
+  /** Show what only the report has: the interval of the expected error and the figures behind the verdict. */
   report(report: Record<string, unknown>): void {
     const interval = report["expected_error_interval"];
-    if (!Array.isArray(interval)) return;
-    const [low, high] = interval.map(Number);
-    if (low === undefined || high === undefined) return;
-    const words = `In nearly eight of ten sequences the true error is between ${percent(low)} and ${percent(high)}.`;
+    const [low, high] = Array.isArray(interval) ? interval.map(Number) : [];
+    const words =
+      low === undefined || high === undefined ? "" : `In nearly eight of ten sequences the true error is between ${percent(low)} and ${percent(high)}.`;
     fill(this.interval, words, () => [words]);
+    const rows = evidenceOf(report);
+    fill(this.evidence, JSON.stringify(rows), () => rows.map(([term, value]) => h("div", {}, h("dt", {}, term), h("dd", {}, value))));
   }
+}
+
+/** Return the figures that the verdict rests on, each with its unit; those that the report does not have are left out. */
+function evidenceOf(report: Record<string, unknown>): [string, string][] {
+  const degrees = (value: number): string => `${value < 10 ? Number(value.toPrecision(2)) : Math.round(value)}°`;
+  const share = (value: number): string => `${percent(value)} of the object's size`;
+  const known: [name: string, term: string, words: (value: number) => string][] = [
+    ["turn_degrees", "Turn between the most different views", degrees],
+    ["degrees_per_frame", "Turn per frame (median)", degrees],
+    ["deformation_per_frame", "Change of shape per frame (median)", share],
+    ["held_out_error", "Left-out observations, distance from their prediction (median)", share],
+  ];
+  return known.flatMap(([name, term, words]) => {
+    const value = report[name];
+    return typeof value === "number" ? [[term, words(value)] as [string, string]] : [];
+  });
 }

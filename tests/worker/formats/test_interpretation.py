@@ -207,7 +207,7 @@ def test_matlab_73_text_and_empty_arrays_are_no_tracks_and_cells_have_a_limit(tm
         assert set(read_matlab73(stream, field="tracks", limits=Limits())) == {"W"}
     with h5py.File(tmp_path / "t.mat", "w") as file:
         file.create_dataset("W", (1, 1 << 20), dtype=h5py.ref_dtype, chunks=(1, 16))
-    with (tmp_path / "t.mat").open("rb") as stream, pytest.raises(InvalidInput, match="at most 20000 cells"):
+    with (tmp_path / "t.mat").open("rb") as stream, pytest.raises(InvalidInput, match="at most 20,000 cells"):
         read_matlab73(stream, field="tracks", limits=Limits())
 
 
@@ -222,7 +222,7 @@ def test_tracks_of_all_pixels_give_their_grid(tmp_path: Path) -> None:
 def test_extreme_visible_coordinates_are_rejected(tmp_path: Path) -> None:
     far = POINTS.copy()
     far[2, 3] = 1e13
-    with pytest.raises(InvalidInput, match="1 points beyond") as caught:
+    with pytest.raises(InvalidInput, match="1 of them beyond") as caught:
         read(tmp_path, {"tracks": far})
     assert (caught.value.code, caught.value.field) == ("out_of_range", "tracks")
     seen = np.ones((F, P), dtype=bool)

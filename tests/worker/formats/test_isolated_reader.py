@@ -65,7 +65,7 @@ def test_errors_are_transferred_completely(all_apart: None, tmp_path: Path) -> N
 
 def test_exceeding_memory_or_time_is_an_input_error(all_apart: None, tmp_path: Path) -> None:
     np.savez_compressed(tmp_path / "t.npz", tracks=np.zeros((1000, 20_000, 2), dtype=np.float32))
-    with pytest.raises(InvalidInput, match="within 419430400 bytes") as caught:
+    with pytest.raises(InvalidInput, match="within 419,430,400 bytes") as caught:
         store_inputs(tracks=tmp_path / "t.npz", options=Options(), limits=Limits(read_memory=400 << 20), target=None)
     assert caught.value.code == "too_large"
     with pytest.raises(InvalidInput, match=r"within 0\.01 s") as late:

@@ -105,7 +105,7 @@ def test_the_length_holds_over_requests(uploads: Uploads) -> None:
 
 def test_too_large_uploads_are_removed_and_those_over_quota_kept(uploads: Uploads) -> None:
     for length in (None, 1001):
-        with pytest.raises(errors.UploadTooLarge, match="at most 1000 bytes"):
+        with pytest.raises(errors.UploadTooLarge, match="at most 1,000 bytes"):
             send(uploads, "one", b"x" * 1001, length=length)
         assert uploads.find("one") is None
     tight = Capacity(max_bytes=1000, quota=100, used=40)

@@ -96,7 +96,7 @@ def _grid(rows: int, columns: int, limits: Limits) -> Mesh:
 
 def _check_faces(count: int, limits: Limits) -> None:
     if count > limits.max_faces:
-        raise too_large("mesh.faces", expected=f"at most {limits.max_faces} faces", got=f"{count}")
+        raise too_large("mesh.faces", expected=f"at most {limits.max_faces:,} faces", got=f"{count:,}")
 
 
 def _mesh_of(arrays: Arrays, num_points: int) -> Mesh:

@@ -64,14 +64,14 @@ def read_npy(stream: IO[bytes], size: int, *, field: str, limits: Limits, texts:
     """
     header, used = read_header(stream, field=field, limits=limits, texts=texts)
     if header.bytes != size - used:
-        raise damaged(field, f"a header that announces {header.bytes} bytes over {size - used} bytes of data")
+        raise damaged(field, f"a header that announces {header.bytes:,} bytes over {size - used:,} bytes of data")
     flat = np.zeros(header.bytes, dtype=np.uint8)
     view = flat.data
     filled = 0
     while filled < header.bytes:
         got = stream.read(min(CHUNK, header.bytes - filled))
         if not got:
-            raise damaged(field, f"{filled} of {header.bytes} bytes")
+            raise damaged(field, f"{filled:,} of {header.bytes:,} bytes")
         view[filled : filled + len(got)] = got
         filled += len(got)
     array = flat.view(header.dtype).reshape(header.shape, order="F" if header.fortran else "C")
@@ -87,7 +87,7 @@ def read_header(stream: IO[bytes], *, field: str, limits: Limits, texts: bool = 
     length_bytes = stream.read(4 if wide else 2)
     length = int.from_bytes(length_bytes, "little")
     if start[6] not in (1, 2, 3) or length > MAX_HEADER:
-        raise damaged(field, f"a NumPy header of version {start[6]} and {length} bytes")
+        raise damaged(field, f"a NumPy header of version {start[6]} and {length:,} bytes")
     text = stream.read(length)
     if len(text) != length:
         raise damaged(field, "a header that is cut off")
@@ -155,7 +155,7 @@ def checked_members(
     """Members by array name, once names, number, methods and the declared sizes of the wanted ones are found in order."""
     infos = archive.infolist()
     if len(infos) > limits.max_members:
-        raise too_large(field, expected=f"at most {limits.max_members} members", got=f"{len(infos)}")
+        raise too_large(field, expected=f"at most {limits.max_members:,} members", got=f"{len(infos)}")
     if any(info.filename.endswith("data.pkl") for info in infos):
         raise pickle_refusal(field)
     if field == "tracks" and infos and all(info.filename.lower().endswith(PICTURES) or info.is_dir() for info in infos):
@@ -181,7 +181,7 @@ def checked_members(
         members[name] = info
     declared = sum(info.file_size for name, info in members.items() if wanted is None or name in wanted)
     if declared > limits.max_bytes:
-        raise too_large(field, expected=f"at most {limits.max_bytes} bytes inflated", got=f"{declared} bytes")
+        raise too_large(field, expected=f"at most {limits.max_bytes:,} bytes inflated", got=f"{declared:,} bytes")
     return members
 
 
@@ -207,7 +207,7 @@ def read_file(
     """Read a file that starts as .npy (named `array`) or as a zip of them; the arrays named in `texts` hold texts."""
     size = path.stat().st_size
     if size > limits.max_bytes:
-        raise too_large(field, expected=f"a file of at most {limits.max_bytes} bytes", got=f"{size} bytes")
+        raise too_large(field, expected=f"a file of at most {limits.max_bytes:,} bytes", got=f"{size:,} bytes")
     with path.open("rb") as file:
         if file.read(6) == NPY_MAGIC:
             file.seek(0, os.SEEK_SET)
@@ -258,5 +258,7 @@ def _checked(described: dict[str, object], field: str, limits: Limits, *, texts:
         )  # fmt: skip
     count = math.prod(shape) * dtype.itemsize
     if count > limits.max_bytes:
-        raise too_large(field, expected=f"at most {limits.max_bytes} bytes", got=f"{shape} of {dtype}: {count} bytes")
+        raise too_large(
+            field, expected=f"at most {limits.max_bytes:,} bytes", got=f"{shape} of {dtype}: {count:,} bytes"
+        )
     return Header(shape, fortran, dtype, count)

@@ -26,7 +26,7 @@ def read_arrays(path: Path, *, field: str, limits: Limits, wanted: Collection[st
     """
     size = path.stat().st_size
     if size > limits.max_bytes:
-        raise too_large(field, expected=f"a file of at most {limits.max_bytes} bytes", got=f"{size} bytes")
+        raise too_large(field, expected=f"a file of at most {limits.max_bytes:,} bytes", got=f"{size:,} bytes")
     with path.open("rb") as file:
         head = file.read(1024)
     if not head:

@@ -87,8 +87,8 @@ def _observations(columns: list[str], rows: list[list[float]], *, field: str, li
     if count * len(names) * 16 > limits.max_bytes or count > 100 * len(table):
         raise too_large(
             field,
-            expected=f"at most {limits.max_bytes} bytes as a full table",
-            got=f"{count} frames × {len(names)} points",
+            expected=f"at most {limits.max_bytes:,} bytes as a full table",
+            got=f"{count:,} frames × {len(names):,} points",
         )
     places = frames * len(names) + points
     if len(np.unique(places)) != len(places):
@@ -142,7 +142,7 @@ def _columns(first: str, lines: Iterator[str], *, field: str, limits: Limits) ->
             continue
         rows.append(_row(line, separator, len(columns), field=field, count=count))
         if len(rows) > limits.max_bytes // 64:
-            raise too_large(field, expected=f"at most {limits.max_bytes // 64} observations", got="more")
+            raise too_large(field, expected=f"at most {limits.max_bytes // 64:,} observations", got="more")
     return columns, rows
 
 

@@ -79,9 +79,12 @@ def _mesh(text: bytes, binary: bytes, field: str, limits: Limits) -> Arrays:
         OverflowError,
         binascii.Error,
     ) as error:
-        raise damaged(field, f"a glTF that cannot be read ({type(error).__name__}: {str(error)[:100]})") from error
+        reason = f"no entry {error}" if isinstance(error, KeyError) else str(error)[:100]
+        raise damaged(field, f"a glTF that cannot be read ({reason})") from error
     if len(faces) > limits.max_faces or len(vertices) > limits.max_points:
-        raise too_large(field, expected=f"at most {limits.max_points} vertices, {limits.max_faces} faces", got="more")
+        raise too_large(
+            field, expected=f"at most {limits.max_points:,} vertices and {limits.max_faces:,} faces", got="more"
+        )
     return {"vertices": vertices.astype(np.float64), "faces": faces}
 
 
@@ -102,7 +105,7 @@ def _accessor(document: dict[str, Any], binary: bytes, index: int, field: str, l
     stride = _whole(view.get("byteStride", size))
     start = _whole(view.get("byteOffset", 0)) + _whole(described.get("byteOffset", 0))
     if not (0 < count <= 3 * limits.max_faces and size <= stride <= 252 + size and start >= 0):
-        raise too_large(field, expected="counts within the limits", got=f"{count} rows of {stride} bytes")
+        raise too_large(field, expected="counts within the limits", got=f"{count:,} rows of {stride} bytes")
     raw = np.frombuffer(_buffer(document, binary, _whole(view["buffer"])), np.uint8)
     if start + (count - 1) * stride + size > len(raw):
         raise ValueError("an accessor beyond its buffer")

@@ -55,7 +55,7 @@ def _collect(group: h5py.Group, prefix: str, found: Arrays, *, field: str, limit
         if name.startswith("#"):
             continue
         if not isinstance(group.get(name, getlink=True), h5py.HardLink):
-            raise _elsewhere(field, f"{prefix}{name} is a soft or external link")
+            raise _elsewhere(field, f"{prefix}{name}, a soft or external link")
         item = group[name]
         if isinstance(item, h5py.Group):
             _collect(item, f"{prefix}{name}.", found, field=field, limits=limits, depth=depth + 1)
@@ -81,7 +81,7 @@ def _cells(item: h5py.Dataset, name: str, so_far: int, field: str, limits: Limit
     """Follow references to matrices of one shape, e.g. one for each frame, and put them along a new first axis."""
     _check_within(item, name, field)
     if item.size > MAX_CELLS:
-        raise too_large(field, expected=f"at most {MAX_CELLS} cells", got=f"{name} of {item.size}")
+        raise too_large(field, expected=f"at most {MAX_CELLS:,} cells", got=f"{name} of {item.size:,}")
     parts: list[np.ndarray] = []
     for reference in item[()].T.reshape(-1, order="F"):
         target = item.file[reference] if reference else None
@@ -97,7 +97,7 @@ def _cells(item: h5py.Dataset, name: str, so_far: int, field: str, limits: Limit
 
 def _check_within(item: h5py.Dataset, name: str, field: str) -> None:
     if item.is_virtual or item.external:
-        raise _elsewhere(field, f"{name} lies in another file")
+        raise _elsewhere(field, f"{name}, which lies in another file")
 
 
 def check_before_reading(item: h5py.Dataset, name: str, so_far: int, field: str, limits: Limits) -> None:
@@ -116,7 +116,9 @@ def check_before_reading(item: h5py.Dataset, name: str, so_far: int, field: str,
     _check_within(item, name, field)
     declared = int(np.prod(item.shape, dtype=np.float64)) * item.dtype.itemsize
     if so_far + declared > limits.max_bytes:
-        raise too_large(field, expected=f"at most {limits.max_bytes} bytes", got=f"{name} declares {declared}")
+        raise too_large(
+            field, expected=f"at most {limits.max_bytes:,} bytes", got=f"{name}, which declares {declared:,}"
+        )
     _check_stored(item, name, declared, field, limits)
 
 
@@ -135,12 +137,12 @@ def _check_stored(item: h5py.Dataset, name: str, declared: int, field: str, limi
     stored = item.id.get_storage_size()
     if declared > SMALL and declared > DEFLATE * stored:
         raise too_large(
-            field, expected=f"at most {DEFLATE} bytes of data for each stored byte", got=f"{name}: {declared} of {stored} bytes"
+            field, expected=f"at most {DEFLATE:,} bytes of data for each stored byte", got=f"{name}: {declared:,} of {stored:,} bytes"
         )  # fmt: skip
     chunk = 0 if item.chunks is None else int(np.prod(item.chunks, dtype=np.float64)) * item.dtype.itemsize
     if chunk > max(SMALL, CHUNK_EXCESS * declared) or chunk > limits.max_bytes:
         raise too_large(
-            field, expected="chunks no larger than their data set", got=f"{name} in chunks of {chunk} bytes"
+            field, expected="chunks no larger than their data set", got=f"{name} in chunks of {chunk:,} bytes"
         )
 
 

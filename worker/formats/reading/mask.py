@@ -32,7 +32,9 @@ def read_png(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
             picture = PngImagePlugin.PngImageFile(stream)
             if picture.width * picture.height > MAX_PIXELS_A_POINT * limits.max_points:
                 raise too_large(
-                    field, expected=f"at most {MAX_PIXELS_A_POINT * limits.max_points} pixels", got=f"{picture.size}"
+                    field,
+                    expected=f"at most {MAX_PIXELS_A_POINT * limits.max_points:,} pixels",
+                    got=f"{picture.width} × {picture.height}",
                 )
             values = np.asarray(picture.convert("LA"))
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:

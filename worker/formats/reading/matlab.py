@@ -66,7 +66,7 @@ def read_matlab5(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
 def _check_declared(shapes: list[tuple[int, ...]], field: str, limits: Limits) -> None:
     total = sum(int(np.prod([max(int(n), 0) for n in shape], dtype=np.float64)) * 8 for shape in shapes)
     if total > limits.max_bytes:
-        raise too_large(field, expected=f"at most {limits.max_bytes} bytes", got=f"{total} bytes declared")
+        raise too_large(field, expected=f"at most {limits.max_bytes:,} bytes", got=f"{total:,} bytes declared")
 
 
 def _collect(name: str, value: object, found: Arrays, depth: int) -> None:

@@ -41,7 +41,7 @@ def read_obj(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
     while line := stream.readline(MAX_LINE + 1):
         number += 1
         if len(line) > MAX_LINE or b"\0" in line:
-            raise damaged(field, f"line {number} longer than {MAX_LINE} bytes or not text")
+            raise damaged(field, f"line {number}, which is longer than {MAX_LINE:,} bytes or not text")
         words = line.split()
         if not words:
             continue
@@ -51,10 +51,10 @@ def read_obj(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
             elif words[0] == b"f":
                 polygons.append([_obj_index(word, len(vertices)) for word in words[1:]])
         except ValueError as error:
-            raise damaged(field, f"line {number} is not a vertex or face") from error
+            raise damaged(field, f"line {number}, which is not a vertex or face") from error
         if len(vertices) > limits.max_points or len(polygons) > limits.max_faces:
             raise too_large(
-                field, expected=f"at most {limits.max_points} vertices, {limits.max_faces} faces", got="more"
+                field, expected=f"at most {limits.max_points:,} vertices and {limits.max_faces:,} faces", got="more"
             )
     if not vertices:
         raise InvalidInput(
@@ -79,8 +79,8 @@ def read_ply(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
     for name, count in PLY_ELEMENT.findall(head):
         if not count.isdigit() or int(count) > allowed.get(name, limits.max_faces):
             raise too_large(
-                field, expected=f"at most {limits.max_points} vertices, {limits.max_faces} faces",
-                got=f"element {name.decode('latin-1')} {count.decode('latin-1')}",
+                field, expected=f"at most {limits.max_points:,} vertices and {limits.max_faces:,} faces",
+                got=f"{count.decode('latin-1')} of {name.decode('latin-1')}",
             )  # fmt: skip
     try:
         content = plyfile.PlyData.read(io.BytesIO(stream.read()), mmap=False)
@@ -88,7 +88,8 @@ def read_ply(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
         vertices = np.column_stack([np.asarray(content["vertex"][axis], dtype=np.float64) for axis in "xyz"])
         polygons = _ply_polygons(content["face"]) if "face" in names else []
     except (plyfile.PlyParseError, ValueError, KeyError, TypeError, IndexError, EOFError, OverflowError) as error:
-        raise damaged(field, f"a PLY file that cannot be read ({str(error)[:120]})") from error
+        reason = f"no element {error}" if isinstance(error, KeyError) else str(error)[:120]
+        raise damaged(field, f"a PLY file that cannot be read ({reason})") from error
     return {"vertices": vertices, "faces": join_polygons(polygons, field=field)}
 
 

@@ -107,7 +107,9 @@ def _in_words(head: bytes) -> str:
         start = head.lstrip(b"\xef\xbb\xbf \t\r\n")
         if start.startswith(b"<"):
             return "a web page or XML"
-        return f"text that begins {start.decode('utf-8', 'replace').splitlines()[0][:40]!r}" if start else "blank text"
+        begins = start.decode("utf-8", "replace").splitlines()[0][:40] if start else ""
+        if begins.count("\ufffd") <= len(begins) // 4:  # a few letters of another encoding are still text
+            return f"text that begins {begins!r}" if begins else "blank text"
     pictures = {start: f"a picture ({name})" for start, name in PICTURES.items()}
     unknown = f"a file of an unknown kind, which begins with the bytes {head[:8].hex(' ')}"
     return next((name for start, name in (pictures | DOCUMENTS).items() if head.startswith(start)), unknown)

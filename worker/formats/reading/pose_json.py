@@ -39,7 +39,7 @@ def read_landmarks(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
     most = min(limits.max_bytes, MOST_BYTES)
     text = stream.read(most + 1)
     if len(text) > most:
-        raise too_large(field, expected=f"at most {most} bytes of JSON", got="more")
+        raise too_large(field, expected=f"at most {most:,} bytes of JSON", got="more")
     try:
         document = json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -61,7 +61,7 @@ def read_landmarks(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
         raise _unreadable(field, got)
     shape = len(frames), counts.pop()
     if shape[0] * shape[1] * 24 > limits.max_bytes:
-        raise too_large(field, expected=f"at most {limits.max_bytes} bytes as arrays", got="more")
+        raise too_large(field, expected=f"at most {limits.max_bytes:,} bytes as arrays", got="more")
     points, sure = np.full((*shape, 2), np.nan), np.zeros(shape)
     for number, frame in enumerate(frames):
         for place, landmark in enumerate(frame or ()):

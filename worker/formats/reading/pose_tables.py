@@ -167,7 +167,7 @@ def read_rows(
         if not line.strip():
             continue
         if len(line) >= LONGEST_ROW:
-            raise too_large(field, expected=f"rows of at most {LONGEST_ROW} characters", got="longer ones")
+            raise too_large(field, expected=f"rows of at most {LONGEST_ROW:,} characters", got="longer ones")
         row = split(line, separator)
         try:
             if len(row) != width:
@@ -176,7 +176,7 @@ def read_rows(
         except ValueError:
             raise not_a_table(field, count, line) from None
         if len(rows) * len(wanted) * 8 > limits.max_bytes:
-            raise too_large(field, expected=f"at most {limits.max_bytes} bytes as a table", got="more")
+            raise too_large(field, expected=f"at most {limits.max_bytes:,} bytes as a table", got="more")
     points = len(columns.x)
     table = np.array(rows, dtype=np.float64).reshape(len(rows), len(wanted))
     found: Arrays = {columns.writer: np.stack([table[:, :points], table[:, points : 2 * points]], axis=2)}

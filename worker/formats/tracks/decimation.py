@@ -86,7 +86,7 @@ def _thin_grid(grid: NDArray[np.int32], stride: int, limit: int) -> tuple[Indice
     if len(kept) < MIN_POINTS:
         raise InvalidInput(
             "too_few_points", field="options.stride", expected=f"a stride that leaves {MIN_POINTS} points or more",
-            got=f"{len(kept)} points at stride {stride}", hint="Use a smaller stride, or a larger max_points.",
+            got=f"{len(kept)} at stride {stride}", hint="Use a smaller stride, or a larger max_points.",
         )  # fmt: skip
     numbers = np.full(int(grid.max()) + 1, -1)
     numbers[kept] = np.arange(len(kept))

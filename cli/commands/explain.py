@@ -1,0 +1,60 @@
+"""`pliant explain`: what an error code means; and the address of that explanation, with which every refusal ends."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from pliant.cli.session import Json
+from pliant.cli.show import out, print_json
+
+if TYPE_CHECKING:
+    from pliant.schemas.problems import ProblemCode
+
+
+def explain(
+    ctx: typer.Context,
+    code: Annotated[str, typer.Argument(help="Code of an error; all codes if not given.", show_default=False)] = "",
+    as_json: Json = False,
+) -> None:
+    """Explain an error code: when the error occurs, and what to do. Every refusal names its code."""
+    from pliant.schemas.problems import ProblemCode
+
+    ctx.obj.json = as_json
+    codes = [found_code(code)] if code else list(ProblemCode)
+    if as_json:
+        print_json([{"code": each, **_members(each)} for each in codes])
+        return
+    screen = out()
+    for each in codes:
+        if not code:
+            screen.print(f"{each.value}  {each.heading}", markup=False)
+            continue
+        status = "" if each.status is None else f" (HTTP status {each.status})"
+        screen.print(f"{each.heading}: {each.value}{status}", markup=False)
+        screen.print(f"{each.cause}\nWhat to do: {each.remedy}", markup=False)
+
+
+def found_code(text: str) -> ProblemCode:
+    """Return the code of this text.
+
+    Raises
+    ------
+    BadArgument
+        There is no such code.
+    """
+    from difflib import get_close_matches
+
+    from pliant.client.errors import BadArgument
+    from pliant.schemas.problems import ProblemCode, find_code
+
+    found = find_code(text)
+    if found is None:
+        close = get_close_matches(text, list(ProblemCode), n=1)
+        meant = f" Did you mean {close[0]}?" if close else ""
+        raise BadArgument(f"CODE: there is no error code {text!r}.{meant} `pliant explain` lists all codes.")
+    return found
+
+
+def _members(code: ProblemCode) -> dict[str, str | int | None]:
+    return {"status": code.status, "title": code.heading, "cause": code.cause, "remedy": code.remedy}

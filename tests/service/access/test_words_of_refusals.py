@@ -1,0 +1,172 @@
+"""The exact words of the service's refusals, as a user of the page, the SDK or HTTP sees them."""
+
+# ruff: noqa: E501
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from pliant.service.testing import InMemoryService
+from pliant.worker import errors
+
+Request = tuple[str, str, dict[str, Any]]
+
+
+def tracks() -> bytes:
+    buffer = io.BytesIO()
+    np.savez(buffer, tracks=np.random.default_rng(0).normal(size=(5, 12, 2)) * 100)
+    return buffer.getvalue()
+
+
+TRACKS = ("tracks.npz", tracks())
+FILM = ("film.mp4", b"\0\0\0\x18ftypmp42")
+
+
+def form(**parts: Any) -> dict[str, Any]:
+    """A form: texts as texts, pairs as files."""
+    return {"files": {name: (None, part) if isinstance(part, str) else part for name, part in parts.items()}}
+
+
+@pytest.fixture(scope="module")
+def http() -> Iterator[httpx.Client]:
+    """A service with the jobs `done` and `running`, the complete upload `whole` and the upload `part`."""
+    service = InMemoryService(steps=1)
+    with httpx.Client(transport=service, base_url="http://pliant.test") as client:
+        prepare(service, client)
+        yield client
+    service.stop()
+
+
+def prepare(service: InMemoryService, client: httpx.Client) -> None:
+    named = {"tracks": TRACKS, "mesh": (None, "none")}
+    assert client.put("/v1/jobs/done", files=named, headers={"Prefer": "wait=20"}).json()["status"] == "succeeded"
+    service.worker.steps = math.inf
+    assert client.put("/v1/jobs/running", files=named).is_success
+    assert client.put("/v1/uploads/whole", content=TRACKS[1]).is_success
+    assert client.put(
+        "/v1/uploads/part", content=b"ab", headers={"Upload-Complete": "?0", "Upload-Length": "9"}
+    ).is_success
+
+
+REQUESTS: dict[str, tuple[Request, str]] = {
+    "no tracks": (("POST", "/v1/jobs", form(mesh="none")),
+        "tracks: expected a file, got none. Add the part, as in curl's -F tracks=@tracks.npz, or a film: -F film=@film.mp4."),
+    "a region without a film": (("POST", "/v1/jobs", form(region=("mask.png", b"x"))),
+        "film: expected a file, got none. A region belongs to a film: add it, as in curl's -F film=@film.mp4."),
+    "a film and tracks": (("POST", "/v1/jobs", form(film=FILM, tracks=TRACKS)),
+        "tracks: expected a film with its region, or tracks with what belongs to them, got film and tracks. Leave one of them out: the tracks and the mesh of a film are made from it."),
+    "tracks twice": (("POST", "/v1/jobs", form(tracks=TRACKS, tracks_upload="whole")),
+        "tracks_upload: expected either tracks or tracks_upload, got both. Leave one of them out."),
+    "an unknown upload": (("POST", "/v1/jobs", form(tracks_upload="nothing")),
+        "tracks_upload: expected the id of an upload, got 'nothing'. PUT it to /v1/uploads/nothing first; uploads that are not used expire."),
+    "an upload that is not complete": (("POST", "/v1/jobs", form(tracks_upload="part")),
+        "tracks_upload: expected a complete upload, got a part of it. Send the rest first, from the offset that HEAD returns."),
+    "kept inputs and files": (("POST", "/v1/jobs", form(inputs_of="done", tracks=TRACKS)),
+        "inputs_of: expected either inputs_of or files, got inputs_of and tracks. Leave one of them out."),
+    "kept inputs read in another way": (("POST", "/v1/jobs", form(inputs_of="done", options='{"frames": "0:4"}')),
+        "options.frames: expected no value, as the inputs of job 'done' were read, got '0:4'. Send the files again to read them in another way."),
+    "kept inputs of no job": (("POST", "/v1/jobs", form(inputs_of="nobody")),
+        "There is no job 'nobody'. List your jobs to see which exist; expired ones are removed."),
+    "an unknown part": (("POST", "/v1/jobs", form(track=TRACKS)),
+        "track: expected one of film, film_upload, ground_truth, ground_truth_upload, inputs_of, mesh, mesh_upload, name, options, priority, region, region_upload, rotations, rotations_upload, tracks, tracks_upload, webhook, webhook_secret, got a part of that name. Leave it out."),
+    "tracks as text": (("POST", "/v1/jobs", form(tracks="1,2,3")),
+        "tracks: expected a file, got text. Give the part a file name, as in curl's -F tracks=@FILE."),
+    "options that are no JSON": (("POST", "/v1/jobs", form(tracks=TRACKS, options="loss=l1")),
+        "options: expected a JSON object, got something else. For example {\"method\": \"robust\"}; the schema is at /v1/options."),
+    "options that are a list": (("POST", "/v1/jobs", form(tracks=TRACKS, options="[]")),
+        "options: expected a JSON object, got a JSON list. For example {\"method\": \"robust\"}; the schema is at /v1/options."),
+    "an unknown option": (("POST", "/v1/jobs", form(tracks=TRACKS, options='{"los": "l1"}')),
+        "options.los: expected a name listed at /v1/options, got the unknown name 'los'. Compare with the schema at /v1/options."),
+    "an option of another value": (("POST", "/v1/jobs", form(tracks=TRACKS, options='{"loss": "l3"}')),
+        "options.loss: expected 'l1', 'l2' or 'huber', got 'l3'. Compare with the schema at /v1/options."),
+    "an option beyond its bounds": (("POST", "/v1/jobs", form(tracks=TRACKS, options='{"fps": 0}')),
+        "options.fps: expected greater than 0, got 0. Compare with the schema at /v1/options."),
+    "an unknown priority": (("POST", "/v1/jobs", form(tracks=TRACKS, priority="urgent")),
+        "priority: expected high, normal, low, got 'urgent'. Leave it out for normal."),
+    "a long name": (("POST", "/v1/jobs", form(tracks=TRACKS, name="a" * 201)),
+        "name: expected at most 200 characters, got 201. Shorten it."),
+    "an id of two letters": (("PUT", "/v1/jobs/ab", form(tracks=TRACKS)),
+        "id: expected 3–64 letters, digits, underscores or dashes, got 'ab'. Choose another id or omit it."),
+    "an id that is taken": (("PUT", "/v1/jobs/done", form(tracks=TRACKS, mesh="3x4")),
+        "The id 'done' is already used by a different job. Choose another id."),
+    "no form": (("POST", "/v1/jobs", {"content": b"abc"}),
+        "The body must be a form: send multipart/form-data with a part `tracks`. An example is at /docs."),
+    "no such job": (("GET", "/v1/jobs/nobody", {}),
+        "There is no job 'nobody'. List your jobs to see which exist; expired ones are removed."),
+    "no such file": (("GET", "/v1/jobs/done/artifacts/shapes.fbx", {}),
+        "Job 'done' has no file 'shapes.fbx'. It has: shapes.npz, shapes.glb, shapes_ply.zip, metrics_frames.csv, metrics_points.csv, preview.bin, report.json."),
+    "no files yet": (("GET", "/v1/jobs/running/artifacts/shapes.npz", {}),
+        "Job 'running' has no file 'shapes.npz'. It has: none (only a succeeded job has files)."),
+    "deleting a running job": (("DELETE", "/v1/jobs/running", {}),
+        "Job 'running' has the status running: it cannot be deleted now. Cancel it first."),
+    "cancelling a finished job": (("POST", "/v1/jobs/done/cancel", {}),
+        "Job 'done' has the status succeeded: it cannot be cancelled now. It is finished; delete it if you do not need it."),
+    "retrying a running job": (("POST", "/v1/jobs/running/retry", {}),
+        "Job 'running' has the status running: it cannot be run again now. Wait until it ends, or cancel it first."),
+    "retrying a job with a result": (("POST", "/v1/jobs/done/retry", {}),
+        "Job 'done' has the status succeeded: it cannot be run again now. It has its result."),
+    "sharing a running job": (("POST", "/v1/jobs/running/shares", {"json": {}}),
+        "Job 'running' has the status running: it cannot be shared now. Wait until it has succeeded."),
+    "sharing for a second": (("POST", "/v1/jobs/done/shares", {"json": {"expires_in": 1}}),
+        "expires_in: expected greater than or equal to 60, got 1. Compare with the schema at /docs."),
+    "a share that there is not": (("DELETE", "/v1/jobs/done/shares/nothing", {}),
+        "Job 'done' has no share link 'nothing'; it may have expired. List the links to see which there are."),
+    "outputs of a running job": (("POST", "/v1/jobs/running/outputs", {"json": {"outputs": ["glb"]}}),
+        "Job 'running' has the status running: it cannot be written in further files now. Wait until it has succeeded."),
+    "outputs of another kind": (("POST", "/v1/jobs/done/outputs", {"json": {"outputs": ["fbx"]}}),
+        "outputs.0: expected 'glb', 'ply', 'obj', 'usd', 'abc', 'mdd', 'mat' or 'csv', got 'fbx'. Compare with the schema at /docs."),
+    "no outputs": (("POST", "/v1/jobs/done/outputs", {"json": {"outputs": []}}),
+        "outputs: expected at least 1 item, got []. Compare with the schema at /docs."),
+    "too many jobs on a page": (("GET", "/v1/jobs?limit=1000", {}),
+        "limit: expected less than or equal to 200, got '1000'. Compare with the schema at /docs."),
+    "a cursor that is none": (("GET", "/v1/jobs?cursor=abc", {}),
+        "cursor: expected `next` of an earlier page, got 'abc'. Start again without a cursor."),
+    "an unknown status": (("GET", "/v1/jobs?status=done", {}),
+        "status.0: expected 'queued', 'running', 'cancelling', 'succeeded', 'failed' or 'cancelled', got 'done'. Compare with the schema at /docs."),
+    "an event that is none": (("GET", "/v1/jobs/running/events", {"headers": {"Last-Event-ID": "abc"}}),
+        "Last-Event-ID: expected the id of an event, got 'abc'. Omit it to get all events that are kept."),
+    "a long idempotency key": (("POST", "/v1/jobs", {**form(tracks=TRACKS), "headers": {"Idempotency-Key": "a" * 256}}),
+        "Idempotency-Key: expected at most 255 characters, got 'aaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaa…. Compare with the schema at /docs."),
+    "an upload at another offset": (("PATCH", "/v1/uploads/part", {"content": b"c", "headers": {"Upload-Offset": "5"}}),
+        "Upload-Offset: expected 2, got 5. Continue at 2."),
+    "an upload that is complete": (("PATCH", "/v1/uploads/whole", {"content": b"c", "headers": {"Upload-Offset": "5"}}),
+        "Upload 'whole' is complete. Use it, or delete it first."),
+    "no such upload": (("HEAD", "/v1/uploads/nothing", {}),
+        "There is no upload 'nothing'; uploads are removed when they expire. Send it again."),
+    "no such address": (("GET", "/v1/job", {}),
+        "No route has this path. All paths are listed at /docs."),
+    "another method": (("PATCH", "/v1/jobs", {}),
+        "This path does not support this method. The methods are listed at /docs."),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", REQUESTS)
+def test_the_words_of_a_refused_request(http: httpx.Client, name: str) -> None:
+    (method, path, more), words = REQUESTS[name]
+    answer = http.request(method, path, **more)
+    assert (answer.is_error, answer.json()["detail"]) == (True, words)
+
+
+ERRORS: dict[str, tuple[Exception, str]] = {
+    "too many queued": (errors.TooManyQueued(3), "Queue limit reached: 3 jobs are already queued. Submit again when one of them has started, or cancel one."),
+    "too many uploads": (errors.TooManyUploads(5), "Upload limit reached: there are already 5 uploads. Delete some, or wait until they expire."),
+    "too many shares": (errors.TooManyShares("job-1", 10), "Job 'job-1' has 10 share links already. Revoke one, or wait until one expires."),
+    "a full quota": (errors.QuotaExceeded(used=900, quota=1000), "Disk quota reached: 900 of 1,000 bytes are used. Delete jobs, wait until they expire, or raise PLIANT_DISK_QUOTA."),
+    "a large upload": (errors.UploadTooLarge(1000, 2000), "body: expected at most 1,000 bytes, got 2,000 or more. Send fewer frames or points, or store float32; see /v1/limits."),
+    "a store that is away": (errors.StoreUnavailable("Redis", reason="connection refused"), "Redis is unavailable (connection refused). No data was lost; try again in a few seconds."),
+    "a directory in use": (errors.DataDirectoryInUse("/srv/pliant", holder="process 7"), "/srv/pliant is already used by process 7. Stop it first, or choose another directory (--data)."),
+    "a job out of time": (errors.TimedOut(60.0), "The job exceeded its option time_limit of 60 s. Raise it, send fewer points or frames, or lower max_reweightings."),
+    "an unknown token": (errors.UnknownToken("t1"), "There is no token 't1'. `pliant token list` lists all tokens."),
+    "newer data": (errors.NewerData(found=9, known=3), "The records were written by a newer Pliant (version 9 of their form; this one reads up to 3). Install that Pliant, or restore a backup that was made before the upgrade."),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ERRORS)
+def test_the_words_of_a_limit(name: str) -> None:
+    error, words = ERRORS[name]
+    assert str(error) == words
