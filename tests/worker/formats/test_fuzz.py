@@ -42,7 +42,7 @@ def fuzzed(parser: str, examples: int, number: int) -> dict[str, int]:
 
 @pytest.mark.parametrize("parser", READERS)
 def test_a_corrupted_file_is_read_or_rejected(parser: str) -> None:
-    examples = 40 if parser in NATIVE else 80
+    examples = 40 if parser in NATIVE else 200  # few bent glTF files can be read: 4 %
     answers = fuzzed(parser, examples, number=7)
     assert sum(answers.values()) >= examples
     assert "a refusal without a hint" not in answers
