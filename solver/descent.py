@@ -36,7 +36,7 @@ STEEPEST = {True: 1.5, False: 3.0}
 """Largest logarithm of a decrease over the next one that is extrapolated, with hidden points and without. Measured without, on faces, flags
 and talking heads of 10 to 60 frames: 2.6 to 4.9 from the first decrease below `TRANSIENT` on; with, on spheres: .1 to .7."""
 
-OVERHEAD = 5.0
+OVERHEAD = 3.0
 """Units of a reweighting besides the iterations: right-hand side, preconditioner, start, evaluation."""
 
 SETTLED, SETTLING = 0.03, 0.4

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from pliant.solver.descent import expected_iterations, expected_reweightings
+from pliant.solver.descent import OVERHEAD, expected_iterations, expected_reweightings
 from pliant.solver.limits import LEARNED_FRAMES
 from pliant.solver.records import Floats
 
@@ -18,9 +18,9 @@ UNIT_SECONDS, FRAME_SECONDS = 7e-5, 1.3e-5
 """Seconds per unit of work, and per unit and frame, on one core: .2 ms at 10 frames, .46 at 30, .7 at 48, 1 at 74. The other times
 below are of the same core."""
 
-ITERATION_SECONDS = {True: 1.2e-7, False: 1e-7}
-"""Seconds per iteration of conjugate gradients, frame and point, with and without a learned prior; measured 0.9e-7 to 1.1e-7
-for 60 × 4,000, 50 × 9,000 and 99 × 6,000."""
+ITERATION_SETUP, ITERATION_SECONDS = 3.7e-3, {True: 5.3e-8, False: 4e-8}
+"""Seconds per unit of a reweighting, whatever the size, and further ones per frame and point, with and without a learned prior; measured
+for 40 × 800, 60 × 4,000, 60 × 10,000, 99 × 6,000 and 50 × 30,000."""
 
 SETUP_SECONDS, START_SECONDS, START_UNITS = 0.1, 8e-7, 9
 """Of the start of the shapes: seconds of any, further ones per frame and point, and its units. Measured for 10 × 20,000, 60 × 4,000,
@@ -67,7 +67,7 @@ UNITS = {
     "refinement": (1500, 360, 1.1),
     "covariance": (380, 360, 1.0),
     "extension": (80, 1_000_000, 3.0),
-    "trust": (10, 100, 78.0),
+    "trust": (10, 100, 60.0),
 }
 """Stages of the default prior: typical number of units, maximum number of frames used, and cost of a unit against that of an iteration.
 Measured on sequences of 10 to 80 frames, clean and spoiled."""
@@ -108,9 +108,9 @@ def planned(
         Of the tracks, see `unseen_frames`.
     """
     iterations = expected_iterations(unseen)
-    work = expected_reweightings(unseen) * (1 + iterations)
+    work = expected_reweightings(unseen) * (1 + iterations + OVERHEAD)
     start = Stage("start", SETUP_SECONDS + START_SECONDS * frames * points, START_UNITS)
-    shapes = Stage("shapes", ITERATION_SECONDS[gaussian] * work * frames * points, 100)
+    shapes = Stage("shapes", work * iteration_seconds(frames, points, gaussian=gaussian), 100)
     last = [Stage("finish", FINISH_SECONDS * frames * points, 3), *([stage_of("trust", frames)] if gaussian else [])]
     first = [Stage("surface", SURFACE_SECONDS * min(frames, 24), 280, setup=SURFACE_SETUP)] if sheet else []
     most_frames, most_points = MOST_COMPLETED
@@ -118,6 +118,11 @@ def planned(
     filled += GRAM_SECONDS * min(frames, LEARNED_FRAMES) ** 2 * points
     first.append(Stage("completion", 0.1 + filled, 6, growth=RANK_GROWTH))
     return (*first, *learning(frames, gaussian=gaussian, known_cameras=known_cameras), start, shapes, *last)
+
+
+def iteration_seconds(frames: int, points: int, *, gaussian: bool) -> float:
+    """Return the seconds of a unit of a reweighting: an iteration of conjugate gradients, or what else takes about as long."""
+    return ITERATION_SETUP + ITERATION_SECONDS[gaussian] * frames * points
 
 
 def unseen_frames(visible: Floats) -> float:

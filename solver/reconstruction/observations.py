@@ -15,7 +15,7 @@ from pliant.solver.mesh import Mesh
 from pliant.solver.monitor import Monitor
 from pliant.solver.records import KnownCamera, Step, Tracks
 from pliant.solver.settings import Settings
-from pliant.solver.stages import ITERATION_SECONDS, planned, unseen_frames
+from pliant.solver.stages import iteration_seconds, planned, unseen_frames
 from pliant.solver.tracks.normalization import Normalized, normalize
 
 OnStep = Callable[[Step], None]
@@ -159,5 +159,5 @@ def monitored(
     return Monitor(
         on_step, should_stop, plan=[stage for stage in plan if not only or stage.name in only],
         descent=Descent(unseen, settings.tolerance, settings.max_reweightings),
-        seconds_per_iteration=ITERATION_SECONDS[settings.gaussian] * tracks.num_frames * tracks.num_points,
+        seconds_per_iteration=iteration_seconds(tracks.num_frames, tracks.num_points, gaussian=settings.gaussian),
     )  # fmt: skip

@@ -166,9 +166,9 @@ def test_points_hidden_for_long_make_more_and_longer_reweightings() -> None:
     seen, hidden = descended([1.0, 0.5]), descended([1.0, 0.5], unseen=20.0, iterations=15)
     assert hidden.reweightings_left() > 1.5 * seen.reweightings_left()
     assert hidden.units_ahead() > 2 * seen.units_ahead()
-    assert descended([1.0, 0.5], unseen=20.0, iterations=30).units_ahead() == 15, "fewer than in the first"
+    assert descended([1.0, 0.5], unseen=20.0, iterations=30).units_ahead() == 13, "fewer than in the first"
     first = Descent()
-    assert first.units_ahead() == 10, "five iterations, and what a reweighting does besides"
+    assert first.units_ahead() == 8, "five iterations, and what a reweighting does besides"
     first.current = 58
     assert first.units_ahead() == 58, "the reweighting under way already has more"
     size = {"gaussian": True, "known_cameras": False, "sheet": False}
@@ -190,7 +190,7 @@ def test_where_nothing_is_hidden_the_end_comes_early_and_costs_little() -> None:
         descent.reweighted(objective)
         left.append((round(descent.reweightings_left(), 1), round(descent.units_ahead(), 1)))
     assert left[2] == (3.0, 12.0), "a decrease of 11 % says nothing about the end"
-    assert left[3] == (1.6, 18.6), "one of .4 % is followed by a smaller and shorter step"
+    assert left[3] == (1.6, 17.4), "one of .4 % is followed by a smaller and shorter step"
     assert left[4][0] == 0
     hidden = descended(objectives[:5], unseen=2.0)
     assert hidden.reweightings_left() > descended(objectives[:5]).reweightings_left() + 1, "hidden points settle slowly"
