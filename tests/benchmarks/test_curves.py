@@ -12,6 +12,7 @@ from benchmarks.accuracy import curves
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_every_draw_is_solved_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(curves, "LEVELS", {"outliers": (0.1,), "noise": (0.05,)})
     out = tmp_path / "curves.jsonl"

@@ -79,6 +79,8 @@ def test_measurements_of_growth_are_appended_to_a_file(tmp_path):
     assert "results" not in rows[0]["command"]
 
 
+@pytest.mark.slow
+@pytest.mark.long
 def test_a_mesh_is_timed_against_a_grid():
     assert any("× the grid's time" in line for line in speed("mesh", "--frames", "6", "--points", "100"))
 

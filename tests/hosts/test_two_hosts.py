@@ -180,7 +180,7 @@ def s3_away(hosts: Hosts, how: str) -> Iterator[None]:
             hosts.restart("s3")
 
 
-@pytest.mark.parametrize("how", ["dropped", "refused"])
+@pytest.mark.parametrize("how", [pytest.param("dropped", marks=pytest.mark.long), "refused"])
 def test_a_job_that_ends_while_s3_is_away_keeps_its_result(hosts: Hosts, how: str) -> None:
     id = hosts.submit(reweightings=12)
     hosts.host_of(id)
@@ -224,6 +224,7 @@ def test_an_attempt_frozen_past_its_lease_and_thawed_writes_nothing(hosts: Hosts
     row("a worker is frozen past its lease, and thawed", noticed=times[0], moved=times[1])
 
 
+@pytest.mark.long
 def test_clocks_that_differ_by_minutes_harm_nothing(hosts: Hosts) -> None:
     shifts = [clock_shift(300), clock_shift(-300)]
     if None in shifts:
@@ -246,6 +247,7 @@ def test_clocks_that_differ_by_minutes_harm_nothing(hosts: Hosts) -> None:
     row("the clocks of the workers' hosts are 5 min fast and 5 min slow")
 
 
+@pytest.mark.long
 def test_a_disk_that_is_five_times_slower_harms_nothing(hosts: Hosts) -> None:
     """Valkey and S3 run for a fifth of the time, in slices, as behind a disk that cannot follow."""
     stop = threading.Event()
