@@ -37,6 +37,7 @@ export class VerdictBox {
   private readonly trust = h("p", { class: "trust" });
   private readonly interval = h("p", {});
   private readonly evidence = h("dl", { class: "evidence" });
+  private readonly figures = h("details", { hidden: true }, h("summary", {}, "Figures behind the verdict"), this.evidence);
   private readonly reasons = h("ul", { class: "reasons" });
   private readonly outcome = h("p", { class: "outcome" });
   readonly element = h(
@@ -46,9 +47,9 @@ export class VerdictBox {
     this.badge,
     this.trust,
     this.interval,
-    this.evidence,
     this.reasons,
     this.outcome,
+    this.figures,
   );
 
   show(job: Job): void {
@@ -71,6 +72,7 @@ export class VerdictBox {
       low === undefined || high === undefined ? "" : `In nearly eight of ten sequences the true error is between ${percent(low)} and ${percent(high)}.`;
     fill(this.interval, words, () => [words]);
     const rows = evidenceOf(report);
+    this.figures.hidden = rows.length === 0;
     fill(this.evidence, JSON.stringify(rows), () => rows.map(([term, value]) => h("div", {}, h("dt", {}, term), h("dd", {}, value))));
   }
 }
@@ -78,7 +80,7 @@ export class VerdictBox {
 /** Return the figures that the verdict rests on, each with its unit; those that the report does not have are left out. */
 function evidenceOf(report: Record<string, unknown>): [string, string][] {
   const degrees = (value: number): string => `${value < 10 ? Number(value.toPrecision(2)) : Math.round(value)}°`;
-  const share = (value: number): string => `${percent(value)} of the object's size`;
+  const share = (value: number): string => `${value < 0.0005 ? "below 0.1 %" : percent(value)} of the object's size`;
   const known: [name: string, term: string, words: (value: number) => string][] = [
     ["turn_degrees", "Turn between the most different views", degrees],
     ["degrees_per_frame", "Turn per frame (median)", degrees],
