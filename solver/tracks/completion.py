@@ -42,6 +42,9 @@ MIN_REPLACED_STDS = 6.0
 POINTS_PER_CHUNK = 4096
 """Points projected onto the basis at once; bounds the memory at POINTS_PER_CHUNK·(6F + r²) numbers."""
 
+CHUNKS_PER_TICK = 16
+"""Chunks of the Gram matrix between two calls of `should_stop`: about a second for 100 frames."""
+
 MIN_RESIDUAL_SCALE = 0.01
 """Floor of the residual scale, normalized units, in the robust weights (clean tracks get plain least squares) and in the
 prior on the coefficients. On rotating bodies, where no point is always visible, a lower floor extrapolates and a higher
@@ -128,7 +131,7 @@ def complete(
     outliers = fill(points, weight, basis, spread, scale)[1]
     clean = outliers == 0.0 and bool((normalized.visible == 1).all())
     filling = None if clean else Filling(basis, spread, scale)
-    gram, translations, sample = _carry(normalized, filling, chosen)
+    gram, translations, sample = _carry(normalized, filling, chosen, should_stop)
     return Completed(gram, sample, translations, 0 if clean else basis.shape[2], outliers, filling)
 
 
@@ -301,13 +304,23 @@ def spans(normalized: Normalized, filling: Filling | None) -> Iterator[tuple[NDA
         yield np.flatnonzero(shown) + span.start, points
 
 
-def _carry(normalized: Normalized, filling: Filling | None, chosen: NDArray[np.intp]) -> tuple[Floats, Floats, Floats]:
-    """Return the Gram matrix, translations and centred sample of all points, completed chunk by chunk."""
+def _carry(
+    normalized: Normalized,
+    filling: Filling | None,
+    chosen: NDArray[np.intp],
+    should_stop: Callable[[], bool] | None,
+) -> tuple[Floats, Floats, Floats]:
+    """Return the Gram matrix, translations and centred sample of all points, completed chunk by chunk.
+
+    They are needed whole: `should_stop` is called so that the time of many points is not silent, and what it returns has no effect here.
+    """
     frames = len(normalized.points)
     gram, total = np.zeros((2 * frames, 2 * frames)), np.zeros((frames, 2))
     sample = np.zeros((frames, len(chosen), 2))
     used = 0
-    for places, points in spans(normalized, filling):
+    for number, (places, points) in enumerate(spans(normalized, filling), start=1):
+        if number % CHUNKS_PER_TICK == 0 and should_stop is not None:
+            should_stop()
         stacked = points.transpose(0, 2, 1).reshape(2 * frames, -1)
         gram += stacked @ stacked.T
         total += points.sum(axis=1)

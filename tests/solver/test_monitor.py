@@ -11,6 +11,8 @@ from pliant.solver import Outcome, Settings, Step, Tracks, gallery, solve
 from pliant.solver.descent import Descent, expected_iterations, steps_left
 from pliant.solver.monitor import Monitor
 from pliant.solver.stages import Pace, Stage, planned, unseen_frames
+from pliant.solver.tracks.completion import CHUNKS_PER_TICK, POINTS_PER_CHUNK, complete
+from pliant.solver.tracks.normalization import normalize
 
 
 def small(*, noisy: bool = False) -> Tracks:
@@ -375,3 +377,12 @@ def test_the_plan_counts_the_gram_matrix_of_many_points() -> None:
     assert few.name == many.name == "completion"
     assert few.seconds < 0.2
     assert 5 < many.seconds < 20  # 100 × 1,000,000 took 15 s with the normalization
+
+
+def test_the_gram_matrix_of_many_points_is_not_silent() -> None:
+    points = np.random.default_rng(0).standard_normal((3, 2 * CHUNKS_PER_TICK * POINTS_PER_CHUNK, 2))
+    asked = []
+    complete(normalize(Tracks.from_arrays(points)), seed=0, should_stop=lambda: bool(asked.append(1)))
+    few = []
+    complete(normalize(Tracks.from_arrays(points[:, :1000])), seed=0, should_stop=lambda: bool(few.append(1)))
+    assert len(asked) >= len(few) + 2
