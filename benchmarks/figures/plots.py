@@ -240,7 +240,14 @@ def progress(records: Records) -> Figure:
         at, left = np.array(r["ticks"]).T / r["seconds"]
         dashes = "--" if r["door"] == "command line" else "-"
         label = f"{r['run']}, {r['frames']} × {r['points']}, {r['door']}, {r['seconds']:.0f} s"
-        axes.plot(at, left, dashes, color=f"C{number % 10}", lw=1.2, label=label)
+        axes.plot(
+            at,
+            left,
+            dashes,
+            color=plt.get_cmap("tab20").colors[2 * number % 20 + number // 10 % 2],
+            lw=1.2,
+            label=label,
+        )
     axes.axvline(0.25, color="black", lw=0.5)
     axes.set_xlim(0, 1)
     axes.set_ylim(0, 1.6)

@@ -1,4 +1,4 @@
-"""`pliant explain`: what an error code means; and the address of that explanation, with which every refusal ends."""
+"""`pliant explain`: what an error code means, and what to do."""
 
 from __future__ import annotations
 

@@ -305,22 +305,16 @@ def spans(normalized: Normalized, filling: Filling | None) -> Iterator[tuple[NDA
 
 
 def _carry(
-    normalized: Normalized,
-    filling: Filling | None,
-    chosen: NDArray[np.intp],
-    should_stop: Callable[[], bool] | None,
+    normalized: Normalized, filling: Filling | None, chosen: NDArray[np.intp], tick: Callable[[], bool] | None
 ) -> tuple[Floats, Floats, Floats]:
-    """Return the Gram matrix, translations and centred sample of all points, completed chunk by chunk.
-
-    They are needed whole: `should_stop` is called so that the time of many points is not silent, and what it returns has no effect here.
-    """
+    """Return the Gram matrix, translations and centred sample of all points, completed chunk by chunk; `tick` is only called."""
     frames = len(normalized.points)
     gram, total = np.zeros((2 * frames, 2 * frames)), np.zeros((frames, 2))
     sample = np.zeros((frames, len(chosen), 2))
     used = 0
     for number, (places, points) in enumerate(spans(normalized, filling), start=1):
-        if number % CHUNKS_PER_TICK == 0 and should_stop is not None:
-            should_stop()
+        if number % CHUNKS_PER_TICK == 0 and tick is not None:
+            tick()
         stacked = points.transpose(0, 2, 1).reshape(2 * frames, -1)
         gram += stacked @ stacked.T
         total += points.sum(axis=1)

@@ -25,7 +25,7 @@ With other options the solver alone, processor s (estimate), the first size chos
     100 × 500            5.2 (5.4)         4.4 (5.4)
     30 × 5,000           2.1 (3.1)         2.2 (3.1)   .8 (1.9)
 
-The solver alone took 11.6 GB and 520 processor seconds for 100 × 1,000,000, estimated at 17 GB and
+With blocks that overlapped more, the solver alone took 11.6 GB and 520 processor seconds for 100 × 1,000,000, estimated at 17 GB and
 814 s. Not covered: points seen in few frames, which take 80 bytes times the square of their number; and time with other options.
 """
 
