@@ -90,7 +90,14 @@ UNITS_PER_START = 348
 
 
 def planned(
-    frames: int, points: int, *, gaussian: bool, known_cameras: bool, sheet: bool, unseen: float = 0.0
+    frames: int,
+    points: int,
+    *,
+    gaussian: bool,
+    known_cameras: bool,
+    sheet: bool,
+    known_scales: bool = False,
+    unseen: float = 0.0,
 ) -> tuple[Stage, ...]:
     """Return the stages that a solve is expected to have, in their order.
 
@@ -102,6 +109,8 @@ def planned(
         Whether the prior is learned.
     known_cameras : bool
         Whether rotations are given.
+    known_scales : bool
+        Whether scales are given with them.
     sheet : bool
         Whether an isometric surface is looked for.
     unseen : float
@@ -117,7 +126,8 @@ def planned(
     filled = COMPLETION_SECONDS * frames * min(frames, most_frames) * min(points, most_points) if unseen > 0 else 0.0
     filled += GRAM_SECONDS * min(frames, LEARNED_FRAMES) ** 2 * points
     first.append(Stage("completion", 0.1 + filled, 6, growth=RANK_GROWTH))
-    return (*first, *learning(frames, gaussian=gaussian, known_cameras=known_cameras), start, shapes, *last)
+    learned = learning(frames, gaussian=gaussian, known_cameras=known_cameras, known_scales=known_scales)
+    return (*first, *learned, start, shapes, *last)
 
 
 def iteration_seconds(frames: int, points: int, *, gaussian: bool) -> float:
@@ -135,11 +145,11 @@ def unseen_frames(visible: Floats) -> float:
     return float(longest.mean())
 
 
-def learning(frames: int, *, gaussian: bool, known_cameras: bool) -> tuple[Stage, ...]:
+def learning(frames: int, *, gaussian: bool, known_cameras: bool, known_scales: bool = False) -> tuple[Stage, ...]:
     """Return the stages of cameras and prior; they run twice where the tracks have outliers."""
     names = ["multistart", "model_order", "starts", "perspective", "scales", "refinement", "covariance"]
     if known_cameras:
-        names = ["model_order", "covariance"] if gaussian else []
+        names = ["model_order", *([] if known_scales else ["scales"]), "covariance"] if gaussian else []
     elif not gaussian:
         names = ["multistart"]
     if gaussian and frames > LEARNED_FRAMES:

@@ -171,7 +171,10 @@ def _estimated(
     if previous is not None:
         estimate = replace(estimate, outliers=max(estimate.outliers, previous.estimate.outliers))
     elif expects_second and settings.gaussian and estimate.outliers > OUTLIER_SHARE:
-        stages = learning(len(estimate.rotations), gaussian=True, known_cameras=known is not None)
+        stages = learning(
+            len(estimate.rotations), gaussian=True, known_cameras=known is not None,
+            known_scales=known is not None and known.scales is not None,
+        )  # fmt: skip
         monitor.expect(stages, before="shapes")
     estimate = replace(estimate, perspective=observations.lens)
     shown = informative_frames(normalized.visible)

@@ -158,6 +158,7 @@ def monitored(
     unseen = 0.0 if tracks.all_visible else unseen_frames(tracks.visible)
     plan = planned(
         tracks.num_frames, tracks.num_points, gaussian=settings.gaussian, known_cameras=known is not None,
+        known_scales=known is not None and known.scales is not None,
         sheet=sheet, unseen=unseen,
     )  # fmt: skip
     return Monitor(
