@@ -60,7 +60,8 @@ demo: $(RUNS) $(PAGE)
 # Two processes share the tests. PROCESSES=1 runs them one after the other.
 PROCESSES ?= 2
 SHARED := $(if $(filter-out 1,$(PROCESSES)),-n $(PROCESSES) --dist loadfile)
-PYTEST := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest $(SHARED)
+# Bytecode is written even where the environment says otherwise: the tests start hundreds of processes.
+PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest $(SHARED)
 NEEDY := slow or chromium or node or s3 or root
 
 test: $(STAMP)
