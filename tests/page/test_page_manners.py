@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from browsing import differing_pixels, why_not
-from paging import DONE, until
+from paging import BOTH_WIDTHS_AND_THEMES, DONE, until
 from playwright.sync_api import Page, expect
 
 pytestmark = [
@@ -42,17 +42,10 @@ def test_an_example_is_run_with_the_keyboard_only(page: Page) -> None:
     for _ in range(4):
         page.keyboard.press("ArrowRight")
     page.wait_for_timeout(300)
-    assert differing_pixels(page, before, canvas.screenshot()) > 0.01
+    assert differing_pixels(before, canvas.screenshot()) > 0.01
 
 
-@pytest.mark.parametrize(
-    ("width", "scheme"),
-    [
-        (1280, "light"),
-        (390, "dark"),
-        *(pytest.param(*other, marks=pytest.mark.long) for other in ((1280, "dark"), (390, "light"))),
-    ],
-)
+@pytest.mark.parametrize(("width", "scheme"), BOTH_WIDTHS_AND_THEMES)
 def test_there_are_no_accessibility_findings_and_no_overflow(
     page: Page, url: str, finished: str, scheme: str, width: int
 ) -> None:
