@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from pliant.solver.pulse import pulse
+
 LEARNED_FRAMES = 360
 """Maximum number of frames from which cameras and covariance are learned together, evenly spread over longer films; the others follow by
 resection (`reconstruction.long_films`)."""
@@ -17,7 +19,8 @@ CHUNK_OBSERVATIONS = 1_000_000
 
 
 def frame_chunks(frames: int, points: int) -> Iterator[slice]:
-    """Yield consecutive frames, of `CHUNK_OBSERVATIONS` observations at most, or single ones."""
+    """Yield consecutive frames, of `CHUNK_OBSERVATIONS` observations at most, or single ones; a pulse precedes each."""
     together = max(1, CHUNK_OBSERVATIONS // max(points, 1))
     for first in range(0, frames, together):
+        pulse()
         yield slice(first, min(first + together, frames))

@@ -15,8 +15,7 @@ MIN_FRACTION_STEP = 0.002
 stages."""
 
 MAX_SILENCE = 0.5
-"""Seconds after which a unit of work is reported however little the fraction has increased. The longest unit of 10 million observations
-takes 1.5 s: no silence then lasts longer than 2 s."""
+"""Seconds after which a unit of work, or a pulse inside one, is reported however little the fraction has increased."""
 
 EXPECTED_SHARE = 0.9
 """Share of a stage that its expected units fill; further units approach its end."""
@@ -84,6 +83,11 @@ class Monitor:
         if fraction >= self._last.fraction + MIN_FRACTION_STEP or self._clock() - self._reported >= MAX_SILENCE:
             self._emit(replace(self._last, fraction=fraction))
         return self.stopped
+
+    def pulse(self) -> None:
+        """Report the progress again after `MAX_SILENCE`; counts no unit of work."""
+        if self._clock() - self._reported >= MAX_SILENCE:
+            self._emit(replace(self._last, fraction=self._fraction()))
 
     def enter(self, name: str, *, units: int | None = None) -> None:
         """Begin a stage that is ahead, otherwise nothing changes; stages before it are dropped.

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pliant.solver.isometry.surface import IsometricVerdict
 from pliant.solver.mesh import Mesh
 from pliant.solver.monitor import Monitor
+from pliant.solver.pulse import pulses_to
 from pliant.solver.reconstruction.blocks import needs_blocks, shapes_in_blocks
 from pliant.solver.reconstruction.cameras import Cameras, cameras_of
 from pliant.solver.reconstruction.observations import Observations, check_fit, monitored, observe
@@ -76,11 +77,12 @@ def solve(
     settings, why = resolved_order(tracks, settings)
     sheet = tries_isometry(cameras, settings)
     monitor = monitored(tracks, cameras, settings, on_step, should_stop, sheet=sheet)
-    if settings.order == "film":
-        return _with_reason(_solved(tracks, mesh, cameras, settings, monitor, scratch), why)
-    order = content_order(differences(tracks))
-    moved, cameras = in_order(tracks, cameras, order)
-    return _with_reason(as_they_came(_solved(moved, mesh, cameras, settings, monitor, scratch), order), why)
+    with pulses_to(monitor.pulse):
+        if settings.order == "film":
+            return _with_reason(_solved(tracks, mesh, cameras, settings, monitor, scratch), why)
+        order = content_order(differences(tracks))
+        moved, cameras = in_order(tracks, cameras, order)
+        return _with_reason(as_they_came(_solved(moved, mesh, cameras, settings, monitor, scratch), order), why)
 
 
 def _with_reason(solution: Solution, why: str) -> Solution:

@@ -9,6 +9,8 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
 
+from pliant.solver.pulse import pulse
+
 SMALLEST = 200_000
 """Minimum number of array elements per thread; below it, starting the thread costs more than it saves."""
 
@@ -49,6 +51,7 @@ def over_ranges(work: Callable[[int, int], None], count: int, *, smallest: int =
     Results do not depend on the number of cores as long as `work` treats indices independently and writes only to its
     own range.
     """
+    pulse()
     cores = min(available_cores(), max(count // smallest, 1))
     if cores == 1:
         work(0, count)

@@ -77,7 +77,10 @@ def refused_file(page: Page, url: str, jobs: Jobs) -> None:
 
 
 def running(page: Page, url: str, jobs: Jobs) -> None:
-    page.goto(f"{url}/#job={jobs.running}")
+    with Client(url) as client:
+        long = face(200, 3000, degrees=40)
+        job = client.submit(long.tracks.points, mesh=long.mesh.faces, name="face, long")
+    page.goto(f"{url}/#job={job.id}")
     page.get_by_text("left.").first.wait_for(timeout=PATIENCE)
 
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
+from pliant.solver.pulse import pulse
 from pliant.solver.records import Floats
 
 INTERVAL = (0.35, 3.6)
@@ -141,11 +142,13 @@ def assess(
         The extent of depth rests on a prior and not on the tracks.
     """
     size = size_of(shapes)
+    pulse()
     seen = visible > 0
     expected = None if shapes_std is None else float(np.sqrt(np.square(shapes_std).mean())) / size
     bounded = expected is not None and not (planar or depth_is_typical)
     interval = (INTERVAL[0] * expected, INTERVAL[1] * expected) if expected is not None and bounded else None
     relative = (residuals / scales[:, None])[seen]
+    pulse()
     residual = float(np.median(relative)) / size if relative.size else np.inf
     turn = turned(rotations)
     hidden = 1.0 - float(seen.mean())
@@ -204,9 +207,10 @@ def _doubts(modes: int, frames: int, *, planar: bool, depth_is_typical: bool) ->
 
 def size_of(shapes: Floats) -> float:
     """Return the root mean square distance of the points from their frame's mean point; positive."""
-    squares = [
-        float(np.square(frame - frame.mean(axis=0)).sum()) for frame in shapes
-    ]  # a frame at a time, for its memory
+    squares = []
+    for frame in shapes:  # one at a time, for its memory
+        pulse()
+        squares.append(float(np.square(frame - frame.mean(axis=0)).sum()))
     return max(float(np.sqrt(np.sum(squares) / max(shapes.shape[0] * shapes.shape[1], 1))), np.finfo(float).tiny)
 
 
@@ -217,6 +221,7 @@ def per_frame(shapes: Floats, rotations: Floats) -> tuple[float | None, float | 
     directions, steps = rotations[:, 2], []
     cosines = np.abs((directions[1:] * directions[:-1]).sum(axis=1))
     for before, after in itertools.pairwise(shapes):
+        pulse()
         moved = after - before
         steps.append(np.square(moved - moved.mean(axis=0)).sum(axis=1).mean())
     turning = float(np.degrees(np.median(np.arccos(np.clip(cosines, 0.0, 1.0)))))

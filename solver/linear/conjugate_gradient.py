@@ -8,6 +8,7 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from pliant.solver.pulse import pulse
 from pliant.solver.threads import SMALLEST, over_ranges
 
 Array = NDArray[np.floating]
@@ -59,6 +60,7 @@ def conjugate_gradient(
     if should_stop is not None:
         should_stop()  # for its progress: first touching gigabytes of memory takes as long as an iteration
     z = precondition(residual, out=spare)
+    pulse()
     direction = np.empty_like(b)
     direction[...] = z
     first = rz = dot(residual, z)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pliant.solver.linear import block_tridiagonal, multigrid, points
 from pliant.solver.linear.conjugate_gradient import Linear
 from pliant.solver.operators.normal_equations import Operator
+from pliant.solver.pulse import pulse
 from pliant.solver.records import Floats, Ints
 from pliant.solver.threads import available_cores, over_ranges
 from scipy import fft, linalg
@@ -82,8 +83,11 @@ def _in_single_precision(inverse: Linear) -> Linear:
         if not spare:
             spare.extend(np.empty_like(r, dtype=np.float32) for _ in range(2))
         rounded, found = spare
+        pulse()
         np.copyto(rounded, r, casting="same_kind")
-        result[...] = inverse(rounded, out=found)
+        solved = inverse(rounded, out=found)
+        pulse()
+        result[...] = solved
         return result
 
     return apply

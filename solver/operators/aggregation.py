@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pliant.solver.pulse import pulse
 from pliant.solver.records import Floats
 from scipy import sparse
 
@@ -55,10 +56,13 @@ def build_levels(laplacian: Matrix, *, seed: int = 0) -> tuple[Level, ...]:
     scale = np.ones(laplacian.shape[0])
     levels: list[Level] = []
     while graph.shape[0] > COARSEST:
+        pulse()
         joined = _aggregates(graph, seed)
+        pulse()
         if joined.shape[1] > 0.7 * joined.shape[0]:  # only isolated points remain
             break
         smooth = _smoothed(graph, joined)
+        pulse()
         whole = sparse.csr_array(whole @ smooth)
         before, scale = scale, 1 / np.sqrt(np.asarray(whole.power(2).sum(axis=0)).ravel())
         up = sparse.csr_array(sparse.diags_array(1 / before) @ smooth @ sparse.diags_array(scale))
@@ -97,6 +101,7 @@ def _independent(graph: Matrix, seed: int) -> NDArray[np.intp]:
     rank = np.random.default_rng(seed).permutation(size)
     open_, chosen = np.ones(size, dtype=bool), np.zeros(size, dtype=bool)
     while open_.any():
+        pulse()
         mine = np.where(open_, rank, -1)
         taken = open_ & (mine > _largest(graph, mine))
         chosen |= taken

@@ -19,6 +19,7 @@ from pliant.solver.evaluation.trust import Trust, Verdict, assess
 from pliant.solver.limits import BLOCK_OBSERVATIONS
 from pliant.solver.mesh import Mesh
 from pliant.solver.monitor import Monitor
+from pliant.solver.pulse import pulse
 from pliant.solver.reconstruction.cameras import Cameras
 from pliant.solver.reconstruction.observations import monitored
 from pliant.solver.reconstruction.prior import Prior, estimate_with
@@ -64,6 +65,7 @@ def shapes_in_blocks(
     began, whole = time.perf_counter(), _Whole(tracks, scratch)
     groups = blocks(tracks, -(-tracks.num_frames * tracks.num_points // BLOCK_OBSERVATIONS))
     edges = np.zeros((0, 2), dtype=np.int32) if mesh is None else mesh.edges
+    pulse()
     bending = _bending(tracks, cameras, prior, mesh, groups, settings, monitor)
     changes = _changes(cameras, prior, monitor)
     for number, own in enumerate(groups):
@@ -81,7 +83,9 @@ def shapes_in_blocks(
 
 
 def _part(tracks: Tracks, kept: NDArray[np.intp]) -> Tracks:
-    return Tracks.from_arrays(tracks.points[:, kept], tracks.visible[:, kept])
+    points = tracks.points[:, kept]
+    pulse()
+    return Tracks.from_arrays(points, tracks.visible[:, kept])
 
 
 def _start_of(
@@ -166,6 +170,13 @@ def with_margin(own: NDArray[np.intp], edges: Ints, num_points: int) -> NDArray[
     return np.flatnonzero(inside)
 
 
+def _copy(values: Floats, places: NDArray[np.intp], *, onto: Floats, own: NDArray[np.intp]) -> None:
+    """Copy the points `places` to the points `own`, frame by frame: a temporary file takes its time."""
+    for row, found in zip(onto, values, strict=True):
+        pulse()
+        row[own] = found[places]
+
+
 def _monitor_of(part: Tracks, settings: Settings, monitor: Monitor, number: int, count: int) -> Monitor:
     """Return the monitor of one block, whose steps are reported as those of the whole."""
 
@@ -190,13 +201,13 @@ class _Whole:
 
     def add(self, solution: Solution, own: NDArray[np.intp], places: NDArray[np.intp]) -> None:
         """Keep what belongs to the block's own points, `places` among those solved."""
-        self._shapes[:, own] = solution.shapes[:, places]
+        _copy(solution.shapes, places, onto=self._shapes, own=own)
         for name in ("residuals", "weights", "shapes_std", "inlier_probability"):
             array = getattr(solution, name)
             if array is not None:
                 if name not in self._others:
                     self._others[name] = allocated(self._shapes.shape[:2], self._scratch)
-                self._others[name][:, own] = array[:, places]
+                _copy(array, places, onto=self._others[name], own=own)
         let_go(self._shapes, *self._others.values(), self._tracks.points, self._tracks.visible)
         none = np.zeros((0, 0))
         self._parts.append(

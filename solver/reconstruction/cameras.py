@@ -15,6 +15,7 @@ from pliant.solver.cameras.planar_ambiguity import is_planar
 from pliant.solver.limits import LEARNED_FRAMES
 from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.monitor import Monitor, enter
+from pliant.solver.pulse import pulses_to
 from pliant.solver.reconstruction.long_films import extended
 from pliant.solver.reconstruction.observations import Observations, OnStep, ShouldStop, check_fit, monitored, observe
 from pliant.solver.records import Camera, Floats, KnownCamera, Step, Tracks, read_only
@@ -115,7 +116,8 @@ def estimate_cameras(
     if rejected is not None:
         observations = observations.without(rejected)
     monitor = monitored(tracks, known, settings, on_step, should_stop, only=STAGES)
-    found = cameras_of(observations, monitor, rejected=rejected, previous=previous)
+    with pulses_to(monitor.pulse):
+        found = cameras_of(observations, monitor, rejected=rejected, previous=previous)
     monitor.report(Step("finish", 1.0))
     return found
 

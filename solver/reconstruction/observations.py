@@ -11,6 +11,7 @@ from pliant.solver.cameras.lens import given_lens
 from pliant.solver.cameras.perspective import Perspective
 from pliant.solver.descent import Descent
 from pliant.solver.errors import InvalidInput
+from pliant.solver.limits import frame_chunks
 from pliant.solver.mesh import Mesh
 from pliant.solver.monitor import Monitor
 from pliant.solver.records import KnownCamera, Step, Tracks
@@ -104,8 +105,11 @@ class Observations:
 
 def in_units_of(normalized: Normalized, tracks: Tracks) -> Normalized:
     """Return tracks in the unit and about the centroids of others."""
-    points = (tracks.points - normalized.centroid[:, None]) / normalized.unit
-    return replace(normalized, points=np.where(tracks.visible[..., None] > 0, points, 0.0), visible=tracks.visible)
+    points = np.zeros(tracks.points.shape)
+    for some in frame_chunks(tracks.num_frames, tracks.num_points):
+        placed = (tracks.points[some] - normalized.centroid[some, None]) / normalized.unit
+        points[some] = np.where(tracks.visible[some, :, None] > 0, placed, 0.0)
+    return replace(normalized, points=points, visible=tracks.visible)
 
 
 def observe(tracks: Tracks, known: KnownCamera | None, settings: Settings) -> Observations:

@@ -12,6 +12,7 @@ from pliant.solver.energy.hyperparameters import noise_std
 from pliant.solver.errors import InvalidInput
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.monitor import Monitor
+from pliant.solver.pulse import pulses_to
 from pliant.solver.reconstruction.cameras import Cameras, estimate_cameras
 from pliant.solver.reconstruction.observations import OnStep, ShouldStop, monitored
 from pliant.solver.records import Floats, KnownCamera, Step, Tracks
@@ -117,7 +118,8 @@ def learn_prior(
     monitor = monitored(
         tracks, observations.known, observations.settings, on_step, should_stop, only=("model_order", "covariance")
     )
-    found = prior_of(cameras, monitor, seed=observations.settings.seed if seed is None else seed)
+    with pulses_to(monitor.pulse):
+        found = prior_of(cameras, monitor, seed=observations.settings.seed if seed is None else seed)
     monitor.report(Step("finish", 1.0))
     return found
 

@@ -11,6 +11,7 @@ from pliant.solver.energy.problem import Problem
 from pliant.solver.errors import InvalidInput
 from pliant.solver.mesh import Mesh
 from pliant.solver.monitor import Monitor
+from pliant.solver.pulse import pulses_to
 from pliant.solver.reconstruction.cameras import Cameras
 from pliant.solver.reconstruction.observations import OnStep, ShouldStop, in_units_of, monitored
 from pliant.solver.reconstruction.prior import Prior
@@ -80,12 +81,13 @@ def solve_shapes(
     began = time.perf_counter()
     begun = prepared(tracks, cameras, prior, mesh, settings)
     monitor = monitored(tracks, None, begun.settings, on_step, should_stop, only=("shapes", "finish", "trust"))
-    begun = with_outlier_reason(with_outliers_rejected(begun, monitor))
-    if start is not None:
-        begun = _warm(begun, np.asarray(start.shapes if isinstance(start, Solution) else start, dtype=np.float64))
-    seconds, starts = {"initialise": time.perf_counter() - began}, [begun]
-    del begun  # `shapes_from` has the only reference, and lets go of the first state
-    return shapes_from(starts.pop(), monitor, seconds=seconds)
+    with pulses_to(monitor.pulse):
+        begun = with_outlier_reason(with_outliers_rejected(begun, monitor))
+        if start is not None:
+            begun = _warm(begun, np.asarray(start.shapes if isinstance(start, Solution) else start, dtype=np.float64))
+        seconds, starts = {"initialise": time.perf_counter() - began}, [begun]
+        del begun  # `shapes_from` has the only reference, and lets go of the first state
+        return shapes_from(starts.pop(), monitor, seconds=seconds)
 
 
 def _warm(start: Start, shapes: Floats) -> Start:

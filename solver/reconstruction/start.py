@@ -13,6 +13,7 @@ from pliant.solver.errors import InvalidInput, InvalidSettings
 from pliant.solver.mesh import Mesh
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.monitor import Monitor
+from pliant.solver.pulse import pulses_to
 from pliant.solver.reconstruction.cameras import Cameras
 from pliant.solver.reconstruction.observations import Observations, OnStep, ShouldStop, check_fit, monitored
 from pliant.solver.reconstruction.prior import Prior, estimate_with
@@ -106,7 +107,8 @@ def find_outliers(
     """
     start = prepared(tracks, cameras, prior, mesh, settings)
     monitor = monitored(tracks, None, start.settings, on_step, should_stop, only=("shapes",))
-    found = with_outliers_rejected(start, monitor).rejected()
+    with pulses_to(monitor.pulse):
+        found = with_outliers_rejected(start, monitor).rejected()
     monitor.report(Step("finish", 1.0))
     return found
 

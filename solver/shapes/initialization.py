@@ -10,6 +10,7 @@ from pliant.solver.energy.problem import Array, Problem
 from pliant.solver.linear.conjugate_gradient import conjugate_gradient
 from pliant.solver.linear.preconditioner import build_preconditioner
 from pliant.solver.operators.normal_equations import Operator
+from pliant.solver.pulse import pulse
 from pliant.solver.records import Floats
 from pliant.solver.shapes.irls import inner_precision
 
@@ -74,4 +75,5 @@ def _uniform(problem: Problem, reduction: float) -> Operator:
 
 def _right_hand_side(problem: Problem, translations: Floats, operator: Operator) -> Array:
     target = problem.points - translations[:, :, None].astype(problem.points.dtype)
+    pulse()
     return operator.right_hand_side(target.astype(operator.weights.dtype, copy=False))

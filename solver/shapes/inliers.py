@@ -19,6 +19,7 @@ from dataclasses import replace
 
 import numpy as np
 from pliant.solver.limits import frame_chunks
+from pliant.solver.pulse import pulse
 from pliant.solver.records import Floats, Tracks, read_only
 from pliant.solver.solution import Solution
 from pliant.solver.tracks.noise import weighted_median
@@ -94,7 +95,9 @@ def inlier_probability(
     found[rejected] = 0.0
     if not used.any():
         return found
+    pulse()
     lengths = np.hypot(left[..., 0], left[..., 1])[used]
+    pulse()
     typical = weighted_median(lengths, confidence[used]) / MEDIAN_LENGTH
     del lengths
     scale = max(noise_std, typical, float(np.finfo(float).tiny) ** 0.25)

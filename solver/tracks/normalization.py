@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.errors import InvalidInput
+from pliant.solver.pulse import pulse
 from pliant.solver.records import Floats, Tracks, read_only
 from pliant.solver.tracks.frame_selection import between
 
@@ -45,12 +46,15 @@ def normalize(tracks: Tracks) -> Normalized:
     """
     seen = tracks.visible > 0
     weight = np.where(_near(tracks, seen), tracks.visible, 0.0)
+    pulse()
     total = weight.sum(axis=1)
     shown = total > 0
     mean = np.einsum("fp,fpc->fc", weight, tracks.points)
     mean[shown] /= total[shown, None]
     centroid = between(np.flatnonzero(shown), mean[shown], tracks.num_frames)
+    pulse()
     points = tracks.points - centroid[:, None]
+    pulse()
     points[~seen] = 0.0
     unit = float(np.sqrt(np.einsum("fp,fpc,fpc->", weight, points, points) / total.sum()))
     if not unit > 1e-12 * max(float(np.abs(centroid).max()), np.finfo(float).tiny):
@@ -69,8 +73,10 @@ def _near(tracks: Tracks, seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
     near = seen.copy()
     radius = np.zeros(seen.shape)
     for frame, mask in enumerate(seen):
+        pulse()
         if mask.any():
             middle = np.median(tracks.points[frame, mask], axis=0)
             radius[frame] = np.hypot(*(tracks.points[frame] - middle).T)
+    pulse()
     near &= radius <= MAX_MEDIAN_RADII * np.median(radius[seen])
     return near if near.any() else seen

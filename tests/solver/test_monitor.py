@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import sys
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +12,9 @@ import pytest
 from pliant.solver import Outcome, Settings, Step, Tracks, gallery, solve
 from pliant.solver.descent import Descent, expected_iterations, steps_left
 from pliant.solver.monitor import Monitor
+from pliant.solver.pulse import pulse, pulses_to
 from pliant.solver.stages import Pace, Stage, planned, unseen_frames
+from pliant.solver.threads import over_ranges, threads_limited
 from pliant.solver.tracks.completion import CHUNKS_PER_TICK, POINTS_PER_CHUNK, complete
 from pliant.solver.tracks.normalization import normalize
 
@@ -133,6 +137,47 @@ def test_slow_units_are_reported_however_little_they_add() -> None:
         now[0] += 0.3
         monitor()
     assert len(steps) == 5
+
+
+def test_pulses_are_reported_after_a_silence_and_count_no_work() -> None:
+    steps: list[Step] = []
+    now = [0.0]
+    monitor = Monitor(steps.append, plan=[Stage("shapes", 1.0, 10**6)], clock=lambda: now[0], work=lambda: now[0])
+    pulse()  # without a receiver
+    with pulses_to(monitor.pulse):
+        for _ in range(10):
+            now[0] += 0.3
+            pulse()
+    pulse()
+    assert len(steps) == 5
+    assert {step.fraction for step in steps} == {0.0}
+
+
+def test_every_range_of_work_of_the_calling_thread_pulses() -> None:
+    callers: list[int] = []
+    with pulses_to(lambda: callers.append(threading.get_ident())):
+        over_ranges(lambda _start, _stop: pulse(), 4)
+        with threads_limited(1):
+            over_ranges(lambda _start, _stop: None, 4)
+    assert set(callers) == {threading.get_ident()}
+
+
+@pytest.mark.parametrize("blocks", [False, True])
+def test_linear_algebra_reports_between_its_pieces_and_returns_the_same(
+    blocks: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sequence = gallery.face(7, 60, degrees=60)
+    settings = Settings(prior="smooth", refine_rotations=False, max_reweightings=5)
+    if blocks:
+        monkeypatch.setattr("pliant.solver.reconstruction.blocks.BLOCK_OBSERVATIONS", 300)
+    seldom: list[Step] = []
+    before = solve(sequence.tracks, sequence.mesh, settings=settings, on_step=seldom.append)
+    monkeypatch.setattr("pliant.solver.monitor.MAX_SILENCE", 0.0)
+    often: list[Step] = []
+    after = solve(sequence.tracks, sequence.mesh, settings=settings, on_step=often.append)
+    assert len(often) > 5 * len(seldom)
+    assert all(one.fraction <= two.fraction for one, two in itertools.pairwise(often))
+    np.testing.assert_array_equal(before.shapes, after.shapes)
 
 
 def descended(objectives: list[float], *, unseen: float = 0.0, iterations: int = 3, most: int = 100) -> Descent:
