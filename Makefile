@@ -71,7 +71,7 @@ COMPUTING := tests/solver tests/tracking
 ASIDE := build/computing.log
 define ALL_TESTS
 @mkdir -p build
-@nice -n 5 $(PYTHON_TESTS) -p no:cacheprovider -m "$(1)" $(COMPUTING) >$(ASIDE) 2>&1 & computing=$$!; \
+@nice -n 3 $(PYTHON_TESTS) -p no:cacheprovider -m "$(1)" $(COMPUTING) >$(ASIDE) 2>&1 & computing=$$!; \
 trap 'kill $$computing' INT TERM; \
 $(PYTEST) -m "$(1)" $(COMPUTING:%=--ignore=%); failed=$$?; \
 wait $$computing || failed=$$?; cat $(ASIDE); exit $$failed
