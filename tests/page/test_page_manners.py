@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 
+import httpx
 import pytest
 from browsing import differing_pixels, why_not
 from paging import BOTH_WIDTHS_AND_THEMES, DONE, until
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Page, Route, expect
 
 pytestmark = [
     pytest.mark.chromium,
@@ -82,3 +84,19 @@ def test_no_request_leaves_the_host(page: Page, url: str, finished: str) -> None
         assert answer is None or answer.headers["content-security-policy"].startswith("default-src 'self';")
     assert len(asked) > 10
     assert [address for address in asked if not address.startswith(f"{url}/")] == []
+
+
+def test_the_list_scrolls_to_the_job_that_is_shown(page: Page, url: str, finished: str) -> None:
+    answer = httpx.get(f"{url}/v1/jobs").json()
+    own = next(job for job in answer["jobs"] if job["id"] == finished)
+    listed = {"jobs": [*({**own, "id": f"{number:032x}"} for number in range(30)), own], "next": None}
+    waiting: list[Route] = []
+    page.route(re.compile(r"/v1/jobs(\?.*)?$"), lambda route: waiting.append(route))
+    page.goto(f"{url}/#job={finished}")
+    shown = page.locator(".jobs a[aria-current]")
+    expect(shown).to_be_in_viewport()  # alone, before the list arrives
+    page.route(re.compile(r"/v1/jobs(\?.*)?$"), lambda route: route.fulfill(json=listed))
+    for route in waiting:
+        route.fulfill(json=listed)
+    expect(page.locator(".jobs li")).to_have_count(31)
+    expect(shown).to_be_in_viewport(ratio=0.9)

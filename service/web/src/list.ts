@@ -32,6 +32,8 @@ export class JobList {
   private selected: string | null = null;
   /** The selected job that the list was scrolled to. */
   private revealed: string | null = null;
+  /** Whether the newest page has arrived; before, the job that is shown may stand alone in the list. */
+  private listed = false;
 
   constructor() {
     const summary = h("summary", {}, h("h2", { id: "jobs-title" }, "Jobs"));
@@ -51,6 +53,7 @@ export class JobList {
     // Beyond the newest page only what is older than it can still exist unseen; the rest has been deleted.
     const kept = this.jobs.filter((job) => !fresh.has(job.id) && page.next !== null && oldest !== undefined && job.created_at < oldest);
     if (kept.length === 0) this.next = page.next;
+    this.listed = true;
     const known = new Map(this.jobs.map((job) => [job.id, job]));
     this.jobs = [...page.jobs.map((job) => newer(known.get(job.id) ?? null, job) ?? (known.get(job.id) as Job)), ...kept];
     this.show();
@@ -114,7 +117,7 @@ export class JobList {
   /** Scroll the list to the selected job, once for each selection; the page itself stays where it is. */
   private reveal(): void {
     const row = this.selected === null ? undefined : this.rows.get(this.selected);
-    if (row === undefined || this.revealed === this.selected) return;
+    if (row === undefined || !this.listed || this.revealed === this.selected) return;
     this.revealed = this.selected;
     const [list, item] = [this.items.getBoundingClientRect(), row.element.getBoundingClientRect()];
     this.items.scrollTop += Math.max(0, item.bottom - list.bottom) + Math.min(0, item.top - list.top);
