@@ -91,6 +91,7 @@ def test_the_list_scrolls_to_the_job_that_is_shown(page: Page, url: str, finishe
     own = next(job for job in answer["jobs"] if job["id"] == finished)
     listed = {"jobs": [*({**own, "id": f"{number:032x}"} for number in range(30)), own], "next": None}
     waiting: list[Route] = []
+    page.goto("about:blank")  # from the front page, another fragment would load no list
     page.route(re.compile(r"/v1/jobs(\?.*)?$"), lambda route: waiting.append(route))
     page.goto(f"{url}/#job={finished}")
     shown = page.locator(".jobs a[aria-current]")
