@@ -225,7 +225,8 @@ def given_cameras(normalized: Normalized, known: KnownCamera, settings: Settings
     """Return given cameras as an estimate; missing scales are estimated if the camera model has them.
 
     Estimated scales are those with which one rigid shape explains the tracks best: Σ_f ‖W_f − s_f R_f S‖² is least. A
-    common factor of all scales has no effect, because S compensates it.
+    common factor of all scales has no effect, because S compensates it. With the Gaussian prior they are 1 here, and
+    `joint_refinement.refine_cameras` frees them where the likelihood gains, because a rigid shape takes deformation for scale.
 
     Where scales are known, the prior does not need the tracks' Gram matrix and translations are estimated with the
     shapes, completion is skipped, because it could take longer than the shapes. `rank` is as for `estimate_cameras`.
@@ -238,6 +239,8 @@ def given_cameras(normalized: Normalized, known: KnownCamera, settings: Settings
         completed = complete(normalized, seed=settings.seed, rank=rank)
     if known.scales is not None:
         scales, reason = np.array(known.scales), "Rotations and scales were given."
+    elif settings.gaussian and settings.estimates_scales:
+        scales, reason = np.ones(frames), "Rotations were given."
     elif settings.estimates_scales:
         scales = rigid_scales(completed.gram, known.rotations)
         reason = "Rotations were given; scales were estimated."

@@ -114,9 +114,12 @@ def refine_cameras(
     """
     start = _Evidence.of(estimate, np.flatnonzero(shown), np.asarray(estimate.scales))
     model_order = _model_order(start, turning=turning, seed=seed, should_stop=should_stop)
-    start = _started(start, normalized, model_order, turning=turning, should_stop=should_stop)
+    unsettled, start = start, _started(start, normalized, model_order, turning=turning, should_stop=should_stop)
     estimate = start.estimate
     if not turning:
+        if estimates_scales and (start.start_scales == 1).all():
+            start = _with_free_scales(start, unsettled, normalized, model_order, should_stop)
+            estimate = start.estimate
         return estimate, LearningData(
             start.gram, start.sample, start.projections, start.used, model_order, selects_again=False, stopped=None,
             rotations=np.asarray(estimate.rotations), scales=np.asarray(estimate.scales), turned=False,
@@ -173,6 +176,39 @@ def _started(
             start.estimate, normalized, start.used, model_order=model_order, turning=turning, should_stop=should_stop
         )
     )
+
+
+def _with_free_scales(
+    settled: _Evidence,
+    unsettled: _Evidence,
+    normalized: Normalized | None,
+    model_order: ModelOrder,
+    should_stop: Callable[[], bool] | None,
+) -> _Evidence:
+    """Return the evidence with scales of given rotations, where free ones gain more likelihood than chance.
+
+    `unsettled` has the tracks as they are, to be corrected for perspective with these scales.
+    """
+    enter(should_stop, "scales")
+    trial = try_free_scales(settled.gram, settled.rotations, model_order, should_stop, turning=False)
+    if trial.start is None:
+        return replace(settled, estimate=_with_scale_reason(settled.estimate, trial))
+    scales = _at_all_frames(settled.used, trial.start, len(settled.start_scales))
+    estimate = replace(_with_scale_reason(unsettled.estimate, trial), scales=scales)
+    again = _Evidence.of(estimate, settled.used, scales)
+    return _started(again, normalized, model_order, turning=False, should_stop=should_stop)
+
+
+def _with_scale_reason(estimate: CameraEstimate, trial: ScaleTrial) -> CameraEstimate:
+    return replace(estimate, reasons={**estimate.reasons, "scales": trial.reason})
+
+
+def _at_all_frames(used: NDArray[np.intp], scales: Floats, frames: int) -> Floats:
+    """Return scales of the frames used, interpolated to all, mean logarithm 0, shape `(F,)`, read-only."""
+    logs = between(used, np.log(scales)[:, None], frames)[:, 0]
+    found = np.exp(logs - logs.mean())
+    read_only(found)
+    return found
 
 
 def _refined(
@@ -258,12 +294,9 @@ def _of_all_frames(
     turns = Rotation.from_matrix(found.rotations @ evidence.rotations.transpose(0, 2, 1)).as_rotvec()
     rotations = exponential(between(used, turns, frames)) @ estimate.rotations
     if trial is not None:
-        estimate = replace(estimate, reasons={**estimate.reasons, "scales": trial.reason})
+        estimate = _with_scale_reason(estimate, trial)
     if trial is not None and trial.start is not None:
-        logs = between(used, np.log(found.scales)[:, None], frames)[:, 0]
-        scales = np.exp(logs - logs.mean())
-        read_only(scales)
-        estimate = replace(estimate, scales=scales)
+        estimate = replace(estimate, scales=_at_all_frames(used, found.scales, frames))
     return _with_rotation_reason(estimate, rotations, np.asarray(start.estimate.rotations)), rotations
 
 

@@ -118,13 +118,19 @@ def learned_at(
 
 
 def turned(
-    gram: Floats, found: Learned, *, with_scales: bool, rounds: int, should_stop: Callable[[], bool] | None
+    gram: Floats,
+    found: Learned,
+    *,
+    with_scales: bool,
+    rounds: int,
+    turning: bool = True,
+    should_stop: Callable[[], bool] | None,
 ) -> Learned:
-    """Return cameras and covariance after rounds of refinement."""
+    """Return cameras and covariance after rounds of refinement; with `turning` False the rotations are kept."""
     for _ in range(rounds):
         if should_stop is not None and should_stop():
             break
-        found = turned_once(gram, found, with_scales=with_scales, should_stop=should_stop)
+        found = turned_once(gram, found, with_scales=with_scales, turning=turning, should_stop=should_stop)
     return found
 
 
@@ -133,11 +139,14 @@ def turned_once(
     found: Learned,
     *,
     with_scales: bool,
+    turning: bool = True,
     factor: Floats | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> Learned:
-    """Return cameras and covariance of higher likelihood; `factor` as for `scene_at`."""
+    """Return cameras and covariance of higher likelihood; `factor` as for `scene_at`, `turning` as for `turned`."""
     ordered = found.covariance.ordered
     scene = scene_at(gram, found.rotations, with_scales=with_scales, ordered=ordered, factor=factor)
-    moved = fit(scene, motion_of(scene, found), iterations=ROTATION_ITERATIONS, turning=True, should_stop=should_stop)
+    moved = fit(
+        scene, motion_of(scene, found), iterations=ROTATION_ITERATIONS, turning=turning, should_stop=should_stop
+    )
     return moved_to(scene, found, *moved)

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from pliant.solver.cameras.factorization import upgrade
 from pliant.solver.cameras.learned import Learned, learned_at, turned
+from pliant.solver.model.marginal_likelihood import Scene, cameras_of, fit, start
 from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.records import Floats
 from pliant.solver.settings import Settings
@@ -31,6 +32,9 @@ WIDEST = 0.3
 
 SCALE_FRAMES = 120
 """Frames used to decide whether scales are free; with 60 instead of 120 chance gains of fixed scales reach .054."""
+
+SMOOTH_ITERATIONS = 120
+"""L-BFGS iterations for the scales of smooth modes, as many as those of `SCALE_ROUNDS`."""
 
 SCALE_ROUNDS = 2
 """Refinements used to decide whether scales are free."""
@@ -108,23 +112,36 @@ class ScaleTrial:
 
 
 def try_free_scales(
-    gram: Floats, rotations: Floats, model_order: ModelOrder, should_stop: Callable[[], bool] | None
+    gram: Floats,
+    rotations: Floats,
+    model_order: ModelOrder,
+    should_stop: Callable[[], bool] | None,
+    *,
+    turning: bool = True,
 ) -> ScaleTrial:
     """Compare free scales with scales of 1 on a subset of the frames.
 
     Scales are free from two starts, 1 and those of a rigid shape. Deformation that is mistaken for scale ends in a worse
-    minimum than fixed scales, or in one with nearly constant scales.
+    minimum than fixed scales, or in one with nearly constant scales. With `turning` False the rotations are kept. The scales of
+    a rigid shape are then a poor start, because nothing but the scales can absorb the deformation; those found with smooth
+    modes are a third one.
     """
     used = evenly_spread(len(rotations), SCALE_FRAMES)
     part, given, none = of_frames(gram, used), rotations[used], np.ones(len(used))
 
-    def turned_some(start: Learned, *, with_scales: bool) -> Learned:
-        return turned(part, start, with_scales=with_scales, rounds=SCALE_ROUNDS, should_stop=should_stop)
+    def turned_some(begun: Learned, *, with_scales: bool) -> Learned:
+        return turned(
+            part, begun, with_scales=with_scales, rounds=SCALE_ROUNDS, turning=turning, should_stop=should_stop
+        )
 
-    even, rigid = (
-        learned_at(part, given, scales, model_order, should_stop) for scales in (none, rigid_scales(part, given))
+    starts = [none, rigid_scales(part, given)]
+    if not turning:
+        starts.append(_smooth_scales(part, given, ordered=model_order.ordered, should_stop=should_stop))
+    even, *others = (learned_at(part, given, scales, model_order, should_stop) for scales in starts)
+    fixed, runs = (
+        turned_some(even, with_scales=False),
+        [turned_some(each, with_scales=True) for each in (even, *others)],
     )
-    fixed, runs = turned_some(even, with_scales=False), [turned_some(each, with_scales=True) for each in (even, rigid)]
     best = min(runs, key=lambda run: run.energy)
     gain, logs = fixed.energy - best.energy, np.log(best.scales)
     extent = f"from {best.scales.min():.3f} to {best.scales.max():.3f}"
@@ -140,6 +157,14 @@ def try_free_scales(
     logs = between(used, logs[:, None], len(rotations))[:, 0]
     reason = f"Scales {extent} gain {gain:.3f} in the logarithm of the likelihood, per point and frame."
     return ScaleTrial(np.exp(logs - logs.mean()), reason, fixed)
+
+
+def _smooth_scales(gram: Floats, rotations: Floats, *, ordered: bool, should_stop: Callable[[], bool] | None) -> Floats:
+    """Return the most probable scales of given rotations where the modes are smooth and the noise is large, shape `(F,)`."""
+    scene = Scene.of(gram, rotations, with_scales=True, ordered=ordered)
+    begun = start(scene, np.ones(len(rotations)))
+    moved, _ = fit(scene, begun, iterations=SMOOTH_ITERATIONS, turning=False, should_stop=should_stop)
+    return cameras_of(scene, moved)[1]
 
 
 def _scale_gain_share(logs: Floats) -> float:

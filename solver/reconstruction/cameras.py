@@ -179,9 +179,11 @@ def _estimated(
     if settings.gaussian:
         # The pose signs of a plane are weakly determined; completed outliers are enough to flip them.
         corrupted_plane = estimate.outliers > OUTLIER_SHARE and is_planar(estimate.gram)
+        scaled = observations.turning or (known is not None and known.scales is None)
+        scaled = scaled and settings.estimates_scales and not (known is None and corrupted_plane)
         estimate, data = refine_cameras(
             estimate, shown, turning=observations.turning and not corrupted_plane,
-            estimates_scales=settings.estimates_scales, seed=settings.seed, normalized=normalized,
+            estimates_scales=scaled, seed=settings.seed, normalized=normalized,
             y_up=settings.y_up, should_stop=monitor,
         )  # fmt: skip
     elif observations.lens is not None:

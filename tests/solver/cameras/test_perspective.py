@@ -207,6 +207,17 @@ def test_given_cameras_may_be_perspective() -> None:
     assert e3d_frame_scaled(found.shapes, SEEN) < 0.03
 
 
+def test_given_rotations_without_scales_are_as_good_as_with_them_under_perspective() -> None:
+    errors = [
+        e3d_frame_scaled(
+            solve(pinhole(SEEN, FOCAL), cameras=KnownCamera.from_arrays(FACE.rotations, scales, focal=FOCAL)).shapes,
+            SEEN,
+        )
+        for scales in (None, np.ones(8))
+    ]
+    assert errors[0] < 1.1 * errors[1]
+
+
 @pytest.mark.slow
 def test_other_priors_take_a_given_focal_length() -> None:
     found = solve(pinhole(SEEN, FOCAL), settings=Settings(prior="smooth", camera="perspective", image_size=PICTURE))

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from pliant.solver import Settings, gallery, solve
+from pliant.solver import KnownCamera, Settings, gallery, solve
 from pliant.solver.cameras.scale import rigid_scales
 from pliant.solver.evaluation import metrics
+from pliant.solver.tracks.normalization import normalize
 
 
 def missed(found: np.ndarray, truth: np.ndarray) -> float:
@@ -43,6 +44,17 @@ def test_implausibly_large_scale_changes_are_rejected(monkeypatch: pytest.Monkey
     found = solve(film.tracks, settings=Settings(max_reweightings=1))
     assert (found.camera.scales == 1).all()
     assert "wider apart than any camera's" in found.choices.reasons["scales"]
+
+
+def test_scales_of_given_rotations_are_more_accurate_than_those_of_a_rigid_shape() -> None:
+    film = gallery.face(24, 150, scale_change=0.1)
+    rows = normalize(film.tracks).points.transpose(0, 2, 1).reshape(48, -1)
+    rigid = rigid_scales(rows @ rows.T, film.rotations)
+    found, poor = (
+        solve(film.tracks, cameras=KnownCamera.from_arrays(film.rotations, scales)) for scales in (None, rigid)
+    )
+    assert missed(found.camera.scales, film.scales) < 0.4 * missed(rigid, film.scales)
+    assert metrics.e3d_frame(found.shapes, film.shapes) < 0.5 * metrics.e3d_frame(poor.shapes, film.shapes)
 
 
 def test_rigid_scales_are_exact_for_a_rigid_shape() -> None:
