@@ -10,7 +10,7 @@ GENERATOR := $(VENV)/generator
 PAGE := service/web/dist/index.html
 PAGE_SOURCES := $(wildcard service/web/*.json service/web/*.mjs service/web/src/* service/web/src/*/*)
 
-.PHONY: help demo test test-slow test-long matrix coverage page client docs types check format clean
+.PHONY: help demo test test-slow test-long matrix coverage page client docs lint types check format clean
 
 help:
 	@echo "make demo    reconstruct a moving face end to end: service, queue, worker, glTF"
@@ -34,8 +34,9 @@ $(RUNS): pyproject.toml constraints.txt
 	touch $@
 
 # What tests and checks need on top.
+EXTRAS ?= test,check
 $(STAMP): $(RUNS)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test,check]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[$(EXTRAS)]'
 	touch $@
 
 # openapi-python-client wants another Typer than the command line does, hence an environment of its own.
@@ -60,14 +61,28 @@ demo: $(RUNS) $(PAGE)
 # Two processes share the tests. PROCESSES=1 runs them one after the other.
 PROCESSES ?= 2
 SHARED := $(if $(filter-out 1,$(PROCESSES)),-n $(PROCESSES) --dist loadfile)
-PYTEST := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest $(SHARED)
+# Bytecode is written even where the environment says otherwise: the tests start hundreds of processes.
+PYTHON_TESTS := env PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest
+PYTEST := $(PYTHON_TESTS) $(SHARED)
 NEEDY := slow or chromium or node or s3 or root
 
+# Services and pages wait for a third of their time. What only computes fills it, in a process of lower priority.
+COMPUTING := tests/solver tests/tracking
+ASIDE := build/computing.log
+define ALL_TESTS
+@mkdir -p build
+@nice -n 3 $(PYTHON_TESTS) -p no:cacheprovider -m "$(1)" $(COMPUTING) >$(ASIDE) 2>&1 & computing=$$!; \
+trap 'kill $$computing' INT TERM; \
+$(PYTEST) -m "$(1)" $(COMPUTING:%=--ignore=%); failed=$$?; \
+wait $$computing || failed=$$?; cat $(ASIDE); exit $$failed
+endef
+RUN_TESTS = $(if $(TESTS)$(filter 1,$(PROCESSES)),$(PYTEST) -m "$(1)" $(TESTS),$(ALL_TESTS))
+
 test: $(STAMP)
-	$(PYTEST) -m "not ($(NEEDY))" $(TESTS)
+	$(call RUN_TESTS,not ($(NEEDY)))
 
 test-slow: $(STAMP) $(PAGE)
-	$(PYTEST) -m "($(NEEDY)) and not long" $(TESTS)
+	$(call RUN_TESTS,($(NEEDY)) and not long)
 
 # Long forms of what other tests cover in less time.
 test-long: $(STAMP) $(PAGE)
@@ -101,10 +116,11 @@ build/typed/pliant:
 types: $(STAMP) build/typed/pliant
 	$(BIN)/mypy -p pliant
 
-check: $(STAMP) build/typed/pliant
+lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy -p pliant
+
+check: lint types
 
 format: $(STAMP)
 	$(BIN)/ruff check --fix .

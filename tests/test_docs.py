@@ -121,7 +121,7 @@ def folder(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
     if "blender" in request.node.name and request.node.name.startswith("test_shell"):
         for file in request.getfixturevalue("film").iterdir():
             (tmp_path / file.name).symlink_to(file)
-    sequence = face(12, 60)
+    sequence = face(6, 40)
     points = sequence.tracks.points
     np.savez(tmp_path / "tracks.npz", tracks=points)
     np.savez(tmp_path / "mesh.npz", faces=sequence.mesh.faces)
@@ -159,7 +159,7 @@ def test_python_runs(document: Path, service_url: str, folder: Path) -> None:
 
 
 def small(code: str) -> str:
-    return SIZE.sub("face(12, 60)", code)
+    return SIZE.sub("face(6, 40)", code)
 
 
 def test_the_readmes_first_program_is_five_lines() -> None:

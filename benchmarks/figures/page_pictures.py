@@ -76,7 +76,7 @@ def refused_file(page: Page, url: str, jobs: Jobs) -> None:
     page.locator("[data-part=tracks]").get_by_role("alert").wait_for()
 
 
-def running(page: Page, url: str, jobs: Jobs) -> None:
+def running(page: Page, url: str, _jobs: Jobs) -> None:
     with Client(url) as client:
         long = face(200, 3000, degrees=40)
         job = client.submit(long.tracks.points, mesh=long.mesh.faces, name="face, long")

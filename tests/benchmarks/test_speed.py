@@ -65,18 +65,19 @@ def test_growth_prints_an_exponent_for_each_size():
 
 def test_measurements_of_growth_are_appended_to_a_file(tmp_path):
     results = tmp_path / "growth.jsonl"
-    for _ in range(2):
-        speed(
-            "growth", "--kind", "face", "--cameras", "true", "--settings", "prior=smooth", "--outliers", "0",
-            "--against-points", "", "--against-frames", "5", "--fixed-points", "40", "--results", str(results),
-        )  # fmt: skip
-    rows = [json.loads(line) for line in results.read_text().splitlines()]
-    assert [(row["against"], row["frames"], row["points"], row["sequence"], row["cameras"]) for row in rows] == [
-        ("frames", 5, 40, "face", "true")
-    ] * 2
-    assert all(0 <= row["silence"] <= row["seconds"] and row["gigabytes"] > 0.02 for row in rows)
-    assert rows[0]["command"].startswith("python -m benchmarks.speed growth --kind face")
-    assert "results" not in rows[0]["command"]
+    results.write_text('{"measured": "before"}\n')
+    speed(
+        "growth", "--kind", "face", "--cameras", "true", "--settings", "prior=smooth", "--outliers", "0",
+        "--against-points", "", "--against-frames", "5", "--fixed-points", "40", "--results", str(results),
+    )  # fmt: skip
+    before, row = (json.loads(line) for line in results.read_text().splitlines())
+    assert before == {"measured": "before"}
+    named = tuple(row[name] for name in ("against", "frames", "points", "sequence", "cameras"))
+    assert named == ("frames", 5, 40, "face", "true")
+    assert 0 <= row["silence"] <= row["seconds"]
+    assert row["gigabytes"] > 0.02
+    assert row["command"].startswith("python -m benchmarks.speed growth --kind face")
+    assert "results" not in row["command"]
 
 
 @pytest.mark.slow

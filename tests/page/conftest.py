@@ -12,7 +12,7 @@ import httpx
 import pytest
 from browsing import Browsing
 from long_jobs import long_request
-from paging import TRACKS, packed
+from paging import QUICK, TRACKS, packed
 from playwright.sync_api import Browser, Page
 from pliant.client import Client
 from pliant.solver.gallery import corrupt, flag
@@ -107,7 +107,7 @@ def finished(url: str, small: dict[str, bytes]) -> str:
     answer = httpx.post(
         f"{url}/v1/jobs",
         files={"tracks": small[TRACKS], "mesh": small["mesh.npz"], "ground_truth": small["truth.npz"]},
-        data={"name": "a finished face"},
+        data={"name": "a finished face", "options": QUICK},
         timeout=60,
     )
     assert answer.status_code == 202, answer.text

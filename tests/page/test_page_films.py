@@ -13,7 +13,7 @@ import httpx
 import numpy as np
 import pytest
 from browsing import why_not
-from paging import drop, until
+from paging import BOTH_WIDTHS_AND_THEMES, drop, until
 from playwright.sync_api import Page, Route, expect
 
 pytestmark = [
@@ -351,8 +351,7 @@ def test_the_result_of_a_film_shows_its_contact_sheet(filming: Page, url: str, f
     expect(filming.get_by_role("region", name="Use from code")).to_contain_text('film="film.mp4"')
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("width", [1280, 390])
+@pytest.mark.parametrize(("width", "scheme"), BOTH_WIDTHS_AND_THEMES)
 def test_form_and_dialog_have_no_accessibility_finding(
     filming: Page, films: dict[str, bytes], scheme: str, width: int
 ) -> None:

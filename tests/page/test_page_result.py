@@ -36,7 +36,7 @@ def test_all_views_of_a_result_differ(page: Page, url: str, finished: str) -> No
     plain = canvas.screenshot()
 
     def different() -> float:
-        return differing_pixels(page, plain, canvas.screenshot())
+        return differing_pixels(plain, canvas.screenshot())
 
     for colour in ("displacement", "residual", "3-D error", "expected error", "how often seen"):
         page.get_by_label("Colour", exact=True).select_option(label=colour)
@@ -53,7 +53,7 @@ def test_all_views_of_a_result_differ(page: Page, url: str, finished: str) -> No
     seek(page, 9)
     from_front = canvas.screenshot()
     page.get_by_role("checkbox", name="Camera's view").check()
-    until(lambda: differing_pixels(page, from_front, canvas.screenshot()) > 0.01)
+    until(lambda: differing_pixels(from_front, canvas.screenshot()) > 0.01)
     seek(page, 3)
     for side in ("Side", "Top"):
         page.get_by_role("button", name=side).click()
@@ -160,7 +160,7 @@ def test_a_dense_result_plays_within_time_and_memory(page: Page, tmp_path: Path)
     until(lambda: float(page.get_by_role("slider", name="Frame").input_value()) > 20)
     page.get_by_role("button", name="Pause").click()
     assert time.monotonic() - began < 20
-    assert differing_pixels(page, first, page.locator(".view canvas").screenshot()) > 0.001
+    assert differing_pixels(first, page.locator(".view canvas").screenshot()) > 0.001
     megabytes = page.evaluate("performance.memory.usedJSHeapSize") / 1e6
     positions = 99 * 29_000 * 6 / 1e6
     assert positions < megabytes < 6 * positions

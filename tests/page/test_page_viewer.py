@@ -12,7 +12,7 @@ import httpx
 import numpy as np
 import pytest
 from browsing import differing_pixels, why_not
-from paging import DONE, TRACKS, packed, seek, until
+from paging import DONE, QUICK, TRACKS, packed, seek, until
 from PIL import Image
 from playwright.sync_api import Browser, Locator, Page, expect
 from pliant.solver import solve
@@ -41,7 +41,7 @@ def jobs(url: str) -> tuple[str, str]:
     ):
         tracks = packed(tracks=sequence.tracks.points, visibility=sequence.tracks.visible > 0)
         files = {"tracks": (TRACKS, tracks), "mesh": ("mesh.npz", packed(faces=sequence.mesh.faces))}
-        answer = httpx.post(f"{url}/v1/jobs", files=files, data={"name": name}, timeout=60)
+        answer = httpx.post(f"{url}/v1/jobs", files=files, data={"name": name, "options": QUICK}, timeout=60)
         ids.append(str(answer.json()["id"]))
     for id in ids:
         while httpx.get(f"{url}/v1/jobs/{id}", headers={"Prefer": "wait=20"}, timeout=60).json()["status"] in (
@@ -113,7 +113,7 @@ def test_views_show_other_sides_and_fit_brings_the_mesh_back(viewer: Page) -> No
     front = canvas(viewer).screenshot()
 
     def changed() -> float:
-        return differing_pixels(viewer, front, canvas(viewer).screenshot())
+        return differing_pixels(front, canvas(viewer).screenshot())
 
     for key in ("2", "3"):
         canvas(viewer).press(key)
@@ -193,10 +193,10 @@ def test_tracks_stand_beside_the_mesh_and_the_mesh_over_them(viewer: Page) -> No
     viewer.wait_for_timeout(200)
     before = tracks.screenshot()
     seek(viewer, 8)
-    until(lambda: differing_pixels(viewer, before, tracks.screenshot()) > 0.005)
+    until(lambda: differing_pixels(before, tracks.screenshot()) > 0.005)
     seek(viewer, 3)
     viewer.get_by_role("checkbox", name="Mesh over it").check()
-    until(lambda: differing_pixels(viewer, before, tracks.screenshot()) > 0.02)
+    until(lambda: differing_pixels(before, tracks.screenshot()) > 0.02)
     viewer.get_by_role("checkbox", name="Tracks beside").uncheck()
     expect(viewer.get_by_role("checkbox", name="Mesh over it")).not_to_be_checked()
     expect(tracks).to_have_count(0)
@@ -211,7 +211,7 @@ def test_another_job_is_compared_point_by_point(viewer: Page) -> None:
     viewer.wait_for_timeout(300)
     before = other.screenshot()
     canvas(viewer).press("2")
-    until(lambda: differing_pixels(viewer, before, other.screenshot()) > 0.02)
+    until(lambda: differing_pixels(before, other.screenshot()) > 0.02)
     viewer.get_by_label("Compare with").select_option("")
     expect(other).to_have_count(0)
 
@@ -312,7 +312,7 @@ def test_picture_film_and_page_are_saved(viewer: Page, tmp_path: Path) -> None:
     assert [address for address in asked if not address.startswith(("file:", "blob:", "data:"))] == []
     before = canvas(alone).screenshot()
     alone.get_by_role("button", name="Side").click()
-    until(lambda: differing_pixels(alone, before, canvas(alone).screenshot()) > 0.02)
+    until(lambda: differing_pixels(before, canvas(alone).screenshot()) > 0.02)
     context.close()
 
 
@@ -320,11 +320,11 @@ def test_a_turntable_turns_the_mesh_and_can_be_stopped(viewer: Page) -> None:
     canvas(viewer).focus()
     before = canvas(viewer).screenshot()
     viewer.get_by_role("button", name="Turntable").click()
-    until(lambda: differing_pixels(viewer, before, canvas(viewer).screenshot()) > 0.02)
+    until(lambda: differing_pixels(before, canvas(viewer).screenshot()) > 0.02)
     viewer.get_by_role("button", name="Stop recording").click()
     expect(viewer.get_by_text("Stopped. Nothing was saved.")).to_be_visible()
     canvas(viewer).focus()
-    until(lambda: differing_pixels(viewer, before, canvas(viewer).screenshot()) == 0)
+    until(lambda: differing_pixels(before, canvas(viewer).screenshot()) == 0)
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

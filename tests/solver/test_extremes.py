@@ -40,9 +40,16 @@ def hidden(frames: object = slice(None), points: object = slice(None)) -> np.nda
     return visible
 
 
+LONG = pytest.mark.long
+"""For combinations whose parts other cases cover."""
+
+
 @EVERY
-@BOTH
-@pytest.mark.parametrize("meshed", [True, False])
+@pytest.mark.parametrize(
+    ("meshed", "cameras"),
+    [(True, CAMERAS), (False, CAMERAS), (True, None), pytest.param(False, None, marks=LONG)],
+    ids=["mesh-known", "no mesh-known", "mesh-estimated", "no mesh-estimated"],
+)
 def test_three_frames_of_four_points(cameras: KnownCamera | None, method: str, meshed: bool) -> None:
     tracks = Tracks.from_arrays(MADE.tracks.points[:3, [0, 20, 50, 110]])
     given = None if cameras is None else KnownCamera.from_arrays(MADE.rotations[:3], MADE.scales[:3])
@@ -59,16 +66,20 @@ def test_fewer_are_rejected(frames: int, points: int) -> None:
 
 
 @BOTH
-@pytest.mark.parametrize("nothing", [np.nan, np.inf, -np.inf])
-def test_only_values_that_are_not_finite_are_hidden(cameras: KnownCamera | None, nothing: float) -> None:
+def test_only_values_that_are_not_finite_are_hidden(cameras: KnownCamera | None) -> None:
     gaps = np.random.default_rng(3).random(MADE.tracks.points.shape[:2]) < 0.2
-    points = MADE.tracks.points.copy()
-    points[gaps, 1] = nothing
-    by_value = solve(Tracks.from_arrays(points), MADE.mesh, cameras=cameras)
-    by_mask = solve(Tracks.from_arrays(MADE.tracks.points, ~gaps), MADE.mesh, cameras=cameras)
-    np.testing.assert_array_equal(by_value.shapes, by_mask.shapes)
-    assert (by_value.weights[gaps] == 0).all()
-    assert (by_value.residuals[gaps] == 0).all()
+    by_mask = Tracks.from_arrays(MADE.tracks.points, ~gaps)
+    for nothing in (np.nan, np.inf, -np.inf):
+        points = MADE.tracks.points.copy()
+        points[gaps, 1] = nothing
+        by_value = Tracks.from_arrays(points)
+        np.testing.assert_array_equal(by_value.points, by_mask.points)
+        np.testing.assert_array_equal(by_value.visible, by_mask.visible)
+    found = solve(by_value, MADE.mesh, cameras=cameras)
+    assert_finite(found)
+    assert (found.weights[gaps] == 0).all()
+    assert (found.weights[~gaps] > 0).any()
+    assert (found.residuals[gaps] == 0).all()
 
 
 @EVERY
@@ -105,8 +116,17 @@ def test_points_never_seen_are_drawn_from_their_neighbours(cameras: KnownCamera 
         assert np.linalg.norm(known.shapes[:, inside] - whole.shapes[:, inside], axis=2).max() < 0.25 * size
 
 
-@BOTH
-@pytest.mark.parametrize("kind", ["uniform", "cotangent", "auto"])
+@pytest.mark.parametrize(
+    ("kind", "cameras"),
+    [
+        ("uniform", CAMERAS),
+        ("cotangent", CAMERAS),
+        ("auto", CAMERAS),
+        ("auto", None),
+        *(pytest.param(kind, None, marks=LONG) for kind in ("uniform", "cotangent")),
+    ],
+    ids=lambda each: each if isinstance(each, str) else "known" if each is CAMERAS else "estimated",
+)
 def test_a_component_of_one_point_is_a_point_like_any_other(cameras: KnownCamera | None, kind: str) -> None:
     """One vertex belongs to no face, and two patches are apart: smoothing knows nothing of them, time does."""
     alone = 33

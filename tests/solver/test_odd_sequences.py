@@ -29,7 +29,9 @@ def test_too_few_observations_are_an_input_error(known: bool) -> None:
     assert (caught.value.code, caught.value.field, caught.value.got) == ("too_little_seen", "visibility", "3")
 
 
-@pytest.mark.parametrize("seed", [*SEEDS, *(pytest.param(seed, marks=pytest.mark.slow) for seed in MORE_SEEDS)])
+@pytest.mark.parametrize(
+    "seed", [*SEEDS, *(pytest.param(seed, marks=[pytest.mark.slow, pytest.mark.long]) for seed in MORE_SEEDS)]
+)
 def test_small_sequences_give_finite_shapes_or_an_input_error(seed: int) -> None:
     random = np.random.default_rng(seed)
     frames, points = int(random.integers(3, 10)), int(random.integers(4, 30))

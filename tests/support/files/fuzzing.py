@@ -1,7 +1,7 @@
 """Honest files of every format, bent by hypothesis, given to the parsers: a refusal or arrays must come back, nothing else.
 
-As a program (`python fuzzing.py PARSER EXAMPLES SEED`) it fuzzes one parser in this process, which a crash of a native library may end,
-and prints how often which answer came.
+As a program (`python fuzzing.py PARSER:EXAMPLES … SEED`) it fuzzes parsers in this process, which a crash of a native library may end,
+and prints how often which answer came from each.
 """
 
 from __future__ import annotations
@@ -190,4 +190,6 @@ def in_a_fork(act: Callable[[], str]) -> str:
 if __name__ == "__main__":
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     warnings.simplefilter("ignore")
-    print(json.dumps(fuzz(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]))))
+    *given_parsers, number = sys.argv[1:]
+    counts = dict(each.split(":") for each in given_parsers)
+    print(json.dumps({name: fuzz(name, int(examples), int(number)) for name, examples in counts.items()}))

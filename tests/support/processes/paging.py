@@ -4,16 +4,27 @@ from __future__ import annotations
 
 import base64
 import io
+import json
 import re
 import time
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import pytest
 from playwright.sync_api import Locator, Page
 
 TRACKS = "tracks.npz"
 DONE = 180_000
+QUICK = json.dumps({"camera": "orthographic", "surface": "free", "refine_rotations": False})
+"""Options of a job whose result is only shown: a third of the default's time."""
+
+BOTH_WIDTHS_AND_THEMES = [
+    (1280, "light"),
+    (390, "dark"),
+    *(pytest.param(*other, marks=pytest.mark.long) for other in ((1280, "dark"), (390, "light"))),
+]
+"""Widths of a window and colour schemes, each once; the other pairs are left to `make test-long`."""
 
 
 def packed(**arrays: Any) -> bytes:

@@ -91,5 +91,5 @@ def test_three_js_shades_the_frames_as_true_normals_do(tmp_path: Path, quantized
         played = Played(page, tmp_path / "x.glb")
         for frame in (5, 20, 33):
             moved = played.picture(frame / 10)
-            assert differing_pixels(page, moved, played.plain(shapes[frame])) < 0.01
-            assert differing_pixels(page, moved, played.plain(shapes[(frame + 12) % 40])) > 0.03
+            assert differing_pixels(moved, played.plain(shapes[frame])) < 0.01
+            assert differing_pixels(moved, played.plain(shapes[(frame + 12) % 40])) > 0.03
