@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from pliant.solver.reconstruct import solve
     from pliant.solver.reconstruction.cameras import Cameras, estimate_cameras
     from pliant.solver.reconstruction.prior import Prior, learn_prior
-    from pliant.solver.reconstruction.shapes import solve_shapes
+    from pliant.solver.reconstruction.solve_shapes import solve_shapes
     from pliant.solver.reconstruction.start import find_outliers
     from pliant.solver.records import Camera, Choices, KnownCamera, Step, Tracks
     from pliant.solver.settings import Settings
@@ -34,7 +34,7 @@ _HOMES = {
     "reconstruct": ("solve",),
     "reconstruction.cameras": ("Cameras", "estimate_cameras"),
     "reconstruction.prior": ("Prior", "learn_prior"),
-    "reconstruction.shapes": ("solve_shapes",),
+    "reconstruction.solve_shapes": ("solve_shapes",),
     "reconstruction.start": ("find_outliers",),
     "mesh": ("Mesh",),
     "records": ("Camera", "Choices", "KnownCamera", "Step", "Tracks"),

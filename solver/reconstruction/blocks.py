@@ -24,7 +24,7 @@ from pliant.solver.reconstruction.cameras import Cameras
 from pliant.solver.reconstruction.observations import monitored
 from pliant.solver.reconstruction.prior import Prior, estimate_with
 from pliant.solver.reconstruction.shapes import shapes_from
-from pliant.solver.reconstruction.start import Start, prepared, with_outlier_reason, with_outliers_rejected
+from pliant.solver.reconstruction.start import Start, prepared, warm, with_outlier_reason, with_outliers_rejected
 from pliant.solver.records import Floats, Ints, Step, Tracks, read_only
 from pliant.solver.settings import Settings
 from pliant.solver.shapes.jackknife import Changes, learning_changes
@@ -59,9 +59,10 @@ def shapes_in_blocks(
     monitor: Monitor,
     *,
     seconds: dict[str, float],
+    start: Floats | None = None,
     scratch: str | Path | None = None,
 ) -> Solution:
-    """Return the solution of all points; `seconds` are those of the stages so far, `scratch` as for `solve`."""
+    """Return the solution of all points; `seconds` are those of the stages so far, `start` and `scratch` as for `solve_shapes`."""
     began, whole = time.perf_counter(), _Whole(tracks, scratch)
     groups = blocks(tracks, -(-tracks.num_frames * tracks.num_points // BLOCK_OBSERVATIONS))
     edges = np.zeros((0, 2), dtype=np.int32) if mesh is None else mesh.edges
@@ -72,8 +73,12 @@ def shapes_in_blocks(
         kept = with_margin(own, edges, tracks.num_points)
         part, surface = _part(tracks, kept), None if mesh is None else mesh_of(mesh, kept)
         inner = _monitor_of(part, settings, monitor, number, len(groups))
+        first = None if start is None else start[:, kept]
         solution = shapes_from(
-            _start_of(part, cameras, prior, surface, settings, inner, bending), inner, seconds={}, changes=changes
+            _start_of(part, cameras, prior, surface, settings, inner, bending, first),
+            inner,
+            seconds={},
+            changes=changes,
         )
         whole.add(solution, own, np.searchsorted(kept, own))
         del part, surface, solution  # before the next block
@@ -96,10 +101,12 @@ def _start_of(
     settings: Settings,
     monitor: Monitor,
     bending: float | None,
+    shapes: Floats | None,
 ) -> Start:
-    """Return the start of some of the points, without gross outliers."""
+    """Return the start of some of the points, without gross outliers; at `shapes`, if they are given."""
     start = prepared(part, cameras, prior, mesh, settings, moving=False, bending=bending, should_stop=monitor)
-    return with_outlier_reason(with_outliers_rejected(start, monitor))
+    start = with_outlier_reason(with_outliers_rejected(start, monitor))
+    return start if shapes is None else warm(start, shapes)
 
 
 def _bending(

@@ -8,17 +8,11 @@ from dataclasses import replace
 import numpy as np
 from pliant.solver.cameras.camera_choice import with_camera_choice
 from pliant.solver.energy.problem import Problem
-from pliant.solver.errors import InvalidInput
-from pliant.solver.mesh import Mesh
 from pliant.solver.monitor import Monitor
-from pliant.solver.pulse import pulses_to
-from pliant.solver.reconstruction.cameras import Cameras
-from pliant.solver.reconstruction.observations import OnStep, ShouldStop, in_units_of, monitored
-from pliant.solver.reconstruction.prior import Prior
+from pliant.solver.reconstruction.observations import in_units_of
 from pliant.solver.reconstruction.solution import finish
-from pliant.solver.reconstruction.start import Start, prepared, with_outlier_reason, with_outliers_rejected
-from pliant.solver.records import Floats, Step, Tracks
-from pliant.solver.settings import Settings
+from pliant.solver.reconstruction.start import Start
+from pliant.solver.records import Floats, Step
 from pliant.solver.shapes.assessment import assessed
 from pliant.solver.shapes.inliers import with_inlier_probability
 from pliant.solver.shapes.irls import init, no_higher, step, terminate
@@ -33,82 +27,6 @@ from pliant.solver.tracks.noise import OUTLIER_SHARE
 DEPTH_ROUNDS, DEPTH_SETTLED = 4, 1e-4
 """Maximum number of corrections of the tracks by the depths of the shapes, and the RMS change of the corrected
 tracks, normalized units, below which they end."""
-
-
-def solve_shapes(
-    tracks: Tracks,
-    cameras: Cameras,
-    prior: Prior | None = None,
-    mesh: Mesh | None = None,
-    *,
-    settings: Settings | None = None,
-    start: Solution | Floats | None = None,
-    on_step: OnStep | None = None,
-    should_stop: ShouldStop | None = None,
-) -> Solution:
-    """Solve for the shape of every frame: the last stage of `solve`.
-
-    Gross outliers are rejected, unless the cameras were estimated with rejected observations, which are left out here as well.
-
-    Parameters
-    ----------
-    tracks : Tracks
-        Of the cameras' frames; the points may be others than those that the cameras were estimated from.
-    cameras : Cameras
-        From `estimate_cameras`.
-    prior : Prior, optional
-        From `learn_prior`; None: smoothness in time, or the prior of `settings` if that is not `gaussian`.
-    mesh : Mesh, optional
-        Which points are neighbours.
-    settings : Settings, optional
-        Method, loss, weights; None takes those of the cameras.
-    start : Solution or ndarray, shape (F, P, 3), optional
-        Shapes to start from, world axes, the tracks' unit; None starts from least squares. The energy is the same either way.
-    on_step : callable, optional
-        Called after every unit of work.
-    should_stop : callable, optional
-        Called between units of work; once it returns True, the solve ends with `Outcome.STOPPED` and the last shapes.
-
-    Raises
-    ------
-    InvalidInput
-        Mesh, cameras, prior or start do not fit the tracks.
-    InvalidSettings
-        The settings are those of another prior than the given one, or need a mesh.
-    NotFinite
-        The arithmetic overflowed.
-    """
-    began = time.perf_counter()
-    begun = prepared(tracks, cameras, prior, mesh, settings)
-    monitor = monitored(tracks, None, begun.settings, on_step, should_stop, only=("shapes", "finish", "trust"))
-    with pulses_to(monitor.pulse):
-        begun = with_outlier_reason(with_outliers_rejected(begun, monitor))
-        if start is not None:
-            begun = _warm(begun, np.asarray(start.shapes if isinstance(start, Solution) else start, dtype=np.float64))
-        seconds, starts = {"initialise": time.perf_counter() - began}, [begun]
-        del begun  # `shapes_from` has the only reference, and lets go of the first state
-        return shapes_from(starts.pop(), monitor, seconds=seconds)
-
-
-def _warm(start: Start, shapes: Floats) -> Start:
-    """Return the start at given shapes.
-
-    Raises
-    ------
-    InvalidInput
-        They have another shape, or are not finite.
-    """
-    expected = (*start.observations.tracks.visible.shape, 3)
-    if shapes.shape != expected or not np.isfinite(shapes).all():
-        got = f"{shapes.shape}" if shapes.shape != expected else "values that are not finite"
-        raise InvalidInput(
-            "wrong_shape", field="start", expected=f"finite shapes {expected}", got=got, hint="Pass a solution of these tracks."
-        )  # fmt: skip
-    part = shapes if start.kept is None else shapes[:, start.kept]
-    problem = start.problem
-    coordinates = (part / start.flat.unit) @ np.linalg.inv(problem.axes).T
-    there = np.ascontiguousarray(coordinates.transpose(0, 2, 1), dtype=problem.points.dtype)
-    return replace(start, state=init(problem, there, start.state.translations))
 
 
 def shapes_from(

@@ -140,7 +140,7 @@ def prepared(
     settings = observations.settings if settings is None else settings
     if prior is None:
         estimate, covariance = cameras.estimate, None
-        settings = replace(settings, prior="smooth", order="film") if settings.gaussian else settings
+        settings = without_learned_prior(settings)
     elif settings.gaussian:
         estimate, covariance = estimate_with(cameras, prior), prior.normalized
     else:
@@ -200,6 +200,43 @@ def _initial(problem: Problem, estimate: CameraEstimate, settings: Settings, sho
     return init(problem, uniform_solution(problem, translations, should_stop=should_stop), translations)
 
 
+def warm(start: Start, shapes: Floats) -> Start:
+    """Return the start at given shapes.
+
+    Raises
+    ------
+    InvalidInput
+        They have another shape, or are not finite.
+    """
+    check_shapes(shapes, start.observations.tracks)
+    part = shapes if start.kept is None else shapes[:, start.kept]
+    problem = start.problem
+    coordinates = (part / start.flat.unit) @ np.linalg.inv(problem.axes).T
+    there = np.ascontiguousarray(coordinates.transpose(0, 2, 1), dtype=problem.points.dtype)
+    return replace(start, state=init(problem, there, start.state.translations))
+
+
+def check_shapes(shapes: Floats, tracks: Tracks) -> None:
+    """Check that shapes to start from fit the tracks.
+
+    Raises
+    ------
+    InvalidInput
+        They have another shape, or are not finite.
+    """
+    expected = (*tracks.visible.shape, 3)
+    if shapes.shape != expected or not np.isfinite(shapes).all():
+        got = f"{shapes.shape}" if shapes.shape != expected else "values that are not finite"
+        raise InvalidInput(
+            "wrong_shape", field="start", expected=f"finite shapes {expected}", got=got, hint="Pass a solution of these tracks."
+        )  # fmt: skip
+
+
+def without_learned_prior(settings: Settings) -> Settings:
+    """Return settings with smoothness in time in place of a learned prior."""
+    return replace(settings, prior="smooth", order="film") if settings.gaussian else settings
+
+
 def with_outliers_rejected(start: Start, monitor: Monitor) -> Start:
     """Return the start without gross outliers, where there are any and the prior resists them.
 
@@ -207,13 +244,14 @@ def with_outliers_rejected(start: Start, monitor: Monitor) -> Start:
     """
     problem = start.problem
     resists = problem.quadratic is not None and problem.weights.temporal > 0
-    if start.outliers <= OUTLIER_SHARE or not resists or _hides_some(start.observations):
+    if start.outliers <= OUTLIER_SHARE or not resists or hides_some(start.observations):
         return start
     kept, state = reject_outliers(problem, start.state, start.outliers, should_stop=monitor)
     return replace(start, problem=kept, state=state)
 
 
-def _hides_some(observations: Observations) -> bool:
+def hides_some(observations: Observations) -> bool:
+    """Return whether visible observations are left out as outliers."""
     return observations.normalized.visible is not observations.tracks.visible
 
 

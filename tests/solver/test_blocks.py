@@ -8,7 +8,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pliant.solver import KnownCamera, Outcome, Settings, Solution, Step, Tracks, gallery, solve
+from pliant.solver import (
+    InvalidInput,
+    KnownCamera,
+    Outcome,
+    Settings,
+    Solution,
+    Step,
+    Tracks,
+    estimate_cameras,
+    gallery,
+    learn_prior,
+    solve,
+    solve_shapes,
+)  # fmt: skip
 from pliant.solver.evaluation import metrics
 from pliant.solver.reconstruction import blocks
 from pliant.solver.shapes.sparsely_observed import mesh_of
@@ -128,6 +141,31 @@ def test_a_result_in_a_file_is_that_in_memory(film: gallery.Sequence, tmp_path: 
         assert isinstance(array.base, np.memmap)
         assert not array.flags.writeable
     assert list(folder.iterdir()) == []
+
+
+@pytest.mark.usefixtures("limited")
+def test_the_stages_are_the_whole_solve_in_blocks_too(film: gallery.Sequence, tmp_path: Path) -> None:
+    settings = Settings(max_reweightings=4)
+    whole = solve(film.tracks, film.mesh, cameras=given(film), settings=settings)
+    cameras = estimate_cameras(film.tracks, given(film), settings=settings)
+    prior = learn_prior(film.tracks, cameras)
+    steps: list[Step] = []
+    parts = solve_shapes(film.tracks, cameras, prior, film.mesh, scratch=tmp_path, on_step=steps.append)
+    for name in ("shapes", "residuals", "weights", "shapes_std", "inlier_probability"):
+        assert np.array_equal(getattr(parts, name), getattr(whole, name))
+    assert isinstance(parts.shapes.base, np.memmap)
+    assert steps[-1].fraction == 1
+    again = solve_shapes(film.tracks, cameras, prior, film.mesh, start=parts)
+    assert again.trace.objective[0] < 1.01 * parts.trace.objective[-1]
+    with pytest.raises(InvalidInput) as caught:
+        solve_shapes(film.tracks, cameras, prior, film.mesh, start=parts.shapes[:, :5])
+    assert (caught.value.code, caught.value.field, caught.value.got) == ("wrong_shape", "start", f"({FRAMES}, 5, 3)")
+    rejected = np.zeros((FRAMES, POINTS), dtype=bool)
+    rejected[3, 7] = True
+    fewer = estimate_cameras(film.tracks, given(film), settings=settings, rejected=rejected)
+    found = solve_shapes(film.tracks, fewer, prior, film.mesh)
+    assert found.weights[3, 7] == 0
+    assert (np.delete(found.weights[3], 7) > 0).all()
 
 
 MEASURED = """

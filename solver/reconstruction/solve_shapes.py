@@ -1,0 +1,98 @@
+"""The public form of the third stage: shapes of given cameras and prior, at once or in blocks of points."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import numpy as np
+from pliant.solver.mesh import Mesh
+from pliant.solver.pulse import pulses_to
+from pliant.solver.reconstruction.blocks import needs_blocks, shapes_in_blocks
+from pliant.solver.reconstruction.cameras import Cameras
+from pliant.solver.reconstruction.observations import OnStep, ShouldStop, check_fit, monitored
+from pliant.solver.reconstruction.prior import Prior
+from pliant.solver.reconstruction.shapes import shapes_from
+from pliant.solver.reconstruction.start import (
+    check_shapes,
+    hides_some,
+    prepared,
+    warm,
+    with_outlier_reason,
+    with_outliers_rejected,
+    without_learned_prior,
+)  # fmt: skip
+from pliant.solver.records import Floats, Tracks
+from pliant.solver.settings import Settings
+from pliant.solver.solution import Solution
+
+
+def solve_shapes(
+    tracks: Tracks,
+    cameras: Cameras,
+    prior: Prior | None = None,
+    mesh: Mesh | None = None,
+    *,
+    settings: Settings | None = None,
+    start: Solution | Floats | None = None,
+    scratch: str | Path | None = None,
+    on_step: OnStep | None = None,
+    should_stop: ShouldStop | None = None,
+) -> Solution:
+    """Solve for the shape of every frame: the last stage of `solve`.
+
+    Gross outliers are rejected, unless the cameras were estimated with rejected observations, which are left out here as well.
+    More than `limits.BLOCK_OBSERVATIONS` are solved in blocks of points, as by `solve`; not where observations are left out.
+
+    Parameters
+    ----------
+    tracks : Tracks
+        Of the cameras' frames; the points may be others than those that the cameras were estimated from.
+    cameras : Cameras
+        From `estimate_cameras`.
+    prior : Prior, optional
+        From `learn_prior`; None: smoothness in time, or the prior of `settings` if that is not `gaussian`.
+    mesh : Mesh, optional
+        Which points are neighbours.
+    settings : Settings, optional
+        Method, loss, weights; None takes those of the cameras.
+    start : Solution or ndarray, shape (F, P, 3), optional
+        Shapes to start from, world axes, the tracks' unit; None starts from least squares. The energy is the same either way.
+    scratch : path, optional
+        Folder for a temporary file that holds the result of blocks, as for `solve`.
+    on_step : callable, optional
+        Called after every unit of work.
+    should_stop : callable, optional
+        Called between units of work; once it returns True, the solve ends with `Outcome.STOPPED` and the last shapes.
+
+    Raises
+    ------
+    InvalidInput
+        Mesh, cameras, prior or start do not fit the tracks.
+    InvalidSettings
+        The settings are those of another prior than the given one, or need a mesh.
+    NotFinite
+        The arithmetic overflowed.
+    OSError
+        The folder `scratch` is missing, cannot be written to, or has too little space.
+    """
+    began = time.perf_counter()
+    check_fit(tracks, mesh, None)
+    observations = cameras.observations.of(tracks)
+    first = None if start is None else np.asarray(start.shapes if isinstance(start, Solution) else start, dtype=float)
+    if first is not None:
+        check_shapes(first, tracks)
+    settings = settings if settings is not None else observations.settings
+    settings = without_learned_prior(settings) if prior is None else settings
+    monitor = monitored(tracks, None, settings, on_step, should_stop, only=("shapes", "finish", "trust"))
+    with pulses_to(monitor.pulse):
+        if needs_blocks(tracks, settings) and not hides_some(observations):
+            return shapes_in_blocks(
+                tracks, cameras, prior, mesh, settings, monitor, seconds={}, start=first, scratch=scratch
+            )
+        begun = with_outlier_reason(with_outliers_rejected(prepared(tracks, cameras, prior, mesh, settings), monitor))
+        if first is not None:
+            begun = warm(begun, first)
+        seconds, starts = {"initialise": time.perf_counter() - began}, [begun]
+        del begun, first  # `shapes_from` has the only reference, and lets go of the first state
+        return shapes_from(starts.pop(), monitor, seconds=seconds)
