@@ -7,7 +7,7 @@ stages run depends on the data: one that is skipped is dropped from the plan whe
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pliant.solver.descent import OVERHEAD, expected_iterations, expected_reweightings
@@ -85,6 +85,9 @@ LOAD_SECONDS, LOAD_PRIOR = 20.0, 1.0
 OWN_PACE = 4.0
 """Weight of a stage's own pace, per completed share of it, beside that of all stages: its units take about the same time."""
 
+GIVEN_ROTATIONS = 1.56
+"""Length of the stage `scales` where rotations are given, which has a third start, against that where they are estimated: 1,283 units."""
+
 UNITS_PER_START = 348
 """Units that one starting point of the stage `starts` takes."""
 
@@ -154,7 +157,12 @@ def learning(frames: int, *, gaussian: bool, known_cameras: bool, known_scales: 
         names = ["multistart"]
     if gaussian and frames > LEARNED_FRAMES:
         names.append("extension")
-    return tuple(stage_of(name, frames) for name in names)
+    stages = tuple(stage_of(name, frames) for name in names)
+    return tuple(_longer(stage) if known_cameras and stage.name == "scales" else stage for stage in stages)
+
+
+def _longer(scales: Stage) -> Stage:
+    return replace(scales, seconds=GIVEN_ROTATIONS * scales.seconds, units=round(GIVEN_ROTATIONS * scales.units))
 
 
 def stage_of(name: str, frames: int) -> Stage:

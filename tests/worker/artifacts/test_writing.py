@@ -15,7 +15,7 @@ import trimesh
 from khronos import assert_valid
 from pliant.solver.evaluation.metrics import point_errors
 from pliant.worker.artifacts import build_report, write_artifacts
-from pliant.worker.artifacts.animation import animate
+from pliant.worker.artifacts.animation import animate, leading
 from pliant.worker.artifacts.colours import linear, shade
 from pliant.worker.artifacts.geometry import triangles_of, upright, vertex_normals, viewer_scale
 from pliant.worker.artifacts.glb import write_glb
@@ -176,6 +176,17 @@ def test_the_number_of_modes_is_minimal() -> None:
     left = np.linalg.svd(moved, full_matrices=False)[0][:, : made.extras["targets"] - 1]
     worst = np.linalg.norm((moved - left @ (left.T @ moved)).reshape(210, -1, 3), axis=2).max()
     assert worst > 0.9 * made.extras["error_bound"]
+
+
+@pytest.mark.parametrize("frames", [150, 450])
+def test_modes_are_the_leading_eigenvectors(frames: int) -> None:
+    random = np.random.default_rng(0)
+    exact = np.linalg.qr(random.standard_normal((frames, frames)))[0]
+    values = 0.8 ** np.arange(frames)
+    found = leading((exact * values) @ exact.T, 40)
+    assert found.shape == (frames, 40)
+    np.testing.assert_allclose(found.T @ found, np.eye(40), atol=1e-9)
+    np.testing.assert_allclose(np.abs(np.einsum("fk,fk->k", found, exact[:, :40])), 1, atol=1e-6)
 
 
 @pytest.mark.node
