@@ -151,7 +151,9 @@ def test_a_point_is_chosen_by_click_by_key_and_by_number(viewer: Page, url: str,
         shown = facts(viewer)
         position = [float(each) for each in shown["Position"].split(", ")]
         np.testing.assert_allclose(position, shapes[3, point], atol=2e-3 * size)
-        assert float(shown["Expected error"].split(" %")[0]) == pytest.approx(100 * spread[3, point] / size, rel=0.06)
+        assert float(shown["Expected error"].split("\u00a0%")[0]) == pytest.approx(
+            100 * spread[3, point] / size, rel=0.06
+        )
         assert re.match(rf"\d+ of {FRAMES} frames", shown["Seen in"])
     assert facts(viewer)["Now"].startswith(("hidden", "rejected"))
     number.fill("")
@@ -166,7 +168,7 @@ def test_the_timeline_moves_by_key_and_states_each_frames_values(viewer: Page) -
         expect(viewer.locator(".clock")).to_have_text(f"{frame} / {FRAMES}")
         texts.add(slider.get_attribute("aria-valuetext"))
     assert len(texts) == 4
-    found = r"frame \d+ of 10, expected error [\d.]+ % of the size, [\d.]+ % of the points hidden"
+    found = r"frame \d+ of 10, expected error [\d.]+\u00a0% of the size, [\d.]+\u00a0% of the points hidden"
     assert all(re.fullmatch(found, str(text)) for text in texts)
     chart = viewer.locator(".frames-chart svg").bounding_box()
     assert chart is not None
@@ -206,7 +208,9 @@ def test_another_job_is_compared_point_by_point(viewer: Page) -> None:
     viewer.get_by_label("Compare with").select_option(label="clean flag")
     other = viewer.get_by_role("img", name="The other job's result, from the same side")
     other.wait_for()
-    expect(viewer.get_by_text(re.compile(r"Expected error: this job [\d.]+ % of the size, clean flag"))).to_be_visible()
+    expect(
+        viewer.get_by_text(re.compile(r"Expected error: this job [\d.]+\s% of the size, clean flag"))
+    ).to_be_visible()
     expect(viewer.locator(".legend")).to_contain_text("this job minus the other")
     viewer.wait_for_timeout(300)
     before = other.screenshot()

@@ -4,7 +4,7 @@ import { Refusal, artifactPath, call, headers } from "./api";
 import { fill, h } from "./dom";
 import { saveWithToken } from "./links";
 import type { Artifact, Job } from "./types";
-import { bytes, number } from "./words";
+import { bytes, number, unbroken } from "./words";
 
 /** What people call a metric, and what exactly it is; the name of the record stands beside it. */
 const METRICS: Record<string, [string, string]> = {
@@ -13,7 +13,7 @@ const METRICS: Record<string, [string, string]> = {
   e3d_sequence: ["3-D error, one alignment", "the same after one orthogonal alignment for the whole sequence"],
   e3d_frame_similarity: ["Shape error", "the same after rotating, mirroring and scaling each frame to fit"],
   e3d_mocap: ["3-D error, motion capture", "as the motion capture literature defines it; share of the shape's spread"],
-  coverage: ["Coverage", "share of the positions within their 90 % interval"],
+  coverage: ["Coverage", "share of the positions within their 90\u00a0% interval"],
   reprojection_median: ["Reprojection, median", "from a visible track to the projected shape, median; in the tracks' unit"],
   reprojection_rms: ["Reprojection, root mean square", "the same, root mean square: sensitive to outliers"],
   rotation_degrees: ["Camera error", "mean angle between estimated and true cameras, in degrees"],
@@ -65,7 +65,7 @@ export class Warnings {
     const reasons = new Set(job.verdict_reasons ?? []);
     const warnings = job.warnings.filter((warning) => !reasons.has(warning));
     this.element.hidden = warnings.length === 0;
-    fill(this.items, warnings.join("\n"), () => warnings.map((warning) => h("li", {}, warning)));
+    fill(this.items, warnings.join("\n"), () => warnings.map((warning) => h("li", {}, unbroken(warning))));
   }
 }
 

@@ -2,7 +2,7 @@
 
 import { fill, h, svg } from "./dom";
 import type { Job, Verdict } from "./types";
-import { percent } from "./words";
+import { percent, unbroken } from "./words";
 
 export const VERDICTS: Record<Verdict, string> = { good: "Good", with_care: "Use with care", do_not_use: "Do not use" };
 
@@ -59,8 +59,8 @@ export class VerdictBox {
     this.element.dataset["verdict"] = verdict;
     const reasons = job.verdict_reasons ?? [];
     fill(this.badge, verdict, () => [badge(verdict)]);
-    fill(this.trust, job.trust_sentence ?? "", () => [job.trust_sentence]);
-    fill(this.reasons, reasons.join("\n"), () => reasons.map((reason) => h("li", {}, reason)));
+    fill(this.trust, job.trust_sentence ?? "", () => [unbroken(job.trust_sentence ?? "")]);
+    fill(this.reasons, reasons.join("\n"), () => reasons.map((reason) => h("li", {}, unbroken(reason))));
     fill(this.outcome, job.sentence ?? "", () => [job.sentence && `Solver: ${job.sentence}`]);
   }
 
@@ -80,7 +80,7 @@ export class VerdictBox {
 /** Return the figures that the verdict rests on, each with its unit; those that the report does not have are left out. */
 function evidenceOf(report: Record<string, unknown>): [string, string][] {
   const degrees = (value: number): string => `${value < 10 ? Number(value.toPrecision(2)) : Math.round(value)}°`;
-  const share = (value: number): string => `${value < 0.0005 ? "below 0.1 %" : percent(value)} of the object's size`;
+  const share = (value: number): string => `${value < 0.0005 ? "below 0.1\u00a0%" : percent(value)} of the object's size`;
   const known: [name: string, term: string, words: (value: number) => string][] = [
     ["turn_degrees", "Turn between the most different views", degrees],
     ["degrees_per_frame", "Turn per frame (median)", degrees],

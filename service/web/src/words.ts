@@ -2,7 +2,7 @@
 
 import type { Job, Status } from "./types";
 
-const whole = new Intl.NumberFormat("en");
+const whole = new Intl.NumberFormat("en", { maximumFractionDigits: 0 });
 
 export function count(value: number, one: string, many = `${one}s`): string {
   return `${whole.format(value)} ${value === 1 ? one : many}`;
@@ -17,9 +17,27 @@ export function number(value: number | null | undefined): string {
   return value.toPrecision(size < 1 ? 3 : 4);
 }
 
+/** No line ends between a number and its per cent sign. */
+const PERCENT = "\u00a0%";
+
 export function percent(fraction: number): string {
   const value = 100 * fraction;
-  return `${value > 0 && value < 10 ? value.toFixed(1) : Math.round(value)} %`;
+  return `${value > 0 && value < 10 ? value.toFixed(1) : Math.round(value)}${PERCENT}`;
+}
+
+const twoDigits = new Intl.NumberFormat("en", { minimumSignificantDigits: 2, maximumSignificantDigits: 2 });
+
+/** A share of the object's size in percent: two significant digits below 10, whole numbers from there; never with an exponent. */
+export function ofSize(share: number): string {
+  const value = 100 * share;
+  // Below that two identical results differ by rounding alone.
+  const digits = value < 5e-5 ? "0" : value < 10 ? twoDigits.format(value) : whole.format(value);
+  return `${digits}${PERCENT} of the size`;
+}
+
+/** A sentence of the service, without line ends between a number and its per cent sign. */
+export function unbroken(text: string): string {
+  return text.replace(/(\d) %/g, `$1${PERCENT}`);
 }
 
 export function bytes(value: number): string {
@@ -95,7 +113,7 @@ export function standing(job: Job): string {
       const stage = STAGES[progress.stage] ?? progress.stage;
       const step =
         progress.stage === "reweight" && progress.max_reweightings > 0
-          ? `, reweighting ${progress.reweighting} of at most ${progress.max_reweightings}`
+          ? `, reweighting ${progress.reweighting}`
           : "";
       const left = progress.seconds_left === null ? "" : `; about ${seconds(progress.seconds_left)} left`;
       return `${stage}${step}${left}.`;

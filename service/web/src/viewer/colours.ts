@@ -1,5 +1,6 @@
 // Per-point values for colour, and the scale from dark to bright that shows them.
 
+import { ofSize } from "../words";
 import { type Preview, isHidden, isRejected } from "./preview";
 
 export type Colouring = "film" | "plain" | "expected" | "seen" | "displacement" | "error" | "residual" | "difference";
@@ -34,11 +35,11 @@ export async function valuesFor(colouring: Colouring, preview: Preview, signal: 
   if (colouring === "seen") return seen(preview);
   if (colouring === "error") {
     const value = distance(preview, await preview.field("truth", signal));
-    return scaled(preview, value, "Distance from the ground truth", percent, false);
+    return scaled(preview, value, "Distance from the ground truth", ofSize, false);
   }
   if (colouring === "expected") {
     const [spread, residuals] = await Promise.all([preview.field("spread", signal), preview.field("residuals", signal)]);
-    return scaled(preview, ifSeen(preview, residuals, deviation(preview, spread)), "Expected error", percent, hides(preview));
+    return scaled(preview, ifSeen(preview, residuals, deviation(preview, spread)), "Expected error", ofSize, hides(preview));
   }
   if (colouring === "residual") return residual(preview, signal);
   return null;
@@ -70,10 +71,8 @@ export async function errorDifference(one: Preview, other: Preview, signal: Abor
   const most = quantile(one, (frame, point) => Math.abs(value(frame, point)));
   const words = `${field === "truth" ? "3-D error" : "Expected error"}, this job minus the other`;
   const mapped: Value = (frame, point) => 0.5 + value(frame, point) / (2 * most);
-  return { words, low: `−${percent(most)}`, high: `+${percent(most)}`, scale: DIVERGING, hasUnknown: false, write: writer(one, mapped) };
+  return { words, low: `−${ofSize(most)}`, high: `+${ofSize(most)}`, scale: DIVERGING, hasUnknown: false, write: writer(one, mapped) };
 }
-
-export const percent = (share: number): string => `${(100 * share).toPrecision(2)} % of the size`;
 
 /** Standard deviation of each position as a share of the object's size. */
 function deviation(preview: Preview, spread: Uint16Array): Value {
@@ -95,7 +94,7 @@ function displacement(preview: Preview): Values {
     const offset = (axis: number): number => (positions[at + axis] as number) - (mean[3 * point + axis] as number);
     return unit * Math.hypot(offset(0), offset(1), offset(2));
   };
-  return scaled(preview, value, "Distance from its mean position", percent, false);
+  return scaled(preview, value, "Distance from its mean position", ofSize, false);
 }
 
 export function distance(preview: Preview, truth: Int16Array): Value {

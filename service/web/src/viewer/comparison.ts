@@ -1,7 +1,8 @@
 // Another job beside this one: its choice, its pane, its curve in the timeline, and the difference of the errors.
 
 import { h, say } from "../dom";
-import { type Values, errorDifference, percent } from "./colours";
+import { ofSize } from "../words";
+import { type Values, errorDifference } from "./colours";
 import { Companion, type Other, meanError } from "./companion";
 import { choice, group } from "./controls";
 import type { Preview } from "./preview";
@@ -93,7 +94,7 @@ export class Comparison {
     const name = [preview, theirs].every((one) => meanError(one, "error") !== null) ? "error" : "expected";
     const [here, there] = [meanError(preview, name), meanError(theirs, name)];
     const words = name === "error" ? "3-D error" : "Expected error";
-    const figures = here !== null && there !== null ? `${words}: this job ${percent(here)}, ${other.title} ${percent(there)}.` : "";
+    const figures = here !== null && there !== null ? `${words}: this job ${ofSize(here)}, ${other.title} ${ofSize(there)}.` : "";
     const shares = sharesPoints ? "The colours show where this job's error is larger (red) or smaller (blue)." : "The two jobs do not have the same points, so errors are not compared point by point.";
     return `${figures} ${shares}`.trim();
   }

@@ -2,8 +2,8 @@
 
 import { BufferAttribute, BufferGeometry, Points, PointsMaterial } from "three";
 import { button, fill, h, uniqueId } from "../dom";
-import { count, number } from "../words";
-import { distance, percent } from "./colours";
+import { count, number, ofSize } from "../words";
+import { distance } from "./colours";
 import { type Preview, isHidden, isRejected } from "./preview";
 
 export class Probe {
@@ -80,9 +80,9 @@ export class Probe {
     const rows: [string, string][] = [...(name ? [["Name", name] satisfies [string, string]] : []), ["Position", place.map((value) => number(value)).join(", ")]];
     if (this.spread) {
       const std = ((preview.header.spread_step ?? 0) * (this.spread[preview.points * frame + point] as number)) / preview.size;
-      rows.push(["Expected error", percent(std)]);
+      rows.push(["Expected error", ofSize(std)]);
     }
-    if (this.truth) rows.push(["3-D error", percent(distance(preview, this.truth)(frame, point))]);
+    if (this.truth) rows.push(["3-D error", ofSize(distance(preview, this.truth)(frame, point))]);
     const counts = preview.counts(point);
     if (counts) {
       const rejected = counts.rejected > 0 ? `, ${counts.rejected} rejected as outliers` : "";

@@ -1,6 +1,7 @@
 // The chart over the slider: error and hidden share of every frame, on the slider's own axis.
 
 import { h, svg, fill } from "../dom";
+import { ofSize, percent } from "../words";
 import type { Preview } from "./preview";
 
 const HEIGHT = 44;
@@ -58,7 +59,7 @@ export class Timeline {
     this.needle.setAttribute("x2", String(x));
     const [error, hidden] = [this.errors[frame] ?? null, this.hidden[frame] ?? null];
     const said = [
-      error !== null && `${this.name} ${percent(error)} of the size`,
+      error !== null && `${this.name} ${ofSize(error)}`,
       hidden !== null && `${percent(hidden)} of the points hidden`,
     ].filter((one): one is string => one !== false);
     const key = said.join();
@@ -98,9 +99,4 @@ export class Timeline {
     const share = Math.min(1, Math.max(0, (event.clientX - box.left) / box.width));
     onSeek(Math.round(share * (this.preview.frames - 1)));
   }
-}
-
-function percent(share: number): string {
-  const value = 100 * share;
-  return `${value === 0 ? "0" : value < 10 ? value.toFixed(1) : Math.round(value)} %`;
 }

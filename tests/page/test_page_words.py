@@ -1,0 +1,52 @@
+"""Numbers and sentences of the page, without a browser: its modules run in Node.js."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+WEB = Path(__file__).parents[2] / "service" / "web"
+BUNDLER = WEB / "node_modules" / "esbuild"
+
+pytestmark = pytest.mark.skipif(
+    (shutil.which("node") is None or not BUNDLER.is_dir()) and not os.environ.get("CI"),
+    reason="Node.js or esbuild is not installed; say `make page`",
+)
+
+RUN = """
+import { build } from "esbuild";
+const { outputFiles: [made] } = await build({ entryPoints: ["src/MODULE.ts"], bundle: true, write: false, format: "esm" });
+const module = await import("data:text/javascript;base64," + Buffer.from(made.text).toString("base64"));
+console.log(JSON.stringify(EXPRESSION));
+"""
+
+
+def evaluate(module: str, expression: str) -> Any:
+    """The value of an expression in which `module` is a module of the page."""
+    script = RUN.replace("MODULE", module).replace("EXPRESSION", expression)
+    command = ["node", "--input-type=module", "-e", script]
+    ran = subprocess.run(command, cwd=WEB, capture_output=True, text=True, timeout=60, check=False)
+    assert ran.returncode == 0, ran.stderr
+    return json.loads(ran.stdout)
+
+
+def test_shares_of_the_size_have_no_exponents_and_no_line_ends() -> None:
+    shares = [3.91, 0.996, 0.0995, 0.0345, 0.001, 0.00001, 0.000001, 5e-324, 0, 12.345]
+    shown = evaluate("words", f"{shares}.map(module.ofSize)")
+    digits = ["391", "100", "10", "3.5", "0.10", "0.0010", "0.00010", "0", "0", "1,235"]
+    assert shown == [f"{each}\u00a0% of the size" for each in digits]
+    assert evaluate("words", "[0, 0.004, 0.5].map(module.percent)") == ["0\u00a0%", "0.4\u00a0%", "50\u00a0%"]
+    said = evaluate("words", "module.unbroken('About 4 % of the size; 5 % hidden.')")
+    assert said == "About 4\u00a0% of the size; 5\u00a0% hidden."
+
+
+def test_a_running_job_names_its_reweighting_and_the_time_left() -> None:
+    progress = {"stage": "reweight", "reweighting": 3, "max_reweightings": 60, "seconds_left": 12}
+    job = json.dumps({"status": "running", "progress": progress})
+    assert evaluate("words", f"module.standing({job})") == "Refining the shapes, reweighting 3; about 12 seconds left."
