@@ -5,9 +5,11 @@ The fields for the solver mirror `pliant.solver.Settings`; a test compares the t
 
 from __future__ import annotations
 
+import re
+from functools import partial
 from typing import Annotated, Literal, get_args
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSchema
 
 SOLVER_FIELDS = (
     "method", "camera", "surface", "order", "basis_size", "refine_rotations", "preset", "temporal_weight", "spatial_weight", "robust_scale",
@@ -18,6 +20,8 @@ SOLVER_FIELDS = (
 
 POINT = r"^-?\d{1,7}(\.\d{1,9})?,-?\d{1,7}(\.\d{1,9})?$"
 """Two numbers separated by a comma."""
+SIZE = r"^[1-9]\d{0,5}x[1-9]\d{0,5}$"
+SLICE = r"^(-?\d{1,7})?:(-?\d{1,7})?(:([1-9]\d{0,6})?)?$"
 
 Weight = Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
 
@@ -35,6 +39,28 @@ def _in_order(given: tuple[Output, ...]) -> tuple[Output, ...]:
     return tuple(name for name in get_args(Output) if name in given)
 
 
+def _matching(given: str, *, pattern: str, words: str) -> str:
+    """Return the text if it matches; else raise ValueError with words and an example, which say more than the pattern."""
+    if re.fullmatch(pattern, given) is None:
+        raise ValueError(words)
+    return given
+
+
+PointText = Annotated[
+    str,
+    AfterValidator(partial(_matching, pattern=POINT, words="x,y in pixels, such as 319.5,239.5")),
+    WithJsonSchema({"type": "string", "pattern": POINT}),
+]
+SizeText = Annotated[
+    str,
+    AfterValidator(partial(_matching, pattern=SIZE, words="width and height in pixels, such as 1920x1080")),
+    WithJsonSchema({"type": "string", "pattern": SIZE}),
+]
+SliceText = Annotated[
+    str,
+    AfterValidator(partial(_matching, pattern=SLICE, words="start:stop:step, such as 10:200:2")),
+    WithJsonSchema({"type": "string", "pattern": SLICE}),
+]
 Pixel = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 
 Outputs = Annotated[tuple[Output, ...], Field(max_length=64), BeforeValidator(_listed), AfterValidator(_in_order)]
@@ -62,7 +88,7 @@ class Options(BaseModel):
         None,
         description="Horizontal angle of view in degrees, instead of focal: focal = width / (2 tan(angle / 2)). Needs image_size.",
     )
-    principal_point: Annotated[str, Field(pattern=POINT)] | None = Field(
+    principal_point: PointText | None = Field(
         None,
         description="Principal point X,Y in pixels, e.g. 319.5,239.5; null: the centre of image_size, "
         "((width - 1) / 2, (height - 1) / 2), or that of the tracks without it.",
@@ -185,7 +211,7 @@ class Options(BaseModel):
         description="Unit of x and y. pixels: used unchanged, whatever their unit. unit: from 0 to 1, divided by (width − 1, "
         "height − 1). signed: from −1 to 1 likewise. auto: by the values; values within 0 … 1 without image_size are an error.",
     )
-    image_size: Annotated[str, Field(pattern=r"^[1-9]\d{0,5}x[1-9]\d{0,5}$")] | None = Field(
+    image_size: SizeText | None = Field(
         None,
         description="WIDTHxHEIGHT of the picture in pixels, e.g. 640x480; needed if coordinates are fractions of it. "
         "Pixel centres lie at whole numbers from 0. The picture's centre is the principal point of a perspective camera.",
@@ -198,7 +224,7 @@ class Options(BaseModel):
         description="Type of the visibility array. bool: not 0 is true. probability: from 0 to 1. logits: any number, 0 is undecided. "
         "auto: by the values. The name of the array determines whether it marks visible or hidden points.",
     )
-    frames: Annotated[str, Field(pattern=r"^(-?\d{1,7})?:(-?\d{1,7})?(:([1-9]\d{0,6})?)?$")] | None = Field(
+    frames: SliceText | None = Field(
         None, description="Frames to use, start:stop:step as in Python, e.g. 10:200:2; null: all."
     )
     stride: int = Field(

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import re
+import zipfile
 from pathlib import Path
 
 import httpx
@@ -38,6 +40,14 @@ def axe_findings(page: Page) -> list[str]:
     return list(json.loads(ran["result"]["value"]))
 
 
+def zipped(name: str) -> bytes:
+    """An archive with one member of this name."""
+    into = io.BytesIO()
+    with zipfile.ZipFile(into, "w") as archive:
+        archive.writestr(name, b"")
+    return into.getvalue()
+
+
 def small_targets(page: Page) -> list[str]:
     """Controls that are seen and smaller than 24 px in a direction; links within a sentence are exempt."""
     script = """() => [...document.querySelectorAll('button, select, input, summary, a')].filter((it) => {
@@ -59,6 +69,15 @@ def test_button_folds_and_refusals_in_place(page: Page) -> None:
     expect(alert).to_contain_text("got line 1: 'time;name;where'.")
     expect(alert).to_contain_text("Write it as in frame,point,x,y and then 0,0,312.5,200.1")
     expect(page.get_by_label("Name (optional)")).to_have_value("walk 7")
+    elsewhere = {"name": "walk 8.npz", "mimeType": "", "buffer": zipped("../tracks.npy")}
+    page.get_by_label("Tracks", exact=True).set_input_files(elsewhere)  # type: ignore[arg-type]
+    expect(alert.get_by_role("paragraph")).to_have_text(
+        [
+            "Expected members named like tracks.npy, got '../tracks.npy'.",
+            "Give the arrays in the file plain names without folders, such as tracks and visibility, and save it again.",
+            "What files can I send?About this errormember_name",
+        ]
+    )
     expect(send).to_be_in_viewport()
     page.get_by_text("Files to write", exact=True).click()
     page.get_by_label("Frame rate").fill("30")
@@ -133,7 +152,13 @@ def test_a_deleted_job_and_a_wrong_option(page: Page, url: str, small: dict[str,
     page.get_by_label("Picture size").fill("wide")
     page.get_by_role("button", name="Reconstruct").click()
     place = page.locator(".option").filter(has=page.get_by_label("Picture size"))
-    expect(place.get_by_role("alert")).to_contain_text("invalid_option")
+    expect(place.get_by_role("alert").get_by_role("paragraph")).to_have_text(
+        [
+            "Expected width and height in pixels, such as 1920x1080, got 'wide'.",
+            "Change the value, or clear the field for the default.",
+            "About this errorinvalid_option",
+        ]
+    )
     expect(page.get_by_text("Not sent: see “Picture size” above.")).to_be_visible()
     page.goto(f"{url}/#job=0123456789abcdef")
     expect(page.get_by_role("heading", name="This job does not exist")).to_be_visible()

@@ -149,5 +149,6 @@ def test_an_ambiguous_input_is_resolved_by_a_click(page: Page, url: str) -> None
 
 def test_submitting_nothing_names_the_missing_part(page: Page) -> None:
     page.get_by_role("button", name="Reconstruct").click()
-    expect(page.get_by_text("Choose a film or track file first")).to_be_visible()
+    expect(page.get_by_text("Choose a film or track file first, or try an example. What can I send?")).to_be_visible()
+    expect(page.get_by_role("link", name="What can I send?")).to_have_attribute("href", "guide#start")
     expect(page.get_by_label("Tracks", exact=True)).to_be_focused()

@@ -159,7 +159,9 @@ export class Compose {
     const form = this.kept ? this.keptForm(this.kept) : this.form();
     this.clear();
     if (form === null) {
-      this.answer.replaceChildren(h("p", { class: "sentence bad" }, `Choose a ${this.slots.hasFilms ? "film or track file" : "track file"} first, or try an example.`));
+      const what = this.slots.hasFilms ? "film or track file" : "track file";
+      const help = h("a", { href: "guide#start", target: "_blank" }, "What can I send?");
+      this.answer.replaceChildren(h("p", { class: "sentence bad" }, `Choose a ${what} first, or try an example. `, help));
       this.slots.focus("tracks");
       return;
     }

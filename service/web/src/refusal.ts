@@ -11,7 +11,13 @@ const ON_THE_PAGE: Record<string, string> = {
   film_as_tracks: "Choose it under Film instead: its points are followed for you.",
   unknown_format: "Choose a file of one of these kinds; the guide shows an example of each.",
   picture_as_tracks: "Depth comes from motion: choose a film, or a zip of all its pictures, under Film.",
+  member_name: "Give the arrays in the file plain names without folders, such as tracks and visibility, and save it again.",
+  duplicate_member: "Give each array in the file a name of its own, and save it again.",
 };
+
+/** What the service advises about an option, and what a person does on the page instead. */
+const SCHEMA = "Compare with the schema at /v1/options.";
+const FIELD = "Change the value, or clear the field for the default.";
 
 /**
  * Make the box that shows a problem. `choose` is called with the reading a person picks where several fit; `inPlace` means that
@@ -27,7 +33,7 @@ export function refusalBox(problem: Problem, choose?: ((choice: Record<string, u
     ["Got", problem.got],
   ];
   const shown = inPlace ? [] : facts.filter(([, value]) => value && !detail.includes(value));
-  const advice = (inPlace && ON_THE_PAGE[problem.code]) || problem.hint;
+  const advice = (inPlace && ON_THE_PAGE[problem.code]) || problem.hint?.replace(SCHEMA, FIELD);
   const hint = advice && (hintInside || !whole.includes(advice)) ? h("p", {}, ...withCode(advice)) : null;
   const list = h("dl", { class: "facts" }, ...shown.flatMap(([term, value]) => [h("dt", {}, term), h("dd", {}, value as string)]));
   const choices = choose ? (problem.choices ?? []).map((choice) => choiceButton(choice, choose)) : [];
@@ -59,7 +65,9 @@ function helpLinks({ code, field }: Problem): HTMLElement[] {
   const links: HTMLElement[] = [];
   const section = GUIDE[(field ?? "").split(".")[0] ?? ""];
   if (section) links.push(h("a", { href: `guide#${section}`, target: "_blank" }, `What ${section === "films" ? "films" : "files"} can I send?`));
-  if (!OURS.includes(code)) links.push(h("a", { href: `errors/${code}`, target: "_blank" }, "About this error"));
+  // The guide explains what the page itself reports.
+  const about = OURS.includes(code) ? "guide#errors" : `errors/${code}`;
+  links.push(h("a", { href: about, target: "_blank" }, "About this error"));
   return links;
 }
 
