@@ -320,8 +320,9 @@ def test_a_notification_at_the_end_for_those_who_asked(filming: Page, url: str, 
     expect(filming.get_by_role("button", name="You will be notified")).to_be_disabled()
     assert filming.evaluate("window.notes") == []
     done = httpx.get(f"{url}/v1/jobs/{finished}").json()
-    answer_with(filming, {**done, "name": "a film", "trust_sentence": "About 2 %."})
-    until(lambda: filming.evaluate("window.notes") == ["Done: a film | About 2 %."])
+    judged = {"verdict": "do_not_use", "trust_sentence": "About 40 %."}
+    answer_with(filming, {**done, "name": "a film", **judged})
+    until(lambda: filming.evaluate("window.notes") == ["a film: do not use | About 40 %."])
     assert filming.title().endswith(" – a film – Pliant")
 
 

@@ -149,7 +149,7 @@ def test_a_point_is_chosen_by_click_by_key_and_by_number(viewer: Page, url: str,
         number.fill(str(point))
         until(lambda point=point: "Now" in facts(viewer))  # type: ignore[misc]
         shown = facts(viewer)
-        position = [float(each) for each in shown["Position"].split(", ")]
+        position = [float(each) for each in shown["Position"].removesuffix(" (tracks' unit)").split(", ")]
         np.testing.assert_allclose(position, shapes[3, point], atol=2e-3 * size)
         assert float(shown["Expected error"].split("\u00a0%")[0]) == pytest.approx(
             100 * spread[3, point] / size, rel=0.06
@@ -211,7 +211,9 @@ def test_another_job_is_compared_point_by_point(viewer: Page) -> None:
     expect(
         viewer.get_by_text(re.compile(r"Expected error: this job [\d.]+\s% of the size, clean flag"))
     ).to_be_visible()
-    expect(viewer.locator(".legend")).to_contain_text("this job minus the other")
+    expect(viewer.locator(".legend")).to_contain_text("Expected error, “spoiled flag” minus “clean flag”")
+    expect(viewer.locator(".legend")).to_contain_text("grey: not seen in one of the two")
+    expect(viewer.locator(".view-name")).to_have_text(["spoiled flag (this job)", "clean flag"])
     viewer.wait_for_timeout(300)
     before = other.screenshot()
     canvas(viewer).press("2")

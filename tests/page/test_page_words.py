@@ -50,3 +50,45 @@ def test_a_running_job_names_its_reweighting_and_the_time_left() -> None:
     progress = {"stage": "reweight", "reweighting": 3, "max_reweightings": 60, "seconds_left": 12}
     job = json.dumps({"status": "running", "progress": progress})
     assert evaluate("words", f"module.standing({job})") == "Refining the shapes, reweighting 3; about 12 seconds left."
+
+
+def test_lengths_in_the_picture_have_a_unit() -> None:
+    words = "['film', 'given'].map((source) => module.inTracksUnit(0.5, {interpretation: {mesh_source: source}}))"
+    assert evaluate("words", words) == ["0.500 pixels", "0.500 (tracks' unit)"]
+
+
+def test_the_difference_of_errors_is_grey_where_one_job_does_not_show_a_point() -> None:
+    jobs = """[[[0, 1, 2], [1, 3, 2]], [[2, 1, 1], [0, 3, 2]], [[2, 4, 1], [0, 0, 0]]].map(([spread, residuals], at) => ({
+      title: "abc"[at],
+      preview: {
+        points: 3, frames: 1, ready: 1, size: 1, header: { spread_step: 0.01 }, has: (name) => name === "spread",
+        field: async (name) => (name === "spread" ? spread : residuals.flatMap((u) => [u === 3 ? -32768 : u, 0])),
+        facts: () => ({ hidden: residuals.includes(3) ? 1 / 3 : 0 }),
+      },
+    }))"""
+    shown = evaluate(
+        "viewer/colours",
+        f"""await (async () => {{
+          const [a, b, c] = {jobs};
+          return Promise.all([[a, b], [b, a], [c, c]].map(async ([one, other]) => {{
+            const values = await module.errorDifference(one, other, null);
+            const into = new Int16Array(3);
+            values.write(0, into, 1, 0);
+            return [values.words, values.low, values.high, values.hasUnknown, values.unknown, [...into]];
+          }}));
+        }})()""",
+    )
+    unknown = "not seen in one of the two"
+    ends = ["−2.0\u00a0% of the size", "+2.0\u00a0% of the size"]
+    assert shown == [
+        ["Expected error, “a” minus “b”", *ends, True, unknown, [0, -32767, 24575]],
+        ["Expected error, “b” minus “a”", *ends, True, unknown, [32767, -32767, 8191]],
+        [
+            "Expected error, “c” minus “c”",
+            "−0\u00a0% of the size",
+            "+0\u00a0% of the size",
+            False,
+            unknown,
+            [16383] * 3,
+        ],
+    ]

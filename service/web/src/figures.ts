@@ -2,7 +2,7 @@
 
 import { fill, h } from "./dom";
 import { type Job, isFinal } from "./types";
-import { duration, number, percent } from "./words";
+import { duration, inTracksUnit, ofSize } from "./words";
 
 const whole = new Intl.NumberFormat("en");
 
@@ -21,12 +21,12 @@ function figures(job: Job): [string, string][] {
   if (frames > 0) rows.push(["Frames", whole.format(frames)]);
   if (points > 0) rows.push(["Points", whole.format(points)]); // none before a film is tracked
   const { e3d_frame: error, reprojection_median: residual } = job.metrics ?? {};
-  if (error !== undefined) rows.push(["3-D error", `${percent(error)} of the size`]);
-  if (residual !== undefined) rows.push(["Reprojection", number(residual)]);
+  if (error !== undefined) rows.push(["3-D error", `${ofSize(error)}, measured against the ground truth`]);
+  if (residual !== undefined) rows.push(["Reprojection", inTracksUnit(residual, job)]);
   if (job.started_at && job.finished_at) rows.push(["Took", duration((Date.parse(job.finished_at) - Date.parse(job.started_at)) / 1000)]);
   const { progress } = job;
   if (progress && !isFinal(job.status)) {
-    if (progress.residual !== null) rows.push(["Residual", number(progress.residual)]);
+    if (progress.residual !== null) rows.push(["Residual", inTracksUnit(progress.residual, job)]);
     rows.push(["Left", progress.seconds_left === null ? "–" : duration(progress.seconds_left)]);
   }
   return rows;

@@ -36,7 +36,7 @@ export class Tab {
 
   private notify(job: Job): void {
     this.wanted = false;
-    const note = new Notification(`${STATUS_WORDS[job.status]}: ${title(job)}`, { body: job.trust_sentence ?? job.sentence ?? "", tag: job.id });
+    const note = new Notification(`${title(job)}: ${outcome(job).toLowerCase()}`, { body: job.trust_sentence ?? job.sentence ?? "", tag: job.id });
     note.addEventListener("click", () => {
       window.focus();
       note.close();
@@ -46,7 +46,11 @@ export class Tab {
 
 /** The part of the title that is read first, since tabs are narrow. */
 function lead(job: Job): string {
+  return `${job.status === "running" ? percent(job.progress?.fraction ?? 0) : outcome(job)} – `;
+}
+
+/** The verdict where there is one, else how far the job is. */
+function outcome(job: Job): string {
   const verdict = verdictOf(job);
-  if (job.status === "running") return `${percent(job.progress?.fraction ?? 0)} – `;
-  return `${verdict ? VERDICTS[verdict] : STATUS_WORDS[job.status]} – `;
+  return verdict ? VERDICTS[verdict] : STATUS_WORDS[job.status];
 }

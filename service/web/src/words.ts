@@ -35,6 +35,11 @@ export function ofSize(share: number): string {
   return `${digits}${PERCENT} of the size`;
 }
 
+/** A length of a job's picture, with its unit: pixels of a film, else whatever unit the tracks have. */
+export function inTracksUnit(value: number, job: Job): string {
+  return `${number(value)} ${job.interpretation.mesh_source === "film" ? "pixels" : "(tracks' unit)"}`;
+}
+
 /** A sentence of the service, without line ends between a number and its per cent sign. */
 export function unbroken(text: string): string {
   return text.replace(/(\d) %/g, `$1${PERCENT}`);

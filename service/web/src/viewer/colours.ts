@@ -22,6 +22,8 @@ export interface Values {
   scale: string[];
   /** True where some positions have no value and are grey. */
   hasUnknown: boolean;
+  /** Why they have none; "not seen" unless stated. */
+  unknown?: string;
   /** Write frame f's values, 0 … 32767 from one end of the scale to the other, `UNKNOWN` for grey; one a point. */
   write: (frame: number, into: Int16Array, stride: number, at: number) => void;
 }
@@ -59,19 +61,30 @@ export function colourings(preview: Preview): [Colouring, string][] {
   return all.filter(([, , has]) => has).map(([name, words]) => [name, words]);
 }
 
-/** The error of each job at each position, for two jobs of the same points and frames: 3-D errors where both have them. */
-export async function errorDifference(one: Preview, other: Preview, signal: AbortSignal): Promise<Values | null> {
+/** A job's result and its name. */
+export interface Named {
+  preview: Preview;
+  title: string;
+}
+
+/** The error of one job less that of the other, for two jobs of the same points and frames: 3-D errors where both have them. */
+export async function errorDifference(mine: Named, theirs: Named, signal: AbortSignal): Promise<Values | null> {
+  const [one, other] = [mine.preview, theirs.preview];
   if (one.points !== other.points || one.frames !== other.frames) return null;
-  const values = async (preview: Preview, field: "truth" | "spread"): Promise<Value> =>
-    field === "truth" ? distance(preview, await preview.field("truth", signal)) : deviation(preview, await preview.field("spread", signal));
+  const values = async (preview: Preview, field: "truth" | "spread"): Promise<Value> => {
+    const residuals = await preview.field("residuals", signal);
+    const error = field === "truth" ? distance(preview, await preview.field("truth", signal)) : deviation(preview, await preview.field("spread", signal));
+    return ifSeen(preview, residuals, error);
+  };
   const field = one.has("truth") && other.has("truth") ? "truth" : "spread";
   if (!one.has(field) || !other.has(field)) return null;
   const [here, there] = await Promise.all([values(one, field), values(other, field)]);
   const value: Value = (frame, point) => here(frame, point) - there(frame, point);
   const most = quantile(one, (frame, point) => Math.abs(value(frame, point)));
-  const words = `${field === "truth" ? "3-D error" : "Expected error"}, this job minus the other`;
+  const words = `${field === "truth" ? "3-D error" : "Expected error"}, “${mine.title}” minus “${theirs.title}”`;
   const mapped: Value = (frame, point) => 0.5 + value(frame, point) / (2 * most);
-  return { words, low: `−${ofSize(most)}`, high: `+${ofSize(most)}`, scale: DIVERGING, hasUnknown: false, write: writer(one, mapped) };
+  const ends = { low: `−${ofSize(most)}`, high: `+${ofSize(most)}`, scale: DIVERGING };
+  return { words, ...ends, hasUnknown: hides(one) || hides(other), unknown: "not seen in one of the two", write: writer(one, mapped) };
 }
 
 /** Standard deviation of each position as a share of the object's size. */

@@ -11,6 +11,8 @@ import type { Timeline } from "./timeline";
 /** The parts of the viewer that a comparison changes. */
 export interface Compared {
   preview: Preview;
+  /** The name of this viewer's job. */
+  title: string;
   timeline: Timeline;
   /** Where the other job's pane is added. */
   panes: HTMLElement;
@@ -28,9 +30,18 @@ export class Comparison {
   readonly summary = h("p", { class: "hint", role: "status" });
   companion: Companion | null = null;
 
-  private readonly own = h("span", { class: "view-name" }, "this job");
+  private readonly own: HTMLElement;
+  private title = "";
 
-  constructor(private readonly parts: Compared) {}
+  constructor(private readonly parts: Compared) {
+    this.own = h("span", { class: "view-name" }, `${parts.title} (this job)`);
+  }
+
+  /** The difference of the errors; null where there is no other job, or none of the same points. */
+  async difference(): Promise<Values | null> {
+    const { preview, title, signal } = this.parts;
+    return this.companion && errorDifference({ preview, title }, { preview: this.companion.preview, title: this.title }, signal);
+  }
 
   /** The choice of a job; the jobs are fetched now, and again when the list is opened. */
   choice(others: () => Promise<Other[]>): HTMLElement {
@@ -50,7 +61,7 @@ export class Comparison {
   }
 
   private async show(other: Other | null): Promise<void> {
-    const { preview, timeline, panes, signal, paint, repaint, guarded } = this.parts;
+    const { timeline, panes, signal, paint, repaint, guarded } = this.parts;
     await guarded(async () => {
       this.companion?.dispose();
       this.companion = null;
@@ -61,11 +72,12 @@ export class Comparison {
       if (other === null) return;
       const companion = await Companion.open(other, signal);
       this.companion = companion;
+      this.title = other.title;
       companion.element.append(h("span", { class: "view-name" }, other.title));
       panes.querySelector(".view:not(.film)")?.append(this.own);
       panes.append(companion.element);
       timeline.compare(companion.preview, other.title);
-      const values = await errorDifference(preview, companion.preview, signal);
+      const values = await this.difference();
       if (values) {
         this.offerDifference(true);
         paint(values);
@@ -93,7 +105,7 @@ export class Comparison {
     const { preview } = this.parts;
     const name = [preview, theirs].every((one) => meanError(one, "error") !== null) ? "error" : "expected";
     const [here, there] = [meanError(preview, name), meanError(theirs, name)];
-    const words = name === "error" ? "3-D error" : "Expected error";
+    const words = name === "error" ? "3-D error, measured against the ground truth" : "Expected error";
     const figures = here !== null && there !== null ? `${words}: this job ${ofSize(here)}, ${other.title} ${ofSize(there)}.` : "";
     const shares = sharesPoints ? "The colours show where this job's error is larger (red) or smaller (blue)." : "The two jobs do not have the same points, so errors are not compared point by point.";
     return `${figures} ${shares}`.trim();

@@ -13,7 +13,7 @@ export function showLegend(legend: HTMLElement, values: Values | null): void {
           h("span", {}, `${values.words}: ${values.low}`),
           h("span", { class: values.low === "0" ? "ramp" : "ramp diverging" }),
           h("span", {}, values.high),
-          values.hasUnknown && h("span", { class: "key-unknown" }, "grey: not seen"),
+          values.hasUnknown && h("span", { class: "key-unknown" }, `grey: ${values.unknown ?? "not seen"}`),
         ],
   );
 }

@@ -77,12 +77,12 @@ export class Probe {
   private rows(frame: number, point: number, place: [number, number, number]): [string, string][] {
     const { preview } = this;
     const name = this.names?.[point];
-    const rows: [string, string][] = [...(name ? [["Name", name] satisfies [string, string]] : []), ["Position", place.map((value) => number(value)).join(", ")]];
+    const rows: [string, string][] = [...(name ? [["Name", name] satisfies [string, string]] : []), ["Position", `${place.map((value) => number(value)).join(", ")} (tracks' unit)`]];
     if (this.spread) {
       const std = ((preview.header.spread_step ?? 0) * (this.spread[preview.points * frame + point] as number)) / preview.size;
       rows.push(["Expected error", ofSize(std)]);
     }
-    if (this.truth) rows.push(["3-D error", ofSize(distance(preview, this.truth)(frame, point))]);
+    if (this.truth) rows.push(["3-D error", `${ofSize(distance(preview, this.truth)(frame, point))}, measured against the ground truth`]);
     const counts = preview.counts(point);
     if (counts) {
       const rejected = counts.rejected > 0 ? `, ${counts.rejected} rejected as outliers` : "";

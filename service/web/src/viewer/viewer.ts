@@ -2,7 +2,7 @@
 
 import { button, h, say } from "../dom";
 import { Body, seenFromBehind } from "./body";
-import { type Colouring, type Values, colourings, errorDifference, valuesFor } from "./colours";
+import { type Colouring, type Values, colourings, valuesFor } from "./colours";
 import type { Other } from "./companion";
 import { Comparison } from "./comparison";
 import { choice, group, ordinal, toggle } from "./controls";
@@ -85,6 +85,7 @@ export class Viewer {
     this.scrub = timeSlider(preview.frames, () => this.player.time, (time) => this.seek(time));
     this.comparison = new Comparison({
       preview,
+      title: sources.title,
       timeline: this.timeline,
       panes: this.panes,
       signal: this.leaving.signal,
@@ -255,10 +256,10 @@ export class Viewer {
   }
 
   private async colour(colouring: Colouring): Promise<void> {
-    const [preview, { companion }] = [this.preview, this.comparison];
+    const { preview } = this;
     const { signal } = this.leaving;
     this.colouring = colouring;
-    const values = colouring === "difference" && companion ? errorDifference(preview, companion.preview, signal) : valuesFor(colouring, preview, signal);
+    const values = colouring === "difference" ? this.comparison.difference() : valuesFor(colouring, preview, signal);
     await this.guarded(async () => {
       const [found, picture] = await Promise.all([values, colouring === "film" ? pictureOf(preview, signal) : null]);
       if (this.colouring === colouring) this.paint(found, picture);
