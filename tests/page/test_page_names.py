@@ -108,6 +108,10 @@ def test_the_film_stands_beside_the_mesh_in_step(browser: Browser, viewed: str) 
     film = page.get_by_role("img", name="The film at the same moment, with its tracks")
     film.wait_for(timeout=DONE)
     expect(page.get_by_role("checkbox", name="Film beside")).to_be_checked()
+    following = page.get_by_role("checkbox", name="Camera's view")
+    expect(following).to_be_checked()
+    following.uncheck()
+    expect(following).not_to_be_checked()
     corner = """(it) => {
       const [across, down] = [it.width / 2, it.height / 2];
       const shown = Math.min(it.width / 320, it.height / 240);

@@ -97,6 +97,9 @@ def test_picture_and_tools_are_visible_without_scrolling(viewer: Page) -> None:
     assert picture is not None
     assert tools is not None
     assert tools["y"] >= picture["y"] + picture["height"]
+    buttons = viewer.get_by_role("button", name="Help").bounding_box()
+    assert buttons is not None
+    assert buttons["y"] + buttons["height"] <= picture["y"]
     sizes = viewer.locator("button:visible, select:visible, .chip:visible, input[type=number]:visible").evaluate_all(
         """(all) => all.map((one) => {
           const box = one.getBoundingClientRect();
@@ -223,7 +226,7 @@ def test_another_job_is_compared_point_by_point(viewer: Page) -> None:
 
 
 def painted() -> bytes:
-    """A preview of a flag whose left half is red and whose right half is blue in the film's picture."""
+    """A preview of a flag whose left half is red and whose right half is blue in the film's picture; its depth has the wrong sign."""
     sequence = flag(FRAMES, POINTS)
     solution = solve(sequence.tracks, sequence.mesh)
     first = sequence.tracks.points[0]
@@ -236,6 +239,7 @@ def painted() -> bytes:
         tracks=sequence.tracks,
         mesh=sequence.mesh,
         solution=solution,
+        truth=solution.shapes * (1, 1, -1),
         texture=Texture.from_tracked(halves, places),
     )
     return into.getvalue()
@@ -261,6 +265,15 @@ def test_a_films_picture_is_on_the_mesh_first_and_after_a_comparison(
         return float(red[:, :middle].mean()), float(blue[:, middle:].mean())
 
     until(lambda: min(halves()) > 0.1)
+    flip, why = (
+        page.get_by_role("checkbox", name="Flip depth"),
+        page.get_by_text("Depth is mirrored to match the ground truth; files are not."),
+    )
+    expect(flip).to_be_checked()
+    expect(why).to_be_visible()
+    flip.uncheck()
+    expect(why).to_be_hidden()
+    flip.check()
     colour.select_option("plain")
     until(lambda: max(halves()) == 0)
     page.get_by_label("Compare with").select_option(label="clean flag")

@@ -53,6 +53,7 @@ export class Viewer {
   private readonly legend = h("div", { class: "legend", hidden: true });
   private readonly play = h("button", { type: "button", class: "play" });
   private readonly clock = h("output", { class: "clock" });
+  private readonly mirrored = h("p", { class: "hint" }, "Depth is mirrored to match the ground truth; files are not.");
   private readonly trouble = h("p", { class: "muted", role: "status" });
   private readonly themes = matchMedia("(prefers-color-scheme: dark)");
 
@@ -141,10 +142,10 @@ export class Viewer {
     );
     const full = document.fullscreenEnabled ? button("Full screen", () => void this.fullScreen()) : "";
     // Before the canvas, so that Shift+Tab leads from the player to the picture itself.
-    this.view.prepend(h("div", { class: "corner" }, full, button("Help", () => openHelp(this.holder))));
+    const corner = h("div", { class: "corner" }, full, button("Help", () => openHelp(this.holder)));
     const thinned = preview.header.frame_stride > 1 ? `Every ${ordinal(preview.header.frame_stride)} frame is shown; the files contain all frames.` : "";
     const note = h("p", { class: "hint", hidden: !thinned }, thinned);
-    const main = h("div", { class: "stage-main" }, this.panes, this.legend, this.comparison.summary, time, note, this.trouble);
+    const main = h("div", { class: "stage-main" }, corner, this.panes, this.legend, this.comparison.summary, time, note, this.trouble);
     this.holder.replaceChildren(main, this.tools());
   }
 
@@ -183,6 +184,7 @@ export class Viewer {
           toggle(this.film ? "Film beside" : "Tracks beside", (on) => void this.beside(on), "beside", this.film !== null),
           preview.faces.length > 0 && toggle("Mesh over it", (on) => void this.meshOver(on), "over"),
         ),
+        this.mirrored,
       ),
       paceControls(this.player),
       group("Point", this.probe.element),
@@ -205,6 +207,7 @@ export class Viewer {
 
   private flip(on: boolean): void {
     this.stage.flip(on);
+    this.mirrored.hidden = !(on && this.preview.header.mirrored);
     for (const body of [this.body, this.truth]) body?.reverse(this.behind !== on);
   }
 
@@ -307,8 +310,9 @@ export class Viewer {
     });
   }
 
-  /** Show the film, or the tracks alone, beside the mesh. */
+  /** Show the film, or the tracks alone, beside the mesh; beside its film a mesh is seen through the same camera. */
   private async beside(on: boolean): Promise<void> {
+    if (on && this.film && this.pane === null) this.follow(true);
     await this.guarded(async () => {
       if (!on) {
         this.pane?.canvas.parentElement?.remove();
