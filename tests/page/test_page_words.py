@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
-import shutil
 import subprocess
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-WEB = Path(__file__).parents[2] / "service" / "web"
+ROOT = Path(__file__).parents[2]
+WEB = ROOT / "service" / "web"
 BUNDLER = WEB / "node_modules" / "esbuild"
 
-pytestmark = pytest.mark.skipif(
-    (shutil.which("node") is None or not BUNDLER.is_dir()) and not os.environ.get("CI"),
-    reason="Node.js or esbuild is not installed; say `make page`",
-)
+pytestmark = [
+    pytest.mark.node,
+    pytest.mark.skipif(
+        not BUNDLER.is_dir() and not os.environ.get("CI"), reason="esbuild is not installed; say `make page`"
+    ),
+]
 
 RUN = """
 import { build } from "esbuild";
@@ -27,10 +30,22 @@ console.log(JSON.stringify(EXPRESSION));
 """
 
 
+def node() -> list[str]:
+    """The command that starts Node.js, as the build of the page finds it."""
+    spec = importlib.util.spec_from_file_location("build_page", ROOT / "build_page.py")
+    assert spec is not None
+    assert spec.loader is not None
+    build_page = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(build_page)
+    commands = build_page.node_commands()
+    assert commands is not None
+    return list(commands[0])
+
+
 def evaluate(module: str, expression: str) -> Any:
     """The value of an expression in which `module` is a module of the page."""
     script = RUN.replace("MODULE", module).replace("EXPRESSION", expression)
-    command = ["node", "--input-type=module", "-e", script]
+    command = [*node(), "--input-type=module", "-e", script]
     ran = subprocess.run(command, cwd=WEB, capture_output=True, text=True, timeout=60, check=False)
     assert ran.returncode == 0, ran.stderr
     return json.loads(ran.stdout)
