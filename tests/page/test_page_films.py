@@ -286,7 +286,7 @@ def test_a_running_films_picture_points_title_and_clock(
         return list(live.evaluate(corner))
 
     until(lambda: reddest()[0] > 150 > reddest()[2])  # before any point is known
-    assert filming.title() == "20 % – a film – Pliant"
+    assert filming.title() == "20\u00a0% – a film – Pliant"
     left = filming.locator(".figures div", has_text="Left").locator("dd")
     first = left.inner_text()
     until(lambda: left.inner_text() != first)  # no message came: the page counts by itself
@@ -297,7 +297,7 @@ def test_a_running_films_picture_points_title_and_clock(
     until(lambda: reddest()[2] > 150 > reddest()[0])
     middle = "(it) => [...it.getContext('2d').getImageData(Math.round(it.width * 160.5 / 320), Math.round(it.height / 2), 1, 1).data]"
     until(lambda: live.evaluate(middle)[0] > live.evaluate(middle)[2] + 60)  # a mark on the white disc
-    assert filming.title() == "30 % – a film – Pliant"
+    assert filming.title() == "30\u00a0% – a film – Pliant"
 
 
 NOTE = """() => {

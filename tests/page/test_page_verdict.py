@@ -67,7 +67,7 @@ def test_the_verdict_is_above_the_viewer_and_in_the_list(
     expect(box.get_by_role("term")).to_have_text(list(figures))
     expect(box.get_by_role("definition")).to_have_text(list(figures.values()))
     expect(box.locator("svg")).to_be_visible()
-    assert box.get_by_role("listitem").all_inner_texts() == reasons
+    expect(box.get_by_role("listitem")).to_have_text(reasons)
     expect(box).to_contain_text("Solver: Converged.")
     expect(page.get_by_role("article").get_by_text("Converged.")).to_have_count(1)  # beside the verdict, nowhere alone
     expect(page.get_by_role("link", name=re.compile("a finished face(?!:)"))).to_contain_text(words)

@@ -187,6 +187,7 @@ def test_hidden_positions_are_grey_and_the_legend_states_the_unit(viewer: Page) 
     viewer.get_by_label("Colour", exact=True).select_option("seen")
     expect(legend).to_contain_text(f"{FRAMES} of {FRAMES} frames")
     viewer.get_by_label("Colour", exact=True).select_option("residual")
+    expect(legend).to_contain_text("(tracks' unit)")
     top = float(re.findall(r"([\d.e-]+) \(tracks' unit\)", legend.inner_text())[0])
     assert top < 1  # the outliers are tens of units away and rejected
 
