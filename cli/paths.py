@@ -25,11 +25,11 @@ def input_file(path: Path | None, name: str) -> None:
         It is missing, a folder, or not readable.
     """
     from pliant.client.errors import BadArgument
-    from pliant.client.multipart import existing_file
+    from pliant.client.multipart import existing_file, expanded
 
     if path is None:
         return
-    if not path.expanduser().exists():
+    if not expanded(path, name).exists():
         raise BadArgument(f"{name}: expected a file, got no file at {path}. Check the path.")
     existing_file(path, name)
 
@@ -43,10 +43,11 @@ def mesh_file(mesh: str | None) -> None:
         It is none of them.
     """
     from pliant.client.errors import BadArgument
+    from pliant.client.multipart import expanded
 
     if mesh is None or re.fullmatch(r"none|\s*\d{1,6}\s*x\s*\d{1,6}\s*", mesh.lower()) is not None:
         return
-    if not Path(mesh).expanduser().exists():
+    if not expanded(mesh, "mesh").exists():
         raise BadArgument(
             f"mesh: expected a mesh file, ROWSxCOLUMNS or none, got no file at {mesh}. "
             "Check the path, or give a grid size such as 48x64."

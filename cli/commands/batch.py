@@ -28,7 +28,7 @@ def expanded(given: list[Path], region: Path | None) -> list[Path]:
     Raises
     ------
     BadArgument
-        A folder has no track file, or a pattern finds nothing.
+        A folder has no track file; a pattern finds nothing or has two asterisks in a row.
     """
     from pliant.client.errors import BadArgument
 
@@ -42,6 +42,10 @@ def expanded(given: list[Path], region: Path | None) -> list[Path]:
                 f"{path}: expected track files ({', '.join(sorted(ENDINGS))}), got an empty folder. Name the files."
             )
         elif not path.exists() and any(sign in path.name for sign in "*?["):
+            if "**" in path.name:  # Python before 3.13 raises ValueError, later ones take it for one asterisk
+                raise BadArgument(
+                    f"{path}: expected a pattern of one folder's files, got **. Write a single * for any characters."
+                )
             matching = sorted(path.parent.glob(path.name))
             if not matching:
                 raise BadArgument(f"{path}: expected files that match, got none. Check the pattern and its quotes.")

@@ -74,6 +74,7 @@ NO_PICTURES = (
     "Give the path of a file in it."
 )
 A_FILE = "--output: expected a folder, got the file TRACKS. Choose another folder."
+NOBODY = "and ~nosuchuser is nobody's home directory. Write out the whole path."
 LISTED = "`pliant options` lists every option."
 
 
@@ -107,6 +108,20 @@ LISTED = "`pliant options` lists every option."
         ("submit TRACKS -g no.npz", f"ground_truth: {NO_FILE} no.npz. Check the path."),
         ("submit TRACKS -r no.npz", f"rotations: {NO_FILE} no.npz. Check the path."),
         ("submit FOLDER/*.npz", "FOLDER/*.npz: expected files that match, got none. Check the pattern and its quotes."),
+        (
+            "submit FOLDER/**.npz",
+            "FOLDER/**.npz: expected a pattern of one folder's files, got **. Write a single * for any characters.",
+        ),
+        *(
+            (f"{command} -o OUT", f"{name}: expected a path, got ~nosuchuser/{file}, {NOBODY}")
+            for command, name, file in (
+                ("solve ~nosuchuser/x.npz", "tracks", "x.npz"),
+                ("submit ~nosuchuser/x.npz", "tracks", "x.npz"),
+                ("submit ~nosuchuser/x.npz TRACKS", "tracks", "x.npz"),
+                ("solve TRACKS -m ~nosuchuser/x.obj", "mesh", "x.obj"),
+                ("track FILM --region ~nosuchuser/x.png", "--region", "x.png"),
+            )
+        ),
         (
             "list -s done",
             "--status: expected one of queued, running, cancelling, succeeded, failed, cancelled, got 'done'.",
