@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from pliant.schemas.job import Job
     from pliant.worker.settings import Settings
 
 RESULT_FILES = ("shapes.npz", "report.json")
@@ -180,6 +181,18 @@ def output_folder(folder: Path, *, force: bool, files: Iterable[str] = RESULT_FI
         raise BadArgument(
             f"--output: {folder} already holds {', '.join(existing)}. Choose another folder, or replace the files with --force."
         )
+
+
+def different_files(job: Job, folder: Path, only: list[str] | None = None) -> list[str]:
+    """Return the files of a job that a folder holds with other content: a download would replace them."""
+    from pliant.client.multipart import sha256
+
+    wanted = [artifact for artifact in job.artifacts if only is None or artifact.name in only]
+    return [
+        artifact.name
+        for artifact in wanted
+        if (folder / artifact.name).is_file() and sha256(folder / artifact.name) != artifact.sha256
+    ]
 
 
 @contextmanager

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from pliant.cli.exits import Exit
 from pliant.cli.films import is_film
-from pliant.cli.paths import output_folder
+from pliant.cli.paths import different_files, made_folder, output_folder
 from pliant.cli.show import COLOURS, details_of, err, explained_at, out, print_json
 
 if TYPE_CHECKING:
@@ -84,18 +84,20 @@ class Batch:
     priority: str
     timeout: float | None
     output: Path | None
+    force: bool
+    """Whether files of other content in the output folders are replaced; else they refuse the download."""
     wait: bool
     url: str
     """Address of the service."""
     rows: list[Row] = field(default_factory=list)
 
-    def check(self, *, name: str, job_id: str | None, region: Path | None, force: bool) -> None:
-        """Refuse options that belong to a single job, and output folders that hold something.
+    def check(self, *, name: str, job_id: str | None, region: Path | None) -> None:
+        """Refuse options that belong to a single job, and make the output folders.
 
         Raises
         ------
         BadArgument
-            One was given, or two files have the same name.
+            One was given, two files have the same name, or a folder cannot be written.
         """
         from pliant.client.errors import BadArgument
         from pliant.client.multipart import existing_file
@@ -116,9 +118,7 @@ class Batch:
                 f"--output: several files are named {twice}, and would share a folder. Submit them separately."
             )
         for each in names:
-            if not force and (self.output / each / "report.json").exists():
-                continue  # of an earlier run: `Client.download` fetches only what is missing or different
-            output_folder(self.output / each, force=True)
+            made_folder(self.output / each, "--output")
 
     def run(self, client: Client) -> None:
         """Submit all, and wait for them if that is wanted. What fails has a row of its own and stops nothing."""
@@ -144,7 +144,9 @@ class Batch:
             try:
                 done = job.wait(load=False, timeout=self.timeout)
                 if self.output is not None:
-                    done.download(self.output / row.file.stem, timeout=self.timeout)
+                    folder = self.output / row.file.stem
+                    output_folder(folder, force=self.force, files=different_files(done.job, folder))
+                    done.download(folder, timeout=self.timeout)
             except PliantError as error:
                 row.error = error
             row.job = client.get(job.id).record

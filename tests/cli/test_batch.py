@@ -74,6 +74,27 @@ def test_results_lie_in_a_folder_for_each_and_a_second_run_goes_on(run: Run, tak
     assert len(jobs_of(run)) == 4
 
 
+def test_files_of_other_content_are_kept_unless_forced(run: Run, takes: Path, tmp_path: Path) -> None:
+    kept = tmp_path / "out" / "take-0" / "shapes.npz"
+    kept.parent.mkdir(parents=True)
+    kept.write_text("mine")
+    command = ("submit", takes, "--mesh", "none", "-o", tmp_path / "out")
+    ran = run(*command, "--json")
+    assert ran.exit_code == Exit.FAILED
+    rows = json.loads(ran.stdout)
+    assert [row["error"] for row in rows] == [
+        f"--output: {kept.parent} already holds shapes.npz. Choose another folder, or replace the files with --force.",
+        None,
+        None,
+    ]
+    assert [row["job"]["status"] for row in rows] == ["succeeded"] * 3
+    assert [path.name for path in kept.parent.iterdir()] == ["shapes.npz"], "nothing else is written beside it"
+    assert kept.read_text() == "mine"
+    ran = run(*command, "--force")
+    assert ran.exit_code == 0, ran.output
+    assert np.load(kept)["shapes"].shape == (5, 12, 3)
+
+
 def test_a_file_that_is_refused_has_its_row_and_stops_nothing(run: Run, takes: Path) -> None:
     np.savez(takes / "take-1.npz", tracks=np.ones((2, 9, 2)))
     ran = run("submit", takes, "--mesh", "none", "--wait")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import math
 import os
@@ -205,6 +206,39 @@ def test_existing_results_are_kept_unless_forced(run: Run, tracks: Path, tmp_pat
     assert np.load(out / "shapes.npz")["shapes"].shape == (5, 12, 3)
 
 
+def test_any_other_file_of_a_result_is_kept_unless_forced(run: Run, tracks: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "shapes.glb").write_text("mine")
+    ran = run("submit", tracks, "-m", "2x6", "--id", "glb", "-o", out)
+    assert ran.exit_code == Exit.REFUSED
+    assert words(ran) == "Job glb " + refusal(
+        f"--output: {out} already holds shapes.glb. Choose another folder, or replace the files with --force."
+    )
+    assert (out / "shapes.glb").read_text() == "mine"
+    assert run("result", "glb", "-o", out, "--force").exit_code == 0
+    assert (out / "shapes.glb").read_bytes().startswith(b"glTF")
+
+
+def test_the_demonstration_replaces_files_of_a_folder_that_was_named_only_if_forced(
+    run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def render(_: object, folder: Path) -> None:
+        raise BadArgument(f"rendered into {folder}")
+
+    monkeypatch.setattr(importlib.import_module("pliant.cli.demo"), "render", render)
+    monkeypatch.chdir(tmp_path)
+    for folder in ("mine", "demo-output"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "tracks.npz").write_text("mine")
+    assert json.loads(run("demo", "--json", "-o", "mine").stderr)["detail"] == (
+        "--output: mine already holds tracks.npz. Choose another folder, or replace the files with --force."
+    )
+    for more, folder in ((["-o", "mine", "--force"], "mine"), ([], "demo-output"), (["-o", "new"], "new")):
+        ran = run("demo", "--json", *more)
+        assert json.loads(ran.stderr)["detail"] == f"rendered into {folder}", more
+
+
 def test_jobs_are_named_by_prefix_or_as_the_last_one(run: Run, tracks: Path) -> None:
     for name in ("apple-1", "apple-2", "banana-1"):
         assert run("submit", tracks, "-m", "none", "--id", name).exit_code == 0
@@ -239,8 +273,6 @@ def test_the_id_is_printed_before_waiting(run: Run, tracks: Path, service: InMem
 def test_a_line_is_printed_regularly_without_a_terminal(
     run: Run, tracks: Path, service: InMemoryService, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import importlib
-
     service.worker.steps = 40
     monkeypatch.setattr(importlib.import_module("pliant.cli.jobs"), "LINE_EVERY", 0.1)
     ran = run("submit", tracks, "-m", "none", "--wait")
