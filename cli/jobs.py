@@ -79,7 +79,7 @@ def submit(
         check_inputs(None, mesh=mesh, ground_truth=ground_truth, rotations=rotations, region=None)
         batch = Batch(
             files=chosen, shared=parts, options=options, key=key or "", priority=priority, timeout=timeout, output=output, force=force,
-            wait=waits, url=url,
+            wait=waits, url=url, session=session,
         )  # fmt: skip
         batch.check(name=name, job_id=job_id, region=region)
         with session.client(url, as_json=as_json) as client:

@@ -12,11 +12,14 @@ from typing import TYPE_CHECKING, Any
 from pliant.cli.exits import Exit
 from pliant.cli.films import is_film
 from pliant.cli.paths import different_files, made_folder, output_folder
-from pliant.cli.show import COLOURS, details_of, err, explained_at, out, print_json
+from pliant.cli.session import LINE_EVERY, Session
+from pliant.cli.show import COLOURS, VERDICTS, details_of, err, explained_at, out, print_json
 
 if TYPE_CHECKING:
     from pliant.client import Client, RemoteJob
+    from pliant.client.progress import Bar
     from pliant.schemas.job import Job
+    from rich.text import Text
 
 ENDINGS = frozenset({".npz", ".npy", ".mat", ".h5", ".hdf5", ".csv", ".txt"})
 """Names that are taken for track files in a folder."""
@@ -62,6 +65,16 @@ def track_files(folder: Path) -> list[Path]:
     return sorted(each for each in folder.iterdir() if each.suffix.lower() in ENDINGS and each.is_file())
 
 
+def judged(job: Job | None) -> Text:
+    """Return a job's verdict in words, with the first of its reasons; nothing where it was not judged."""
+    from rich.text import Text
+
+    if job is None or job.verdict is None:
+        return Text()
+    words, colour = VERDICTS.get(job.verdict, (job.verdict, "yellow"))
+    return Text.assemble((words, colour), *(f"\n{reason}" for reason in job.verdict_reasons[:1]))
+
+
 @dataclass(slots=True)
 class Row:
     """A file, and what became of it."""
@@ -89,6 +102,8 @@ class Batch:
     wait: bool
     url: str
     """Address of the service."""
+    session: Session
+    """Is told which jobs Ctrl-C would leave."""
     rows: list[Row] = field(default_factory=list)
 
     def check(self, *, name: str, job_id: str | None, region: Path | None) -> None:
@@ -122,35 +137,55 @@ class Batch:
 
     def run(self, client: Client) -> None:
         """Submit all, and wait for them if that is wanted. What fails has a row of its own and stops nothing."""
-        from pliant.client.errors import InvalidRequest, PliantError
+        from pliant.client.progress import progress_bar
+
+        with progress_bar(line_every=LINE_EVERY) as bar:
+            submitted = self._submit(client, bar)
+            for index, (row, job) in enumerate(submitted if self.wait else ()):
+                self.session.following, self.session.others = job.id, len(submitted) - index - 1
+                bar.label = str(row.file)
+                self._follow(row, job, bar)
+                row.job = client.get(job.id).record
+                err().print(f"{row.file}: {row.job.status}", highlight=False, markup=False)
+
+    def _submit(self, client: Client, bar: Bar) -> list[tuple[Row, RemoteJob]]:
+        """Submit each file and print the id of its job at once, so that an interruption loses none."""
+        from pliant.client.errors import InvalidRequest
 
         submitted: list[tuple[Row, RemoteJob]] = []
         for file in self.files:
             row = Row(file)
             self.rows.append(row)
+            bar.label = str(file)
             try:
                 film = is_film(file, None)
                 job = client.submit(
                     None if film else file, film=file if film else None, name=file.stem, options=self.options,
                     idempotency_key=self._key_of(file), priority=self.priority, timeout=self.timeout,  # type: ignore[arg-type]
-                    webhook_secret=os.environ.get("PLIANT_WEBHOOK_SECRET") if self.shared.get("webhook") else None, **self.shared,
+                    webhook_secret=os.environ.get("PLIANT_WEBHOOK_SECRET") if self.shared.get("webhook") else None,
+                    on_upload=bar.on_upload, **self.shared,
                 )  # fmt: skip
             except InvalidRequest as error:
                 row.error = error
                 continue
             row.job = job.record
+            self.session.following, self.session.others = job.id, len(submitted)
             submitted.append((row, job))
-        for row, job in submitted if self.wait else ():
-            try:
-                done = job.wait(load=False, timeout=self.timeout)
-                if self.output is not None:
-                    folder = self.output / row.file.stem
-                    output_folder(folder, force=self.force, files=different_files(done.job, folder))
-                    done.download(folder, timeout=self.timeout)
-            except PliantError as error:
-                row.error = error
-            row.job = client.get(job.id).record
-            err().print(f"{row.file}: {row.job.status}", highlight=False, markup=False)
+            err().print(f"{file}: job {job.id}", highlight=False, markup=False)
+        return submitted
+
+    def _follow(self, row: Row, job: RemoteJob, bar: Bar) -> None:
+        """Wait for a job, and download its files if that is wanted."""
+        from pliant.client.errors import PliantError
+
+        try:
+            done = job.wait(on_progress=bar.on_progress, load=False, timeout=self.timeout)
+            if self.output is not None:
+                folder = self.output / row.file.stem
+                output_folder(folder, force=self.force, files=different_files(done.job, folder))
+                done.download(folder, on_download=bar.on_download, timeout=self.timeout)
+        except PliantError as error:
+            row.error = error
 
     @property
     def exit_code(self) -> Exit:
@@ -178,7 +213,7 @@ class Batch:
             )
             table.add_row(
                 Text(str(row.file)), "" if job is None else job.id, Text(status, COLOURS.get(status, "red")),
-                "" if job is None else job.verdict or "", "" if took is None else f"{took.total_seconds():.1f}",
+                judged(job), "" if took is None else f"{took.total_seconds():.1f}",
                 Text("" if row.error is None else self._refusal(row.error)),
             )  # fmt: skip
         out().print(table)
