@@ -18,7 +18,7 @@ from pliant.solver.records import Floats
 
 INTERVAL = (0.35, 3.6)
 """Factors around the expected error: about the 10 and 90 % quantiles of true over expected error on the sequences for calibration of
-`benchmarks.trust`, of which they hold 39 in 50; they hold 54 in 70 of the others, where the expected error is more often too large."""
+`benchmarks.trust`, of which they hold 44 in 56; they hold 61 in 77 of the others, where the expected error is more often too large."""
 
 POOR, BAD = 0.2, 1.8
 """Upper end of the expected error, share of the size, from which a result is to be used with care, and not to be used. With the first no
@@ -96,8 +96,8 @@ class Trust:
         if self.expected_error is None:
             return f"The error is not estimated; {rests}."
         if self.interval is None:
-            return f"Expected error at least {_at_most(self.expected_error)}; {rests}."
-        return f"Expected error about {_at_most(self.expected_error)}; {rests}."
+            return f"Expected error at least {_share(self.expected_error)}; {rests}."
+        return f"Expected error about {_share(self.expected_error)}; {rests}."
 
 
 def assess(
@@ -159,7 +159,7 @@ def assess(
         _sign(hidden, HIDDEN_SHARE, UNSEEN_SHARE, unseen),
     ]
     if interval is not None:
-        found.append(_sign(interval[1], POOR, BAD, f"The error may be as large as {_at_most(interval[1])}."))
+        found.append(_sign(interval[1], POOR, BAD, f"The error may be as large as {_share(interval[1])}."))
     if held_out_error is not None:
         far = f"{_percent(held_out_error)} of the object's size"
         sentence = f"Observations that were left out are {far} from where the others predict them."
@@ -167,7 +167,8 @@ def assess(
     turning, deforming = per_frame(shapes, rotations) if ordered else (None, None)
     if turning is not None and deforming is not None:
         found += _untold(turning, deforming)
-    found += _doubts(modes, len(shapes), planar=planar, depth_is_typical=depth_is_typical)
+    off = off_plane(shapes) if planar else None
+    found += _doubts(modes, len(shapes), off=off, turn=turn if depth_is_typical else None)
     signs = sorted((sign for sign in found if sign[0] is not Verdict.GOOD), key=lambda sign: -_SEVERITY[sign[0]])
     verdict = signs[0][0] if signs else Verdict.GOOD
     return Trust(
@@ -187,20 +188,25 @@ def _untold(turning: float, deforming: float) -> list[tuple[Verdict, str]]:
     return [(Verdict.WITH_CARE, sentence)]
 
 
-def _doubts(modes: int, frames: int, *, planar: bool, depth_is_typical: bool) -> list[tuple[Verdict, str]]:
-    """Return the reasons to doubt the model itself, which the standard deviations do not include."""
+def _doubts(modes: int, frames: int, *, off: float | None, turn: float | None) -> list[tuple[Verdict, str]]:
+    """Return the reasons to doubt the model itself, which the standard deviations do not include.
+
+    `off` is how far a sheet is from its plane, `turn` that of an object whose depth is typical; None where they are not.
+    """
     found: list[tuple[Verdict, str]] = []
     if modes > FLEXIBLE * frames:
         sentence = (
             f"{modes} modes of deformation in {frames} frames: the motion hardly determines depth. Use more frames."
         )
         found.append((Verdict.WITH_CARE, sentence))
-    if planar:
-        found.append(
-            (Verdict.WITH_CARE, "The tracks are those of a thin sheet, whose bending this motion hardly shows.")
+    if off is not None:
+        sentence = f"The tracks are those of a thin sheet, here {_percent(off)} of its size off its plane; how it bends hardly shows."
+        found.append((Verdict.WITH_CARE, sentence))
+    if turn is not None:
+        sentence = (
+            f"With {turn:.0f}° of turn the tracks hardly show how deep the object is; its depth is one that is usual for its width. Let it "
+            "turn further."
         )
-    if depth_is_typical:
-        sentence = "The tracks hardly show how deep the object is; its depth is one that is usual for its width. Let it turn further."
         found.append((Verdict.WITH_CARE, sentence))
     return found
 
@@ -212,6 +218,15 @@ def size_of(shapes: Floats) -> float:
         pulse()
         squares.append(float(np.square(frame - frame.mean(axis=0)).sum()))
     return max(float(np.sqrt(np.sum(squares) / max(shapes.shape[0] * shapes.shape[1], 1))), np.finfo(float).tiny)
+
+
+def off_plane(shapes: Floats) -> float:
+    """Return the root mean square distance of the points from the plane that fits their frame best, share of the size, median of frames."""
+    some = shapes[:: max(1, len(shapes) // 100)]
+    spreads = [np.linalg.eigvalsh(np.cov(frame.T, bias=True)) for frame in some]
+    return float(
+        np.median([np.sqrt(max(spread[0], 0.0) / spread.sum()) if spread.sum() > 0 else 0.0 for spread in spreads])
+    )
 
 
 def per_frame(shapes: Floats, rotations: Floats) -> tuple[float | None, float | None]:
@@ -244,9 +259,11 @@ def _sign(value: float, care: float, never: float, sentence: str) -> tuple[Verdi
     return (Verdict.WITH_CARE if value >= care else Verdict.GOOD), sentence
 
 
-def _at_most(share: float) -> str:
-    return f"{_percent(share)} of the object's size" if share < 1 else "the object itself"
+def _share(share: float) -> str:
+    return f"{_percent(share)} of the object's size"
 
 
 def _percent(share: float) -> str:
+    if share >= 1:
+        return f"{float(f'{100 * share:.2g}'):.0f} %"  # two digits: 390 %
     return f"{100 * share:.2g} %" if share < 0.1 else f"{100 * share:.0f} %"

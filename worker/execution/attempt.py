@@ -25,6 +25,7 @@ from pliant.worker import tracing
 from pliant.worker.errors import Interrupted, StaleAttempt, StoreUnavailable, UnknownJob
 from pliant.worker.execution.failures import problem_of, timed_out
 from pliant.worker.execution.monitor import Patience
+from pliant.worker.execution.progress import Reporter
 from pliant.worker.execution.workdir import OUTPUT, working_directory
 from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.service import Jobs
@@ -228,14 +229,16 @@ def work(
         from pliant.solver import threads_limited
 
         file = directory / "inputs.npz"
-        attempt.wait_for_store(lambda: attempt.jobs.blobs.fetch(stored.inputs, file))
+        with _repeating(attempt, "loading", 0.0):
+            attempt.wait_for_store(lambda: attempt.jobs.blobs.fetch(stored.inputs, file))
         results = directory / "artifacts"
         with threads_limited(attempt.jobs.settings.threads_per_job):
             if stored.result is not None:
                 finished = _write_further(attempt, stored, file, results)
             else:
                 finished = _reconstruct(attempt, stored, file, results, reconstruct=reconstruct)
-        attempt.store(finished, results)
+        with _repeating(attempt, "exporting", 1.0):
+            attempt.store(finished, results)
     except Interrupted:
         late = time.monotonic() >= attempt.deadline
         attempt.log("Stopped: the time limit was reached." if late else "Stopped on request.")
@@ -253,6 +256,15 @@ def work(
     return finished
 
 
+@contextlib.contextmanager
+def _repeating(attempt: Attempt, part: str, done: float) -> Iterator[None]:
+    """Repeat the progress of a part that cannot report any: a gigabyte is fetched, read or stored."""
+    reporter = Reporter(attempt.report)
+    reporter.part(part, done)
+    with reporter.ticking():
+        yield
+
+
 def _reconstruct(
     attempt: Attempt, stored: Stored, inputs: Path, results: Path, *, reconstruct: Callable[..., Finished] | None
 ) -> Finished:
@@ -264,9 +276,10 @@ def _reconstruct(
 
     options = stored.job.options
     if not is_source(inputs):
+        with _repeating(attempt, "loading", 0.0):
+            read = load_inputs(inputs)
         return (reconstruct or pipeline.reconstruct)(
-            load_inputs(inputs), options, results, name=stored.job.name, on_progress=attempt.report,
-            should_stop=attempt.should_stop,
+            read, options, results, name=stored.job.name, on_progress=attempt.report, should_stop=attempt.should_stop,
         )  # fmt: skip
     settings, scratch = attempt.jobs.settings, inputs.with_name("film")
     source = open_source(inputs, inputs.with_name("source"))

@@ -100,7 +100,7 @@ class Reporter:
                 if self._furthest >= WORTH_ESTIMATING:
                     left = spent * (1 - self._furthest) / self._furthest
             else:
-                self._furthest = max(self._furthest, spent / (spent + left) if spent + left > 0 else 0.0)
+                self._furthest = max(self._furthest, spent / (spent + left) if spent + left > 0 else 1.0)
             self._left = None if left is None else (left, now)
             self._send(now, left, followed)
 
@@ -125,7 +125,7 @@ class Reporter:
         """Repeat the last progress if nothing was reported for `TICK` seconds, with the time that is left by now."""
         with self._lock:
             now = self.clock()
-            if self._began is None or now - self._sent < TICK or self._furthest == 1.0:
+            if self._began is None or now - self._sent < TICK:
                 return
             left = None if self._left is None else max(0.0, self._left[0] - (now - self._left[1]))
             self._send(now, left, None)

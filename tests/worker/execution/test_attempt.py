@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
@@ -11,12 +12,13 @@ import pytest
 from pliant.schemas.job import Artifact, Interpretation, Progress, Status
 from pliant.schemas.options import Options
 from pliant.worker.errors import Interrupted, StoreUnavailable
-from pliant.worker.execution.attempt import Attempt
+from pliant.worker.execution.attempt import Attempt, work
 from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.finished import Finished
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.jobs.submission import Submission
 from pliant.worker.store.blobs import Blobs
+from worker_house import make_inputs
 
 
 @pytest.fixture
@@ -113,3 +115,37 @@ def test_a_new_stage_is_reported_at_once(jobs: Jobs, attempt: Attempt, now: list
         progress = jobs.get(attempt.id).progress
         assert progress is not None
         assert progress.stage == stage
+
+
+def test_progress_is_repeated_while_files_are_fetched_and_stored(
+    jobs: Jobs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read = make_inputs(tmp_path / "in.npz", frames=4, points=30).interpretation
+    options = Options(method="pseudo_inverse", outputs=(), refine_rotations=False)
+    id = jobs.submit(tmp_path / "in.npz", Submission(options=options), interpretation=read).id
+    stored = jobs.records.get(id)
+    told: list[Progress] = []
+    during: dict[str, list[Progress]] = {}
+    monkeypatch.setattr("pliant.worker.execution.progress.TICK", 0.01)
+    monkeypatch.setattr(Attempt, "report", lambda self, progress: told.append(progress))
+
+    def slowly(name: str) -> Callable[..., object]:
+        call = getattr(Blobs, name)
+
+        def wait(self: Blobs, *given: object, **more: object) -> object:
+            before, patience = len(told), threading.Event()
+            while len(told) < before + 2:
+                patience.wait(0.01)
+            during[name] = told[before:]
+            return call(self, *given, **more)
+
+        return wait
+
+    monkeypatch.setattr(Blobs, "fetch", slowly("fetch"))
+    monkeypatch.setattr(Blobs, "put", slowly("put"))
+    attempt = Attempt(jobs=jobs, id=id, attempt_id=stored.attempt_id, deadline=float("inf"))
+    monkeypatch.setattr(Attempt, "should_stop", lambda self: False)
+    end = work(attempt, stored, tmp_path)
+    assert isinstance(end, Finished)
+    assert {(each.stage, each.fraction) for each in during["fetch"]} == {("loading", 0.0)}
+    assert {(each.fraction, each.seconds_left) for each in during["put"]} == {(1.0, 0.0)}
