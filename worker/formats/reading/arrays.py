@@ -159,7 +159,7 @@ def checked_members(
 ) -> dict[str, zipfile.ZipInfo]:
     """Members by array name, once names, number, methods and the declared sizes of the wanted ones are found in order."""
     infos = archive.infolist()
-    spreadsheet = _spreadsheet([info.filename for info in infos])
+    spreadsheet = spreadsheet_kind([info.filename for info in infos])
     if spreadsheet is not None:
         raise spreadsheet_refusal(field, spreadsheet)
     if len(infos) > limits.max_members:
@@ -212,7 +212,7 @@ def spreadsheet_refusal(field: str, got: str) -> InvalidInput:
     return InvalidInput("unknown_format", field=field, expected=f"{kinds}, recognised by content", got=got, hint=hint)
 
 
-def _spreadsheet(members: Collection[str]) -> str | None:
+def spreadsheet_kind(members: Collection[str]) -> str | None:
     """Return what kind of spreadsheet a zip with these members is, None for anything else."""
     if "[Content_Types].xml" in members and any(name.startswith("xl/") for name in members):
         return "a spreadsheet (xlsx)"
