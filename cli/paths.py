@@ -196,10 +196,10 @@ def different_files(job: Job, folder: Path, only: list[str] | None = None) -> li
 
 
 @contextmanager
-def results_folder(folder: Path, *, force: bool) -> Iterator[None]:
+def results_folder(folder: Path, *, force: bool, files: Iterable[str] = RESULT_FILES) -> Iterator[None]:
     """Run the work that writes results into a folder: checked as by `output_folder` before, and removed if it was made in vain."""
     new = not folder.exists()
-    output_folder(folder, force=force)
+    output_folder(folder, force=force, files=files)
     try:
         yield
     finally:

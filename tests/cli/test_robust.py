@@ -220,6 +220,32 @@ def test_any_other_file_of_a_result_is_kept_unless_forced(run: Run, tracks: Path
     assert (out / "shapes.glb").read_bytes().startswith(b"glTF")
 
 
+@pytest.mark.parametrize(
+    ("given", "existing", "more"),
+    [("tracks.npz", "shapes.glb", ()), ("film.gif", "contact_sheet.jpg", ()), ("tracks.npz", "shapes.mdd", ("-O", 'outputs=["mdd"]'))],
+)  # fmt: skip
+def test_solve_keeps_every_file_that_it_would_replace(
+    run: Run, tracks: Path, tmp_path: Path, given: str, existing: str, more: tuple[str, ...]
+) -> None:
+    (tmp_path / "film.gif").write_bytes(b"GIF89a")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / existing).write_text("mine")
+    ran = run("solve", tracks.with_name(given), "-o", tmp_path / "out", *more)
+    assert ran.exit_code == Exit.REFUSED
+    assert words(ran) == refusal(
+        f"--output: {tmp_path / 'out'} already holds {existing}. Choose another folder, or replace the files with --force."
+    )
+    assert [path.name for path in (tmp_path / "out").iterdir()] == [existing]
+
+
+def test_solve_leaves_files_that_no_result_has(run: Run, tracks: Path) -> None:
+    for name in ("shapes.mdd", "contact_sheet.jpg"):
+        (tracks.parent / name).write_text("mine")
+    ran = run("solve", tracks, "-o", tracks.parent, "-O", 'outputs=["mat"]', *FAST)
+    assert ran.exit_code == 0, ran.output
+    assert (tracks.parent / "shapes.mdd").read_text() == "mine"
+
+
 def test_the_demonstration_replaces_files_of_a_folder_that_was_named_only_if_forced(
     run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
