@@ -17,8 +17,8 @@ from typing import IO, TYPE_CHECKING, Annotated
 import typer
 from pliant.cli.exits import Exit
 from pliant.cli.extras import require_server
-from pliant.cli.paths import output_folder
-from pliant.cli.session import LINE_EVERY, Json, Session
+from pliant.cli.paths import RESULT_FILES, different_files, output_folder
+from pliant.cli.session import LINE_EVERY, Force, Json, Session
 from pliant.cli.show import METRIC_MEANINGS, err, out, print_json, verdict_lines
 
 if TYPE_CHECKING:
@@ -63,14 +63,24 @@ MEANINGS: Mapping[str, str] = {
     "visibility_recall": "share of the visible points called visible",
 }
 
+DEMO_OUTPUT = Path("demo-output")
+DEMO_FILES = ("film.mp4", "region.png", "tracks.npz", *RESULT_FILES, "shapes.glb")
+"""Files that are refused before anything is rendered, if they exist in a folder that was named."""
+
 STOPS_WITHIN = 60.0
 
 
 def demo(
     ctx: typer.Context,
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the results.")] = Path("demo-output"),
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output", "-o", help="Folder for the results; by default demo-output, whose files are replaced."
+        ),
+    ] = None,
     small: Annotated[bool, typer.Option("--small", help="A shorter and smaller film: faster.")] = False,
     keep: Annotated[bool, typer.Option("--keep", help="Keep the service and its page running until Ctrl-C.")] = False,
+    force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Turn a rendered film of a face into a moving mesh, using the real service, queue and worker.
@@ -80,7 +90,9 @@ def demo(
     session: Session = ctx.obj
     session.json = as_json
     require_server("pliant demo")
-    output_folder(output, force=True)
+    force = force or output is None
+    output = DEMO_OUTPUT if output is None else output
+    output_folder(output, force=force, files=DEMO_FILES)
     scene = SMALL if small else FULL
     if not as_json:
         width, height = scene.size
@@ -98,6 +110,7 @@ def demo(
                 on_upload=bar.on_upload,
             )
             result = job.wait(on_progress=bar.on_progress, load=False)
+            output_folder(output, force=force, files=different_files(result.job, output))
             paths = result.download(output, on_download=bar.on_download)
         metrics = compare(film, paths)
         good = judge(metrics)

@@ -74,7 +74,7 @@ def code_of(fault: BaseException) -> Exit | None:
     return None
 
 
-def sentence_of(fault: BaseException, job: str | None = None) -> str:
+def sentence_of(fault: BaseException, job: str | None = None, *, others: int = 0) -> str:
     """Return the message for an error.
 
     Parameters
@@ -83,10 +83,18 @@ def sentence_of(fault: BaseException, job: str | None = None) -> str:
         What ended the command.
     job : str, optional
         Id of the job that the command was waiting for.
+    others : int
+        How many further jobs it had submitted and not yet seen to the end.
     """
     if isinstance(fault, KeyboardInterrupt):
         if job is None:
             return "Interrupted."
+        if others > 0:
+            rest = "1 other" if others == 1 else f"{others} others"
+            return (
+                f"Interrupted. Job {job} and {rest} continue: the same command again returns to all of them, "
+                f"`pliant watch {job}` follows this one, `pliant cancel {job}` stops it."
+            )
         return f"Interrupted. Job {job} continues: `pliant watch {job}` follows it, `pliant cancel {job}` stops it."
     if isinstance(fault, OSError) and fault.strerror is not None and type(fault).__module__ == "builtins":
         name = "" if fault.filename is None else f"{os.fsdecode(fault.filename)}: "
@@ -111,7 +119,7 @@ class Guarded(TyperGroup):
             from pliant.cli.show import show_fault
 
             session = ctx.obj
-            sentence = sentence_of(fault, getattr(session, "following", None))
+            sentence = sentence_of(fault, getattr(session, "following", None), others=getattr(session, "others", 0))
             show_fault(
                 fault, sentence, code, as_json=bool(session is not None and session.json), url=getattr(session, "url", None),
             )  # fmt: skip

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 from pliant.cli.films import is_film
 from pliant.cli.ids import find_job
-from pliant.cli.paths import check_inputs, output_folder
+from pliant.cli.paths import check_inputs, different_files, output_folder
 from pliant.cli.session import (
     HOME,
     LINE_EVERY,
@@ -32,7 +32,6 @@ from pliant.cli.show import err, out, print_json, show_job, show_jobs, show_opti
 
 if TYPE_CHECKING:
     from pliant.client import Client, RemoteJob
-    from pliant.schemas.job import Job
 
 Files = Annotated[
     list[Path],
@@ -79,10 +78,10 @@ def submit(
     if chosen != files or len(chosen) > 1:
         check_inputs(None, mesh=mesh, ground_truth=ground_truth, rotations=rotations, region=None)
         batch = Batch(
-            files=chosen, shared=parts, options=options, key=key or "", priority=priority, timeout=timeout, output=output, wait=waits,
-            url=url,
+            files=chosen, shared=parts, options=options, key=key or "", priority=priority, timeout=timeout, output=output, force=force,
+            wait=waits, url=url, session=session,
         )  # fmt: skip
-        batch.check(name=name, job_id=job_id, region=region, force=force)
+        batch.check(name=name, job_id=job_id, region=region)
         with session.client(url, as_json=as_json) as client:
             batch.run(client)
         batch.show(as_json=as_json)
@@ -97,14 +96,14 @@ def submit(
         "webhook_secret": None if webhook is None else os.environ.get("PLIANT_WEBHOOK_SECRET"),
     }  # fmt: skip
     with session.client(url, as_json=as_json) as client:
-        job = _submitted(session, client, given, wait=waits, output=output)
+        job = _submitted(session, client, given, wait=waits, output=output, force=force)
         show_job(job.record, as_json=as_json)
         if not job.status.final and not as_json:
             err().print(f"Follow it with: pliant watch {job.id}", highlight=False)
 
 
 def _submitted(
-    session: Session, client: Client, given: dict[str, Any], *, wait: bool, output: Path | None
+    session: Session, client: Client, given: dict[str, Any], *, wait: bool, output: Path | None, force: bool
 ) -> RemoteJob:
     """Submit one job with a progress bar, and follow it to its end and download its files where that is wanted."""
     from pliant.client.progress import progress_bar
@@ -117,6 +116,7 @@ def _submitted(
                 err().print(f"Job {job.id}", highlight=False)
             done = job.wait(on_progress=bar.on_progress, load=False, timeout=given["timeout"])
             if output is not None:
+                output_folder(output, force=force, files=different_files(done.job, output))
                 done.download(output, on_download=bar.on_download)
     return job
 
@@ -179,18 +179,6 @@ def result(
         return
     for path in paths.values():
         out().print(str(path), markup=False)
-
-
-def different_files(job: Job, folder: Path, only: list[str] | None) -> list[str]:
-    """Return the files of a job that a folder holds with other content: a download would replace them."""
-    from pliant.client.multipart import sha256
-
-    wanted = [artifact for artifact in job.artifacts if only is None or artifact.name in only]
-    return [
-        artifact.name
-        for artifact in wanted
-        if (folder / artifact.name).is_file() and sha256(folder / artifact.name) != artifact.sha256
-    ]
 
 
 def list_jobs(

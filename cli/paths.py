@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from pliant.schemas.job import Job
     from pliant.worker.settings import Settings
 
 RESULT_FILES = ("shapes.npz", "report.json")
@@ -25,11 +26,11 @@ def input_file(path: Path | None, name: str) -> None:
         It is missing, a folder, or not readable.
     """
     from pliant.client.errors import BadArgument
-    from pliant.client.multipart import existing_file
+    from pliant.client.multipart import existing_file, expanded
 
     if path is None:
         return
-    if not path.expanduser().exists():
+    if not expanded(path, name).exists():
         raise BadArgument(f"{name}: expected a file, got no file at {path}. Check the path.")
     existing_file(path, name)
 
@@ -43,10 +44,11 @@ def mesh_file(mesh: str | None) -> None:
         It is none of them.
     """
     from pliant.client.errors import BadArgument
+    from pliant.client.multipart import expanded
 
     if mesh is None or re.fullmatch(r"none|\s*\d{1,6}\s*x\s*\d{1,6}\s*", mesh.lower()) is not None:
         return
-    if not Path(mesh).expanduser().exists():
+    if not expanded(mesh, "mesh").exists():
         raise BadArgument(
             f"mesh: expected a mesh file, ROWSxCOLUMNS or none, got no file at {mesh}. "
             "Check the path, or give a grid size such as 48x64."
@@ -181,11 +183,23 @@ def output_folder(folder: Path, *, force: bool, files: Iterable[str] = RESULT_FI
         )
 
 
+def different_files(job: Job, folder: Path, only: list[str] | None = None) -> list[str]:
+    """Return the files of a job that a folder holds with other content: a download would replace them."""
+    from pliant.client.multipart import sha256
+
+    wanted = [artifact for artifact in job.artifacts if only is None or artifact.name in only]
+    return [
+        artifact.name
+        for artifact in wanted
+        if (folder / artifact.name).is_file() and sha256(folder / artifact.name) != artifact.sha256
+    ]
+
+
 @contextmanager
-def results_folder(folder: Path, *, force: bool) -> Iterator[None]:
+def results_folder(folder: Path, *, force: bool, files: Iterable[str] = RESULT_FILES) -> Iterator[None]:
     """Run the work that writes results into a folder: checked as by `output_folder` before, and removed if it was made in vain."""
     new = not folder.exists()
-    output_folder(folder, force=force)
+    output_folder(folder, force=force, files=files)
     try:
         yield
     finally:

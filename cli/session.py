@@ -75,6 +75,8 @@ class Session:
     """Address of the service that the command talks to; it explains the errors of its answers."""
     following: str | None = None
     """Id of the job that the command waits for; Ctrl-C prints how to return to it."""
+    others: int = 0
+    """Further jobs that the command has submitted and not yet seen to the end."""
 
     def client(self, url: str, *, as_json: bool, first_contact: float | None = None) -> Client:
         """Return a client; the token comes from PLIANT_TOKEN, so that it never appears in a list of processes."""

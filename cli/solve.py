@@ -53,9 +53,9 @@ def solve(
     ctx.obj.json = as_json
     one_numerical_thread()  # the first check of a path imports NumPy
     check_inputs(tracks, mesh=mesh, ground_truth=ground_truth, rotations=rotations, region=region)
-    with results_folder(output, force=force):
-        options, name = parse_options(option), name_of(name, tracks)
-        if is_film(tracks, region):
+    options, name, film = parse_options(option), name_of(name, tracks), is_film(tracks, region)
+    with results_folder(output, force=force, files=() if force else files_of(options, film=film)):
+        if film:
             refuse_parts_of_tracks(mesh=mesh, ground_truth=ground_truth, rotations=rotations)
             done = solve_film(
                 tracks, output, region=region, options=options, name=name, threads=threads, as_json=as_json
@@ -64,6 +64,23 @@ def solve(
             parts = {"tracks": tracks, "mesh": file_or_word(mesh), "ground_truth": ground_truth, "rotations": rotations}
             done = solve_tracks(parts, output, options=options, name=name, threads=threads, as_json=as_json)
     show_finished(done, output, as_json=as_json)
+
+
+def files_of(options: dict[str, Any], *, film: bool) -> list[str]:
+    """Return the names of the files that a result with these options may have.
+
+    Raises
+    ------
+    BadArgument
+        An option is unknown or invalid.
+    """
+    from pliant.client.multipart import checked_options
+    from pliant.worker.artifacts.kinds import KINDS
+    from pliant.worker.execution.film import FILES
+
+    outputs = checked_options(options).outputs
+    own = [kind.name for kind in KINDS if kind.output is None or kind.output in outputs]
+    return [*own, "report.json", *(FILES if film else ())]
 
 
 def solve_tracks(

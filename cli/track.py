@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from pliant.cli.paths import input_file, output_file
-from pliant.cli.session import Force, Json, one_numerical_thread
+from pliant.cli.session import LINE_EVERY, Force, Json, one_numerical_thread
 from pliant.cli.show import err, out, print_json
 
 if TYPE_CHECKING:
@@ -68,14 +68,20 @@ def track(
 
 @contextmanager
 def _bars() -> Iterator[OnStep]:
-    """Show one bar for each stage on a terminal; nothing where there is no terminal."""
+    """Show one bar for each stage on a terminal, print a line every `LINE_EVERY` seconds elsewhere."""
+    from contextlib import nullcontext
+
+    from pliant.client.progress import printed_lines
     from rich.progress import Progress, TaskID
 
-    screen = err()
-    with Progress(console=screen, disable=not screen.is_terminal) as progress:
+    screen, latest = err(), "waiting"
+    lines = nullcontext() if screen.is_terminal else printed_lines(lambda: latest, screen, seconds=LINE_EVERY)
+    with Progress(console=screen, disable=not screen.is_terminal) as progress, lines:
         tasks: dict[str, TaskID] = {}
 
         def on_step(step: TrackingStep) -> None:
+            nonlocal latest
+            latest = f"{step.stage} " + (f"{step.done / step.total:.0%}" if step.total else f"{step.done} frames")
             if step.stage not in tasks:
                 tasks[step.stage] = progress.add_task(step.stage, total=step.total)
             progress.update(tasks[step.stage], completed=step.done, total=step.total)

@@ -261,6 +261,23 @@ def _alone(visible: ArrayLike | None) -> None:
         )
 
 
+def expanded(path: Path | str, name: str) -> Path:
+    """Return a path with ``~`` or ``~user`` at its beginning expanded.
+
+    Raises
+    ------
+    BadArgument
+        There is no such user, or the user has no home directory.
+    """
+    try:
+        return Path(path).expanduser()
+    except RuntimeError:
+        raise BadArgument(
+            f"{name}: expected a path, got {path}, and {Path(path).parts[0]} is nobody's home directory. "
+            "Write out the whole path."
+        ) from None
+
+
 def existing_file(path: Path | str, name: str) -> Path:
     """Return the path of an input, with ``~`` expanded.
 
@@ -269,7 +286,7 @@ def existing_file(path: Path | str, name: str) -> Path:
     BadArgument
         There is no file, it is a folder, or it cannot be read.
     """
-    found = Path(path).expanduser()
+    found = expanded(path, name)
     if found.is_dir():
         raise BadArgument(f"{name}: expected a file, got the folder {found}. Give the path of a file in it.")
     if not found.is_file():

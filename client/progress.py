@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
@@ -22,6 +22,8 @@ class Bar:
     def __init__(self, bars: RichProgress) -> None:
         self._bars = bars
         self._task = bars.add_task("", total=1.0, note="")
+        self.label = ""
+        """What is shown beside the progress, for example which of several files it is of."""
         self.latest = ""
         """The display as one line of text."""
 
@@ -49,6 +51,7 @@ class Bar:
         self._show(progress.stage, progress.fraction, describe(progress))
 
     def _show(self, stage: str, fraction: float, note: str) -> None:
+        note = ", ".join(each for each in (self.label, note) if each)
         self.latest = f"{stage} {fraction:.0%}" + (f", {note}" if note else "")
         self._bars.update(self._task, description=stage, completed=fraction, note=note)
 
@@ -57,7 +60,7 @@ def describe(progress: Progress) -> str:
     """Summarise progress in a few words."""
     words = []
     if progress.reweighting > 0:
-        words.append(f"reweighting {progress.reweighting} of at most {progress.max_reweightings}")
+        words.append(f"reweighting {progress.reweighting}")
     if progress.residual is not None:
         words.append(f"residual {progress.residual:.3g}")
     if progress.seconds_left is not None:
@@ -97,19 +100,22 @@ def progress_bar(console: Console | None = None, *, line_every: float | None = N
         if screen.is_terminal or line_every is None:
             yield bar
             return
-        with _printed(bar, screen, line_every):
+        with printed_lines(lambda: bar.latest or "waiting", screen, seconds=line_every):
             yield bar
 
 
 @contextmanager
-def _printed(bar: Bar, screen: Console, seconds: float) -> Iterator[None]:
-    """Print the display as a line every so many seconds, from a thread: callbacks may be further apart."""
+def printed_lines(latest: Callable[[], str], screen: Console, *, seconds: float) -> Iterator[None]:
+    """Print the time that has passed and the latest state as a line every so many seconds.
+
+    From a thread: callbacks may be further apart.
+    """
     finished, began = threading.Event(), time.monotonic()
 
     def print_lines() -> None:
         while not finished.wait(seconds):
             elapsed = time.monotonic() - began
-            screen.print(f"{elapsed:.0f} s: {bar.latest or 'waiting'}", markup=False, highlight=False, soft_wrap=True)
+            screen.print(f"{elapsed:.0f} s: {latest()}", markup=False, highlight=False, soft_wrap=True)
 
     thread = threading.Thread(target=print_lines, name="pliant-progress", daemon=True)
     thread.start()

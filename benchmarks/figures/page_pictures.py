@@ -71,7 +71,7 @@ def dropped_files(page: Page, url: str, jobs: Jobs) -> None:
 
 def refused_file(page: Page, url: str, jobs: Jobs) -> None:
     first_view(page, url, jobs)
-    wrong = {"name": "thesis.pdf", "mimeType": "application/pdf", "buffer": b"%PDF-1.7\n" + bytes(2000)}
+    wrong = {"name": "holiday.npz", "mimeType": "application/octet-stream", "buffer": b"\0\0\0\x18ftypmp42" + bytes(600)}
     page.get_by_label("Tracks", exact=True).set_input_files(wrong)  # type: ignore[arg-type]
     page.locator("[data-part=tracks]").get_by_role("alert").wait_for()
 

@@ -1,4 +1,4 @@
-"""Seconds left, as shown while a job runs, against the true ones: twelve runs over HTTP and on the command line.
+"""Seconds left, as shown while a job runs, against the true ones: thirteen runs over HTTP and on the command line.
 
     python -m benchmarks.installation.progress --results benchmarks/results/progress.jsonl
     python -m benchmarks.installation.progress --only flag,sphere
@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 from pliant.client import Client
 from pliant.solver.gallery import Sequence, corrupt, face, flag, sphere, talk
+from pliant.tracking.rendering import face_paint, render_film
 
 from benchmarks.installation.instance import Instance
 from benchmarks.rows import append_row
@@ -47,6 +48,8 @@ class Run:
     options: dict[str, str] = field(default_factory=dict)
     cameras: bool = False
     """Whether the true rotations are given."""
+    film: bool = False
+    """Whether a rendered film is sent in place of tracks and mesh."""
 
 
 RUNS = (
@@ -60,6 +63,7 @@ RUNS = (
     Run("smooth prior", lambda: face(60, 10_000, degrees=40), line=True, options={"prior": "smooth"}),
     Run("known cameras", lambda: face(99, 6000, degrees=40), cameras=True),
     Run("size of the picture", lambda: face(40, 600, degrees=40), line=True, options={"image_size": "640x480"}),
+    Run("film", lambda: face(30, 900, degrees=50), line=True, film=True),
     Run("many points", lambda: face(50, 100_000, degrees=40)),
     Run("many frames", lambda: talk(3000, 300), line=True),
 )
@@ -97,6 +101,9 @@ def measured(run: Run, scratch: Path, instance: Instance) -> dict[str, Any]:
     files = {"tracks": scratch / "tracks.npz", "mesh": scratch / "mesh.npz"}
     np.savez(files["tracks"], tracks=sequence.tracks.points, visibility=sequence.tracks.visible > 0)
     np.savez(files["mesh"], faces=sequence.mesh.faces)
+    if run.film:
+        files = {"tracks": scratch / "film.webm"}
+        render_film(sequence, size=(320, 240), paint=face_paint(sequence.mesh.num_points)).write(files["tracks"])
     if run.cameras:
         files["rotations"] = scratch / "rotations.npz"
         np.savez(files["rotations"], rotations=sequence.rotations)

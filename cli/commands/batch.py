@@ -11,12 +11,15 @@ from typing import TYPE_CHECKING, Any
 
 from pliant.cli.exits import Exit
 from pliant.cli.films import is_film
-from pliant.cli.paths import output_folder
-from pliant.cli.show import COLOURS, details_of, err, explained_at, out, print_json
+from pliant.cli.paths import different_files, made_folder, output_folder
+from pliant.cli.session import LINE_EVERY, Session
+from pliant.cli.show import COLOURS, VERDICTS, details_of, err, explained_at, out, print_json
 
 if TYPE_CHECKING:
     from pliant.client import Client, RemoteJob
+    from pliant.client.progress import Bar
     from pliant.schemas.job import Job
+    from rich.text import Text
 
 ENDINGS = frozenset({".npz", ".npy", ".mat", ".h5", ".hdf5", ".csv", ".txt"})
 """Names that are taken for track files in a folder."""
@@ -28,7 +31,7 @@ def expanded(given: list[Path], region: Path | None) -> list[Path]:
     Raises
     ------
     BadArgument
-        A folder has no track file, or a pattern finds nothing.
+        A folder has no track file; a pattern finds nothing or has two asterisks in a row.
     """
     from pliant.client.errors import BadArgument
 
@@ -42,6 +45,10 @@ def expanded(given: list[Path], region: Path | None) -> list[Path]:
                 f"{path}: expected track files ({', '.join(sorted(ENDINGS))}), got an empty folder. Name the files."
             )
         elif not path.exists() and any(sign in path.name for sign in "*?["):
+            if "**" in path.name:  # Python before 3.13 raises ValueError, later ones take it for one asterisk
+                raise BadArgument(
+                    f"{path}: expected a pattern of one folder's files, got **. Write a single * for any characters."
+                )
             matching = sorted(path.parent.glob(path.name))
             if not matching:
                 raise BadArgument(f"{path}: expected files that match, got none. Check the pattern and its quotes.")
@@ -56,6 +63,16 @@ def track_files(folder: Path) -> list[Path]:
     if not folder.is_dir():
         return []
     return sorted(each for each in folder.iterdir() if each.suffix.lower() in ENDINGS and each.is_file())
+
+
+def judged(job: Job | None) -> Text:
+    """Return a job's verdict in words, with the first of its reasons; nothing where it was not judged."""
+    from rich.text import Text
+
+    if job is None or job.verdict is None:
+        return Text()
+    words, colour = VERDICTS.get(job.verdict, (job.verdict, "yellow"))
+    return Text.assemble((words, colour), *(f"\n{reason}" for reason in job.verdict_reasons[:1]))
 
 
 @dataclass(slots=True)
@@ -80,18 +97,22 @@ class Batch:
     priority: str
     timeout: float | None
     output: Path | None
+    force: bool
+    """Whether files of other content in the output folders are replaced; else they refuse the download."""
     wait: bool
     url: str
     """Address of the service."""
+    session: Session
+    """Is told which jobs Ctrl-C would leave."""
     rows: list[Row] = field(default_factory=list)
 
-    def check(self, *, name: str, job_id: str | None, region: Path | None, force: bool) -> None:
-        """Refuse options that belong to a single job, and output folders that hold something.
+    def check(self, *, name: str, job_id: str | None, region: Path | None) -> None:
+        """Refuse options that belong to a single job, and make the output folders.
 
         Raises
         ------
         BadArgument
-            One was given, or two files have the same name.
+            One was given, two files have the same name, or a folder cannot be written.
         """
         from pliant.client.errors import BadArgument
         from pliant.client.multipart import existing_file
@@ -112,39 +133,59 @@ class Batch:
                 f"--output: several files are named {twice}, and would share a folder. Submit them separately."
             )
         for each in names:
-            if not force and (self.output / each / "report.json").exists():
-                continue  # of an earlier run: `Client.download` fetches only what is missing or different
-            output_folder(self.output / each, force=True)
+            made_folder(self.output / each, "--output")
 
     def run(self, client: Client) -> None:
         """Submit all, and wait for them if that is wanted. What fails has a row of its own and stops nothing."""
-        from pliant.client.errors import InvalidRequest, PliantError
+        from pliant.client.progress import progress_bar
+
+        with progress_bar(line_every=LINE_EVERY) as bar:
+            submitted = self._submit(client, bar)
+            for index, (row, job) in enumerate(submitted if self.wait else ()):
+                self.session.following, self.session.others = job.id, len(submitted) - index - 1
+                bar.label = str(row.file)
+                self._follow(row, job, bar)
+                row.job = client.get(job.id).record
+                err().print(f"{row.file}: {row.job.status}", highlight=False, markup=False)
+
+    def _submit(self, client: Client, bar: Bar) -> list[tuple[Row, RemoteJob]]:
+        """Submit each file and print the id of its job at once, so that an interruption loses none."""
+        from pliant.client.errors import InvalidRequest
 
         submitted: list[tuple[Row, RemoteJob]] = []
         for file in self.files:
             row = Row(file)
             self.rows.append(row)
+            bar.label = str(file)
             try:
                 film = is_film(file, None)
                 job = client.submit(
                     None if film else file, film=file if film else None, name=file.stem, options=self.options,
                     idempotency_key=self._key_of(file), priority=self.priority, timeout=self.timeout,  # type: ignore[arg-type]
-                    webhook_secret=os.environ.get("PLIANT_WEBHOOK_SECRET") if self.shared.get("webhook") else None, **self.shared,
+                    webhook_secret=os.environ.get("PLIANT_WEBHOOK_SECRET") if self.shared.get("webhook") else None,
+                    on_upload=bar.on_upload, **self.shared,
                 )  # fmt: skip
             except InvalidRequest as error:
                 row.error = error
                 continue
             row.job = job.record
+            self.session.following, self.session.others = job.id, len(submitted)
             submitted.append((row, job))
-        for row, job in submitted if self.wait else ():
-            try:
-                done = job.wait(load=False, timeout=self.timeout)
-                if self.output is not None:
-                    done.download(self.output / row.file.stem, timeout=self.timeout)
-            except PliantError as error:
-                row.error = error
-            row.job = client.get(job.id).record
-            err().print(f"{row.file}: {row.job.status}", highlight=False, markup=False)
+            err().print(f"{file}: job {job.id}", highlight=False, markup=False)
+        return submitted
+
+    def _follow(self, row: Row, job: RemoteJob, bar: Bar) -> None:
+        """Wait for a job, and download its files if that is wanted."""
+        from pliant.client.errors import PliantError
+
+        try:
+            done = job.wait(on_progress=bar.on_progress, load=False, timeout=self.timeout)
+            if self.output is not None:
+                folder = self.output / row.file.stem
+                output_folder(folder, force=self.force, files=different_files(done.job, folder))
+                done.download(folder, on_download=bar.on_download, timeout=self.timeout)
+        except PliantError as error:
+            row.error = error
 
     @property
     def exit_code(self) -> Exit:
@@ -172,7 +213,7 @@ class Batch:
             )
             table.add_row(
                 Text(str(row.file)), "" if job is None else job.id, Text(status, COLOURS.get(status, "red")),
-                "" if job is None else job.verdict or "", "" if took is None else f"{took.total_seconds():.1f}",
+                judged(job), "" if took is None else f"{took.total_seconds():.1f}",
                 Text("" if row.error is None else self._refusal(row.error)),
             )  # fmt: skip
         out().print(table)

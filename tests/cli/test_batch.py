@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import importlib
 import json
+import math
+import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -74,6 +78,27 @@ def test_results_lie_in_a_folder_for_each_and_a_second_run_goes_on(run: Run, tak
     assert len(jobs_of(run)) == 4
 
 
+def test_files_of_other_content_are_kept_unless_forced(run: Run, takes: Path, tmp_path: Path) -> None:
+    kept = tmp_path / "out" / "take-0" / "shapes.npz"
+    kept.parent.mkdir(parents=True)
+    kept.write_text("mine")
+    command = ("submit", takes, "--mesh", "none", "-o", tmp_path / "out")
+    ran = run(*command, "--json")
+    assert ran.exit_code == Exit.FAILED
+    rows = json.loads(ran.stdout)
+    assert [row["error"] for row in rows] == [
+        f"--output: {kept.parent} already holds shapes.npz. Choose another folder, or replace the files with --force.",
+        None,
+        None,
+    ]
+    assert [row["job"]["status"] for row in rows] == ["succeeded"] * 3
+    assert [path.name for path in kept.parent.iterdir()] == ["shapes.npz"], "nothing else is written beside it"
+    assert kept.read_text() == "mine"
+    ran = run(*command, "--force")
+    assert ran.exit_code == 0, ran.output
+    assert np.load(kept)["shapes"].shape == (5, 12, 3)
+
+
 def test_a_file_that_is_refused_has_its_row_and_stops_nothing(run: Run, takes: Path) -> None:
     np.savez(takes / "take-1.npz", tracks=np.ones((2, 9, 2)))
     ran = run("submit", takes, "--mesh", "none", "--wait")
@@ -108,3 +133,67 @@ def test_a_priority_reaches_the_job(run: Run, takes: Path) -> None:
     ran = run("submit", takes / "take-0.npz", "--mesh", "none", "--priority", "high", "--json")
     assert json.loads(ran.stdout)["priority"] == "high"
     assert run("submit", takes / "take-0.npz", "--priority", "urgent").exit_code == Exit.USAGE
+
+
+def words(ran: Result) -> str:
+    return " ".join(ran.stderr.split())
+
+
+def test_ids_are_printed_at_submission_and_lines_while_waiting(
+    run: Run, service: InMemoryService, takes: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    service.worker.steps = 30
+    monkeypatch.setattr(importlib.import_module("pliant.cli.commands.batch"), "LINE_EVERY", 0.1)
+    ran = run("submit", takes, "--mesh", "none", "--wait", "--json")
+    assert ran.exit_code == 0, ran.output
+    lines = ran.stderr.splitlines()
+    ids = [f"{row['file']}: job {row['job']['id']}" for row in json.loads(ran.stdout)]
+    assert [line for line in lines if ": job " in line] == ids
+    assert lines.index(ids[-1]) < lines.index(f"{takes / 'take-0.npz'}: succeeded")
+    form = re.compile(rf"\d+ s: [a-z]+ \d+%, {re.escape(str(takes))}/take-\d\.npz(, .*)?")
+    while_waiting = [line for line in lines if " s: " in line]
+    assert len(while_waiting) >= 3
+    assert all(form.fullmatch(line) or line.endswith(" s: waiting") for line in while_waiting), while_waiting
+
+
+@pytest.mark.parametrize(("count", "rest"), [(3, " and 2 others continue"), (2, " and 1 other continue")])
+def test_ctrl_c_while_waiting_prints_how_to_return(
+    run: Run, service: InMemoryService, takes: Path, monkeypatch: pytest.MonkeyPatch, count: int, rest: str
+) -> None:
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    service.worker.steps = math.inf
+    monkeypatch.setattr("pliant.client._sync.job.RemoteJob.wait", interrupt)
+    files = sorted(takes.glob("*.npz"))[:count]
+    ran = run("submit", *files, "--mesh", "none", "--wait")
+    ids = [line.rpartition(" ")[2] for line in ran.stderr.splitlines() if ": job " in line]
+    first = ids[0]
+    assert (ran.exit_code, len(ids)) == (Exit.INTERRUPTED, count)
+    assert words(ran).partition("error ")[2] == (
+        f"Interrupted. Job {first}{rest}: the same command again returns to all of them, "
+        f"`pliant watch {first}` follows this one, `pliant cancel {first}` stops it."
+    )
+    for each in ids:
+        run("cancel", each)
+    assert len(jobs_of(run)) == count
+
+
+def test_ctrl_c_while_sending_names_the_jobs_that_exist(run: Run, takes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from pliant.client import Client
+
+    submit = Client.submit
+
+    def interrupted(self: Client, *given: Any, name: str, **more: Any) -> Any:
+        if name == "take-1":
+            raise KeyboardInterrupt
+        return submit(self, *given, name=name, **more)
+
+    monkeypatch.setattr(Client, "submit", interrupted)
+    ran = run("submit", takes, "--mesh", "none")
+    (only,) = [job["id"] for job in jobs_of(run)]
+    assert ran.exit_code == Exit.INTERRUPTED
+    assert words(ran) == (
+        f"{takes / 'take-0.npz'}: job {only} error Interrupted. Job {only} continues: `pliant watch {only}` follows it, "
+        f"`pliant cancel {only}` stops it."
+    )

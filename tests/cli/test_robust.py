@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import math
 import os
@@ -74,6 +75,7 @@ NO_PICTURES = (
     "Give the path of a file in it."
 )
 A_FILE = "--output: expected a folder, got the file TRACKS. Choose another folder."
+NOBODY = "and ~nosuchuser is nobody's home directory. Write out the whole path."
 LISTED = "`pliant options` lists every option."
 
 
@@ -107,6 +109,20 @@ LISTED = "`pliant options` lists every option."
         ("submit TRACKS -g no.npz", f"ground_truth: {NO_FILE} no.npz. Check the path."),
         ("submit TRACKS -r no.npz", f"rotations: {NO_FILE} no.npz. Check the path."),
         ("submit FOLDER/*.npz", "FOLDER/*.npz: expected files that match, got none. Check the pattern and its quotes."),
+        (
+            "submit FOLDER/**.npz",
+            "FOLDER/**.npz: expected a pattern of one folder's files, got **. Write a single * for any characters.",
+        ),
+        *(
+            (f"{command} -o OUT", f"{name}: expected a path, got ~nosuchuser/{file}, {NOBODY}")
+            for command, name, file in (
+                ("solve ~nosuchuser/x.npz", "tracks", "x.npz"),
+                ("submit ~nosuchuser/x.npz", "tracks", "x.npz"),
+                ("submit ~nosuchuser/x.npz TRACKS", "tracks", "x.npz"),
+                ("solve TRACKS -m ~nosuchuser/x.obj", "mesh", "x.obj"),
+                ("track FILM --region ~nosuchuser/x.png", "--region", "x.png"),
+            )
+        ),
         (
             "list -s done",
             "--status: expected one of queued, running, cancelling, succeeded, failed, cancelled, got 'done'.",
@@ -190,6 +206,65 @@ def test_existing_results_are_kept_unless_forced(run: Run, tracks: Path, tmp_pat
     assert np.load(out / "shapes.npz")["shapes"].shape == (5, 12, 3)
 
 
+def test_any_other_file_of_a_result_is_kept_unless_forced(run: Run, tracks: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "shapes.glb").write_text("mine")
+    ran = run("submit", tracks, "-m", "2x6", "--id", "glb", "-o", out)
+    assert ran.exit_code == Exit.REFUSED
+    assert words(ran) == "Job glb " + refusal(
+        f"--output: {out} already holds shapes.glb. Choose another folder, or replace the files with --force."
+    )
+    assert (out / "shapes.glb").read_text() == "mine"
+    assert run("result", "glb", "-o", out, "--force").exit_code == 0
+    assert (out / "shapes.glb").read_bytes().startswith(b"glTF")
+
+
+@pytest.mark.parametrize(
+    ("given", "existing", "more"),
+    [("tracks.npz", "shapes.glb", ()), ("film.gif", "contact_sheet.jpg", ()), ("tracks.npz", "shapes.mdd", ("-O", 'outputs=["mdd"]'))],
+)  # fmt: skip
+def test_solve_keeps_every_file_that_it_would_replace(
+    run: Run, tracks: Path, tmp_path: Path, given: str, existing: str, more: tuple[str, ...]
+) -> None:
+    (tmp_path / "film.gif").write_bytes(b"GIF89a")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / existing).write_text("mine")
+    ran = run("solve", tracks.with_name(given), "-o", tmp_path / "out", *more)
+    assert ran.exit_code == Exit.REFUSED
+    assert words(ran) == refusal(
+        f"--output: {tmp_path / 'out'} already holds {existing}. Choose another folder, or replace the files with --force."
+    )
+    assert [path.name for path in (tmp_path / "out").iterdir()] == [existing]
+
+
+def test_solve_leaves_files_that_no_result_has(run: Run, tracks: Path) -> None:
+    for name in ("shapes.mdd", "contact_sheet.jpg"):
+        (tracks.parent / name).write_text("mine")
+    ran = run("solve", tracks, "-o", tracks.parent, "-O", 'outputs=["mat"]', *FAST)
+    assert ran.exit_code == 0, ran.output
+    assert (tracks.parent / "shapes.mdd").read_text() == "mine"
+
+
+def test_the_demonstration_replaces_files_of_a_folder_that_was_named_only_if_forced(
+    run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def render(_: object, folder: Path) -> None:
+        raise BadArgument(f"rendered into {folder}")
+
+    monkeypatch.setattr(importlib.import_module("pliant.cli.demo"), "render", render)
+    monkeypatch.chdir(tmp_path)
+    for folder in ("mine", "demo-output"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "tracks.npz").write_text("mine")
+    assert json.loads(run("demo", "--json", "-o", "mine").stderr)["detail"] == (
+        "--output: mine already holds tracks.npz. Choose another folder, or replace the files with --force."
+    )
+    for more, folder in ((["-o", "mine", "--force"], "mine"), ([], "demo-output"), (["-o", "new"], "new")):
+        ran = run("demo", "--json", *more)
+        assert json.loads(ran.stderr)["detail"] == f"rendered into {folder}", more
+
+
 def test_jobs_are_named_by_prefix_or_as_the_last_one(run: Run, tracks: Path) -> None:
     for name in ("apple-1", "apple-2", "banana-1"):
         assert run("submit", tracks, "-m", "none", "--id", name).exit_code == 0
@@ -224,8 +299,6 @@ def test_the_id_is_printed_before_waiting(run: Run, tracks: Path, service: InMem
 def test_a_line_is_printed_regularly_without_a_terminal(
     run: Run, tracks: Path, service: InMemoryService, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import importlib
-
     service.worker.steps = 40
     monkeypatch.setattr(importlib.import_module("pliant.cli.jobs"), "LINE_EVERY", 0.1)
     ran = run("submit", tracks, "-m", "none", "--wait")

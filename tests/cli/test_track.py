@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import json
+import re
 from pathlib import Path
 
 import films
@@ -10,6 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from pliant.cli import app
+from pliant.tracking.records import TrackingStep
 from typer.testing import CliRunner
 
 
@@ -30,6 +33,26 @@ def test_a_film_becomes_tracks_and_a_preview(tmp_path: Path) -> None:
     ran = CliRunner().invoke(app, ["track", *files, "--frames", ":4", "--force"])
     assert "points in 4 frames" in ran.stdout
     assert "Only 4 frames" in ran.stderr
+
+
+def test_a_line_is_printed_regularly_without_a_terminal(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module = importlib.import_module("pliant.cli.track")
+    monkeypatch.setattr(module, "LINE_EVERY", 0.02)
+    printed = ""
+    steps = {
+        "waiting": None,
+        "read 30 frames": TrackingStep(stage="read", done=30, total=None),
+        "track 25%": TrackingStep(stage="track", done=5, total=20),
+    }
+    with module._bars() as on_step:
+        for line, step in steps.items():
+            if step is not None:
+                on_step(step)
+            while f" s: {line}\n" not in printed:  # a thread prints them
+                printed += capsys.readouterr().err
+    assert all(re.fullmatch(rf"\d+ s: ({'|'.join(steps)})", line) for line in printed.splitlines()), printed
 
 
 def test_a_playlist_is_rejected_with_a_message(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from pliant.cli.commands.batch import Batch, Row
 from pliant.cli.demo import MEANINGS, report
+from pliant.cli.session import Session
 from pliant.cli.show import METRIC_MEANINGS, metrics_table, show_job, show_jobs, verdict_lines
 from pliant.cli.solve import show_finished
 from pliant.schemas.job import Interpretation, Job, Status
@@ -129,9 +130,31 @@ def test_ids_are_whole_on_a_narrow_terminal(
         priority="normal",
         timeout=None,
         output=None,
+        force=False,
         wait=True,
         url="http://pliant.test",
+        session=Session(),
     )
     batch.rows = [Row(Path("a file with a long name.npz"), known)]
     batch.show(as_json=False)
     assert known.id in capsys.readouterr().out
+
+
+def test_the_table_of_a_batch_has_verdicts_in_words_and_the_first_reason(capsys: pytest.CaptureFixture[str]) -> None:
+    batch = Batch(
+        files=[], shared={}, options={}, key="", priority="normal", timeout=None, output=None, force=False, wait=True,
+        url="http://pliant.test", session=Session(),
+    )  # fmt: skip
+    verdicts = {
+        "with_care": [REASON, "A second reason."],
+        "good": [],
+        "do_not_use": ["The residual is large."],
+        None: [],
+    }
+    batch.rows = [
+        Row(Path(f"{verdict}.npz"), job(verdict=verdict, verdict_reasons=reasons))
+        for verdict, reasons in verdicts.items()
+    ]
+    batch.show(as_json=False)
+    rows = [[cell.strip() for cell in line.split("│")] for line in capsys.readouterr().out.splitlines() if "│" in line]
+    assert [row[4] for row in rows] == ["Use with care", REASON, "Good", "Do not use", "The residual is large.", ""]

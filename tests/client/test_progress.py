@@ -70,7 +70,7 @@ def test_progress_is_described() -> None:
         seconds_left=6.2,
         updated_at=now,
     )
-    assert describe(full) == "reweighting 3 of at most 30, residual 0.25, 7 s left"
+    assert describe(full) == "reweighting 3, residual 0.25, 7 s left"
     assert describe(full.model_copy(update={"seconds_left": 0.01})).endswith(", 1 s left"), "0 only at the end"
     assert describe(full.model_copy(update={"seconds_left": 0.0})).endswith(", 0 s left")
 

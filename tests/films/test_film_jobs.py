@@ -159,7 +159,14 @@ def test_films_are_recognised_on_the_command_line(film: Path, tmp_path: Path) ->
     films.write_film(tmp_path / "a.avi", films.textured_pictures(3))
     given = (film, moved, pictures, tmp_path, tmp_path / "list.mp4", tmp_path / "missing.mov", tmp_path / "a.avi")
     assert [path for path in given if not looks_like_film(path)] == []
-    others = (tmp_path / "tracks.npz", tmp_path / "tracks.npy", tmp_path / "broken.zip", tmp_path / "missing.npz")
+    sheets = {
+        "a.xlsx": ("[Content_Types].xml", "xl/workbook.xml", "xl/media/image1.png"),
+        "a.ods": ("mimetype", "content.xml", "Thumbnails/thumbnail.png"),
+    }
+    for name, members in sheets.items():
+        films.zip_of(tmp_path / name, dict.fromkeys(members, b""))
+    names = ("tracks.npz", "tracks.npy", "broken.zip", "missing.npz", *sheets)
+    others = [tmp_path / name for name in names]
     assert [path for path in others if looks_like_film(path)] == []
 
 

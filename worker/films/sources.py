@@ -10,6 +10,7 @@ from pathlib import Path
 
 from pliant.schemas.job import Interpretation
 from pliant.worker.formats.errors import damaged
+from pliant.worker.formats.reading.arrays import spreadsheet_kind
 from pliant.worker.settings import Settings
 
 VERSION = 1
@@ -102,9 +103,10 @@ def looks_like_film(path: Path) -> bool:
 def _holds_pictures(path: Path) -> bool:
     try:
         with zipfile.ZipFile(path) as archive:
-            return any(name.lower().endswith(PICTURES) for name in archive.namelist())
+            names = archive.namelist()
     except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError):
         return False
+    return spreadsheet_kind(names) is None and any(name.lower().endswith(PICTURES) for name in names)
 
 
 def save_source(source: FilmSource, interpretation: Interpretation, target: Path) -> None:

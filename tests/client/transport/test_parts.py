@@ -93,6 +93,10 @@ def test_truth_and_cameras_are_arrays_dictionaries_or_files(tmp_path: Path) -> N
     ("make", "words"),
     [
         (lambda here: tracks_file("nowhere.npz", None, here), "got no file at nowhere.npz"),
+        (
+            lambda here: tracks_file("~nosuchuser/x.npz", None, here),
+            "tracks: expected a path, got ~nosuchuser/x.npz, and ~nosuchuser is nobody's home directory",
+        ),
         (lambda here: tracks_file({"tracks": POINTS}, np.ones((4, 9)), here), "contains its own visibility"),
         (lambda here: tracks_file({"model": "cotracker3"}, None, here), "model: expected an array of numbers"),
         (lambda here: tracks_file(np.array([None]), None, here), "got dtype object"),

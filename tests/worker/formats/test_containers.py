@@ -57,6 +57,8 @@ def test_csv_lines_may_come_in_any_order_and_missing_ones_are_hidden(tmp_path: P
     assert got.tracks.visible[0, 3] == 0
     assert (got.tracks.visible == 0).sum() == 1
     np.testing.assert_array_equal(got.tracks.points[1:], POINTS[1:])
+    (tmp_path / "t.csv").write_text("frame,point,x,y\n" + "\n".join(lines), encoding="utf-16")
+    np.testing.assert_array_equal(read(tmp_path / "t.csv").tracks.points, POINTS)
     (tmp_path / "t.csv").write_text("frame,point,x,y\n0,0,1,2\n0,0,1,3\n")
     assert code_of(tmp_path / "t.csv") == "duplicate_observation"
     (tmp_path / "t.csv").write_text("frame,point,x,y\n0,0,1,2\n99999999,0,1,3\n")

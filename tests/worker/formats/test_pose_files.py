@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import io
 import json
 import zipfile
@@ -92,6 +93,15 @@ def test_a_table_is_read(case: str, tmp_path: Path) -> None:
     np.testing.assert_allclose(read.tracks.visible, expected)
     seen = expected > 0
     np.testing.assert_allclose(read.tracks.points[seen], POINTS[seen])
+
+
+@pytest.mark.parametrize(("mark", "encoding"), [(codecs.BOM_UTF16_LE, "utf-16-le"), (codecs.BOM_UTF16_BE, "utf-16-be")])
+def test_unicode_text_of_a_spreadsheet_is_read(mark: bytes, encoding: str, tmp_path: Path) -> None:
+    text = one_row_a_frame("\t", ",").replace("\n", "\r\n")
+    (tmp_path / "tracks.txt").write_bytes(mark + text.encode(encoding))
+    read = read_inputs(tracks=tmp_path / "tracks.txt", mesh="none", options=Options())
+    assert read.interpretation.format == "one row a frame"
+    np.testing.assert_allclose(read.tracks.points[SURE > 0.5], POINTS[SURE > 0.5])
 
 
 def test_mediapipe_landmarks_are_fractions_of_the_picture(tmp_path: Path) -> None:
@@ -194,6 +204,22 @@ def pictures() -> bytes:
     return held.getvalue()
 
 
+def spreadsheet(*members: str) -> bytes:
+    held = io.BytesIO()
+    with zipfile.ZipFile(held, "w") as archive:
+        for name in members:
+            archive.writestr(name, "<a/>")
+    return held.getvalue()
+
+
+def utf_16(text: str) -> bytes:
+    return codecs.BOM_UTF16_LE + text.encode("utf-16-le")
+
+
+FILES = "npz, npy, MATLAB .mat, CSV, or DeepLabCut, SLEAP and MediaPipe exports"
+UNKNOWN = f"tracks: expected {FILES}, recognised by content, got"
+AS_CSV = f"Save it as CSV in the spreadsheet program. {EXAMPLE}"
+CONVERT = "Convert it, e.g. numpy.savez('tracks.npz', tracks=points, visibility=visible)."
 TABLE = "tracks: expected a table with the columns frame, point, x and y, or with one row a frame, got line"
 JSON = "tracks: expected MediaPipe landmarks: a list of frames, each with landmarks x, y and visibility, got"
 JSON_EXAMPLE = (
@@ -209,6 +235,33 @@ REFUSED: dict[str, tuple[bytes, str, str]] = {
         b"\x89PNG\r\n\x1a\n" + bytes(600), "picture_as_tracks",
         "tracks: expected point tracks over several frames, got a single picture (png). "
         "Depth comes from motion: send a film, or a zip of all its pictures, as the film.",
+    ),
+    "a spreadsheet": (
+        spreadsheet("xl/workbook.xml", "xl/worksheets/sheet1.xml", "[Content_Types].xml"), "unknown_format",
+        f"{UNKNOWN} a spreadsheet (xlsx). {AS_CSV}",
+    ),
+    "a spreadsheet of many sheets": (
+        spreadsheet("[Content_Types].xml", *(f"xl/worksheets/sheet{index}.xml" for index in range(2000))), "unknown_format",
+        f"{UNKNOWN} a spreadsheet (xlsx). {AS_CSV}",
+    ),
+    "an OpenDocument spreadsheet": (
+        spreadsheet("mimetype", "content.xml"), "unknown_format", f"{UNKNOWN} an OpenDocument file (ods). {AS_CSV}",
+    ),
+    "an old spreadsheet": (
+        b"\xd0\xcf\x11\xe0" + bytes(600), "unknown_format", f"{UNKNOWN} an Office document (xls, doc). {AS_CSV}",
+    ),
+    "a document": (
+        spreadsheet("[Content_Types].xml", "word/document.xml"), "member_name",
+        "tracks: expected members named like tracks.npy, got '[Content_Types].xml'. Write the file with numpy.savez and plain names.",
+    ),
+    "words in UTF-16": (
+        utf_16("time\tname\twhere\r\n1\t2\t3\r\n"), "unreadable_table", f"{TABLE} 1: 'time\\tname\\twhere'. {EXAMPLE}",
+    ),
+    "other text in UTF-16": (utf_16("Hello world\r\n"), "unknown_format", f"{UNKNOWN} UTF-16 text that begins 'Hello world'. {CONVERT}"),
+    "blank text in UTF-16": (utf_16(" \r\n"), "unknown_format", f"{UNKNOWN} blank UTF-16 text. {CONVERT}"),
+    "bytes that begin as UTF-16": (
+        b"\xff\xfe" + bytes([1, 0, 2, 0, 3, 0]), "unknown_format",
+        f"{UNKNOWN} a file of an unknown kind, which begins with the bytes ff fe 01 00 02 00 03 00. {CONVERT}",
     ),
     "words in a table": (b"frame,point,x,y\n0,0,1,2\n0,1,left,2\n", "unreadable_table", f"{TABLE} 3: '0,1,left,2'. {EXAMPLE}"),
     "other columns": (b"time,name,where,how\n1,2,3,4\n", "unreadable_table", f"{TABLE} 1: 'time,name,where,how'. {EXAMPLE}"),
@@ -256,6 +309,19 @@ def test_a_refusal_says_what_was_seen_and_what_to_do(case: str, tmp_path: Path) 
         read_inputs(tracks=tmp_path / "tracks", mesh=None, options=Options())
     assert caught.value.code == code
     assert str(caught.value) == sentence
+
+
+@pytest.mark.parametrize(
+    ("part", "kinds"), [("mesh", "npz, npy, OBJ, PLY, glTF, GLB or a PNG mask"), ("ground_truth", FILES)]
+)
+def test_a_spreadsheet_as_another_input_is_refused(part: str, kinds: str, tmp_path: Path) -> None:
+    np.savez(tmp_path / "tracks.npz", tracks=POINTS)
+    (tmp_path / "table").write_bytes(spreadsheet("[Content_Types].xml", "xl/workbook.xml"))
+    with pytest.raises(InvalidInput) as caught:
+        read_inputs(**{"tracks": tmp_path / "tracks.npz", "mesh": "none", part: tmp_path / "table"}, options=Options())
+    assert str(caught.value) == (
+        f"{part}: expected {kinds}, recognised by content, got a spreadsheet (xlsx). Write the arrays with numpy.savez."
+    )
 
 
 def test_a_table_that_is_not_deeplabcuts_is_refused(tmp_path: Path) -> None:

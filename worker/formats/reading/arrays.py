@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.solver import InvalidInput
 from pliant.worker.formats.errors import damaged, too_large
+from pliant.worker.formats.reading.pose_tables import EXAMPLE
 from pliant.worker.formats.records import Arrays, Limits
 
 NPY_MAGIC = b"\x93NUMPY"
@@ -36,6 +37,10 @@ UNREADABLE_ZIP = (
     zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, OSError, OverflowError, struct.error, UnicodeDecodeError,
 )  # fmt: skip
 """Exceptions of Python's zip reader for invalid files."""
+
+TRACK_FILES = "npz, npy, MATLAB .mat, CSV, or DeepLabCut, SLEAP and MediaPipe exports"
+MESH_FILES = "npz, npy, OBJ, PLY, glTF, GLB or a PNG mask"
+"""What is read, in the words of refusals."""
 
 PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 
@@ -154,6 +159,9 @@ def checked_members(
 ) -> dict[str, zipfile.ZipInfo]:
     """Members by array name, once names, number, methods and the declared sizes of the wanted ones are found in order."""
     infos = archive.infolist()
+    spreadsheet = spreadsheet_kind([info.filename for info in infos])
+    if spreadsheet is not None:
+        raise spreadsheet_refusal(field, spreadsheet)
     if len(infos) > limits.max_members:
         raise too_large(field, expected=f"at most {limits.max_members:,} members", got=f"{len(infos)}")
     if any(info.filename.endswith("data.pkl") for info in infos):
@@ -191,6 +199,24 @@ def film_as_tracks(got: str) -> InvalidInput:
             "film_as_tracks", field="tracks", expected="point tracks", got=got,
         hint="Send it as the film instead (on the page: under Film; REST: -F film=@film.mp4): its points are tracked for you.",
     )  # fmt: skip
+
+
+def spreadsheet_refusal(field: str, got: str) -> InvalidInput:
+    """Return the refusal of a spreadsheet program's own file, with the way to save it."""
+    kinds = MESH_FILES if field == "mesh" else TRACK_FILES
+    hint = (
+        f"Save it as CSV in the spreadsheet program. {EXAMPLE}"
+        if field == "tracks"
+        else "Write the arrays with numpy.savez."
+    )
+    return InvalidInput("unknown_format", field=field, expected=f"{kinds}, recognised by content", got=got, hint=hint)
+
+
+def spreadsheet_kind(members: Collection[str]) -> str | None:
+    """Return what kind of spreadsheet a zip with these members is, None for anything else."""
+    if "[Content_Types].xml" in members and any(name.startswith("xl/") for name in members):
+        return "a spreadsheet (xlsx)"
+    return "an OpenDocument file (ods)" if "mimetype" in members and "content.xml" in members else None
 
 
 def pickle_refusal(field: str) -> InvalidInput:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import io
 from collections.abc import Iterator
 from typing import IO
@@ -23,6 +24,10 @@ from pliant.worker.formats.reading.pose_tables import (
 )
 from pliant.worker.formats.records import Arrays, Limits
 
+UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+"""Beginnings of texts in UTF-16."""
+codecs.lookup("utf-16")  # imports the decoder now: a contained process cannot open its module later
+
 COLUMNS = ("frame", "point", "x", "y")
 SEEN = ("visible", "visibility")
 WIDE = 8
@@ -31,7 +36,7 @@ WIDE = 8
 
 def looks_like_csv(head: bytes) -> bool:
     """Whether the first line has cells: at least three, so that what is wrong with the table can be shown."""
-    line = head.split(b"\n", 1)[0].decode("utf-8-sig", "replace")
+    line = head.decode(_encoding(head), "replace").split("\n", 1)[0]
     return len(split(line, separator_of(line))) >= 3
 
 
@@ -52,12 +57,19 @@ def read_csv(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
     InvalidInput
         Codes damaged_file, duplicate_observation, too_large, unreadable_table.
     """
-    text = io.TextIOWrapper(stream, encoding="utf-8-sig", errors="replace", newline="")
+    start = stream.read(len(codecs.BOM_UTF16_LE))
+    stream.seek(0)
+    text = io.TextIOWrapper(stream, encoding=_encoding(start), errors="replace", newline="")
     try:
         found = _read(iter(lambda: text.readline(LONGEST_ROW), ""), field=field, limits=limits)
     finally:
         text.detach()
     return found if isinstance(found, dict) else _observations(*found, field=field, limits=limits)
+
+
+def _encoding(start: bytes) -> str:
+    """Return the encoding of a text by its first bytes: spreadsheet programs write "Unicode text" as UTF-16."""
+    return "utf-16" if start.startswith(UTF_16) else "utf-8-sig"
 
 
 def _read(lines: Iterator[str], *, field: str, limits: Limits) -> Arrays | tuple[list[str], list[list[float]]]:

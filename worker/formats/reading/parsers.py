@@ -9,8 +9,14 @@ from typing import IO
 
 from pliant.solver import InvalidInput
 from pliant.worker.formats.errors import too_large
-from pliant.worker.formats.reading.arrays import film_as_tracks, pickle_refusal
-from pliant.worker.formats.reading.csv import looks_like_csv
+from pliant.worker.formats.reading.arrays import (
+    MESH_FILES,
+    TRACK_FILES,
+    film_as_tracks,
+    pickle_refusal,
+    spreadsheet_refusal,
+)
+from pliant.worker.formats.reading.csv import UTF_16, looks_like_csv
 from pliant.worker.formats.records import Arrays, Limits
 
 
@@ -46,8 +52,9 @@ PARSERS = {
 }
 MATLAB_5, HDF5 = b"MATLAB 5.0", b"\x89HDF\r\n\x1a\n"
 PICTURES = {b"\x89PNG\r\n": "png", b"\xff\xd8\xff": "jpeg", b"BM": "bmp", b"II*\0": "tiff", b"MM\0*": "tiff"}
+OFFICE = b"\xd0\xcf\x11\xe0"
 DOCUMENTS = {
-    b"%PDF": "a PDF document", b"PK\x03\x04": "a zip archive", b"\xd0\xcf\x11\xe0": "an Office document (xls, doc)",
+    b"%PDF": "a PDF document", b"PK\x03\x04": "a zip archive", OFFICE: "an Office document (xls, doc)",
     b"\x1f\x8b": "a gzip archive", b"7z\xbc\xaf": "a 7z archive", b"Rar!": "a RAR archive", b"\xfd7zXZ": "an xz archive",
     b"ID3": "a sound recording (mp3)", b"\0asm": "a program", b"\x7fELF": "a program", b"MZ": "a program",
     b"SQLite format 3": "an SQLite database",
@@ -80,6 +87,8 @@ def recognise(head: bytes, field: str) -> str:
             return "json"
         if looks_like_csv(head):
             return "csv"
+    if head.startswith(UTF_16) and field != "mesh" and looks_like_csv(head):
+        return "csv"
     raise unknown_format(field, head)
 
 
@@ -93,8 +102,9 @@ def parse(parser: Callable[..., Arrays], stream: IO[bytes], *, field: str, limit
 
 def unknown_format(field: str, head: bytes) -> InvalidInput:
     """Return the error for a file of an unknown format."""
-    mesh = "npz, npy, OBJ, PLY, glTF, GLB or a PNG mask"
-    kinds = mesh if field == "mesh" else "npz, npy, MATLAB .mat, CSV, or DeepLabCut, SLEAP and MediaPipe exports"
+    if head.startswith(OFFICE):
+        return spreadsheet_refusal(field, DOCUMENTS[OFFICE])
+    kinds = MESH_FILES if field == "mesh" else TRACK_FILES
     return InvalidInput(
             "unknown_format", field=field, expected=f"{kinds}, recognised by content", got=_in_words(head),
         hint="Convert it, e.g. numpy.savez('tracks.npz', tracks=points, visibility=visible).",
@@ -110,6 +120,10 @@ def _in_words(head: bytes) -> str:
         begins = start.decode("utf-8", "replace").splitlines()[0][:40] if start else ""
         if begins.count("\ufffd") <= len(begins) // 4:  # a few letters of another encoding are still text
             return f"text that begins {begins!r}" if begins else "blank text"
+    if head.startswith(UTF_16):
+        begins = next(iter(head.decode("utf-16", "replace").strip().splitlines()), "")[:40]
+        if begins.isprintable():
+            return f"UTF-16 text that begins {begins!r}" if begins else "blank UTF-16 text"
     pictures = {start: f"a picture ({name})" for start, name in PICTURES.items()}
     unknown = f"a file of an unknown kind, which begins with the bytes {head[:8].hex(' ')}"
     return next((name for start, name in (pictures | DOCUMENTS).items() if head.startswith(start)), unknown)
