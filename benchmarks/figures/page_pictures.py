@@ -71,7 +71,11 @@ def dropped_files(page: Page, url: str, jobs: Jobs) -> None:
 
 def refused_file(page: Page, url: str, jobs: Jobs) -> None:
     first_view(page, url, jobs)
-    wrong = {"name": "holiday.npz", "mimeType": "application/octet-stream", "buffer": b"\0\0\0\x18ftypmp42" + bytes(600)}
+    wrong = {
+        "name": "holiday.npz",
+        "mimeType": "application/octet-stream",
+        "buffer": b"\0\0\0\x18ftypmp42" + bytes(600),
+    }
     page.get_by_label("Tracks", exact=True).set_input_files(wrong)  # type: ignore[arg-type]
     page.locator("[data-part=tracks]").get_by_role("alert").wait_for()
 
