@@ -8,11 +8,12 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from pliant.schemas.job import Artifact, Progress
+from pliant.schemas.job import Artifact, FollowedPoints, Progress
 from pliant.schemas.options import Options
+from pliant.solver.stages import planned
 from pliant.worker.artifacts import described, kinds_for
 from pliant.worker.errors import Interrupted
-from pliant.worker.execution.pipeline import Halt, silent, solve_and_write
+from pliant.worker.execution.pipeline import Halt, silent, solve_and_write, solver_settings
 from pliant.worker.execution.progress import FILM_SHARES, Reporter
 from pliant.worker.films import frame_strip
 from pliant.worker.films.inputs import read_tracked
@@ -77,11 +78,16 @@ def reconstruct_film(
     with reporter.ticking():
         reporter.part("track", 0.0)
         began = time.perf_counter()
+
+        def told(done: float, size: tuple[int, int] | None, followed: FollowedPoints | None) -> None:
+            if size is not None:
+                reporter.following_seconds = _solving_seconds(*size, options)
+            reporter.part("track", done, followed=followed)
+
         try:
             tracked = track_film(
                 source, options, scratch, bounds=bounds, threads=threads,
-                on_progress=lambda done, followed: reporter.part("track", done, followed=followed),
-                should_stop=halt.requested,
+                on_progress=told, should_stop=halt.requested,
             )  # fmt: skip
         except Interrupted:
             halt.check()
@@ -100,6 +106,13 @@ def reconstruct_film(
         warnings=(*tracked.warnings, *finished.warnings),
         interpretation=inputs.interpretation,
     )
+
+
+def _solving_seconds(frames: int, points: int, options: Options) -> float:
+    """Return the planned time of a solve; the size of the picture is known, so that isometric surfaces are tried."""
+    settings = solver_settings(options)
+    stages = planned(frames, points, gaussian=settings.gaussian, known_cameras=False, sheet=settings.surface != "free")
+    return sum(stage.seconds for stage in stages)
 
 
 def _moved(file: Path, directory: Path) -> Artifact:

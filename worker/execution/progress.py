@@ -47,6 +47,8 @@ class Reporter:
     shares: Mapping[str, tuple[float, float]] = field(default_factory=lambda: SHARES)
     export_seconds: float = 0.0
     """Expected duration of the part `exporting`."""
+    following_seconds: float = 0.0
+    """Expected duration of everything after the part `track`; 0 where it is not known."""
     _began: float | None = None
     _export_began: float | None = None
     _furthest: float = 0.0
@@ -138,6 +140,9 @@ class Reporter:
                 self._export_began = now
             # The plan counts less, and the time spent more, the more is done.
             return (1 - done) * ((1 - done) * self.export_seconds + now - self._export_began)
+        if part in ("track", "loading") and self.following_seconds > 0 and done > 0 and self._began is not None:
+            tracking = (now - self._began) * (1 - done) / done if part == "track" else 0.0
+            return tracking + self.following_seconds
         return None if seconds_left is None else seconds_left + self.export_seconds
 
     def _send(self, now: float, left: float | None, followed: FollowedPoints | None) -> None:

@@ -173,9 +173,17 @@ def _reporter(target: int, size: tuple[int, int]) -> Callable[[TrackingStep], No
         after = now + PROGRESS_EVERY
         low, high = SHARES[step.stage]
         done = low if not step.total else low + (high - low) * min(1.0, step.done / step.total)
-        os.write(target, json.dumps({"done": done, "followed": _followed(step, size)}).encode() + b"\n")
+        line = {"done": done, "observations": _observations(step), "followed": _followed(step, size)}
+        os.write(target, json.dumps(line).encode() + b"\n")
 
     return report
+
+
+def _observations(step: TrackingStep) -> list[int] | None:
+    """Return the numbers of frames and points that the tracks will have, once they are known; a few points may be dropped at the end."""
+    if step.followed is None or step.total is None:
+        return None
+    return [(step.total + 1) // 2, len(step.followed.points)]
 
 
 def _followed(step: TrackingStep, size: tuple[int, int]) -> dict[str, Any] | None:

@@ -98,6 +98,12 @@ def check_film(
     return _answer(FilmFacts, ended, bounds, bounds.check_seconds)
 
 
+OnProgress = Callable[[float, tuple[int, int] | None, FollowedPoints | None], None]
+
+MOST = 1 << 24
+"""Largest number of frames, and of points, that is believed."""
+
+
 def track_film(
     source: FilmSource,
     options: Options,
@@ -105,7 +111,7 @@ def track_film(
     *,
     bounds: FilmBounds = FilmBounds(),  # noqa: B008 - frozen
     threads: int = 1,
-    on_progress: Callable[[float, FollowedPoints | None], None] | None = None,
+    on_progress: OnProgress | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> Tracked:
     """Track a film; `tracks.npz` and `contact_sheet.jpg` are then in the scratch folder.
@@ -119,7 +125,8 @@ def track_film(
     threads : int
         Threads for optical flow.
     on_progress : callable, optional
-        Called with the completed share, in [0, 1], and the points that were just tracked, if any.
+        Called with the completed share, in [0, 1], the numbers of frames and points where they are known, and the points that were just
+        tracked, if any.
     should_stop : callable, optional
         Called ten times a second; the film process is killed once it returns True.
 
@@ -135,12 +142,20 @@ def track_film(
     def on_line(stated: dict[str, Any]) -> None:
         done = stated.get("done")
         if on_progress is not None and isinstance(done, int | float) and 0 <= done <= 1:
-            on_progress(float(done), _followed(stated.get("followed")))
+            on_progress(float(done), _size(stated.get("observations")), _followed(stated.get("followed")))
 
     ended = _run("track", source, options, bounds, scratch, threads=threads, on_line=on_line, should_stop=should_stop)
     if ended.stopped:
         raise Interrupted
     return _answer(Tracked, ended, bounds, bounds.track_seconds)
+
+
+def _size(stated: object) -> tuple[int, int] | None:
+    """Take over numbers of frames and points that the film process states; None for anything else."""
+    match stated:
+        case [int(frames), int(points)] if 0 < frames <= MOST and 0 < points <= MOST:
+            return frames, points
+    return None
 
 
 def _followed(stated: object) -> FollowedPoints | None:

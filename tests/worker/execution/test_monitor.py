@@ -17,7 +17,7 @@ from pliant.solver import InvalidInput
 from pliant.worker.errors import StoreUnavailable
 from pliant.worker.execution.failures import how_it_ended, out_of_memory, problem_of, timed_out
 from pliant.worker.execution.monitor import Patience, Reason, Watch, finalize
-from pliant.worker.execution.progress import SHARES, Reporter
+from pliant.worker.execution.progress import FILM_SHARES, SHARES, Reporter
 from pliant.worker.execution.workdir import OUTPUT, working_directory
 from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.service import Jobs
@@ -276,6 +276,22 @@ def test_stated_seconds_decide_fraction_and_time_left() -> None:
     assert told[-1].seconds_left == pytest.approx(0.5 * (1 + 4))
     reporter.part("exporting", 1.0)
     assert (told[-1].seconds_left, told[-1].fraction) == (0.0, 1.0)
+
+
+def test_a_film_is_tracked_and_then_solved_for_as_long_as_planned() -> None:
+    told: list[Progress] = []
+    time = [0.0]
+    reporter = Reporter(told.append, clock=lambda: time[0], shares=FILM_SHARES)
+    reporter.part("track", 0.0)
+    time[0] = 2.0
+    reporter.following_seconds = 20.0
+    reporter.part("track", 0.25)
+    assert (told[-1].seconds_left, told[-1].fraction) == (26.0, pytest.approx(2 / 28))
+    time[0] = 8.0
+    reporter.part("loading", 1.0)
+    assert (told[-1].seconds_left, told[-1].fraction) == (20.0, pytest.approx(8 / 28))
+    reporter.part("solving", 0.1, stage="cameras", seconds_left=17.0)
+    assert told[-1].seconds_left == 17.0, "then the solver knows better"
 
 
 def test_silence_is_filled_with_the_seconds_counted_down() -> None:
