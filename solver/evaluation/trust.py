@@ -200,7 +200,7 @@ def _doubts(modes: int, frames: int, *, off: float | None, turn: float | None) -
         )
         found.append((Verdict.WITH_CARE, sentence))
     if off is not None:
-        sentence = f"The tracks are those of a thin sheet, here {_percent(off)} of its size off its plane; how it bends hardly shows."
+        sentence = f"A thin sheet, {_percent(off)} of its size off its plane; the motion hardly shows bending."
         found.append((Verdict.WITH_CARE, sentence))
     if turn is not None:
         sentence = (

@@ -56,7 +56,7 @@ def test_a_result_without_reasons_against_it_is_good() -> None:
             "may be as large as 200 % of the object's size",
         ),
         ({"visible": np.eye(FRAMES, POINTS) + np.eye(FRAMES, POINTS, 12)}, Verdict.DO_NOT_USE, "are not seen"),
-        ({"planar": True}, Verdict.WITH_CARE, "of a thin sheet, here 45 % of its size off its plane"),
+        ({"planar": True}, Verdict.WITH_CARE, "A thin sheet, 45 % of its size off its plane"),
         ({"depth_is_typical": True}, Verdict.WITH_CARE, "With 60° of turn the tracks hardly show"),
         ({"modes": 7}, Verdict.WITH_CARE, "7 modes of deformation in 12 frames"),
         (
