@@ -145,7 +145,7 @@ export class Viewer {
     const corner = h("div", { class: "corner" }, full, button("Help", () => openHelp(this.holder)));
     const thinned = preview.header.frame_stride > 1 ? `Every ${ordinal(preview.header.frame_stride)} frame is shown; the files contain all frames.` : "";
     const note = h("p", { class: "hint", hidden: !thinned }, thinned);
-    const main = h("div", { class: "stage-main" }, corner, this.panes, this.legend, this.comparison.summary, time, note, this.trouble);
+    const main = h("div", { class: "stage-main" }, corner, this.panes, this.legend, this.comparison.summary, time, note, this.mirrored, this.trouble);
     this.holder.replaceChildren(main, this.tools());
   }
 
@@ -184,7 +184,6 @@ export class Viewer {
           toggle(this.film ? "Film beside" : "Tracks beside", (on) => void this.beside(on), "beside", this.film !== null),
           preview.faces.length > 0 && toggle("Mesh over it", (on) => void this.meshOver(on), "over"),
         ),
-        this.mirrored,
       ),
       paceControls(this.player),
       group("Point", this.probe.element),
