@@ -103,7 +103,7 @@ class Batch:
     url: str
     """Address of the service."""
     session: Session
-    """Is told which jobs Ctrl-C would leave."""
+    """Its `following` and `others` name the jobs that continue after Ctrl-C."""
     rows: list[Row] = field(default_factory=list)
 
     def check(self, *, name: str, job_id: str | None, region: Path | None) -> None:

@@ -27,11 +27,11 @@ from pliant.solver.errors import InvalidInput
 from pliant.tracking import open_film
 from pliant.tracking.contact_sheet import small_jpeg
 from pliant.worker.errors import Interrupted, TimedOut
-from pliant.worker.execution.film import reconstruct_film
+from pliant.worker.execution.film import reconstruct_film, solving_seconds
 from pliant.worker.films import frame_strip, tracker
 from pliant.worker.films.inputs import read_tracked
 from pliant.worker.films.sources import FilmBounds, FilmSource, is_source, looks_like_film, open_source, save_source
-from pliant.worker.films.tracker import Tracked, check_film, described, film_options, track_film
+from pliant.worker.films.tracker import Tracked, believed_size, check_film, described, film_options, track_film
 from pliant.worker.formats import Inputs
 from pliant.worker.processes.contained import MAX_LINE, Ended, _Progress
 from pliant.worker.processes.no_network import forbid_network
@@ -330,3 +330,17 @@ def test_progress_is_passed_on_and_invalid_lines_dropped() -> None:
             os.write(progress.target, piece)
             progress.read()
     assert heard == [{"done": 0.5}, {"done": 0.7}, {"done": 1}]
+
+
+@pytest.mark.parametrize(
+    "stated", [None, [30], [30, 0], [30, -1], [30, 1.5], [30, 1 << 30], ["30", "900"], {"frames": 30}]
+)
+def test_only_plausible_sizes_are_believed(stated: object) -> None:
+    assert believed_size(stated) is None
+    assert believed_size([30, 900]) == (30, 900)
+
+
+def test_the_plan_of_a_film_includes_the_search_for_an_isometric_surface() -> None:
+    free, auto = (solving_seconds(30, 900, Options(surface=surface)) for surface in ("free", "auto"))
+    assert 1 < free < auto
+    assert solving_seconds(60, 900, Options(surface="free")) > free

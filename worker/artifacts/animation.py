@@ -124,8 +124,8 @@ def _modes(shapes: Floats, y_axis: str, most: int) -> Animation:
 def leading(gram: Floats, most: int) -> Floats:
     """Return the eigenvectors of the largest eigenvalues of a Gram matrix, as columns, largest first.
 
-    Of long films by subspace iteration (Halko, Martinsson, Tropp, "Finding structure with randomness", 2011, algorithm 4.4): LAPACK
-    would hold the interpreter's lock for 2 s at 3,000 frames, in which nothing reports progress.
+    Of long films by subspace iteration (Halko, Martinsson, Tropp, "Finding structure with randomness", 2011, algorithm 4.4): SciPy's
+    `eigh` holds the interpreter's lock, at 3,000 frames for 2 s, in which no thread can report progress.
     """
     frames = len(gram)
     if frames <= MAX_FRAME_TARGETS:

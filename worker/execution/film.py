@@ -10,6 +10,7 @@ from pathlib import Path
 
 from pliant.schemas.job import Artifact, FollowedPoints, Progress
 from pliant.schemas.options import Options
+from pliant.solver.reconstruction.surface import tries_isometry
 from pliant.solver.stages import planned
 from pliant.worker.artifacts import described, kinds_for
 from pliant.worker.errors import Interrupted
@@ -81,7 +82,7 @@ def reconstruct_film(
 
         def told(done: float, size: tuple[int, int] | None, followed: FollowedPoints | None) -> None:
             if size is not None:
-                reporter.following_seconds = _solving_seconds(*size, options)
+                reporter.following_seconds = solving_seconds(*size, options)
             reporter.part("track", done, followed=followed)
 
         try:
@@ -108,10 +109,11 @@ def reconstruct_film(
     )
 
 
-def _solving_seconds(frames: int, points: int, options: Options) -> float:
-    """Return the planned time of a solve; the size of the picture is known, so that isometric surfaces are tried."""
-    settings = solver_settings(options)
-    stages = planned(frames, points, gaussian=settings.gaussian, known_cameras=False, sheet=settings.surface != "free")
+def solving_seconds(frames: int, points: int, options: Options) -> float:
+    """Return the planned time of the solve of a film's tracks, which have the size of its pictures."""
+    settings = replace(solver_settings(options), image_size=(1.0, 1.0))  # any size: only whether it is known matters
+    sheet = tries_isometry(None, settings)
+    stages = planned(frames, points, gaussian=settings.gaussian, known_cameras=False, sheet=sheet)
     return sum(stage.seconds for stage in stages)
 
 

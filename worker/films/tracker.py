@@ -142,7 +142,7 @@ def track_film(
     def on_line(stated: dict[str, Any]) -> None:
         done = stated.get("done")
         if on_progress is not None and isinstance(done, int | float) and 0 <= done <= 1:
-            on_progress(float(done), _size(stated.get("observations")), _followed(stated.get("followed")))
+            on_progress(float(done), believed_size(stated.get("observations")), _followed(stated.get("followed")))
 
     ended = _run("track", source, options, bounds, scratch, threads=threads, on_line=on_line, should_stop=should_stop)
     if ended.stopped:
@@ -150,8 +150,8 @@ def track_film(
     return _answer(Tracked, ended, bounds, bounds.track_seconds)
 
 
-def _size(stated: object) -> tuple[int, int] | None:
-    """Take over numbers of frames and points that the film process states; None for anything else."""
+def believed_size(stated: object) -> tuple[int, int] | None:
+    """Return the numbers of frames and points that the film process states; None for anything else, since the process is not trusted."""
     match stated:
         case [int(frames), int(points)] if 0 < frames <= MOST and 0 < points <= MOST:
             return frames, points
