@@ -168,7 +168,7 @@ def submitted(client: Client) -> Jobs:
         rest = face(24, 900, degrees=50)
         render_film(rest, size=(320, 240), paint=face_paint(900)).write(path)
         corners = [[160 + 62 * np.cos(turn), 120 + 82 * np.sin(turn)] for turn in np.linspace(0, 6, 24)]
-        film = client.submit(film=path, name="talking", options={"region_polygon": corners})
+        film = client.submit(film=path, name="talking", options={"region_polygon": corners, "region_frame": 12})
         film.wait(timeout=PATIENCE / 1000, load=False)
     shared = client.share(good).path
     long = face(200, 3000, degrees=40)
