@@ -85,8 +85,9 @@ LOAD_SECONDS, LOAD_PRIOR = 20.0, 1.0
 OWN_PACE = 4.0
 """Weight of a stage's own pace, per completed share of it, beside that of all stages: its units take about the same time."""
 
-GIVEN_ROTATIONS = 1.56
-"""Length of the stage `scales` where rotations are given, which has a third start, against that where they are estimated: 1,283 units."""
+GIVEN_ROTATIONS = (1.56, 1.6)
+"""Units of the stage `scales` where rotations are given, which has a third start, against those where they are estimated, and time of a
+unit against one there: 1,283 units; measured for 30, 60 and 99 frames."""
 
 UNITS_PER_START = 348
 """Units that one starting point of the stage `starts` takes."""
@@ -162,7 +163,8 @@ def learning(frames: int, *, gaussian: bool, known_cameras: bool, known_scales: 
 
 
 def _longer(scales: Stage) -> Stage:
-    return replace(scales, seconds=GIVEN_ROTATIONS * scales.seconds, units=round(GIVEN_ROTATIONS * scales.units))
+    units, cost = GIVEN_ROTATIONS
+    return replace(scales, seconds=units * cost * scales.seconds, units=round(units * scales.units))
 
 
 def stage_of(name: str, frames: int) -> Stage:

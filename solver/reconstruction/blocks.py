@@ -232,8 +232,10 @@ class _Whole:
         """Return the solution of all points, centred per frame where the cameras are orthographic."""
         first, camera = self._parts[0], self._parts[0].camera
         if camera.focal is None:
-            middle = np.stack([shape.mean(axis=0) for shape in self._shapes])
+            middle = np.zeros((len(self._shapes), 3))
             for shape, mean in zip(self._shapes, middle, strict=True):
+                pulse()
+                mean[:] = shape.mean(axis=0)
                 shape -= mean
             moved = camera.scales[:, None] * np.einsum("fij,fj->fi", camera.rotations[:, :2], middle)
             camera = replace(camera, translations=camera.translations + moved)

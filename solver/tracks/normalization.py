@@ -78,5 +78,12 @@ def _near(tracks: Tracks, seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
             middle = np.median(tracks.points[frame, mask], axis=0)
             radius[frame] = np.hypot(*(tracks.points[frame] - middle).T)
     pulse()
-    near &= radius <= MAX_MEDIAN_RADII * np.median(radius[seen])
+    near &= radius <= MAX_MEDIAN_RADII * _median(radius[seen])
     return near if near.any() else seen
+
+
+def _median(values: Floats) -> float:
+    """Return the median of finite `values (N,)`, which are reordered; `np.median` takes three times as long for 40 million."""
+    lower, upper = (values.size - 1) // 2, values.size // 2
+    values.partition((lower, upper))
+    return float((values[lower] + values[upper]) / 2)
