@@ -18,7 +18,7 @@ RESULT_FILES = ("shapes.npz", "report.json")
 
 
 def input_file(path: Path | None, name: str) -> None:
-    """Check that a file given on the command line can be read.
+    """Check that a file given on the command line can be read. Expanding ``~`` is up to the shell, as for other commands.
 
     Raises
     ------
@@ -26,11 +26,11 @@ def input_file(path: Path | None, name: str) -> None:
         It is missing, a folder, or not readable.
     """
     from pliant.client.errors import BadArgument
-    from pliant.client.multipart import existing_file, expanded
+    from pliant.client.multipart import existing_file
 
     if path is None:
         return
-    if not expanded(path, name).exists():
+    if not path.exists():
         raise BadArgument(f"{name}: expected a file, got no file at {path}. Check the path.")
     existing_file(path, name)
 
@@ -44,11 +44,10 @@ def mesh_file(mesh: str | None) -> None:
         It is none of them.
     """
     from pliant.client.errors import BadArgument
-    from pliant.client.multipart import expanded
 
     if mesh is None or re.fullmatch(r"none|\s*\d{1,6}\s*x\s*\d{1,6}\s*", mesh.lower()) is not None:
         return
-    if not expanded(mesh, "mesh").exists():
+    if not Path(mesh).exists():
         raise BadArgument(
             f"mesh: expected a mesh file, ROWSxCOLUMNS or none, got no file at {mesh}. "
             "Check the path, or give a grid size such as 48x64."

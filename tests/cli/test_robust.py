@@ -75,7 +75,6 @@ NO_PICTURES = (
     "Give the path of a file in it."
 )
 A_FILE = "--output: expected a folder, got the file TRACKS. Choose another folder."
-NOBODY = "and ~nosuchuser is nobody's home directory. Write out the whole path."
 LISTED = "`pliant options` lists every option."
 
 
@@ -113,16 +112,14 @@ LISTED = "`pliant options` lists every option."
             "submit FOLDER/**.npz",
             "FOLDER/**.npz: expected a pattern of one folder's files, got **. Write a single * for any characters.",
         ),
-        *(
-            (f"{command} -o OUT", f"{name}: expected a path, got ~nosuchuser/{file}, {NOBODY}")
-            for command, name, file in (
-                ("solve ~nosuchuser/x.npz", "tracks", "x.npz"),
-                ("submit ~nosuchuser/x.npz", "tracks", "x.npz"),
-                ("submit ~nosuchuser/x.npz TRACKS", "tracks", "x.npz"),
-                ("solve TRACKS -m ~nosuchuser/x.obj", "mesh", "x.obj"),
-                ("track FILM --region ~nosuchuser/x.png", "--region", "x.png"),
-            )
+        ("solve ~nosuchuser/x.npz -o OUT", f"tracks: {NO_FILE} ~nosuchuser/x.npz. Check the path."),
+        ("submit ~/x.npz", f"tracks: {NO_FILE} ~/x.npz. Check the path."),
+        (
+            "solve TRACKS -m ~nosuchuser/x.obj -o OUT",
+            "mesh: expected a mesh file, ROWSxCOLUMNS or none, got no file at ~nosuchuser/x.obj. "
+            "Check the path, or give a grid size such as 48x64.",
         ),
+        ("track FILM -o OUT --region ~nosuchuser/x.png", f"--region: {NO_FILE} ~nosuchuser/x.png. Check the path."),
         (
             "list -s done",
             "--status: expected one of queued, running, cancelling, succeeded, failed, cancelled, got 'done'.",
