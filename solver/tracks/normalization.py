@@ -52,10 +52,11 @@ def normalize(tracks: Tracks) -> Normalized:
     mean = np.einsum("fp,fpc->fc", weight, tracks.points)
     mean[shown] /= total[shown, None]
     centroid = between(np.flatnonzero(shown), mean[shown], tracks.num_frames)
+    points = np.zeros(tracks.points.shape)
+    for frame, mask in enumerate(seen):
+        pulse()
+        points[frame, mask] = tracks.points[frame, mask] - centroid[frame]
     pulse()
-    points = tracks.points - centroid[:, None]
-    pulse()
-    points[~seen] = 0.0
     unit = float(np.sqrt(np.einsum("fp,fpc,fpc->", weight, points, points) / total.sum()))
     if not unit > 1e-12 * max(float(np.abs(centroid).max()), np.finfo(float).tiny):
         raise InvalidInput(

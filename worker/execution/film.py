@@ -10,6 +10,7 @@ from pathlib import Path
 
 from pliant.schemas.job import Artifact, FollowedPoints, Progress
 from pliant.schemas.options import Options
+from pliant.solver.pace import MachinePace
 from pliant.solver.reconstruction.surface import tries_isometry
 from pliant.solver.stages import planned
 from pliant.worker.artifacts import described, kinds_for
@@ -75,14 +76,14 @@ def reconstruct_film(
     """
     kinds_for(options)
     reporter = Reporter(on_progress if on_progress is not None else silent, shares=FILM_SHARES)
-    halt = Halt(should_stop, options.time_limit)
+    halt, pace = Halt(should_stop, options.time_limit), MachinePace()
     with reporter.ticking():
         reporter.part("track", 0.0)
         began = time.perf_counter()
 
         def told(done: float, size: tuple[int, int] | None, followed: FollowedPoints | None) -> None:
             if size is not None:
-                reporter.following_seconds = solving_seconds(*size, options)
+                reporter.following_seconds = pace.measure() * solving_seconds(*size, options)
             reporter.part("track", done, followed=followed)
 
         try:
@@ -110,7 +111,7 @@ def reconstruct_film(
 
 
 def solving_seconds(frames: int, points: int, options: Options) -> float:
-    """Return the planned time of the solve of a film's tracks, which have the size of its pictures."""
+    """Return the planned time of the solve of a film's tracks, which have the size of its pictures, at a `MachinePace` of 1."""
     settings = replace(solver_settings(options), image_size=(1.0, 1.0))  # any size: only whether it is known matters
     sheet = tries_isometry(None, settings)
     stages = planned(frames, points, gaussian=settings.gaussian, known_cameras=False, sheet=sheet)
