@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from pliant.solver.descent import Descent
 from pliant.solver.records import Step
-from pliant.solver.stages import PACE_PRIOR, Load, Pace, Stage
+from pliant.solver.stages import Load, Pace, Stage
 
 MIN_FRACTION_STEP = 0.002
 """Least increase of the fraction that is reported on its own: at most 500 calls of `on_step` besides those of the
@@ -41,8 +41,6 @@ class Monitor:
         What is known about the reweightings before they begin.
     seconds_per_iteration : float
         Planned time of an iteration of conjugate gradients.
-    pace : float
-        Time over the planned one on this machine, until the first stages have shown it; see `MachinePace`.
     clock : callable
         Monotonic seconds.
     work : callable
@@ -58,7 +56,6 @@ class Monitor:
         plan: Sequence[Stage] = (Stage("shapes", 1.0, 1000),),
         descent: Descent | None = None,
         seconds_per_iteration: float = 0.0,
-        pace: float = 1.0,
         clock: Callable[[], float] = time.monotonic,
         work: Callable[[], float] = time.process_time,
     ) -> None:
@@ -69,7 +66,7 @@ class Monitor:
         self._reported = clock()
         self._done, self._current, self._ahead = 0.0, plan[0], list(plan[1:])
         self._units, self._share, self._blocks = 0, 0.0, False
-        self._pace, self._load = Pace(work(), measured=pace * PACE_PRIOR), Load(clock(), work())
+        self._pace, self._load = Pace(work()), Load(clock(), work())
         self._descent = Descent() if descent is None else descent
         self._seconds_per_iteration = seconds_per_iteration
 

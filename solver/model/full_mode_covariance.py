@@ -25,9 +25,9 @@ from dataclasses import dataclass
 import numpy as np
 from pliant.solver.model.camera_motion_prior import rotation_roughness, scale_roughness
 from pliant.solver.model.image_density import ImageModel, terms
-from pliant.solver.model.marginal_likelihood import UNLIKELY, Scene, cameras_of, root_matrix
+from pliant.solver.model.marginal_likelihood import UNLIKELY, Scene, cameras_and_jacobian, cameras_of, root_matrix
 from pliant.solver.model.shape_covariance import ShapeCovariance
-from pliant.solver.model.so3 import left_jacobian, vee
+from pliant.solver.model.so3 import vee
 from pliant.solver.records import Floats
 from scipy.optimize import minimize
 
@@ -117,7 +117,7 @@ def energy(scene: Scene, axis_covariance: Floats, basis: Basis) -> tuple[float, 
         Where.
     """
     frames, size = basis.weights.shape
-    rotations, scales = cameras_of(scene, basis)
+    rotations, scales, jacobian = cameras_and_jacobian(scene, basis)
     projections = rotations[:, :2] * scales[:, None, None]
     root = root_matrix(axis_covariance)
     shapes = np.einsum("fk,fid->fikd", basis.weights, projections).reshape(2 * frames, 3 * size)
@@ -138,7 +138,7 @@ def energy(scene: Scene, axis_covariance: Floats, basis: Basis) -> tuple[float, 
     by_rotations *= scene.prior_weight
     by_rotations[:, :2] += by_projections * scales[:, None, None]
     gradient = Basis(
-        np.einsum("fji,fj->fi", left_jacobian(basis.turns), vee(by_rotations @ np.swapaxes(rotations, 1, 2))),
+        np.einsum("fji,fj->fi", jacobian, vee(by_rotations @ np.swapaxes(rotations, 1, 2))),
         (by_logs - by_logs.mean()) * scene.with_scales,
         np.einsum("fikd,fid->fk", by_shapes, projections),
         shapes.T @ found.by_columns,

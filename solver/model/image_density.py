@@ -21,10 +21,11 @@ residuals instead of differences of large numbers, so that a small σ costs no d
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from pliant.solver.model.random_walk import WalkPosterior, random_walk
-from pliant.solver.records import Floats
+from pliant.solver.records import Floats, read_only
 from scipy import linalg
 from scipy.linalg import lapack
 
@@ -61,8 +62,8 @@ class ImageModel:
         """Return V, shape `(2F, 2F)`."""
         rows = self.walk.reshape(-1, 3)
         image: Floats = self.columns @ self.columns.T
-        image += (rows @ rows.T) * _doubled(self.walk_variance * random_walk(len(self.walk), self.ordered))
-        image[np.diag_indices(len(rows))] += self.noise_variance
+        image += (rows @ rows.T) * (self.walk_variance * _wide_walk(len(self.walk), self.ordered))
+        image.flat[:: len(rows) + 1] += self.noise_variance
         return image
 
 
@@ -118,7 +119,7 @@ def dense_terms(model: ImageModel, factor: Floats) -> Terms:
     explained = inverse @ factor
     value = 0.5 * (log_det + float(np.einsum("ij,ij->", explained, factor))) / frames
     slope = (inverse - explained @ explained.T) * (0.5 / frames)
-    walked = slope * _doubled(model.walk_variance * random_walk(frames, model.ordered))
+    walked = slope * (model.walk_variance * _wide_walk(frames, model.ordered))
     by_walk = 2 * (walked @ model.walk.reshape(-1, 3)).reshape(frames, 2, 3)
     return Terms(
         value, 2 * slope @ model.columns, by_walk, float(np.trace(slope)),
@@ -237,7 +238,7 @@ def inverted(matrix: Floats) -> tuple[Floats, float]:
     if not np.isfinite(log_det):
         raise np.linalg.LinAlgError("the covariance of the images is not positive definite")
     inverse = np.asarray(lapack.dpotri(factor, lower=1, overwrite_c=1)[0])
-    inverse[np.diag_indices(len(inverse))] /= 2  # above the diagonal, the factor has zeros
+    inverse.flat[:: len(inverse) + 1] /= 2  # above the diagonal, the factor has zeros
     return inverse + inverse.T, log_det
 
 
@@ -252,6 +253,9 @@ def _solved(walk: WalkPosterior, model: ImageModel, columns: Floats) -> tuple[Fl
     return rest.reshape(columns.shape), means
 
 
-def _doubled(matrix: Floats) -> Floats:
-    """Return the matrix over frames as one over image coordinates, shape `(2F, 2F)`."""
-    return np.repeat(np.repeat(matrix, 2, axis=0), 2, axis=1)
+@lru_cache(maxsize=8)
+def _wide_walk(frames: int, ordered: bool) -> Floats:
+    """Return T over image coordinates, shape `(2F, 2F)`, read-only."""
+    wide = np.repeat(np.repeat(random_walk(frames, ordered), 2, axis=0), 2, axis=1)
+    read_only(wide)
+    return wide

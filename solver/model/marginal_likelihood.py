@@ -26,7 +26,7 @@ from typing import Protocol
 import numpy as np
 from pliant.solver.model.camera_motion_prior import rotation_roughness, scale_roughness
 from pliant.solver.model.image_density import ImageModel, factor_of, inverted, terms
-from pliant.solver.model.so3 import exponential, left_jacobian, vee
+from pliant.solver.model.so3 import exponential_and_jacobian, vee
 from pliant.solver.records import Floats
 from scipy.optimize import minimize
 
@@ -171,9 +171,15 @@ class Moved(Protocol):
 
 def cameras_of(scene: Scene, motion: Moved) -> tuple[Floats, Floats]:
     """Return rotations (F, 3, 3) and scales (F,), mean logarithm 0."""
-    rotations = exponential(motion.turns) @ scene.rotations
-    logs = motion.log_scales - motion.log_scales.mean() if scene.with_scales else np.zeros(len(rotations))
-    return rotations, np.exp(logs)
+    rotations, scales, _ = cameras_and_jacobian(scene, motion)
+    return rotations, scales
+
+
+def cameras_and_jacobian(scene: Scene, motion: Moved) -> tuple[Floats, Floats, Floats]:
+    """Return the same and the left Jacobians of the turns, shape `(F, 3, 3)`."""
+    turned, jacobian = exponential_and_jacobian(motion.turns)
+    logs = motion.log_scales - motion.log_scales.mean() if scene.with_scales else np.zeros(len(turned))
+    return turned @ scene.rotations, np.exp(logs), jacobian
 
 
 def covariances_of(scene: Scene, motion: Motion) -> tuple[Floats, Floats, float, float]:
@@ -186,12 +192,14 @@ def covariances_of(scene: Scene, motion: Motion) -> tuple[Floats, Floats, float,
 def image_of(scene: Scene, motion: Motion) -> ImageModel:
     """Return the covariance of the images in factored form."""
     rotations, scales = cameras_of(scene, motion)
-    projections = rotations[:, :2] * scales[:, None, None]
-    root0, root1 = _root(motion.mean_root), _root(motion.axis_root)
+    return _image(scene, motion, rotations[:, :2] * scales[:, None, None])
+
+
+def _image(scene: Scene, motion: Motion, projections: Floats) -> ImageModel:
     noise, walk_variance = np.exp(2 * motion.logs)
-    walk = projections @ root1
+    walk = projections @ _root(motion.axis_root)
     columns = np.concatenate(
-        [(projections @ root0)[:, :, None], motion.modes[:, None, :, None] * walk[:, :, None]], axis=2
+        [(projections @ _root(motion.mean_root))[:, :, None], motion.modes[:, None, :, None] * walk[:, :, None]], axis=2
     )
     return ImageModel(
         columns.reshape(2 * len(projections), -1), walk, float(noise) + scene.noise_std_floor**2, float(walk_variance),
@@ -217,14 +225,14 @@ def energy(scene: Scene, motion: Motion) -> tuple[float, Motion]:
     vector.
     """
     frames = len(scene.rotations)
-    rotations, scales = cameras_of(scene, motion)
+    rotations, scales, jacobian = cameras_and_jacobian(scene, motion)
     projections = rotations[:, :2] * scales[:, None, None]
     root0, root1 = _root(motion.mean_root), _root(motion.axis_root)
     noise, walk_variance = np.exp(2 * motion.logs)
     try:
         if walk_variance == 0:  # underflow
             raise np.linalg.LinAlgError("no random walk is left")
-        model = image_of(scene, motion)
+        model = _image(scene, motion, projections)
         found = terms(model, scene.factor)
     except np.linalg.LinAlgError:
         return UNLIKELY, Motion.unflat(np.zeros_like(motion.flat()), frames)
@@ -239,7 +247,7 @@ def energy(scene: Scene, motion: Motion) -> tuple[float, Motion]:
     by_rotations[:, :2] += by_projections * scales[:, None, None]
     turned = vee(by_rotations @ np.swapaxes(rotations, 1, 2))
     gradient = Motion(
-        np.einsum("fji,fj->fi", left_jacobian(motion.turns), turned),
+        np.einsum("fji,fj->fi", jacobian, turned),
         (by_logs - by_logs.mean()) * scene.with_scales,
         by_modes + np.einsum("fikc,fic->fk", by_columns[:, :, 1:], model.walk),
         np.einsum("fic,fid->cd", projections, by_columns[:, :, 0])[LOWER],

@@ -59,11 +59,12 @@ def logarithm(rotations: Floats) -> Floats:
     return np.asarray(axis * angle[..., None])
 
 
-def left_jacobian(vectors: Floats) -> Floats:
-    """Return J with exp(v + dv) = exp(J dv) exp(v) to first order, shape `(..., 3, 3)`."""
-    _, second, third = _coefficients(vectors)
-    skew = hat(vectors)
-    return np.eye(3) + second * skew + third * (skew @ skew)
+def exponential_and_jacobian(vectors: Floats) -> tuple[Floats, Floats]:
+    """Return exp(v) and its left Jacobian J, exp(v + dv) = exp(J dv) exp(v) to first order, shapes `(..., 3, 3)`."""
+    first, second, third = _coefficients(vectors)
+    skew, identity = hat(vectors), np.eye(3)
+    square = skew @ skew
+    return identity + first * skew + second * square, identity + second * skew + third * square
 
 
 def from_rows(rows: Floats) -> Floats:

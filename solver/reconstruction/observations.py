@@ -14,7 +14,6 @@ from pliant.solver.errors import InvalidInput
 from pliant.solver.limits import frame_chunks
 from pliant.solver.mesh import Mesh
 from pliant.solver.monitor import Monitor
-from pliant.solver.pace import MachinePace
 from pliant.solver.records import KnownCamera, Step, Tracks
 from pliant.solver.settings import Settings
 from pliant.solver.stages import iteration_seconds, planned, unseen_frames
@@ -166,5 +165,4 @@ def monitored(
         on_step, should_stop, plan=[stage for stage in plan if not only or stage.name in only],
         descent=Descent(unseen, settings.tolerance, settings.max_reweightings),
         seconds_per_iteration=iteration_seconds(tracks.num_frames, tracks.num_points, gaussian=settings.gaussian),
-        pace=MachinePace().measure(),
     )  # fmt: skip

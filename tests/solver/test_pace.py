@@ -3,10 +3,7 @@
 import numpy as np
 import pytest
 from pliant.solver import pace
-from pliant.solver.gallery import face
 from pliant.solver.pace import PIECE_SECONDS, PIECES, MachinePace
-from pliant.solver.reconstruct import solve
-from pliant.solver.records import Step
 
 
 def test_the_pace_is_the_measured_time_over_the_planned_one_averaged(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -19,14 +16,3 @@ def test_the_pace_is_the_measured_time_over_the_planned_one_averaged(monkeypatch
 
 def test_a_machine_has_a_pace() -> None:
     assert 0.02 < MachinePace().measure() < 200
-
-
-def test_a_solve_on_a_slower_machine_is_expected_to_take_longer(monkeypatch: pytest.MonkeyPatch) -> None:
-    def first_estimate(measured: float) -> float:
-        monkeypatch.setattr(MachinePace, "measure", lambda self: measured)
-        steps: list[Step] = []
-        solve(face(8, 40).tracks, on_step=steps.append, should_stop=lambda: True)
-        assert steps[0].seconds_left is not None
-        return steps[0].seconds_left
-
-    assert first_estimate(4.0) > 2 * first_estimate(1.0)

@@ -13,7 +13,7 @@ from pliant.solver.model.camera_motion_prior import SCALE_FLOOR, TURN_FLOOR, rot
 from pliant.solver.model.marginal_likelihood import Motion, Scene, energy, start
 from pliant.solver.model.so3 import (
     exponential,
-    left_jacobian,
+    exponential_and_jacobian,
     logarithm,
     start_at_identity,
 )
@@ -129,7 +129,9 @@ def test_the_exponential_map_and_its_jacobian() -> None:
     random = np.random.default_rng(0)
     vector, small = random.normal(size=3), 1e-6 * random.normal(size=3)
     np.testing.assert_allclose(exponential(vector) @ exponential(-vector), np.eye(3), atol=1e-14)
-    moved = exponential(left_jacobian(vector) @ small) @ exponential(vector)
+    turned, jacobian = exponential_and_jacobian(vector)
+    np.testing.assert_array_equal(turned, exponential(vector))
+    moved = exponential(jacobian @ small) @ turned
     np.testing.assert_allclose(exponential(vector + small), moved, atol=1e-11)
 
 
