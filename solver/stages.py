@@ -18,13 +18,13 @@ UNIT_SECONDS, FRAME_SECONDS = 7e-5, 1.3e-5
 """Seconds per unit of work, and per unit and frame, on one core: .2 ms at 10 frames, .46 at 30, .7 at 48, 1 at 74. The other times
 below are of the same core."""
 
-ITERATION_SETUP, ITERATION_SECONDS = 3.7e-3, {True: 5.3e-8, False: 4e-8}
-"""Seconds per unit of a reweighting, whatever the size, and further ones per frame and point, with and without a learned prior; measured
-for 40 × 800, 60 × 4,000, 60 × 10,000, 99 × 6,000 and 50 × 30,000."""
+ITERATION_FRAME_SECONDS, ITERATION_SECONDS = 3e-5, {True: 5.3e-8, False: 4e-8}
+"""Seconds per unit of a reweighting and frame, whatever the number of points, and further ones per frame and point, with and without a
+learned prior; measured for 40 × 800, 60 × 4,000, 99 × 600, 99 × 6,000, 300 × 300, 1,000 × 300 and 3,000 × 300: within 40 %."""
 
-SETUP_SECONDS, START_SECONDS, START_UNITS = 0.1, 8e-7, 9
-"""Of the start of the shapes: seconds of any, further ones per frame and point, and its units. Measured for 10 × 20,000, 60 × 4,000,
-50 × 30,000 and 50 × 100,000: 7e-7 to 1.1e-6 seconds, 9 units."""
+START_FRAME_SECONDS, START_SECONDS, START_UNITS = 5e-4, 8e-7, 9
+"""Of the start of the shapes: seconds per frame, further ones per frame and point, and its units. Measured for the same sizes and
+50 × 100,000."""
 
 FINISH_SECONDS = 3e-7
 """Seconds per frame and point of the solution in the tracks' unit and of the probabilities; measured for 50 × 30,000 and 50 × 100,000."""
@@ -71,6 +71,10 @@ UNITS = {
 }
 """Stages of the default prior: typical number of units, maximum number of frames used, and cost of a unit against that of an iteration.
 Measured on sequences of 10 to 80 frames, clean and spoiled."""
+
+CUBIC_FRAMES = {"covariance": 200}
+"""Frames for which a unit takes twice as long as the above says, because it also takes eigenvalues, whose time is cubic in the frames:
+1.3 times as long for 60 frames, 1.5 for 99, 2.2 for 150, 2.8 for 360."""
 
 PACE_PRIOR = 0.5
 """Seconds of the plan that count as measured at the planned pace, so that the first units do not decide the pace alone."""
@@ -122,7 +126,7 @@ def planned(
     """
     iterations = expected_iterations(unseen)
     work = expected_reweightings(unseen) * (1 + iterations + OVERHEAD)
-    start = Stage("start", SETUP_SECONDS + START_SECONDS * frames * points, START_UNITS)
+    start = Stage("start", frames * (START_FRAME_SECONDS + START_SECONDS * points), START_UNITS)
     shapes = Stage("shapes", work * iteration_seconds(frames, points, gaussian=gaussian), 100)
     last = [Stage("finish", FINISH_SECONDS * frames * points, 3), *([stage_of("trust", frames)] if gaussian else [])]
     first = [Stage("surface", SURFACE_SECONDS * min(frames, 24), 280, setup=SURFACE_SETUP)] if sheet else []
@@ -136,7 +140,7 @@ def planned(
 
 def iteration_seconds(frames: int, points: int, *, gaussian: bool) -> float:
     """Return the seconds of a unit of a reweighting: an iteration of conjugate gradients, or what else takes about as long."""
-    return ITERATION_SETUP + ITERATION_SECONDS[gaussian] * frames * points
+    return frames * (ITERATION_FRAME_SECONDS + ITERATION_SECONDS[gaussian] * points)
 
 
 def unseen_frames(visible: Floats) -> float:
@@ -170,7 +174,9 @@ def _longer(scales: Stage) -> Stage:
 def stage_of(name: str, frames: int) -> Stage:
     """Return a stage of `UNITS` for so many frames."""
     units, most_frames, cost = UNITS[name]
-    return Stage(name, units * cost * (UNIT_SECONDS + FRAME_SECONDS * min(frames, most_frames)), units)
+    used = min(frames, most_frames)
+    curved = 1 + used / CUBIC_FRAMES[name] if name in CUBIC_FRAMES else 1.0
+    return Stage(name, units * cost * curved * (UNIT_SECONDS + FRAME_SECONDS * used), units)
 
 
 @dataclass(slots=True)
