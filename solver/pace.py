@@ -9,9 +9,9 @@ import numpy as np
 SIZE, PIECES = 60, 5
 """Order of a matrix as in the stage of the cameras for 30 frames, and how often it is inverted for one measurement."""
 
-PIECE_SECONDS = 6.6e-5
-"""Processor seconds of a piece where the stages take as long as planned: six solves of a face of 30 frames, on a machine whose cores were
-taken by others and that took 2.7 to 3.2 times as long, gave 6.1e-5 to 7.1e-5."""
+PIECE_SECONDS = 1e-4
+"""Processor seconds of a piece where the solve of a film takes as long as planned: 7.2e-5 to 1.02e-4 on an idle machine at half the speed
+of the plan's core, with sequences of 30 and 40 frames, and 1.1e-4 beside the two threads of the tracker."""
 
 
 class MachinePace:

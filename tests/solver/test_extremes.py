@@ -83,8 +83,14 @@ def test_only_values_that_are_not_finite_are_hidden(cameras: KnownCamera | None)
 
 
 @EVERY
-@BOTH
-@pytest.mark.parametrize("frames", [[5], [0], [11], [0, 1, 6, 7]], ids=str)
+@pytest.mark.parametrize(
+    ("frames", "cameras"),
+    [
+        *(pytest.param(frames, CAMERAS, id=f"{frames}-known") for frames in ([5], [0], [11], [0, 1, 6, 7])),
+        pytest.param([0, 1, 6, 7], None, id="[0, 1, 6, 7]-estimated"),
+        *(pytest.param(frames, None, id=f"{frames}-estimated", marks=LONG) for frames in ([5], [0], [11])),
+    ],
+)
 def test_frames_that_show_nothing_lie_between_their_neighbours(
     frames: list[int], cameras: KnownCamera | None, method: str
 ) -> None:
