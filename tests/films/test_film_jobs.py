@@ -24,6 +24,7 @@ from pliant.schemas.job import Progress
 from pliant.schemas.options import Options
 from pliant.service.routes.local_result import read_result
 from pliant.solver.errors import InvalidInput
+from pliant.solver.pace import MachinePace
 from pliant.tracking import open_film
 from pliant.tracking.contact_sheet import small_jpeg
 from pliant.worker.errors import Interrupted, TimedOut
@@ -202,6 +203,21 @@ def test_a_film_becomes_shapes_tracks_and_a_contact_sheet(film: Path, region: Pa
         assert sheet.format == "JPEG"
     check_followed(steps, tmp_path / "out")
     check_film_frames(tmp_path / "out", count=10)
+
+
+def test_the_solve_is_planned_at_the_pace_of_the_machine(
+    film: Path, region: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steps: list[Progress] = []
+    (tmp_path / "scratch").mkdir()
+    monkeypatch.setattr(MachinePace, "measure", lambda self: 1000.0)
+    with pytest.raises(Interrupted):
+        reconstruct_film(
+            FilmSource(film, region), Options(surface="free"), tmp_path / "out", scratch=tmp_path / "scratch",
+            on_progress=steps.append, should_stop=lambda: any(each.seconds_left for each in steps),
+        )  # fmt: skip
+    shown = max(each.seconds_left or 0.0 for each in steps)
+    assert shown > 1000 * solving_seconds(5, 10, Options(surface="free"))
 
 
 def check_followed(steps: list[Progress], folder: Path) -> None:
