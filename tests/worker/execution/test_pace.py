@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from pliant.solver import pace
-from pliant.solver.pace import PIECE_SECONDS, PIECES, MachinePace
+from pliant.worker.execution import pace
+from pliant.worker.execution.pace import PIECE_SECONDS, PIECES, MachinePace
 
 
 def test_the_pace_is_the_measured_time_over_the_planned_one_averaged(monkeypatch: pytest.MonkeyPatch) -> None:
