@@ -10,9 +10,9 @@ SIZE, PIECES = 60, 5
 """Order of a matrix as in the stage of the cameras for 30 frames, and how often it is inverted for one measurement."""
 
 PIECE_SECONDS = 1e-4
-"""Processor seconds of a piece where the solve of a film takes as long as planned. Three solves of 30 and 40 frames with a known image size, on
-an idle machine at half the speed of the plan's core, gave 7.2e-5 to 1.02e-4. The upper end is taken, since the threads of the tracker run
-beside the measurement; chosen on the film of `benchmarks.installation.progress`."""
+"""Processor seconds of a piece where the solve of a film takes as long as planned. Three solves of 30 and 40 frames with a known
+image size, on an idle machine at half the speed of the plan's core, gave 7.2e-5 to 1.02e-4. The upper end is taken, since the
+threads of the tracker run beside the measurement; chosen on the film of `benchmarks.installation.progress`."""
 
 
 class MachinePace:
