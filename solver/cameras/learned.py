@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from pliant.solver.model.expectation_maximisation import learned
-from pliant.solver.model.marginal_likelihood import Motion, Scene, cameras_of, covariances_of, fit, root_of
+from pliant.solver.model.marginal_likelihood import Motion, Scene, cameras_of, covariances_of, fit, metric_of, root_of
 from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.shape_covariance import AXIS_VARIANCE_FLOOR, NOISE_VARIANCE_FLOOR, ShapeCovariance
 from pliant.solver.records import Floats
@@ -146,7 +146,13 @@ def turned_once(
     """Return cameras and covariance of higher likelihood; `factor` as for `scene_at`, `turning` as for `turned`."""
     ordered = found.covariance.ordered
     scene = scene_at(gram, found.rotations, with_scales=with_scales, ordered=ordered, factor=factor)
+    motion = motion_of(scene, found)
     moved = fit(
-        scene, motion_of(scene, found), iterations=ROTATION_ITERATIONS, turning=turning, should_stop=should_stop
+        scene,
+        motion,
+        iterations=ROTATION_ITERATIONS,
+        turning=turning,
+        metric=metric_of(scene, motion),
+        should_stop=should_stop,
     )
     return moved_to(scene, found, *moved)

@@ -20,11 +20,12 @@ the cost does not depend on P.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
 from pliant.solver.model.camera_motion_prior import rotation_roughness, scale_roughness
+from pliant.solver.model.frame_metric import FrameMetric
 from pliant.solver.model.image_density import ImageModel, factor_of, inverted, terms
 from pliant.solver.model.so3 import exponential_and_jacobian, vee
 from pliant.solver.records import Floats
@@ -258,20 +259,35 @@ def energy(scene: Scene, motion: Motion) -> tuple[float, Motion]:
 
 
 def fit(
-    scene: Scene, motion: Motion, *, iterations: int, turning: bool, should_stop: Callable[[], bool] | None = None
+    scene: Scene,
+    motion: Motion,
+    *,
+    iterations: int,
+    turning: bool,
+    metric: FrameMetric | None = None,
+    should_stop: Callable[[], bool] | None = None,
 ) -> tuple[Motion, float]:
     """Return the parameters that minimise the energy, by L-BFGS from `motion`, and the energy reached.
 
-    With `turning` False the rotations stay fixed; everything else, including scales, is fitted. `should_stop` is
-    called after every iteration; once it returns True, the parameters reached so far are returned.
+    With `turning` False the rotations stay fixed; everything else, including scales, is fitted. With a `metric`, steps are
+    taken in its coordinates over the frames. `should_stop` is called after every iteration; once it returns True, the
+    parameters reached so far are returned.
     """
     frames = len(scene.rotations)
     held = 0 if turning else 3 * frames
-    given = motion.flat()
+    size = (
+        1 if metric is None else frames
+    )  # the metric is that of the whole film's likelihood, the energy that of a frame
+    given = (motion if metric is None else _over_frames(metric.coordinates, motion)).flat()
+
+    def parameters(free: Floats) -> Motion:
+        reached = Motion.unflat(np.concatenate([given[:held], free]), frames)
+        return reached if metric is None else _over_frames(metric.parameters, reached)
 
     def objective(free: Floats) -> tuple[float, Floats]:
-        value, gradient = energy(scene, Motion.unflat(np.concatenate([given[:held], free]), frames))
-        return value, gradient.flat()[held:]
+        value, gradient = energy(scene, parameters(free))
+        steepest = gradient if metric is None else _over_frames(metric.gradient, gradient)
+        return size * value, size * steepest.flat()[held:]
 
     def stop_check(xk: Floats) -> None:  # noqa: ARG001 - SciPy calls it by this name
         if should_stop is not None and should_stop():
@@ -281,7 +297,24 @@ def fit(
         objective, given[held:], jac=True, method="L-BFGS-B", callback=stop_check,
         options={"maxiter": iterations, "maxcor": 20},
     )  # fmt: skip
-    return Motion.unflat(np.concatenate([given[:held], np.asarray(found.x)]), frames), float(found.fun)
+    return parameters(np.asarray(found.x)), float(found.fun) / size
+
+
+def metric_of(scene: Scene, motion: Motion) -> FrameMetric:
+    """Return the metric of the likelihood at some parameters, for `fit`."""
+    noise, walk_variance = np.exp(2 * motion.logs)
+    return FrameMetric.of(
+        motion.modes,
+        noise_variance=float(noise) + scene.noise_std_floor**2,
+        walk_variance=float(walk_variance),
+        ordered=scene.ordered,
+    )
+
+
+def _over_frames(change: Callable[[Floats], Floats], motion: Motion) -> Motion:
+    """Return parameters, or a gradient, with turns, scales and modes changed over the frames."""
+    changed = change(np.hstack([motion.turns, motion.log_scales[:, None], motion.modes]))
+    return replace(motion, turns=changed[:, :3], log_scales=changed[:, 3], modes=changed[:, 4:])
 
 
 def root_of(matrix: Floats) -> Floats:
