@@ -275,9 +275,8 @@ def fit(
     """
     frames = len(scene.rotations)
     held = 0 if turning else 3 * frames
-    size = (
-        1 if metric is None else frames
-    )  # the metric is that of the whole film's likelihood, the energy that of a frame
+    # The metric is that of the whole film's likelihood, the energy that of one frame.
+    factor = 1 if metric is None else frames
     given = (motion if metric is None else _over_frames(metric.coordinates, motion)).flat()
 
     def parameters(free: Floats) -> Motion:
@@ -286,8 +285,8 @@ def fit(
 
     def objective(free: Floats) -> tuple[float, Floats]:
         value, gradient = energy(scene, parameters(free))
-        steepest = gradient if metric is None else _over_frames(metric.gradient, gradient)
-        return size * value, size * steepest.flat()[held:]
+        by_coordinates = gradient if metric is None else _over_frames(metric.gradient, gradient)
+        return factor * value, factor * by_coordinates.flat()[held:]
 
     def stop_check(xk: Floats) -> None:  # noqa: ARG001 - SciPy calls it by this name
         if should_stop is not None and should_stop():
@@ -297,7 +296,7 @@ def fit(
         objective, given[held:], jac=True, method="L-BFGS-B", callback=stop_check,
         options={"maxiter": iterations, "maxcor": 20},
     )  # fmt: skip
-    return parameters(np.asarray(found.x)), float(found.fun) / size
+    return parameters(np.asarray(found.x)), float(found.fun) / factor
 
 
 def metric_of(scene: Scene, motion: Motion) -> FrameMetric:
