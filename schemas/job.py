@@ -175,11 +175,17 @@ class Interpretation(Record):
 
 
 class Inspection(Interpretation):
-    """Interpretation of inputs, with a sample of them."""
+    """Interpretation of inputs, with a sample of tracks or the first frame of a film."""
 
     sample: list[list[int]] = Field(
         default_factory=list,
         description="Some points in some frames, for a picture: x and y in turn, 0 to 1000, y down; -1 twice where hidden.",
+    )
+    first_frame: str | None = Field(
+        None,
+        description="First frame of a film, for a picture: a JPEG in base64, at most 800 pixels a side; `image_size` states the film's own "
+        "pixels. Null for tracks.",
+        json_schema_extra={"contentEncoding": "base64", "contentMediaType": "image/jpeg"},
     )
 
 

@@ -114,12 +114,12 @@ def accept(
         return known, False
     canonical = folder / "canonical.npz"
     if kept is not None and kept.canonical is not None:
-        read = kept.job.interpretation
-        kinds_for(options, size=(read.num_frames, read.num_points))
-        return jobs.submit(kept.canonical, submission, interpretation=read), True
+        known_reading = kept.job.interpretation
+        kinds_for(options, size=(known_reading.num_frames, known_reading.num_points))
+        return jobs.submit(kept.canonical, submission, interpretation=known_reading), True
     films = FilmBounds.of(jobs.settings, max_bytes=limits.max_bytes)
-    interpretation, options = read_form(form, options, limits, films=films, target=canonical)
-    job = jobs.submit(canonical, replace(submission, options=options), interpretation=interpretation)
+    read = read_form(form, options, limits, films=films, target=canonical)
+    job = jobs.submit(canonical, replace(submission, options=read.options), interpretation=read.interpretation)
     return job, True
 
 
@@ -219,19 +219,23 @@ def with_uploads(form: Form, folder: Path, uploads: Uploads) -> Form:
     return Form(files=files, texts=texts)
 
 
+@dataclass(frozen=True, slots=True)
+class ReadInputs:
+    """What the files of a form turned out to be."""
+
+    interpretation: Interpretation
+    options: Options
+    """Those given, completed by what a film or its tracks state."""
+    first_frame: str | None = None
+    """Of a film, as a JPEG in base64; None for tracks, or where it was not wanted."""
+
+
 def read_form(
-    form: Form, options: Options, limits: Limits, *, films: FilmBounds, target: Path | None
-) -> tuple[Interpretation, Options]:
+    form: Form, options: Options, limits: Limits, *, films: FilmBounds, target: Path | None, picture: bool = False
+) -> ReadInputs:
     """Read, check and interpret the files of a form, and store them if a target is given. Blocks; call it on a thread.
 
-    A film is only opened, not tracked.
-
-    Returns
-    -------
-    interpretation : Interpretation
-        How the files were read.
-    options : Options
-        Those given, completed by what a film or its tracks state.
+    A film is only opened, not tracked; with `picture`, its first frame is returned, too.
 
     Raises
     ------
@@ -245,12 +249,12 @@ def read_form(
         raise missing("tracks")
     kinds_for(options)  # refuses outputs that this installation cannot write
     if is_film:
-        return _read_film(form, options, films, target)
+        return _read_film(form, options, films, target, picture=picture)
     files: dict[str, Path | str | None] = {part: file.path for part, file in form.files.items()}
     if form.texts.get("mesh", "").strip():
         files["mesh"] = form.texts["mesh"].strip()
     interpretation = store_inputs(**files, options=options, limits=limits, target=target)  # type: ignore[arg-type]
-    return interpretation, tracks_options(options, interpretation)
+    return ReadInputs(interpretation, tracks_options(options, interpretation))
 
 
 def _check_film_parts(form: Form) -> None:
@@ -268,18 +272,18 @@ def _check_film_parts(form: Form) -> None:
         )
 
 
-def _read_film(form: Form, options: Options, bounds: FilmBounds, target: Path | None) -> tuple[Interpretation, Options]:
+def _read_film(form: Form, options: Options, bounds: FilmBounds, target: Path | None, *, picture: bool) -> ReadInputs:
     region = form.files.get("region")
     source = FilmSource(
         form.files["film"].path, None if region is None else region.path, film_name=form.files["film"].name or "the film",
         region_name="the region" if region is None else region.name or "the region",
     )  # fmt: skip
-    facts = check_film(source, options, bounds)
+    facts = check_film(source, options, bounds, picture=picture)
     options = film_options(options, facts)
     interpretation = described(facts, options)
     if target is not None:
         save_source(source, interpretation, target)
-    return interpretation, options
+    return ReadInputs(interpretation, options, facts.first_frame or None)
 
 
 def missing(part: str) -> Refusal:

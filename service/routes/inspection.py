@@ -45,15 +45,15 @@ async def inspect(request: Request, core: Core, bounds: Bound, uploads: MyUpload
 
 
 def interpret(form: Form, folder: Path, uploads: Uploads, core: Service) -> Inspection:
-    """Read a form as for a job, and return the interpretation with a sample. Blocks; call it on a thread."""
+    """Read a form as for a job, and return the interpretation with a sample or a first frame. Blocks; call it on a thread."""
     whole, canonical = with_uploads(form, folder, uploads), folder / "canonical.npz"
     films = FilmBounds.of(core.jobs.settings, max_bytes=core.limits.max_bytes)
     options = parse_options(whole.texts.get("options", ""))
-    found, _ = read_form(whole, options, core.limits, films=films, target=canonical)
+    read = read_form(whole, options, core.limits, films=films, target=canonical, picture=True)
     # Inputs too large to be parsed in this process are too large to be sampled in it.
     tracked = "film" not in whole.files and canonical.stat().st_size <= LARGE
     sample = sample_of(load_inputs(canonical)) if tracked else []
-    return Inspection(**found.model_dump(), sample=sample)
+    return Inspection(**read.interpretation.model_dump(), sample=sample, first_frame=read.first_frame)
 
 
 def sample_of(inputs: Inputs) -> list[list[int]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import errno
 import io
 import itertools
@@ -14,6 +15,7 @@ import subprocess
 import sys
 import textwrap
 import time
+from contextlib import nullcontext
 from pathlib import Path
 
 import films
@@ -32,9 +34,17 @@ from pliant.worker.execution.pace import MachinePace
 from pliant.worker.films import frame_strip, tracker
 from pliant.worker.films.inputs import read_tracked
 from pliant.worker.films.sources import FilmBounds, FilmSource, is_source, looks_like_film, open_source, save_source
-from pliant.worker.films.tracker import Tracked, believed_size, check_film, described, film_options, track_film
+from pliant.worker.films.tracker import (
+    FilmFacts,
+    Tracked,
+    believed_size,
+    check_film,
+    described,
+    film_options,
+    track_film,
+)
 from pliant.worker.formats import Inputs
-from pliant.worker.processes.contained import MAX_LINE, Ended, _Progress
+from pliant.worker.processes.contained import MAX_ANSWER, MAX_LINE, Ended, _Progress
 from pliant.worker.processes.no_network import forbid_network
 from pliant.worker.settings import Settings
 
@@ -71,6 +81,29 @@ def test_a_film_is_checked_without_being_tracked(film: Path, region: Path) -> No
     stated = described(facts, options)
     assert stated.mesh_source == "film"
     assert "96×72 pixels" in stated.notes[0]
+
+
+def test_the_first_frame_of_the_complete_film_is_returned_where_it_is_wanted(film: Path, tmp_path: Path) -> None:
+    assert check_film(FilmSource(film), Options()).first_frame == ""
+    for frames in ("", "4:10"):
+        facts = check_film(FilmSource(film), Options(frames=frames) if frames else Options(), picture=True)
+        with Image.open(io.BytesIO(base64.b64decode(facts.first_frame))) as picture:
+            assert (picture.format, picture.size) == ("JPEG", SIZE)
+            shown = np.asarray(picture, float)
+        differences = [np.abs(shown - each).mean() for each in films.textured_pictures(10, SIZE)]
+        assert np.argmin(differences) == 0
+    large = np.full((900, 1200, 3), 128, np.uint8)
+    pictures = films.zip_of(tmp_path / "large.zip", {f"{number}.png": films.png(large) for number in range(3)})
+    facts = check_film(FilmSource(pictures), Options(), picture=True)
+    with Image.open(io.BytesIO(base64.b64decode(facts.first_frame))) as picture:
+        assert picture.size == (800, 600)
+    assert (facts.width, facts.height) == (1200, 900)
+
+
+def test_a_first_frame_of_noise_fits_the_answer(tmp_path: Path) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (900, 900, 3), dtype=np.uint8)
+    pictures = films.zip_of(tmp_path / "noise.zip", {f"{number}.png": films.png(noise) for number in range(3)})
+    assert len(check_film(FilmSource(pictures), Options(), picture=True).first_frame) < MAX_ANSWER / 1.5
 
 
 def test_an_installation_sets_the_bounds_of_films(film: Path) -> None:
@@ -126,6 +159,20 @@ def test_every_end_of_the_film_process_has_a_message() -> None:
     assert isinstance(tracker._fault(Ended(1, b"", "Traceback"), FilmBounds(), 1.0), RuntimeError)
     with pytest.raises(InvalidInput, match="confuses its decoder"):
         tracker._answer(Tracked, Ended(0, b'{"container": 3}', ""), FilmBounds(), 1.0)
+    facts = {
+        "container": "mp4",
+        "width": 2,
+        "height": 2,
+        "fps": 1,
+        "stated_frames": 3,
+        "frames": 3,
+        "seconds": 3,
+        "rotation": 0,
+    }
+    for first_frame, believed in (("AAAA", True), ("<svg/>", False)):
+        answer = Ended(0, json.dumps({**facts, "pixel_aspect": 1, "first_frame": first_frame}).encode(), "")
+        with nullcontext() if believed else pytest.raises(InvalidInput, match="confuses its decoder"):
+            tracker._answer(FilmFacts, answer, FilmBounds(), 1.0)
 
 
 def test_a_film_and_its_region_are_stored_byte_for_byte(film: Path, region: Path, tmp_path: Path) -> None:

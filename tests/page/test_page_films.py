@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import io
 import json
 import os
@@ -237,10 +238,41 @@ def test_a_film_that_the_browser_cannot_show_is_sent_without_a_region(
     drop(filming, {"old.mp4": films["old.mp4"]})
     expect(filming.get_by_text("This browser cannot show the film")).to_be_visible()
     expect(filming.get_by_role("button", name="Draw a region")).to_be_hidden()
+    expect(filming.get_by_text("How your files are interpreted")).to_be_visible()
     filming.get_by_role("button", name="Reconstruct").click()
     expect(filming.get_by_text("Tracking the film")).to_be_visible()
     assert dict(filming.evaluate("window.sent"))["film"] == "old.mp4"
     assert "region_polygon" not in sent_options(filming)
+
+
+@pytest.mark.parametrize("name", ["old.mp4", "film.webm"])
+def test_a_region_is_drawn_on_the_first_frame_that_the_service_decoded(
+    filming: Page, url: str, films: dict[str, bytes], finished: str, name: str
+) -> None:
+    """Unless the browser decodes it, whichever of the two is first; corners are in the film's pixels."""
+    small = bytes(cv2.imencode(".jpg", np.full((HEIGHT // 2, WIDTH // 2, 3), BLUE, np.uint8))[1])
+    seen = {
+        **film_record(url, finished)["interpretation"],
+        "sample": [],
+        "image_size": f"{WIDTH}x{HEIGHT}",
+        "first_frame": base64.b64encode(small).decode(),
+    }
+    filming.route("**/v1/inspect", lambda route: route.fulfill(json=seen))
+    drop(filming, {name: films[name]})
+    shown = filming.get_by_role("img", name="First frame of the film")
+    expect(filming.get_by_text("How your files are interpreted")).to_be_visible()
+    shown.wait_for()
+    pixel = shown.evaluate("(it) => [...it.getContext('2d').getImageData(4, 4, 1, 1).data]")
+    assert (pixel[2] > 150) == (name == "old.mp4")
+    answer_with(filming, film_record(url, finished))
+    filming.get_by_role("button", name="Draw a region").click()
+    filming.get_by_role("button", name="Rectangle").click()
+    drag(filming, (0.25, 0.25), (0.75, 0.5))
+    filming.get_by_role("button", name="Use this region").click()
+    filming.get_by_role("button", name="Reconstruct").click()
+    expect(filming.get_by_text("Tracking the film")).to_be_visible()
+    (left, top), _, (right, bottom), _ = sent_options(filming)["region_polygon"]
+    assert np.allclose([left, top, right, bottom], [80, 60, 240, 120], atol=2)
 
 
 def test_a_service_without_films_offers_no_film_input(page: Page, url: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import io
 import json
 import threading
@@ -111,6 +112,8 @@ def test_inspection_opens_a_film_and_tracks_nothing(running: Running, http: http
     answer = http.post("/v1/inspect", files=parts(film, region=mask()))
     assert answer.status_code == 200, answer.text
     assert (answer.json()["num_frames"], answer.json()["num_points"], answer.json()["sample"]) == (10, 0, [])
+    assert base64.b64decode(answer.json()["first_frame"]).startswith(b"\xff\xd8\xff")
+    assert http.post("/v1/inspect", files={"tracks": tracks()}).json()["first_frame"] is None
     assert running.waiting == before
 
 

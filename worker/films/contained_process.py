@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import errno
 import json
 import os
@@ -38,6 +39,9 @@ SHARES = {"read": (0.0, 0.15), "locate": (0.15, 0.25), "track": (0.25, 1.0)}
 
 LEAST_FRAMES = 3
 """Minimum number of frames of a reconstruction."""
+
+PICTURE_SIDE, PICTURE_QUALITY = 800, 80
+"""Longest side of the first frame that is sent along, pixels, and its JPEG quality: 0.1 MB, 0.5 MB at most."""
 
 FULL = ("Insufficient memory", "can't start new thread")
 """Messages of OpenCV and Python when the address space is exhausted."""
@@ -103,7 +107,7 @@ def _check(request: dict[str, Any], bounds: FilmBounds) -> dict[str, Any]:
     region = _region(request)
     if region is not None:
         read_region(region, film.size)
-    facts = {
+    facts: dict[str, Any] = {
         "container": film.container, "width": film.size[0], "height": film.size[1], "fps": film.fps / step,
         "stated_frames": film.stated_frames, "frames": count or 0, "seconds": film.stated_frames / film.fps,
         "rotation": film.rotation, "pixel_aspect": film.pixel_aspect,
@@ -116,7 +120,18 @@ def _check(request: dict[str, Any], bounds: FilmBounds) -> dict[str, Any]:
             longest_side=options["longest_side"], threads=request["threads"],
         )  # fmt: skip
         facts |= {"points": expected.points, "track_seconds": expected.seconds}
+    if request["picture"]:
+        facts["first_frame"] = _first_frame(request, bounds)
     return facts
+
+
+def _first_frame(request: dict[str, Any], bounds: FilmBounds) -> str:
+    """Return the first frame of the complete film as a JPEG in base64."""
+    from pliant.tracking import open_film
+    from pliant.tracking.contact_sheet import small_jpeg
+
+    first = next(open_film(Path(request["film"]), limits=_limits(bounds)).frames())
+    return base64.b64encode(small_jpeg(first.image, longest_side=PICTURE_SIDE, quality=PICTURE_QUALITY)).decode()
 
 
 def _track(request: dict[str, Any], bounds: FilmBounds) -> dict[str, Any]:

@@ -58,6 +58,9 @@ class FilmFacts(BaseModel):
     track_seconds: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
     """Seconds that tracking would take on this machine, about; 0 if it was not estimated."""
 
+    first_frame: Annotated[str, Field(max_length=1 << 20, pattern=r"^[A-Za-z0-9+/]*={0,2}$")] = ""
+    """First frame of the complete film as a JPEG in base64; empty if it was not wanted."""
+
 
 class Tracked(BaseModel):
     """Results of tracking besides the files."""
@@ -74,6 +77,7 @@ def check_film(
     bounds: FilmBounds = FilmBounds(),  # noqa: B008 - frozen
     *,
     estimate: bool = False,
+    picture: bool = False,
     threads: int = 1,
 ) -> FilmFacts:
     """Open a film and its region without tracking it; takes seconds, whatever the film's length.
@@ -84,6 +88,8 @@ def check_film(
         The film, how it would be tracked, and what it may cost.
     estimate
         Also estimate how many points would be tracked, and the time that it would take with so many threads.
+    picture
+        Also return the first frame.
     threads
         Threads that tracking would have.
 
@@ -94,7 +100,9 @@ def check_film(
     """
     _check_region(source, options)
     with TemporaryDirectory(prefix="pliant-film-") as scratch:
-        ended = _run("check", source, options, bounds, Path(scratch), threads=threads, estimate=estimate)
+        ended = _run(
+            "check", source, options, bounds, Path(scratch), threads=threads, estimate=estimate, picture=picture
+        )
     return _answer(FilmFacts, ended, bounds, bounds.check_seconds)
 
 
@@ -197,11 +205,11 @@ def _check_region(source: FilmSource, options: Options) -> None:
 
 def _run(
     action: str, source: FilmSource, options: Options, bounds: FilmBounds, scratch: Path, *, threads: int, estimate: bool = False,
-    on_line: Callable[[dict[str, Any]], None] | None = None, should_stop: Callable[[], bool] | None = None,
+    picture: bool = False, on_line: Callable[[dict[str, Any]], None] | None = None, should_stop: Callable[[], bool] | None = None,
 ) -> Ended:  # fmt: skip
     request = {
         "action": action, "film": str(source.film.absolute()), "threads": max(1, min(threads, 64)), "estimate": estimate,
-        "region": None if source.region is None else str(source.region.absolute()),
+        "picture": picture, "region": None if source.region is None else str(source.region.absolute()),
         "names": source.names, "options": options.model_dump(mode="json", include=TRACKING_OPTIONS),
         "bounds": asdict(bounds), "folder": str(scratch.absolute()),
     }  # fmt: skip

@@ -17,6 +17,7 @@ export class Compose {
   private readonly inspection = new Inspection(
     () => this.form(),
     (refusal) => (refusal ? this.refuse(refusal, () => undefined) : this.clear()),
+    (seen) => void this.slots.seen(seen),
   );
   private readonly label = h("input", { type: "text", id: "job-name", maxlength: 200, autocomplete: "off" });
   private readonly send = h("button", { type: "submit", class: "primary" }, "Reconstruct");

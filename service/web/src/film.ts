@@ -1,6 +1,7 @@
 // A film as a chosen file: how it is recognised, and its first frame as the browser decodes it.
 
 import { type Entry, listing, unpacked } from "./peek";
+import type { Inspection } from "./types";
 
 const FILMS = /\.(mp4|m4v|mov|webm|mkv|avi|gif|3gp)$/i;
 const PICTURES: [RegExp, string][] = [
@@ -29,6 +30,15 @@ export async function firstFrame(file: File): Promise<ImageBitmap | null> {
     if (error instanceof DOMException || error instanceof RangeError || error instanceof TypeError) return null;
     throw error;
   }
+}
+
+/** Return the first frame as the service decoded it, enlarged to the film's own pixels; null if the answer has none. */
+export async function servedFrame({ first_frame, image_size }: Inspection): Promise<ImageBitmap | null> {
+  const [width, height] = (image_size ?? "").split("x").map(Number);
+  if (!first_frame || !width || !height) return null;
+  const jpeg = Uint8Array.from(atob(first_frame), (letter) => letter.charCodeAt(0));
+  const picture = new Blob([jpeg], { type: "image/jpeg" });
+  return createImageBitmap(picture, { resizeWidth: width, resizeHeight: height, resizeQuality: "high" });
 }
 
 async function firstPicture(file: File): Promise<ImageBitmap | null> {

@@ -7,8 +7,8 @@ import { type Point, type Region, described, paint, polygon } from "./region";
 
 const ADVICE = "Film advice: turn by 30° or more, keep it sharp, and keep the object large in the picture.";
 const UNDECODED =
-  "This browser cannot show the film, so no region can be drawn on it and the whole picture is tracked. " +
-  "Most browsers show MP4 (H.264) and WebM.";
+  "This browser cannot show the film. Its first frame appears here once the service has read it; " +
+  "without it no region can be drawn, and the whole picture is tracked.";
 /** Longest side of the small picture, in its own pixels. */
 const SIDE = 640;
 
@@ -27,7 +27,11 @@ export class Filming {
   );
   private film: File | null = null;
   private picture: ImageBitmap | null = null;
+  /** The first frame as the service decoded it, for a film that the browser may still be trying to. */
+  private served: ImageBitmap | null = null;
   private region: Region | null = null;
+  /** Whether the browser gave up decoding the film. */
+  private undecoded = false;
   private shown: Promise<void> = Promise.resolve();
 
   /** `onChange` is called when another region has been chosen. */
@@ -49,10 +53,19 @@ export class Filming {
     if (this.film) this.choose({ kind: "lasso", corners });
   }
 
+  /** Show the first frame of the film as the service decoded it, if the browser cannot. */
+  offer(film: File, picture: ImageBitmap): void {
+    if (this.film !== film || this.picture || this.served) return picture.close();
+    this.served = picture;
+    if (this.undecoded) this.settle(null);
+  }
+
   private async begin(film: File | null): Promise<void> {
     this.film = film;
     this.picture?.close();
-    this.picture = this.region = null;
+    this.served?.close();
+    this.picture = this.served = this.region = null;
+    this.undecoded = false;
     this.element.hidden = film === null;
     this.write(film ? "Reading the first frame…" : "");
     if (film === null) return;
@@ -61,8 +74,16 @@ export class Filming {
       picture?.close();
       return;
     }
-    this.picture = picture;
-    this.write(picture ? described(null) : UNDECODED);
+    this.settle(picture);
+  }
+
+  /** Show what the browser decoded, else what the service did. */
+  private settle(decoded: ImageBitmap | null): void {
+    this.undecoded = decoded === null;
+    this.picture = decoded ?? this.served;
+    if (decoded) this.served?.close();
+    this.served = null;
+    this.write(this.picture ? described(this.region) : UNDECODED);
   }
 
   private edit(): void {

@@ -141,7 +141,7 @@ export interface components {
         };
         /**
          * Inspection
-         * @description Interpretation of inputs, with a sample of them.
+         * @description Interpretation of inputs, with a sample of tracks or the first frame of a film.
          */
         Inspection: {
             /** Num Frames */
@@ -238,6 +238,11 @@ export interface components {
              * @description Some points in some frames, for a picture: x and y in turn, 0 to 1000, y down; -1 twice where hidden.
              */
             sample: number[][];
+            /**
+             * First Frame
+             * @description First frame of a film, for a picture: a JPEG in base64, at most 800 pixels a side; `image_size` states the film's own pixels. Null for tracks.
+             */
+            first_frame: string | null;
         };
         /**
          * Interpretation

@@ -2,11 +2,11 @@
 
 import { CameraDialog, canRecord } from "./camera";
 import { button, h, uniqueId } from "./dom";
-import { looksLikeFilm } from "./film";
+import { looksLikeFilm, servedFrame } from "./film";
 import { Filming } from "./filming";
 import { type Entry, describe, peek } from "./peek";
 import type { Point } from "./region";
-import { PARTS, type Part } from "./types";
+import { type Inspection, PARTS, type Part } from "./types";
 import { bytes } from "./words";
 
 export const PLACES: Record<Part, { label: string; hint: string }> = {
@@ -102,6 +102,13 @@ export class Slots {
   /** Choose what to track in the film: corners in its pixels. */
   async outline(corners: Point[]): Promise<void> {
     await this.filming.take(corners);
+  }
+
+  /** The service has read the files as they are now: it can show a film that the browser cannot. */
+  async seen(seen: Inspection): Promise<void> {
+    const film = this.file("film");
+    const picture = film && (await servedFrame(seen));
+    if (picture) this.filming.offer(film, picture);
   }
 
   /** Put dropped files where their names and contents say they belong. */

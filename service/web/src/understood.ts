@@ -3,7 +3,7 @@
 import { Refusal, inspect } from "./api";
 import { button, fill, h } from "./dom";
 import { Glimpse } from "./glimpse";
-import type { Interpretation, Job } from "./types";
+import type { Inspection as InspectionAnswer, Interpretation, Job } from "./types";
 import { bytes, count, percent } from "./words";
 
 const MESHES: Record<string, string> = {
@@ -78,10 +78,11 @@ export class Inspection {
   private asking: AbortController | null = null;
   private timer = 0;
 
-  /** `form` gives what would be sent, null where there is neither a film nor tracks; `refused` shows why it would be refused. */
+  /** `form` gives what would be sent, null where there is neither a film nor tracks; `refused` shows why it would be refused, `onSeen` gets the answer. */
   constructor(
     private readonly form: () => FormData | null,
     private readonly refused: (refusal: Refusal | null) => void,
+    private readonly onSeen: (seen: InspectionAnswer) => void,
   ) {
     this.clear();
   }
@@ -131,6 +132,7 @@ export class Inspection {
       this.facts.show(facts(seen), seen.notes);
       this.found.hidden = false;
       this.glimpse.show(seen.sample ?? []);
+      this.onSeen(seen);
       this.words.textContent = "";
     } catch (error) {
       if (asking.signal.aborted) return;
