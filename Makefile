@@ -66,12 +66,12 @@ PYTHON_TESTS := env PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 OPENBLAS_NUM_THRE
 PYTEST := $(PYTHON_TESTS) $(SHARED)
 NEEDY := slow or chromium or node or s3 or root
 
-# Services and pages wait for a third of their time. What only computes fills it, in a process of lower priority.
+# Services and pages wait for a third of their time. What only computes fills it, in as many processes of low priority.
 COMPUTING := tests/solver tests/tracking
 ASIDE := build/computing.log
 define ALL_TESTS
 @mkdir -p build
-@nice -n 3 $(PYTHON_TESTS) -p no:cacheprovider -m "$(1)" $(COMPUTING) >$(ASIDE) 2>&1 & computing=$$!; \
+@nice -n 5 $(PYTEST) --timeout=900 -p no:cacheprovider -m "$(1)" $(COMPUTING) >$(ASIDE) 2>&1 & computing=$$!; \
 trap 'kill $$computing' INT TERM; \
 $(PYTEST) -m "$(1)" $(COMPUTING:%=--ignore=%); failed=$$?; \
 wait $$computing || failed=$$?; cat $(ASIDE); exit $$failed
