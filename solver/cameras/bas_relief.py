@@ -20,7 +20,6 @@ from dataclasses import replace
 
 import numpy as np
 from pliant.solver.cameras.learned import Learned, motion_of, scene_at
-from pliant.solver.cameras.perspective import mirrored
 from pliant.solver.model.marginal_likelihood import CAMERA_PRIOR_WEIGHT, energy
 from pliant.solver.model.so3 import exponential
 from pliant.solver.records import Floats
@@ -80,8 +79,10 @@ def settled_depth(gram: Floats, found: Learned) -> tuple[Learned, float]:
     return replace(moved, energy=energy(scene, motion_of(scene, moved))[0]), float(np.exp(at))
 
 
-def facing(found: Learned, sample: Floats, *, y_up: bool) -> Learned:
-    """Return cameras and covariance or their mirror images, whichever bulge toward the camera, as half a sphere that one sees does.
+def bulges(found: Learned, sample: Floats, *, y_up: bool) -> bool:
+    """Whether the middle of the rigid shape is nearer to the camera than its rim, as that of half a sphere that one sees.
+
+    Orthographic images are those of the mirror image in depth as well; surfaces that one sees from in front bulge more often than not.
 
     Parameters
     ----------
@@ -99,10 +100,7 @@ def facing(found: Learned, sample: Floats, *, y_up: bool) -> Learned:
     depth = (toward @ rigid) * (-1 if y_up else 1)
     width = rigid - np.outer(toward, toward @ rigid)
     radius = (width**2).sum(axis=0)
-    if depth @ (radius - radius.mean()) >= 0:
-        return found
-    rotations, covariance = mirrored(found.rotations, found.covariance)
-    return replace(found, rotations=rotations, covariance=covariance)
+    return bool(depth @ (radius - radius.mean()) >= 0)
 
 
 def extent_penalty(ratio: float) -> float:

@@ -12,23 +12,23 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.solver.cameras.bas_relief import DECIDED, facing, settled_depth
+from pliant.solver.cameras.bas_relief import DECIDED, bulges, settled_depth
 from pliant.solver.cameras.covariance_learning import LearningData
 from pliant.solver.cameras.depth_rounds import settled, settled_again
 from pliant.solver.cameras.estimation import CameraEstimate, restarted
 from pliant.solver.cameras.learned import Learned, refined, scene_at, turned
+from pliant.solver.cameras.perspective import mirrored
 from pliant.solver.cameras.scale import SCALE_ROUNDS, ScaleTrial, try_free_scales
 from pliant.solver.model import full_mode_covariance
 from pliant.solver.model.expectation_maximisation import MAX_MODES
 from pliant.solver.model.model_order import ModelOrder, select_model_order
-from pliant.solver.model.so3 import angles_between, exponential
+from pliant.solver.model.so3 import MIRROR, angles_between
 from pliant.solver.monitor import enter
 from pliant.solver.records import Floats, read_only
 from pliant.solver.stages import REFINEMENT_UNITS, UNITS_PER_START
-from pliant.solver.tracks.frame_selection import between, evenly_spread, of_frames
+from pliant.solver.tracks.frame_selection import between, evenly_spread, of_frames, rotations_between
 from pliant.solver.tracks.noise import OUTLIER_SHARE
 from pliant.solver.tracks.normalization import Normalized
-from scipy.spatial.transform import Rotation
 
 REFINEMENT_ROUNDS = 5
 """Refinements of rotations and covariance, each with a new L-BFGS memory. EM in between would undo part of the gain,
@@ -68,6 +68,11 @@ class _Evidence:
     def corrected(self, estimate: CameraEstimate) -> _Evidence:
         """Return an estimate whose tracks are corrected for other depths, at the same frames."""
         return _Evidence.of(estimate, self.used, self.start_scales)
+
+    @property
+    def bends(self) -> bool:
+        """Whether perspective is found, which distinguishes the signs of depth."""
+        return self.estimate.perspective is not None and self.estimate.perspective.bends
 
     @property
     def rotations(self) -> Floats:
@@ -128,8 +133,10 @@ def refine_cameras(
     if estimates_scales and (start.start_scales == 1).all():
         enter(should_stop, "scales")
         trial = try_free_scales(start.gram, start.rotations, model_order, should_stop)
-    evidence, found = _refined(start, normalized, trial, model_order, y_up=y_up, should_stop=should_stop)
+    evidence, found = _refined(start, normalized, trial, model_order, should_stop)
     refined_estimate, rotations = _of_all_frames(start, evidence, found, trial)
+    if not evidence.bends and not bulges(found, evidence.sample, y_up=y_up):
+        refined_estimate, rotations, found = _mirrored(refined_estimate, rotations, found)
     return refined_estimate, LearningData(
         evidence.gram, evidence.sample, found.rotations[:, :2] * found.scales[:, None, None], start.used, model_order,
         selects_again=_is_spoiled(estimate), stopped=None if np.isfinite(found.energy) else found.covariance,
@@ -216,13 +223,10 @@ def _refined(
     normalized: Normalized | None,
     trial: ScaleTrial | None,
     model_order: ModelOrder,
-    *,
-    y_up: bool,
     should_stop: Callable[[], bool] | None,
 ) -> tuple[_Evidence, Learned]:
     """Return the refined cameras and covariance of the frames used, and the tracks as their depths correct them."""
-    estimate, with_scales = evidence.estimate, trial is not None and trial.start is not None
-    bends = estimate.perspective is not None and estimate.perspective.bends
+    estimate, with_scales, bends = evidence.estimate, trial is not None and trial.start is not None, evidence.bends
     may_couple = model_order == ModelOrder(ordered=estimate.ordered)
     enter(should_stop, "refinement", units=REFINEMENT_UNITS[may_couple])
     found = _first_rounds(evidence, trial, model_order, should_stop)
@@ -233,7 +237,7 @@ def _refined(
         if bends:
             evidence, found = _with_settled_depths(evidence, normalized, found, model_order, should_stop)
     if not bends and np.isfinite(found.energy):
-        return _with_probable_depth(evidence, found, model_order, y_up=y_up, should_stop=should_stop)
+        return _with_probable_depth(evidence, found, model_order, should_stop)
     return evidence, found
 
 
@@ -270,20 +274,22 @@ def _with_settled_depths(
 
 
 def _with_probable_depth(
-    evidence: _Evidence,
-    found: Learned,
-    model_order: ModelOrder,
-    *,
-    y_up: bool,
-    should_stop: Callable[[], bool] | None,
+    evidence: _Evidence, found: Learned, model_order: ModelOrder, should_stop: Callable[[], bool] | None
 ) -> tuple[_Evidence, Learned]:
     """Return cameras and covariance at the most probable depth; where the tracks hardly determine it, the best of all candidates."""
     found, stretch = settled_depth(evidence.gram, found)
     estimate = _with_depth_choice(evidence.estimate, stretch)
     if estimate.depth_is_typical:
         found = _best_candidate(estimate, evidence.gram, evidence.used, found, model_order, should_stop)
-        found = facing(found, evidence.sample, y_up=y_up)
     return replace(evidence, estimate=estimate), found
+
+
+def _mirrored(estimate: CameraEstimate, rotations: Floats, found: Learned) -> tuple[CameraEstimate, Floats, Learned]:
+    """Return the mirror images in depth of cameras of all frames, in both axes, and of those that belong to the covariance."""
+    ours, other = (MIRROR @ np.asarray(each) @ MIRROR for each in (estimate.rotations, rotations))
+    read_only(ours)
+    own, covariance = mirrored(found.rotations, found.covariance)
+    return replace(estimate, rotations=ours), other, replace(found, rotations=own, covariance=covariance)
 
 
 def _of_all_frames(
@@ -291,8 +297,7 @@ def _of_all_frames(
 ) -> tuple[CameraEstimate, Floats]:
     """Return the estimate with the cameras found, interpolated to all frames, and its rotations in the axes of `found`."""
     estimate, used, frames = evidence.estimate, evidence.used, len(evidence.start_scales)
-    turns = Rotation.from_matrix(found.rotations @ evidence.rotations.transpose(0, 2, 1)).as_rotvec()
-    rotations = exponential(between(used, turns, frames)) @ estimate.rotations
+    rotations = rotations_between(used, found.rotations, frames)
     if trial is not None:
         estimate = _with_scale_reason(estimate, trial)
     if trial is not None and trial.start is not None:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from pliant.solver import gallery, solve
+from pliant.solver import Settings, Tracks, gallery, solve
 from pliant.solver.cameras import bas_relief, joint_refinement
-from pliant.solver.cameras.bas_relief import VISIBLE_DEPTH, extent_penalty, facing, settled_depth
+from pliant.solver.cameras.bas_relief import VISIBLE_DEPTH, bulges, extent_penalty, settled_depth
 from pliant.solver.cameras.learned import Learned
-from pliant.solver.cameras.perspective import MIRROR
 from pliant.solver.model.shape_covariance import ShapeCovariance
-from pliant.solver.model.so3 import exponential
+from pliant.solver.model.so3 import MIRROR, angles_between, exponential
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
@@ -129,13 +128,33 @@ def test_a_head_that_turns_by_30_degrees_keeps_its_depth(monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize("y_up", [False, True])
-def test_of_two_mirror_images_the_one_that_bulges_toward_the_camera_is_taken(y_up: bool) -> None:
+def test_a_hill_bulges_and_a_bowl_does_not(y_up: bool) -> None:
     _, given = found(10, 0.5)
     side = np.linspace(-1, 1, 9)
     x, y = (each.ravel() for each in np.meshgrid(side, side))
-    bowl = np.stack([x, y, (-1 if y_up else 1) * (x**2 + y**2)])  # the rim lies behind the middle
-    bowl -= bowl.mean(axis=1, keepdims=True)
-    sample = (given.rotations[:, :2] @ bowl).transpose(0, 2, 1)
-    assert facing(given, sample, y_up=y_up) is given
-    hollow = facing(given, (given.rotations[:, :2] @ (np.array([[1], [1], [-1]]) * bowl)).transpose(0, 2, 1), y_up=y_up)
-    np.testing.assert_allclose(hollow.rotations, MIRROR @ given.rotations @ MIRROR)
+    hill = np.stack([x, y, (-1 if y_up else 1) * (x**2 + y**2)])  # the rim lies behind the middle
+    hill -= hill.mean(axis=1, keepdims=True)
+    assert bulges(given, (given.rotations[:, :2] @ hill).transpose(0, 2, 1), y_up=y_up)
+    assert not bulges(given, (given.rotations[:, :2] @ MIRROR @ hill).transpose(0, 2, 1), y_up=y_up)
+
+
+@pytest.mark.parametrize("y_up", [False, True])
+@pytest.mark.parametrize("hidden", [(), (3, 9)])
+def test_a_face_has_its_nose_in_front(y_up: bool, hidden: tuple[int, ...]) -> None:
+    """The first cameras of this one are inside out. Those of frames that show too little are between their neighbours'."""
+    head = gallery.face(14, 60, degrees=30, seed=1)
+    visible = head.tracks.visible.copy()
+    visible[list(hidden), 2:] = 0
+    tracks = Tracks.from_arrays(head.tracks.points * (1, -1 if y_up else 1), visible)
+    solution = solve(tracks, head.mesh, settings=Settings(y_up=y_up))
+    assert solution.choices.depth_sign == "ambiguous"
+    around = solution.shapes - solution.shapes.mean(axis=1, keepdims=True)
+    radius, depth = (around[..., :2] ** 2).sum(axis=2), (-1 if y_up else 1) * around[..., 2]
+    assert ((radius - radius.mean(axis=1, keepdims=True)) * depth).sum() > 0
+    seen = np.einsum("f,fij,fpj->fpi", solution.camera.scales, solution.camera.rotations[:, :2], around)
+    shown = tracks.points - tracks.points.mean(axis=1, keepdims=True)
+    whole = [frame for frame in range(14) if frame not in hidden]
+    scale = (seen[whole] * shown[whole]).sum() / (seen[whole] ** 2).sum()
+    assert np.abs(scale * seen[whole] - shown[whole]).max() < 0.05 * np.abs(shown).max()
+    steps = angles_between(solution.camera.rotations[1:], solution.camera.rotations[:-1])
+    assert steps.max() < 3 * np.median(steps)
