@@ -107,7 +107,7 @@ export class Slots {
   /** The service has read the files as they are now: it can show a film that the browser cannot. */
   async seen(seen: Inspection): Promise<void> {
     const film = this.file("film");
-    const picture = film && (await servedFrame(seen));
+    const picture = film && (await servedFrame(seen).catch(() => null)); // not a picture after all
     if (picture) this.filming.offer(film, picture);
   }
 
