@@ -21,6 +21,7 @@ from pliant.worker.maintenance.fsck import findings
 from pliant.worker.processes.valkey import find_binary
 from pliant.worker.settings import Settings
 from pliant.worker.store.connection import connect
+from redis import Redis, RedisError
 from worker_house import House, running, settled
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="finds processes in /proc")
@@ -83,7 +84,11 @@ def test_jobs_run_on_a_redis_with_a_password_and_on_s3(
         threads=1,
     )  # fmt: skip
     client = connect(settings.redis, decode=True)
-    client.ping()
+    deadline = time.monotonic() + 30
+    while not _answers(client):
+        assert server.poll() is None, (tmp_path / "log").read_text()
+        assert time.monotonic() < deadline, "the server does not answer"
+        time.sleep(0.05)
     client.close()
     with House(settings, inputs=inputs_files) as house:
         job = house.final(house.submit())
@@ -102,6 +107,13 @@ def test_jobs_run_on_a_redis_with_a_password_and_on_s3(
         assert house.jobs.blobs.list() == []
     server.terminate()
     server.wait(10)
+
+
+def _answers(client: Redis) -> bool:
+    try:
+        return bool(client.ping())
+    except RedisError:
+        return False
 
 
 SUPERVISOR = """
