@@ -107,7 +107,14 @@ def error_by_sequence(records: Records) -> Figure:
         label, marker = PEERS[method]
         at = [names.index(name) for name in found]
         axes.scatter(
-            list(found.values()), at, marker=marker, s=30, facecolors="none", edgecolors="#555555", label=label
+            list(found.values()),
+            at,
+            marker=marker,
+            s=30,
+            facecolors="none",
+            edgecolors="#555555",
+            label=label,
+            zorder=4,
         )
     published = [r for r in read("published") if r["metric"] == "e3d_frame" and r["sequence"] in names]
     if published:
