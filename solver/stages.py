@@ -61,7 +61,7 @@ GRAM_SECONDS = 1e-9
 UNITS = {
     "multistart": (1600, 120, 1.3),
     "model_order": (1000, 360, 0.6),
-    "starts": (1740, 40, 0.8),
+    "starts": (3480, 40, 0.8),
     "perspective": (10, 360, 30.0),
     "scales": (820, 120, 0.85),
     "refinement": (1500, 360, 1.1),

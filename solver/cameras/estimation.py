@@ -91,11 +91,16 @@ class CameraEstimate:
     warnings: tuple[str, ...] = ()
     """Reasons to distrust the result."""
 
-    candidates: tuple[Floats, ...] = ()
-    """Rotations of all candidates of the multistart, to be compared at a typical depth where the tracks do not determine it."""
+    candidates: tuple[tuple[int, Floats], ...] = ()
+    """K and rotations `(F, 3, 3)` of all candidates of the multistart, which refinement with the shapes may rank otherwise."""
 
     depth_is_typical: bool = False
     """Whether the extent of depth rests on its prior and not on the tracks (`cameras.bas_relief`)."""
+
+    @property
+    def other_starts(self) -> tuple[tuple[int, Floats], ...]:
+        """K and rotations that refinement with the shapes may start from instead of these."""
+        return (*self.candidates, *self.hypotheses)
 
 
 def estimate_cameras(
@@ -143,7 +148,7 @@ def estimate_cameras(
         refined = f"{refined} {pose_signs}"
     compared = ran if settings.refine_rotations and not planar else []
     hypotheses = _hypotheses(factorized, compared, part, used)
-    candidates = tuple(_everywhere(own.rotations, each, used, settings)[0] for each in compared)
+    candidates = tuple((each.basis_size, _everywhere(own.rotations, each, used, settings)[0]) for each in compared)
     read_only(rotations)
     read_only(scales)
     report(Step("cameras", PROGRESS_SHARE))
@@ -183,9 +188,9 @@ def _factorized(
 
 
 def restarted(estimate: CameraEstimate, size: int, rotations: Floats) -> CameraEstimate:
-    """Return the estimate with the unrefined rotations of the factorization with K = `size`."""
+    """Return the estimate with other rotations, which come from the factorization with K = `size`."""
     known = estimate.reasons.get("basis_size", "")
-    why = f"{known} With the shapes, the rotations of K = {size} as they came lead to more probable motion."
+    why = f"{known} With the shapes, other rotations, from K = {size}, lead to more probable motion."
     return replace(
         estimate,
         rotations=rotations,

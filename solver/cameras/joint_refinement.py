@@ -34,8 +34,8 @@ REFINEMENT_ROUNDS = 5
 """Refinements of rotations and covariance, each with a new L-BFGS memory. EM in between would undo part of the gain,
 since it keeps modes and random walk apart."""
 
-START_FRAMES, START_ROUNDS = 40, 2
-"""Frames and refinements used to compare the starting cameras."""
+STARTS_COMPARED, START_ROUNDS = ((40, 3), (80, 1)), 2
+"""Frames at which the starting cameras are compared, and how many are kept, in successive rounds; refinements of each."""
 
 CANDIDATE_ROUNDS = 3
 """Refinements of every candidate where they are compared at settled depths."""
@@ -171,8 +171,10 @@ def _started(
     should_stop: Callable[[], bool] | None,
 ) -> _Evidence:
     """Return the most probable start, with tracks corrected for perspective where they need it."""
-    if turning and start.estimate.hypotheses:
-        enter(should_stop, "starts", units=UNITS_PER_START * (1 + len(start.estimate.hypotheses)))
+    if turning and start.estimate.other_starts:
+        (frames, kept), _ = STARTS_COMPARED
+        fits = 1 + len(start.estimate.other_starts) + (kept if len(start.used) > frames else 0)
+        enter(should_stop, "starts", units=UNITS_PER_START * fits)
         best = _best_start(start.estimate, start.gram, start.used, model_order, should_stop)
         start = replace(start, estimate=best)
     if start.estimate.perspective is None or normalized is None:
@@ -312,25 +314,29 @@ def _best_start(
     model_order: ModelOrder,
     should_stop: Callable[[], bool] | None,
 ) -> CameraEstimate:
-    """Return the estimate with the rotations, its own or a hypothesis's, that give the lowest energy after a short refinement.
+    """Return the estimate with the rotations that reach the lowest energy by successive halving: its own, a candidate's or a hypothesis's.
 
     The multistart models deformation by smooth modes and moves cameras by degrees to fit it; joint refinement hardly
-    moves them back, because every mode would have to move along. The unrefined cameras of a factorization can
-    therefore be the better start.
+    moves them back, because every mode would have to move along. A candidate that the multistart ranks lower, or the
+    unrefined cameras of a factorization, can therefore be the better start.
     """
-    some = evenly_spread(len(used), START_FRAMES)
-    part, ones = of_frames(gram, some), np.ones(len(some))
-    best, lowest = estimate, np.inf
-    for start in (estimate, *(restarted(estimate, size, rotations) for size, rotations in estimate.hypotheses)):
-        if should_stop is not None and should_stop():
-            break
-        given = np.asarray(start.rotations)[used[some]]
-        found = refined(
-            part, given, ones, with_scales=False, rounds=START_ROUNDS, model_order=model_order, should_stop=should_stop
-        )
-        if found.energy < lowest:
-            best, lowest = start, found.energy
-    return best
+    running = [estimate, *(restarted(estimate, size, rotations) for size, rotations in estimate.other_starts)]
+    for frames, kept in STARTS_COMPARED:
+        some = evenly_spread(len(used), frames)
+        part, ones, reached = of_frames(gram, some), np.ones(len(some)), []
+        for start in running:
+            if reached and should_stop is not None and should_stop():
+                break
+            found = refined(
+                part, np.asarray(start.rotations)[used[some]], ones,
+                with_scales=False, rounds=START_ROUNDS, model_order=model_order, should_stop=should_stop,
+            )  # fmt: skip
+            reached.append((found.energy, start))
+        ranked = [start for _, start in sorted(reached, key=lambda each: each[0])]
+        if len(some) == len(used):
+            return ranked[0]
+        running = ranked[:kept]
+    return running[0]
 
 
 def _best_candidate(
@@ -346,7 +352,7 @@ def _best_candidate(
     The prior on camera motion prefers rotations that are too small, whatever their direction. Only at comparable depths does it distinguish
     a turn of the object from its deformation.
     """
-    for rotations in estimate.candidates:
+    for _, rotations in estimate.candidates:
         if should_stop is not None and should_stop():
             break
         other = refined(

@@ -1,4 +1,4 @@
-"""Multistart over camera hypotheses: factorizations with several K, refined on one energy and ranked by it.
+"""Multistart over camera candidates: factorizations with several K, refined on one energy and ranked by it.
 
 No single K suits all data: dense surfaces with small motion need K = 1, motion capture 5 to 12, and a body that
 deforms as fast as it rotates none of them. Every K therefore gives a start, and the two most probable ones a second

@@ -1,4 +1,4 @@
-"""Multistart: several factorizations as hypotheses, and the choice of the best start."""
+"""Multistart: several factorizations as candidates, and the choice of the best start."""
 
 from __future__ import annotations
 
@@ -8,13 +8,26 @@ from learning import learn
 from pliant.solver import Settings, gallery
 from pliant.solver.cameras import joint_refinement
 from pliant.solver.cameras.estimation import MAX_START_DEPTH_VARIANCE, CameraEstimate, estimate_cameras, restarted
-from pliant.solver.cameras.multistart import depth
+from pliant.solver.cameras.multistart import CANDIDATES, SMOOTH_STARTS, depth
 from pliant.solver.model.expectation_maximisation import MAX_MODES
 from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.so3 import angles_between, exponential, nearest
 from pliant.solver.tracks.normalization import normalize
 
 FRAMES = 16
+
+
+@pytest.mark.slow
+def test_candidates_are_cameras_of_every_factorization_and_of_smooth_starts() -> None:
+    face = gallery.face(24, 200)
+    found = estimate_cameras(normalize(face.tracks), Settings())
+    sizes = [size for size, _ in found.candidates]
+    assert set(sizes) == {size for size in CANDIDATES if size <= 16}
+    assert len(sizes) == len(set(sizes)) + SMOOTH_STARTS
+    for _, rotations in found.candidates:
+        assert np.allclose(rotations @ rotations.transpose(0, 2, 1), np.eye(3))
+        assert np.allclose(rotations[0], np.eye(3))
+    assert not estimate_cameras(normalize(face.tracks), Settings(refine_rotations=False)).candidates
 
 
 @pytest.mark.slow
@@ -30,8 +43,10 @@ def test_hypotheses_are_distinct_cameras_of_plausible_depth() -> None:
 
 
 @pytest.mark.slow
-def test_a_sheet_has_no_further_hypotheses() -> None:
-    assert not estimate_cameras(normalize(gallery.flag(24, 400).tracks), Settings()).hypotheses
+def test_a_sheet_has_no_further_starts() -> None:
+    found = estimate_cameras(normalize(gallery.flag(24, 400).tracks), Settings())
+    assert not found.hypotheses
+    assert not found.candidates
 
 
 @pytest.mark.slow
@@ -41,9 +56,12 @@ def test_cameras_with_implausible_depth_are_no_hypotheses(monkeypatch: pytest.Mo
     assert not estimate_cameras(normalize(face.tracks), Settings()).hypotheses
 
 
+@pytest.mark.parametrize("kind", ["candidates", "hypotheses"])
 @pytest.mark.parametrize("better", ["own", "rival"])
 @pytest.mark.slow
-def test_the_start_that_leads_to_the_higher_likelihood_is_chosen(better: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_start_that_leads_to_the_higher_likelihood_is_chosen(
+    better: str, kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(
         "pliant.solver.model.full_mode_covariance.POINTS_PER_COEFFICIENT", np.inf
     )  # it would mend either start
@@ -54,15 +72,15 @@ def test_the_start_that_leads_to_the_higher_likelihood_is_chosen(better: str, mo
     tracks = np.einsum("fij,fjp->fpi", true[:, :2], shapes)
     rows = tracks.transpose(0, 2, 1).reshape(2 * FRAMES, -1)
     wrong = exponential(0.2 * np.stack([np.sin(5 * time + 1), np.cos(3 * time), np.sin(2 * time)], axis=1)) @ true
-    own, hypothesis = (true, wrong) if better == "own" else (wrong, true)
+    own, other = (true, wrong) if better == "own" else (wrong, true)
     estimate = CameraEstimate(
-        own, np.ones(FRAMES), np.zeros((FRAMES, 2)), 1, rows @ rows.T / 300, tracks, hypotheses=((7, hypothesis),)
+        own, np.ones(FRAMES), np.zeros((FRAMES, 2)), 1, rows @ rows.T / 300, tracks, **{kind: ((7, other),)}
     )
     found, _ = learn(estimate, np.ones(FRAMES, dtype=bool), turning=True)
     common = nearest(np.einsum("fij,fik->jk", found.rotations, true))
     assert np.degrees(angles_between(found.rotations @ common, true)).mean() < 0.1
     assert found.basis_size == (7 if better == "rival" else 1)
-    assert ("K = 7 as they came" in found.reasons.get("basis_size", "")) == (better == "rival")
+    assert ("other rotations, from K = 7" in found.reasons.get("basis_size", "")) == (better == "rival")
 
 
 @pytest.mark.parametrize("outliers", [0.0, 0.1])
@@ -93,7 +111,7 @@ def test_with_outliers_cameras_keep_all_modes_and_shapes_the_validated_ones(
     assert (covariance.modes.shape[1] <= 4) == (outliers > 0)
 
 
-def test_a_chosen_hypothesis_with_little_rotation_gives_a_warning() -> None:
+def test_a_chosen_candidate_with_little_rotation_gives_a_warning() -> None:
     still = np.broadcast_to(np.eye(3), (FRAMES, 3, 3))
     turning = exponential(np.linspace(0, 1, FRAMES)[:, None] * np.array([0.0, 1.0, 0.0]))
     own = CameraEstimate(turning, np.ones(FRAMES), np.zeros((FRAMES, 2)), 1, np.zeros((0, 0)), np.zeros((FRAMES, 0, 2)))
