@@ -323,7 +323,8 @@ def _best_start(
     running = [estimate, *(restarted(estimate, size, rotations) for size, rotations in estimate.other_starts)]
     for frames, kept in STARTS_COMPARED:
         some = evenly_spread(len(used), frames)
-        part, ones, reached = of_frames(gram, some), np.ones(len(some)), []
+        part, ones = of_frames(gram, some), np.ones(len(some))
+        reached: list[tuple[float, CameraEstimate]] = []
         for start in running:
             if reached and should_stop is not None and should_stop():
                 break
@@ -332,10 +333,9 @@ def _best_start(
                 with_scales=False, rounds=START_ROUNDS, model_order=model_order, should_stop=should_stop,
             )  # fmt: skip
             reached.append((found.energy, start))
-        ranked = [start for _, start in sorted(reached, key=lambda each: each[0])]
+        running = [start for _, start in sorted(reached, key=lambda each: each[0])[:kept]]
         if len(some) == len(used):
-            return ranked[0]
-        running = ranked[:kept]
+            break
     return running[0]
 
 
