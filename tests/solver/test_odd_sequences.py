@@ -127,8 +127,14 @@ def finite_or_refused(image: np.ndarray, cameras: KnownCamera | None, settings: 
         assert_finite(found, np.isfinite(image).all(axis=2))
 
 
-@pytest.mark.parametrize("kind", ODD)
-@pytest.mark.parametrize(("frames", "points"), [(3, 4), pytest.param(5, 8, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("frames", "points", "kind"),
+    [
+        *((3, 4, kind) for kind in ODD),
+        *(pytest.param(5, 8, kind, marks=pytest.mark.slow) for kind in ("hidden", "a point seen once")),
+        *(pytest.param(5, 8, kind, marks=[pytest.mark.slow, pytest.mark.long]) for kind in ODD[:5]),
+    ],
+)
 def test_odd_tracks_of_known_cameras_give_finite_results_or_an_input_error(kind: str, frames: int, points: int) -> None:
     rotations = exponential(np.linspace(0, 1, frames)[:, None] * (0.0, 1.0, 0.0))
     for settings in (Settings(order="film"), Settings(prior="smooth"), Settings(method="temporal")):

@@ -31,7 +31,7 @@ def tracked(turning: tuple[Path, RenderedFilm]) -> TrackedFilm:
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param("face", marks=pytest.mark.slow),
+        pytest.param("face", marks=[pytest.mark.slow, pytest.mark.long]),
         pytest.param("flag", marks=pytest.mark.slow),
         "sphere",
         pytest.param("occluded", marks=pytest.mark.slow),
@@ -40,13 +40,13 @@ def tracked(turning: tuple[Path, RenderedFilm]) -> TrackedFilm:
 def test_tracks_agree_with_the_truth(tmp_path: Path, name: str) -> None:
     sequence = {
         "face": lambda: face(20, 1500, degrees=25),
-        "flag": lambda: flag(20, 1500, degrees=30),
+        "flag": lambda: flag(16, 1000, degrees=24),
         "sphere": lambda: sphere(12, 600, degrees=18),
-        "occluded": lambda: flag(20, 1500, degrees=20),
+        "occluded": lambda: flag(16, 1000, degrees=16),
     }[name]()
     size = (120, 90) if name == "sphere" else films.SIZE
     film = films.rendered(sequence, tmp_path / "film.avi", size=size, occluder=name == "occluded")
-    start = {"sphere": 6, "occluded": 5}.get(name, 10)
+    start = {"sphere": 6, "occluded": 5}.get(name, 8)
     tracked = track_film(tmp_path / "film.avi", region=film.region(start), region_frame=start)
     result = films.accuracy(tracked, film)
     assert result["median"] <= 0.3, result

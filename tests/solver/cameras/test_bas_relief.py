@@ -99,7 +99,7 @@ def depth_of(shapes: np.ndarray, rotations: np.ndarray) -> float:
 
 @pytest.mark.slow
 def test_a_head_that_turns_by_2_degrees_is_as_deep_as_a_head() -> None:
-    head = gallery.face(20, 150, degrees=1, tilt=0.5)
+    head = gallery.face(14, 100, degrees=1, tilt=0.5)
     tracks, _ = gallery.corrupt_tracks(head.tracks, noise=0.003, seed=0)
     solution = solve(tracks, head.mesh)
     found = depth_of(solution.shapes, solution.camera.rotations)

@@ -154,6 +154,7 @@ def test_mirrored_input_gives_mirrored_shapes(close: Solution) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_tracks_with_y_up_are_the_same_scene_in_other_axes(close: Solution) -> None:
     tracks = pinhole(SEEN, FOCAL)
     up = Tracks.from_arrays(np.array([0.0, PICTURE[1] - 1]) + tracks.points * [1, -1])
