@@ -38,10 +38,11 @@ def test_a_sandbox_loads_only_its_parser(parser: str) -> None:
     [
         "import pliant.worker.formats.read",
         "import pliant.worker.films.contained_process, pliant.tracking.region; pliant.tracking.open_film",
+        "import pliant.service.app",
     ],
-    ids=["reader", "film"],
+    ids=["reader", "film", "service"],
 )
-def test_reading_and_opening_a_film_load_neither_scipy_nor_the_tracker(code: str) -> None:
+def test_what_solves_nothing_loads_neither_scipy_nor_the_tracker(code: str) -> None:
     listed = f"import sys; {code}; print(*sys.modules)"
     ran = subprocess.run([sys.executable, "-I", "-c", listed], capture_output=True, text=True, check=True)
     assert not {"scipy", "pliant.tracking.track", "pliant.solver.reconstruct"} & set(ran.stdout.split())
