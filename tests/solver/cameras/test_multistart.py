@@ -19,24 +19,24 @@ FRAMES = 16
 
 @pytest.mark.slow
 def test_hypotheses_are_distinct_cameras_of_plausible_depth() -> None:
-    face = gallery.face(24, 200)
+    face = gallery.face(16, 120)
     found = estimate_cameras(normalize(face.tracks), Settings())
     assert found.hypotheses
     assert len({size for size, _ in found.hypotheses}) == len(found.hypotheses)
     for _, rotations in found.hypotheses:
-        assert rotations.shape == (24, 3, 3)
+        assert rotations.shape == (16, 3, 3)
         assert depth(found.gram, rotations) < MAX_START_DEPTH_VARIANCE
     assert not estimate_cameras(normalize(face.tracks), Settings(refine_rotations=False)).hypotheses
 
 
 @pytest.mark.slow
 def test_a_sheet_has_no_further_hypotheses() -> None:
-    assert not estimate_cameras(normalize(gallery.flag(24, 400).tracks), Settings()).hypotheses
+    assert not estimate_cameras(normalize(gallery.flag(12, 150).tracks), Settings()).hypotheses
 
 
 @pytest.mark.slow
 def test_cameras_with_implausible_depth_are_no_hypotheses(monkeypatch: pytest.MonkeyPatch) -> None:
-    face = gallery.face(24, 200)
+    face = gallery.face(16, 120)
     monkeypatch.setattr("pliant.solver.cameras.estimation.MAX_START_DEPTH_VARIANCE", 0.0)
     assert not estimate_cameras(normalize(face.tracks), Settings()).hypotheses
 
