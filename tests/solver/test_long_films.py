@@ -26,10 +26,14 @@ from pliant.solver.reconstruction import cameras, long_films
 FRAMES, LEARNED = 120, 20
 
 
+def learn_from(frames: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cameras, "LEARNED_FRAMES", frames)
+    monkeypatch.setattr(perspective, "LEARNED_FRAMES", frames)
+
+
 @pytest.fixture
 def limited(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cameras, "LEARNED_FRAMES", LEARNED)
-    monkeypatch.setattr(perspective, "LEARNED_FRAMES", LEARNED)
+    learn_from(LEARNED, monkeypatch)
 
 
 @pytest.fixture(scope="module")
@@ -85,8 +89,8 @@ def test_hidden_points_and_outliers_of_the_other_frames_are_predicted(film: gall
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("limited")
-def test_perspective_is_corrected_in_every_frame() -> None:
+def test_perspective_is_corrected_in_every_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    learn_from(40, monkeypatch)
     film, focal, distance = gallery.talk(90, 60), 600.0, 600.0
     seen = np.einsum("fij,fpj->fpi", film.rotations, film.shapes)
     seen -= seen.mean(axis=1, keepdims=True)
