@@ -40,11 +40,11 @@ def tracked(turning: tuple[Path, RenderedFilm]) -> TrackedFilm:
 def test_tracks_agree_with_the_truth(tmp_path: Path, name: str) -> None:
     sequence = {
         "face": lambda: face(20, 1500, degrees=25),
-        "flag": lambda: flag(16, 1000, degrees=24),
+        "flag": lambda: flag(16, 800, degrees=24),
         "sphere": lambda: sphere(12, 600, degrees=18),
-        "occluded": lambda: flag(16, 1000, degrees=16),
+        "occluded": lambda: flag(16, 800, degrees=16),
     }[name]()
-    size = (120, 90) if name == "sphere" else films.SIZE
+    size = films.SIZE if name == "face" else (120, 90)
     film = films.rendered(sequence, tmp_path / "film.avi", size=size, occluder=name == "occluded")
     start = {"sphere": 6, "occluded": 5}.get(name, 8)
     tracked = track_film(tmp_path / "film.avi", region=film.region(start), region_frame=start)
