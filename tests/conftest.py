@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import secrets
 import shutil
@@ -10,11 +11,14 @@ import socket
 import subprocess
 import sys
 import sysconfig
+import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import certifi
 import pytest
+import typer.testing
 
 NANIO = shutil.which("nanio", path=f"{sysconfig.get_path('scripts')}:{Path(sys.executable).parent}")
 """A small S3 server."""
@@ -23,6 +27,19 @@ NANIO = shutil.which("nanio", path=f"{sysconfig.get_path('scripts')}:{Path(sys.e
 # press Ctrl-C on purpose.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+# Every HTTP client that a test opens would read all authorities of the world, for as long as a request takes. None of them is
+# asked: a test that speaks TLS brings its own certificate.
+AUTHORITY = tempfile.NamedTemporaryFile(suffix=".pem")  # noqa: SIM115 - as long as the process
+AUTHORITY.write(
+    certifi.contents().partition("-----END CERTIFICATE-----\n")[0].encode() + b"-----END CERTIFICATE-----\n"
+)
+AUTHORITY.flush()
+certifi.where = lambda: AUTHORITY.name
+
+# Typer builds all commands anew for each one that a test invokes.
+typer.testing._get_command = functools.cache(typer.testing._get_command)
 
 
 @pytest.fixture(scope="session")

@@ -6,6 +6,7 @@ import ast
 import subprocess
 import sys
 import tomllib
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -84,6 +85,7 @@ def test_imports_follow_the_arrows(path: Path) -> None:
             assert name[0] in sys.stdlib_module_names | {"numpy"}, f"the solver does not use {module}"
 
 
+@cache
 def run_time_imports(path: Path) -> set[str]:
     """Return the modules of Pliant that a file imports when it runs; those for type checkers alone do not count."""
     tree = ast.parse(path.read_text())

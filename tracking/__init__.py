@@ -5,7 +5,7 @@
     tracked = track_film("face.mp4", region="mask.png")
     tracked.save_npz("tracks.npz")
 
-Needs OpenCV: `pip install 'pliant[film]'`.
+Needs OpenCV: `pip install 'pliant[film]'`. Names are imported on first access, so that opening a film does not load the tracker.
 """
 
 if __name__ != "pliant.tracking":
@@ -16,13 +16,26 @@ try:
 except ImportError as error:
     raise ImportError("Tracking films needs OpenCV. Install it with: pip install 'pliant[film]'") from error
 
-from pliant.tracking.decoding.film import Film, Frame, open_film
-from pliant.tracking.decoding.limits import FilmLimits
-from pliant.tracking.errors import FilmError, TrackingError, TrackingStopped
-from pliant.tracking.records import FilmInfo, OnStep, TrackedFilm, TrackingStep
-from pliant.tracking.track import track_film
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pliant.tracking.decoding.film import Film, Frame, open_film
+    from pliant.tracking.decoding.limits import FilmLimits
+    from pliant.tracking.errors import FilmError, TrackingError, TrackingStopped
+    from pliant.tracking.records import FilmInfo, OnStep, TrackedFilm, TrackingStep
+    from pliant.tracking.track import track_film
 
 del _cv2
+
+_HOMES = {
+    "decoding.film": ("Film", "Frame", "open_film"),
+    "decoding.limits": ("FilmLimits",),
+    "errors": ("FilmError", "TrackingError", "TrackingStopped"),
+    "records": ("FilmInfo", "OnStep", "TrackedFilm", "TrackingStep"),
+    "track": ("track_film",),
+}
+_HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 
 __all__ = [
     "Film",
@@ -38,3 +51,9 @@ __all__ = [
     "open_film",
     "track_film",
 ]
+
+
+def __getattr__(name: str) -> object:
+    if name not in _HOME_OF:
+        raise AttributeError(f"module 'pliant.tracking' has no attribute {name!r}")
+    return getattr(import_module(f"pliant.tracking.{_HOME_OF[name]}"), name)

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from pliant.solver.gallery.sequence import refusal
 from pliant.solver.mesh import Mesh
 from pliant.solver.records import MIN_POINTS, Floats, Ints
-from scipy.spatial import Delaunay
 
 Kind = Literal["grid", "triangles"]
 
@@ -67,6 +66,8 @@ def _numbered(plane: Floats, inside: NDArray[np.int64]) -> tuple[Floats, Mesh]:
 
 def _triangulate(flat: Floats) -> Ints:
     """Return Delaunay triangles, counter-clockwise when v points down, without slivers on the border."""
+    from scipy.spatial import Delaunay  # not for grids, nor for a service that only lists its examples
+
     triangles = Delaunay(flat).simplices.astype(np.int32)
     first, second = flat[triangles[:, 1]] - flat[triangles[:, 0]], flat[triangles[:, 2]] - flat[triangles[:, 0]]
     area = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]

@@ -6,7 +6,6 @@ import numpy as np
 from pliant.solver.gallery.sequence import Sequence, film, refusal, sweep
 from pliant.solver.mesh import Mesh
 from pliant.solver.records import MIN_POINTS, Floats, Ints
-from scipy.spatial import ConvexHull
 
 LOBES = 5
 
@@ -75,6 +74,8 @@ def _lattice(num_points: int) -> Floats:
 
 def _outward(points: Floats) -> Ints:
     """Return the faces of the convex hull, counter-clockwise seen from outside."""
+    from scipy.spatial import ConvexHull  # not for a service that only lists its examples
+
     hull = ConvexHull(points)
     faces = hull.simplices.astype(np.int32)
     corners = points[faces]

@@ -24,8 +24,8 @@ WANTED = (
     "cancel_exporting",
 )  # fmt: skip
 
-AGAIN = {"valkey_down", "api_uploading", "frozen", "cancel_loading"}
-"""Those that `tests/hosts` or a cancelled job in another state covers as well."""
+AGAIN = {"valkey_down", "api_uploading", "frozen", "stopped", "cancel_loading"}
+"""Those that `tests/hosts`, a worker that stops (`tests/worker`) or a cancelled job in another state covers as well."""
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -105,7 +105,7 @@ def test_work_serves_a_queue_until_it_is_stopped(tmp_path: Path) -> None:
 
 
 def test_solve_and_the_service_give_the_same_bits(service_url: str, tmp_path: Path) -> None:
-    sequence = corrupt(face(16, 300), noise=0.005, outliers=0.03, hidden=0.05, seed=5)
+    sequence = corrupt(face(8, 80), noise=0.005, outliers=0.03, hidden=0.05, seed=5)
     points = np.where(sequence.tracks.visible[..., None] > 0, sequence.tracks.points, np.nan)
     np.savez(tmp_path / "tracks.npz", tracks=points)
     np.savez(tmp_path / "mesh.npz", faces=sequence.mesh.faces)

@@ -75,7 +75,7 @@ def test_solves_are_done_once_and_the_table_says_what_matters(
     out = tmp_path / "sensitivity.jsonl"
     command = [
         "--only",
-        "START_SMOOTHNESS",
+        "hyperparameters.BENDING_SHARE",
         "--only",
         "hyperparameters.SPATIAL_SHARE",
         "--workers",

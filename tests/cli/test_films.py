@@ -14,6 +14,7 @@ from pliant.cli.exits import Exit
 from typer.testing import CliRunner, Result
 
 QUICK = ["-O", "outputs=[]", "-O", "max_reweightings=2", "-O", "grid_step=6", "-O", "refine_rotations=false"]
+QUICK += ["-O", "prior=smooth", "-O", "surface=free", "-O", "camera=orthographic"]
 
 
 @pytest.fixture(scope="module")

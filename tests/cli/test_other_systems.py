@@ -17,10 +17,13 @@ IMPORTS = """
 import pliant
 pliant.Client, pliant.AsyncClient, pliant.solve, pliant.__version__
 import pliant.client, pliant.solver, pliant.tracking
+pliant.tracking.open_film, pliant.tracking.track_film
 """
 COMMAND = """
 from pliant.cli import main
-sys.argv = ["pliant", "solve", sys.argv[1], "-o", "out", "--option", "prior=smooth", "--option", "max_reweightings=1"]
+sys.argv = ["pliant", "solve", sys.argv[1], "-o", "out"]
+for option in ("prior=smooth", "max_reweightings=1", "refine_rotations=false", "surface=free"):
+    sys.argv += ["--option", option]
 sys.exit(main())
 """
 

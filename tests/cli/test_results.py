@@ -117,7 +117,8 @@ def test_both_roads_name_the_object_after_the_file(monkeypatch: pytest.MonkeyPat
     monkeypatch.delenv("PLIANT_TOKEN", raising=False)
     given = tmp_path / "my take.npz"
     np.savez(given, tracks=np.random.default_rng(0).normal(size=(4, 12, 2)))
-    same = ("-O", "max_reweightings=1", "-O", "outputs=glb,ply,obj", "--mesh", "3x4")
+    same = ("-O", "prior=smooth", "-O", "refine_rotations=false", "-O", "surface=free", "-O", "max_reweightings=1")
+    same += ("-O", "outputs=glb,ply,obj", "--mesh", "3x4")
     session = Session(transport=InMemoryService(reconstruct=None))
     for command in ("solve", "submit"):
         ran = CliRunner().invoke(app, [command, str(given), *same, "-o", str(tmp_path / command)], obj=session)

@@ -27,7 +27,18 @@ from pliant.worker.settings import NUMERICAL_THREADS
 from typer.testing import CliRunner, Result
 
 Run = Callable[..., Result]
-FAST = ("-m", "none", "-O", "prior=smooth+low_rank", "-O", "max_reweightings=1")
+FAST = (
+    "-m",
+    "none",
+    "-O",
+    "prior=smooth+low_rank",
+    "-O",
+    "max_reweightings=1",
+    "-O",
+    "refine_rotations=false",
+    "-O",
+    "surface=free",
+)
 
 
 @pytest.fixture(scope="module")

@@ -50,10 +50,28 @@ def moving_points(frames: int = 6, count: int = 16) -> np.ndarray:
     return 100 + 20 * np.einsum("fij,pj->fpi", turns, surface)
 
 
-@pytest.fixture(params=["double", "service"])
-def asked(request: pytest.FixtureRequest) -> dict[str, Any]:
+Door = tuple[str, str]
+"""Which client, and what it asks."""
+
+DOORS: list[Door] = [("sync", "double"), ("async", "double"), ("async", "service")]
+EVERY_DOOR = pytest.mark.parametrize("door", [*DOORS, ("sync", "service")], indirect=True, ids="-".join)
+"""The synchronous client is generated from the other one: what differs between their transports is asked of the service, too."""
+
+
+@pytest.fixture(params=DOORS, ids="-".join)
+def door(request: pytest.FixtureRequest) -> Door:
+    return cast(Door, request.param)
+
+
+@pytest.fixture
+def kind(door: Door) -> str:
+    return door[0]
+
+
+@pytest.fixture
+def asked(request: pytest.FixtureRequest, door: Door) -> dict[str, Any]:
     """What a client is made with: the double, or the address of a real service."""
-    if request.param == "double":
+    if door[1] == "double":
         return {"url": "http://pliant.test", "transport": InMemoryService(), "retries": PATIENT}
     return {"url": request.getfixturevalue("service_url"), "retries": PATIENT}
 
@@ -71,23 +89,20 @@ def opened(kind: str, asked: dict[str, Any]) -> Iterator[Client]:
         client.close()
 
 
-@pytest.fixture(params=["sync", "async"])
-def kind(request: pytest.FixtureRequest) -> str:
-    return str(request.param)
-
-
 @pytest.fixture
 def client(kind: str, asked: dict[str, Any]) -> Iterator[Client]:
     with opened(kind, asked) as client:
         yield client
 
 
+@EVERY_DOOR
 def test_submit_wait_shapes_is_one_line(client: Client) -> None:
     shapes = client.submit(moving_points(), options=FAST).wait(timeout=60).shapes
     assert shapes.shape == (6, 16, 3)
     np.testing.assert_allclose(shapes.mean(axis=1), 0, atol=1e-9)
 
 
+@EVERY_DOOR
 def test_a_result_holds_arrays_report_and_job(client: Client, tmp_path: Path) -> None:
     updates: list[Job] = []
     sent: list[tuple[int, int]] = []
@@ -215,6 +230,7 @@ def test_the_service_describes_its_options_and_limits(client: Client) -> None:
     assert client.ready()["workers"] == "ok"
 
 
+@pytest.mark.parametrize("door", [("async", "double"), ("async", "service")], indirect=True, ids="-".join)
 def test_many_jobs_at_once(asked: dict[str, Any]) -> None:
     async def use() -> None:
         async with AsyncClient(**asked) as client:
@@ -228,6 +244,7 @@ def test_many_jobs_at_once(asked: dict[str, Any]) -> None:
     asyncio.run(use())
 
 
+@EVERY_DOOR
 def test_events_follow_a_job_from_the_queue_to_its_end(client: Client) -> None:
     job = client.submit(moving_points(), options=FAST)
     seen = list(job.events(timeout=60))
@@ -266,6 +283,7 @@ def test_cancelling_ends_the_wait_and_a_retry_is_a_new_job(kind: str, asked: dic
         again.cancel()
 
 
+@EVERY_DOOR
 def test_large_inputs_are_uploaded_first_with_the_same_result(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
     points, key = moving_points(6, 4000), secrets.token_hex()
     carried = client.submit(points, options=FAST, idempotency_key=key)
@@ -369,6 +387,7 @@ def test_a_share_link_reads_one_result_until_it_is_revoked(
         job.share(days=1000)
 
 
+@pytest.mark.parametrize("door", DOORS[:2], indirect=True, ids="-".join)
 def test_a_job_that_failed_is_failed_after_the_wait(kind: str) -> None:
     problem = Problem(title="Too short", status=422, code="too_few_frames", detail="Track more frames.")
     with opened(kind, {"url": "http://pliant.test", "transport": InMemoryService(problem=problem)}) as client:

@@ -50,7 +50,7 @@ def in_model(points: np.ndarray) -> np.ndarray:
     return ((points + 0.5) * (256 / 640, 256 / 480)).astype(np.float32)
 
 
-@pytest.mark.parametrize("model", ["TAPNext", "TAPIR"])
+@pytest.mark.parametrize("model", ["TAPNext", pytest.param("TAPIR", marks=[pytest.mark.slow, pytest.mark.long])])
 def test_from_tapnext(run, tmp_path: Path, model: str) -> None:
     points = in_model(SEQUENCE.tracks.points)[None]
     shape = points.shape[:3]
@@ -82,11 +82,11 @@ def test_from_alltracker(run, tmp_path: Path) -> None:
     certain[3, 0, 12, 16] = 0.1
     np.savez(tmp_path / "tracks.npz", traj_maps_e=maps[None], visconf_maps_e=certain[None])
     mask = np.zeros((2 * height, 2 * width), np.uint8)
-    mask[10:40, 12:52] = 255
+    mask[16:36, 16:44] = 255
     Image.fromarray(mask).save(tmp_path / "mask.png")
     printed = run("from_alltracker.py", "tracks.npz", "mask.png", "face.glb")
-    assert "points: 300 one pixel in 1" in printed
-    assert f"shapes ({frames}, 300, 3)" in printed
+    assert "points: 140 one pixel in 1" in printed
+    assert f"shapes ({frames}, 140, 3)" in printed
     assert (tmp_path / "face.glb").read_bytes()[:4] == b"glTF"
 
 
@@ -101,15 +101,13 @@ def test_from_mat(run, tmp_path: Path) -> None:
 
 def test_batch_resumes_where_it_stopped(run, tmp_path: Path) -> None:
     (tmp_path / "clips").mkdir()
-    for name in ("a", "b"):
-        np.savez(tmp_path / "clips" / f"{name}.npz", tracks=SEQUENCE.tracks.points)
+    np.savez(tmp_path / "clips" / "right.npz", tracks=SEQUENCE.tracks.points)
     np.savez(tmp_path / "clips" / "wrong.npz", tracks=np.ones((2, 9, 2)))
     for _ in range(2):
         printed = run("batch.py", "clips", "out")
         assert "wrong.npz: " in printed
-        assert printed.count("files in") == 2
-    held = [(tmp_path / "out" / name / "report.json").read_text() for name in ("a", "b")]
-    assert all(held)
+        assert printed.count("files in") == 1
+    assert (tmp_path / "out" / "right" / "report.json").read_text()
 
 
 def test_many_at_once(run, tmp_path: Path) -> None:

@@ -74,7 +74,7 @@ def test_every_response_is_declared(
 ) -> None:
     operation = schema[path][method]
     headers = {"Authorization": f"Bearer {token}"}
-    finished = _finished_job(guarded, headers)
+    finished = _finished_job(guarded, headers) if "{id}" in path else ""
 
     @settings(
         max_examples=EXAMPLES, deadline=None, database=None, derandomize=True, phases=[Phase.generate],

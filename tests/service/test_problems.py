@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import httpx
@@ -16,11 +17,10 @@ ROOT = Path(__file__).parents[2]
 FOLDERS = ("solver", "tracking", "worker", "service", "client", "cli")
 
 
-def sources() -> Iterator[tuple[Path, ast.Module]]:
-    for folder in FOLDERS:
-        for path in sorted((ROOT / folder).rglob("*.py")):
-            if "testing" not in path.parts:
-                yield path, ast.parse(path.read_text())
+@cache
+def sources() -> list[tuple[Path, ast.Module]]:
+    paths = [path for folder in FOLDERS for path in sorted((ROOT / folder).rglob("*.py"))]
+    return [(path, ast.parse(path.read_text())) for path in paths if "testing" not in path.parts]
 
 
 def code_parameters() -> dict[str, int]:

@@ -16,6 +16,9 @@ from pliant.solver.evaluation import metrics
 
 pytestmark = pytest.mark.slow
 
+LONG = pytest.mark.long
+"""For cases whose parts other cases cover."""
+
 CLOSE = 2e-4
 """Relative difference that conjugate gradients, stopped at a reduction and not at the exact answer, may leave."""
 
@@ -115,6 +118,10 @@ def permuted(given: Scene) -> tuple[Scene, np.ndarray]:
     )
 
 
+def in_another_unit(given: Scene) -> Scene:
+    return replace(given, points=given.points * 0.37, shapes=given.shapes * 0.37)
+
+
 def reversed_in_time(given: Scene) -> Scene:
     return Scene(
         given.points[::-1],
@@ -126,7 +133,9 @@ def reversed_in_time(given: Scene) -> Scene:
     )
 
 
-@pytest.mark.parametrize(("loss", "degrees"), [("l1", 90), ("l1", 180), ("l2", 33), ("huber", 33)])
+@pytest.mark.parametrize(
+    ("loss", "degrees"), [("l1", 90), pytest.param("l1", 180, marks=LONG), ("l2", 33), ("huber", 33)]
+)
 def test_the_camera_may_be_held_askew(loss: str, degrees: float) -> None:
     """L1 is taken along each image axis (as in the paper), so it knows quarter turns alone; the others any angle."""
     straight, askew = (each.solved(loss=loss, **TIGHT) for each in (SCENE, rolled(SCENE, degrees)))
@@ -149,7 +158,7 @@ def test_where_the_object_stands_in_the_image_does_not_matter(prior: str) -> Non
     )
 
 
-@pytest.mark.parametrize("factor", [1e-6, 0.37, 1e6])
+@pytest.mark.parametrize("factor", [1e-6, pytest.param(0.37, marks=LONG), 1e6])
 def test_the_unit_scales_the_shapes_and_nothing_else(factor: float) -> None:
     plain, scaled = (each.solved() for each in (SCENE, replace(SCENE, points=SCENE.points * factor)))
     assert_same(scaled.shapes / factor, plain.shapes, 1e-6)
@@ -160,14 +169,21 @@ def test_the_unit_scales_the_shapes_and_nothing_else(factor: float) -> None:
 
 
 @pytest.mark.parametrize("settings", [{"prior": "smooth"}, {"prior": "smooth", "temporal_order": 2}, {}], ids=str)
-@pytest.mark.parametrize("given", [SCENE, TRIANGLES], ids=["grid", "triangles"])
+@pytest.mark.parametrize("given", [pytest.param(SCENE, id="grid"), pytest.param(TRIANGLES, id="triangles", marks=LONG)])
 def test_a_film_run_backwards_gives_the_shapes_backwards(given: Scene, settings: dict[str, object]) -> None:
     forwards, backwards = (each.solved(**settings, **TIGHT) for each in (given, reversed_in_time(given)))
     assert_same(backwards.shapes[::-1], forwards.shapes, CLOSE if settings else LEARNED)
 
 
-@pytest.mark.parametrize("prior", ["smooth", "gaussian"])
-@pytest.mark.parametrize("given", [SCENE, TRIANGLES], ids=["grid", "triangles"])
+@pytest.mark.parametrize(
+    ("given", "prior"),
+    [
+        pytest.param(SCENE, "smooth", id="grid-smooth"),
+        pytest.param(SCENE, "gaussian", id="grid-gaussian"),
+        pytest.param(TRIANGLES, "smooth", id="triangles-smooth"),
+        pytest.param(TRIANGLES, "gaussian", id="triangles-gaussian", marks=LONG),
+    ],
+)
 def test_the_order_of_the_points_does_not_matter(given: Scene, prior: str) -> None:
     shuffled, order = permuted(given)
     found, expected = (each.solved(prior=prior, **TIGHT) for each in (shuffled, given))
@@ -186,8 +202,10 @@ TRANSFORMED = {
     "mirrored": mirrored(NOISY),
     "permuted": permuted(NOISY)[0],
     "backwards": reversed_in_time(NOISY),
-    "in another unit": replace(NOISY, points=NOISY.points * 0.37, shapes=NOISY.shapes * 0.37),
+    "in another unit": in_another_unit(NOISY),
+    "moved, mirrored and in another unit": in_another_unit(mirrored(moved(NOISY))),
 }
+QUICK = ("askew", "permuted", "moved, mirrored and in another unit")
 
 
 @pytest.fixture(scope="module")
@@ -195,7 +213,7 @@ def plain_error() -> float:
     return NOISY.error(NOISY.solved(estimated=True))
 
 
-@pytest.mark.parametrize("how", TRANSFORMED)
+@pytest.mark.parametrize("how", [each if each in QUICK else pytest.param(each, marks=LONG) for each in TRANSFORMED])
 def test_estimated_cameras_are_as_good_however_the_film_was_taken(how: str, plain_error: float) -> None:
     given = TRANSFORMED[how]
     assert 0.01 < plain_error < 0.06

@@ -23,18 +23,22 @@ from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import exponential
 from pliant.solver.reconstruction import cameras, long_films
 
-LEARNED = 40
+FRAMES, LEARNED = 120, 20
+
+
+def learn_from(frames: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cameras, "LEARNED_FRAMES", frames)
+    monkeypatch.setattr(perspective, "LEARNED_FRAMES", frames)
 
 
 @pytest.fixture
 def limited(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cameras, "LEARNED_FRAMES", LEARNED)
-    monkeypatch.setattr(perspective, "LEARNED_FRAMES", LEARNED)
+    learn_from(LEARNED, monkeypatch)
 
 
 @pytest.fixture(scope="module")
 def film() -> gallery.Sequence:
-    return gallery.talk(240, 60)
+    return gallery.talk(FRAMES, 60)
 
 
 def given(sequence: gallery.Sequence) -> KnownCamera:
@@ -45,8 +49,8 @@ def given(sequence: gallery.Sequence) -> KnownCamera:
 def test_deformation_between_the_frames_learned_from_is_found(film: gallery.Sequence) -> None:
     found = estimate_cameras(film.tracks, given(film))
     prior = learn_prior(film.tracks, found)
-    used = np.arange(0, 240, 6)
-    thin = replace(prior.normalized, modes=prior.normalized.modes[used]).stretched(used, 240)
+    used = np.arange(0, FRAMES, 6)
+    thin = replace(prior.normalized, modes=prior.normalized.modes[used]).stretched(used, FRAMES)
     error, interpolated = (
         metrics.e3d_frame(solve_shapes(film.tracks, found, each, film.mesh).shapes, film.shapes)
         for each in (prior, replace(prior, normalized=thin))
@@ -65,7 +69,7 @@ def test_a_quick_motion_that_interpolation_loses_is_found(
     interpolated = solve(film.tracks, film.mesh)
     found, lost = (metrics.e3d_frame(each.shapes, film.shapes) for each in (solution, interpolated))
     assert found < 0.1 * lost
-    assert f"These are {LEARNED} of 240 frames" in solution.choices.reasons["rotations"]
+    assert f"These are {LEARNED} of {FRAMES} frames" in solution.choices.reasons["rotations"]
     assert solution.camera.rotations[0] == pytest.approx(np.eye(3), abs=1e-12)
     assert np.log(solution.camera.scales).mean() == pytest.approx(0, abs=1e-9)
 
@@ -73,10 +77,10 @@ def test_a_quick_motion_that_interpolation_loses_is_found(
 @pytest.mark.usefixtures("limited")
 def test_hidden_points_and_outliers_of_the_other_frames_are_predicted(film: gallery.Sequence) -> None:
     spoiled, _ = gallery.corrupt_tracks(film.tracks, outliers=0.03, noise=0.0)
-    visible = np.random.default_rng(0).random((240, 60)) > 0.2
+    visible = np.random.default_rng(0).random((FRAMES, 60)) > 0.2
     tracks = Tracks.from_arrays(spoiled.points, visible)
     found = estimate_cameras(tracks, given(film))
-    assert found.estimate.sample.shape == (240, 60, 2)
+    assert found.estimate.sample.shape == (FRAMES, 60, 2)
     truth = film.tracks.points - film.tracks.points.mean(axis=1, keepdims=True)
     error = np.linalg.norm(found.estimate.sample * found.observations.normalized.unit - truth, axis=2)
     assert np.median(error) < 0.02 * found.observations.normalized.unit
@@ -85,8 +89,8 @@ def test_hidden_points_and_outliers_of_the_other_frames_are_predicted(film: gall
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("limited")
-def test_perspective_is_corrected_in_every_frame() -> None:
+def test_perspective_is_corrected_in_every_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    learn_from(40, monkeypatch)
     film, focal, distance = gallery.talk(90, 60), 600.0, 600.0
     seen = np.einsum("fij,fpj->fpi", film.rotations, film.shapes)
     seen -= seen.mean(axis=1, keepdims=True)
@@ -101,13 +105,13 @@ def test_perspective_is_corrected_in_every_frame() -> None:
 def test_a_stop_leaves_cameras_for_every_frame(film: gallery.Sequence) -> None:
     solution = solve(film.tracks, film.mesh, should_stop=lambda: True)
     assert solution.outcome is Outcome.STOPPED
-    assert solution.shapes.shape == (240, 60, 3)
+    assert solution.shapes.shape == (FRAMES, 60, 3)
     assert np.isfinite(solution.shapes).all()
 
 
 @pytest.mark.usefixtures("limited")
 def test_scales_that_are_not_given_are_found_in_every_frame(film: gallery.Sequence) -> None:
-    zoom = np.exp(0.2 * np.sin(np.arange(240) / 3))
+    zoom = np.exp(0.2 * np.sin(np.arange(FRAMES) / 3))
     points = film.tracks.points * zoom[:, None, None]
     settings = Settings(camera="scaled_orthographic")
     found = estimate_cameras(Tracks.from_arrays(points), KnownCamera.from_arrays(film.rotations), settings=settings)

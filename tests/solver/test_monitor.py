@@ -394,9 +394,8 @@ CASES = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "case", ["default", *(pytest.param(each, marks=pytest.mark.long) for each in ("outliers", "perspective"))]
-)
+@pytest.mark.long
+@pytest.mark.parametrize("case", CASES)
 def test_a_stop_at_every_place_that_asks_is_reported(case: str) -> None:
     tracks, settings = CASES[case]
     cameras = KnownCamera.from_arrays(np.tile(np.eye(3), (tracks.num_frames, 1, 1)))

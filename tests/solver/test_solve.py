@@ -55,7 +55,7 @@ def test_smoothness_gives_depth_that_the_pseudo_inverse_does_not() -> None:
 
 
 def test_estimated_cameras_and_a_mesh_run_end_to_end() -> None:
-    _, _, tracks, _ = scene()
+    _, _, tracks, _ = scene(10)  # enough frames for modes that have axes of their own
     steps: list[Step] = []
     found = solve(tracks, triangulated(sheet()[1]), on_step=steps.append)
     assert found.outcome is Outcome.CONVERGED

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import IO
 
 import numpy as np
-import scipy.io
 from pliant.worker.artifacts.result import Result
 
 HEADER = b"MATLAB 5.0 MAT-file, written by Pliant"
@@ -23,6 +22,8 @@ def fits(num_frames: int, num_points: int) -> bool:
 
 def write_mat(result: Result, file: IO[bytes]) -> None:
     """Write the arrays of `shapes.npz` under the same names; indices in `faces` count from 1, `point_names` is a cell array."""
+    import scipy.io  # not for the API process, which writes no file
+
     solution, camera = result.solution, result.solution.camera
     names = result.inputs.point_names
     posterior = {"shapes_std": solution.shapes_std, "inlier_probability": solution.inlier_probability}

@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg
 from pliant.worker.artifacts.animation import Animation
 from pliant.worker.artifacts.geometry import Ints, Singles, vertex_normals
 
@@ -50,6 +49,8 @@ def fit_normals(animation: Animation, triangles: Ints) -> FittedNormals:
     triangles : array of int, shape (T, 3)
         Not empty.
     """
+    import scipy.linalg  # not for the API process, which writes no file
+
     frames, modes = animation.weights.shape
     step = max(1, frames // max(FRAMES_OF_FIT, 4 * (modes + 1)))
     used = range(0, frames, step)

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.records import Camera
 from pliant.worker.artifacts.geometry import Floats, Singles
-from scipy.spatial.transform import Rotation
 
 MARGIN = 2.0
 """Near and far planes lie this factor before the nearest and beyond the farthest point."""
@@ -120,6 +119,8 @@ def _stated(camera: Camera, centre: Floats, size: Floats, image_size: tuple[floa
 
 def _quaternions(rotations: Floats) -> Singles:
     """Return unit quaternions x, y, z, w; neighbours lie on one side, so that a viewer turns the short way between them."""
+    from scipy.spatial.transform import Rotation  # not for the API process, which writes no file
+
     found = Rotation.from_matrix(rotations).as_quat()
     turns = np.where((found[1:] * found[:-1]).sum(axis=1) < 0, -1.0, 1.0)
     return np.asarray(found * np.concatenate([[1.0], np.cumprod(turns)])[:, None], dtype=np.float32)

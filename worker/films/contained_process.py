@@ -11,6 +11,7 @@ import resource
 import sys
 import time
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -64,6 +65,8 @@ def _answer(request: dict[str, Any]) -> str:
             "film_unavailable", field="film", expected="tracks, or a service with OpenCV", got="a film",
             hint="Install OpenCV beside service and worker (pip install 'pliant[film]'), or send tracks.",
         ) from error  # fmt: skip
+    if request["action"] == "track" or request["estimate"]:
+        import_module("pliant.tracking.track")  # before the limit of memory, which is for the film
     bounds = FilmBounds(**request["bounds"])
     seconds = bounds.check_seconds if request["action"] == "check" else bounds.track_seconds * request["threads"]
     limit_process(

@@ -19,10 +19,10 @@ FRAMES = 16
 
 @pytest.mark.slow
 def test_candidates_are_cameras_of_every_factorization_and_of_smooth_starts() -> None:
-    face = gallery.face(24, 200)
+    face = gallery.face(16, 120)
     found = estimate_cameras(normalize(face.tracks), Settings())
     sizes = [size for size, _ in found.candidates]
-    assert set(sizes) == {size for size in CANDIDATES if size <= 16}
+    assert set(sizes) == {size for size in CANDIDATES if size <= 2 * 16 / 3}
     assert len(sizes) == len(set(sizes)) + SMOOTH_STARTS
     for _, rotations in found.candidates:
         assert np.allclose(rotations @ rotations.transpose(0, 2, 1), np.eye(3))
@@ -32,26 +32,24 @@ def test_candidates_are_cameras_of_every_factorization_and_of_smooth_starts() ->
 
 @pytest.mark.slow
 def test_hypotheses_are_distinct_cameras_of_plausible_depth() -> None:
-    face = gallery.face(24, 200)
+    face = gallery.face(16, 120)
     found = estimate_cameras(normalize(face.tracks), Settings())
     assert found.hypotheses
     assert len({size for size, _ in found.hypotheses}) == len(found.hypotheses)
     for _, rotations in found.hypotheses:
-        assert rotations.shape == (24, 3, 3)
+        assert rotations.shape == (16, 3, 3)
         assert depth(found.gram, rotations) < MAX_START_DEPTH_VARIANCE
     assert not estimate_cameras(normalize(face.tracks), Settings(refine_rotations=False)).hypotheses
 
 
 @pytest.mark.slow
 def test_a_sheet_has_no_further_starts() -> None:
-    found = estimate_cameras(normalize(gallery.flag(24, 400).tracks), Settings())
-    assert not found.hypotheses
-    assert not found.candidates
+    assert not estimate_cameras(normalize(gallery.flag(12, 150).tracks), Settings()).other_starts
 
 
 @pytest.mark.slow
 def test_cameras_with_implausible_depth_are_no_hypotheses(monkeypatch: pytest.MonkeyPatch) -> None:
-    face = gallery.face(24, 200)
+    face = gallery.face(16, 120)
     monkeypatch.setattr("pliant.solver.cameras.estimation.MAX_START_DEPTH_VARIANCE", 0.0)
     assert not estimate_cameras(normalize(face.tracks), Settings()).hypotheses
 

@@ -15,7 +15,7 @@ def missed(found: np.ndarray, truth: np.ndarray) -> float:
     return float(np.std(np.log(found / truth)))
 
 
-@pytest.mark.parametrize(("frames", "points"), [(24, 300)])
+@pytest.mark.parametrize(("frames", "points"), [(16, 150)])
 @pytest.mark.slow
 def test_scales_of_a_zooming_camera_are_recovered(frames: int, points: int) -> None:
     film = gallery.face(frames, points, scale_change=0.1)
@@ -31,14 +31,14 @@ def test_scales_of_a_zooming_camera_are_recovered(frames: int, points: int) -> N
 @pytest.mark.parametrize("name", ["face", pytest.param("flag", marks=pytest.mark.long)])
 @pytest.mark.slow
 def test_a_camera_that_does_not_zoom_has_scales_of_one(name: str) -> None:
-    film = {"face": gallery.face, "flag": gallery.flag}[name](30, 300)
+    film = {"face": gallery.face, "flag": gallery.flag}[name](16, 150)
     found = solve(film.tracks)
     assert (found.camera.scales == 1).all()
     assert found.choices.reasons["scales"].startswith("Every scale is 1")
 
 
 def test_implausibly_large_scale_changes_are_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
-    film = gallery.face(24, 100, scale_change=0.1)
+    film = gallery.face(10, 50, scale_change=0.1)
     # Neither the rigid scales nor those found with the shapes may vary more.
     monkeypatch.setattr("pliant.solver.cameras.scale.WIDEST", 0.02)
     found = solve(film.tracks, settings=Settings(max_reweightings=1))

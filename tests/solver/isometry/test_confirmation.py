@@ -29,7 +29,7 @@ def test_halves_of_a_rolled_sheet_agree() -> None:
 
 
 def test_depths_along_the_rays_of_an_orthographic_flag_are_found_out_although_lengths_hardly_change() -> None:
-    search = search_of(gallery.flag(8, 60).tracks)
+    search = search_of(gallery.flag(6, 40).tracks)
     focal = 400.0
     first = tried_at(search, focal, None)
     assert first is not None
@@ -40,7 +40,7 @@ def test_depths_along_the_rays_of_an_orthographic_flag_are_found_out_although_le
 
 
 def test_what_halves_do_not_confirm_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    tracks = rolled().tracks
+    tracks = rolled(frames=6, side=7).tracks
     monkeypatch.setattr(surface, "disagreement", lambda search, chosen: 0.4)
     refused = isometric_surface(tracks, focal=FOCAL, image_size=SIZE)
     assert refused.surface is None

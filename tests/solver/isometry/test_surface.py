@@ -16,6 +16,9 @@ from pliant.solver.isometry.refinement import edge_lengths, inconsistency, refin
 from pliant.solver.isometry.surface import isometric_surface
 from rolled_sheets import CENTRE, FOCAL, SIZE, one_scale_error, rolled
 
+SMALL = {"frames": 6, "side": 7}
+"""Of a cylinder that is recovered in half the time of the usual one."""
+
 
 def graph_of(frames: int = 5, side: int = 5) -> tuple[SurfaceGraph, np.ndarray]:
     """Exact rays of a cylinder, and its true depths."""
@@ -71,7 +74,7 @@ def test_maximum_depth_respects_every_cone_and_is_about_the_sheet() -> None:
 
 @pytest.mark.parametrize(("kind", "error"), [("cylinder", 0.015), pytest.param("cone", 0.08, marks=pytest.mark.slow)])
 def test_a_rolled_sheet_is_recovered_with_the_focal_length_known(kind: str, error: float) -> None:
-    sheet = rolled(kind)
+    sheet = rolled(kind, **SMALL) if kind == "cylinder" else rolled(kind)
     # The cone's edges hardly tell one focal length from another, so that it is not taken unless it is required.
     verdict = isometric_surface(sheet.tracks, focal=FOCAL, image_size=SIZE, required=kind == "cone")
     assert verdict.surface is not None, verdict.reason
@@ -84,7 +87,7 @@ def test_a_rolled_sheet_is_recovered_with_the_focal_length_known(kind: str, erro
 
 
 def test_a_rolled_sheet_is_recovered_with_the_focal_length_found() -> None:
-    sheet = rolled()
+    sheet = rolled(**SMALL)
     verdict = isometric_surface(sheet.tracks, image_size=SIZE)
     assert verdict.surface is not None, verdict.reason
     assert verdict.surface.focal == pytest.approx(FOCAL, rel=0.06)
@@ -109,8 +112,8 @@ def test_hidden_points_and_outliers_leave_the_sheet_where_it_is() -> None:
 
 
 def test_the_order_of_the_frames_has_no_effect() -> None:
-    sheet = rolled(frames=6, side=6)
-    order = np.array([3, 0, 5, 1, 4, 2])
+    sheet = rolled(frames=5, side=5)
+    order = np.array([3, 0, 1, 4, 2])
     plain = isometric_surface(sheet.tracks, focal=FOCAL, image_size=SIZE, required=True).surface
     shuffled = Tracks.from_arrays(sheet.tracks.points[order])
     other = isometric_surface(shuffled, focal=FOCAL, image_size=SIZE, required=True).surface
@@ -121,7 +124,7 @@ def test_the_order_of_the_frames_has_no_effect() -> None:
 
 @pytest.mark.parametrize("focal", [FOCAL, pytest.param(None, marks=[pytest.mark.slow, pytest.mark.long])])
 def test_a_stretching_sheet_is_not_taken_as_isometric(focal: float | None) -> None:
-    verdict = isometric_surface(rolled("cone", stretch=0.2).tracks, focal=focal, image_size=SIZE)
+    verdict = isometric_surface(rolled("cone", stretch=0.2, **SMALL).tracks, focal=focal, image_size=SIZE)
     assert verdict.surface is None
     assert verdict.reason
 
@@ -162,7 +165,7 @@ def test_a_stopped_solve_does_not_assume_isometry() -> None:
 
 
 def test_the_solution_projects_back_onto_the_tracks_and_turns_a_camera_around_one_world() -> None:
-    sheet = rolled()
+    sheet = rolled(**SMALL)
     solution = solve(sheet.tracks, settings=Settings(focal=FOCAL, image_size=SIZE, order="film"))
     assert solution.outcome is Outcome.CONVERGED
     assert solution.camera.focal == FOCAL
@@ -171,7 +174,7 @@ def test_the_solution_projects_back_onto_the_tracks_and_turns_a_camera_around_on
     assert reprojection(sheet.tracks, solution).median < 1e-6
     assert one_scale_error(solution.shapes, sheet.points) < 0.015
     rotations = solution.camera.rotations
-    np.testing.assert_allclose(rotations @ rotations.transpose(0, 2, 1), np.tile(np.eye(3), (8, 1, 1)), atol=1e-12)
+    np.testing.assert_allclose(rotations @ rotations.transpose(0, 2, 1), np.tile(np.eye(3), (6, 1, 1)), atol=1e-12)
     np.testing.assert_allclose(rotations[0], np.eye(3), atol=1e-12)
     assert np.log(solution.camera.scales).mean() == pytest.approx(0, abs=1e-12)
     np.testing.assert_allclose(solution.shapes.mean(axis=1), 0, atol=1e-9)
@@ -185,7 +188,7 @@ def test_the_solution_projects_back_onto_the_tracks_and_turns_a_camera_around_on
 
 
 def test_a_wrong_focal_length_is_reported_as_improbable() -> None:
-    sheet = rolled()
+    sheet = rolled(**SMALL)
     verdict = isometric_surface(sheet.tracks, focal=2 * FOCAL, image_size=SIZE, required=True)
     assert verdict.surface is not None
     assert verdict.surface.focal == 2 * FOCAL
@@ -223,7 +226,8 @@ def test_given_rotations_and_a_required_isometry_contradict() -> None:
 def test_a_free_surface_is_the_solve_without_isometry() -> None:
     tracks = gallery.sphere(5, 40).tracks
     free, auto = (
-        solve(tracks, settings=Settings(surface=kind, image_size=SIZE, max_reweightings=1)) for kind in ("free", "auto")
+        solve(tracks, settings=Settings(surface=kind, image_size=SIZE, refine_rotations=False, max_reweightings=1))
+        for kind in ("free", "auto")
     )
     np.testing.assert_array_equal(free.shapes, auto.shapes)
     assert "surface" not in free.choices.reasons

@@ -84,7 +84,7 @@ def test_sparsely_observed_points_match_their_observations() -> None:
     assert errors[1] < 0.9 * errors[0]
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=[pytest.mark.slow, pytest.mark.long])])
 def test_two_noisy_observations_from_one_side_keep_the_depth_bounded(seed: int) -> None:
     """They hardly tell how deep it is; of points that may be anywhere in the body the error would be three times that of no look."""
     noise = np.random.default_rng(seed).normal(size=MADE.tracks.points.shape) * 0.02 * np.abs(TRUE).max()

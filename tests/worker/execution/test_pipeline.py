@@ -19,7 +19,7 @@ from pliant.worker.execution.pipeline import reconstruct, solver_settings
 from pliant.worker.formats import Inputs
 from worker_house import make_inputs
 
-CHEAP = Options(prior="smooth", max_reweightings=1)
+CHEAP = Options(prior="smooth", max_reweightings=1, refine_rotations=False, surface="free", camera="orthographic")
 """The default prior takes longer to learn than everything that is asked with this one."""
 
 

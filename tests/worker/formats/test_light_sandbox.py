@@ -6,6 +6,7 @@ import subprocess
 import sys
 
 import pliant.solver
+import pliant.tracking
 import pliant.worker.formats
 import pytest
 from pliant.worker.formats.reading.parsers import PARSERS
@@ -32,9 +33,24 @@ def test_a_sandbox_loads_only_its_parser(parser: str) -> None:
     assert loaded & HEAVY <= needed | ALSO.get(parser, set())
 
 
-@pytest.mark.parametrize("package", [pliant.solver, pliant.worker.formats])
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import pliant.worker.formats.read",
+        "import pliant.worker.films.contained_process, pliant.tracking.region; pliant.tracking.open_film",
+        "import pliant.service.app",
+    ],
+    ids=["reader", "film", "service"],
+)
+def test_what_solves_nothing_loads_neither_scipy_nor_the_tracker(code: str) -> None:
+    listed = f"import sys; {code}; print(*sys.modules)"
+    ran = subprocess.run([sys.executable, "-I", "-c", listed], capture_output=True, text=True, check=True)
+    assert not {"scipy", "pliant.tracking.track", "pliant.solver.reconstruct"} & set(ran.stdout.split())
+
+
+@pytest.mark.parametrize("package", [pliant.solver, pliant.tracking, pliant.worker.formats])
 def test_lazily_imported_names_exist(package: object) -> None:
     for name in package.__all__:  # type: ignore[attr-defined]
-        assert getattr(package, name).__name__ == name
+        assert getattr(package, name).__name__ in (name, "Callable")
     with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
         package.nonsense  # type: ignore[attr-defined]  # noqa: B018

@@ -47,7 +47,8 @@ def digests(jobs: Jobs, id: str) -> dict[str, str]:
 def test_a_backup_under_load_is_restored_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(Path(__file__).parents[2]))
     house_of = import_module("benchmarks.installation.instance").Instance
-    tracks, stop = face(4, 60).tracks.points, threading.Event()
+    sequence, stop = face(4, 60), threading.Event()
+    given = {"tracks": sequence.tracks.points, "rotations": sequence.rotations, "mesh": "none"}
     options = {"max_reweightings": 2, "outputs": [], "prior": "smooth", "camera": "scaled_orthographic"}
     with house_of(tmp_path / "before") as house:
 
@@ -55,13 +56,13 @@ def test_a_backup_under_load_is_restored_whole(tmp_path: Path, monkeypatch: pyte
             with house.client() as client:
                 while not stop.is_set() and len(house.acknowledged) < 8:
                     try:
-                        job = client.submit(tracks, mesh="none", options=options)
+                        job = client.submit(**given, options=options)
                         house.acknowledged.append(job.id)
                     except PliantError:
                         continue
 
         with house.client() as client:
-            early = [client.submit(tracks, mesh="none", options=options).id for _ in range(3)]
+            early = [client.submit(**given, options=options).id for _ in range(3)]
         house.acknowledged += early
         for id in early:
             assert house.final(id).status is Status.SUCCEEDED

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver import Mesh, Tracks
-from scipy.spatial import Delaunay, QhullError
 
 MAX_EDGE_RATIO = 5.0
 """Ratio of an edge to the median edge above which its triangles are removed: they bridge gaps and concave parts of the outline."""
@@ -24,6 +23,8 @@ def triangulate(tracks: Tracks, *, y_axis: str) -> tuple[Mesh | None, list[str]]
     notes : list of str
         Notes for the job's interpretation.
     """
+    from scipy.spatial import Delaunay, QhullError  # not for inputs that need no triangulation
+
     frame = int(np.argmax((tracks.visible > 0).sum(axis=1)))
     seen = np.flatnonzero(tracks.visible[frame] > 0)
     points = tracks.points[frame, seen]

@@ -11,14 +11,16 @@ two dimensions come to a surface's own.
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from pliant.schemas.options import Options
 from pliant.solver import InvalidInput, Mesh
 from pliant.solver.records import MIN_POINTS
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components, dijkstra
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array  # imported where a mesh is thinned, which few inputs want
 
 SEED_MOVES = 4
 """Moves of the seeds; the spread hardly changes after these."""
@@ -98,6 +100,8 @@ def _thin_grid(grid: NDArray[np.int32], stride: int, limit: int) -> tuple[Indice
 def _thin_mesh(
     points: NDArray[np.generic], visible: NDArray[np.float64] | None, mesh: Mesh, limit: int
 ) -> tuple[Indices, Mesh, list[str]]:
+    from scipy.sparse.csgraph import connected_components
+
     places, seen = _places(points, visible)
     triangles = split_quads(mesh.faces)
     graph = edge_lengths(places, seen, mesh.edges)
@@ -176,6 +180,8 @@ def _one_a_cell(mean: NDArray[np.float64], low: NDArray[np.float64], size: float
 
 def edge_lengths(places: NDArray[np.float64], seen: NDArray[np.bool], edges: NDArray[np.int32]) -> csr_array:
     """Return the mesh's edges as a graph, each as long as the greatest distance of its ends in a frame that shows both."""
+    from scipy.sparse import csr_array
+
     one, two = edges[:, 0], edges[:, 1]
     lengths = np.zeros(len(edges))
     for frame, there in zip(places, seen, strict=True):
@@ -193,6 +199,8 @@ def split_quads(faces: NDArray[np.int32]) -> NDArray[np.int32]:
 
 def _nearest(graph: csr_array, seeds: Indices) -> Indices:
     """Return the number of the seed that is nearest along the edges, −1 where none can be reached."""
+    from scipy.sparse.csgraph import dijkstra
+
     _, _, source = dijkstra(graph, directed=False, indices=seeds, min_only=True, return_predecessors=True)
     number = np.full(graph.shape[0] + 1, -1, dtype=np.intp)
     number[seeds] = np.arange(len(seeds))
@@ -203,6 +211,8 @@ def _middles(
     graph: csr_array, edges: NDArray[np.int32], cluster: Indices, seeds: Indices, shown: NDArray[np.float64]
 ) -> Indices:
     """Return, of each cluster, the vertex farthest from other clusters, those seen often preferred; the seed where there are none."""
+    from scipy.sparse.csgraph import dijkstra
+
     border = np.unique(edges[cluster[edges[:, 0]] != cluster[edges[:, 1]]])
     if len(border) == 0:
         return seeds
