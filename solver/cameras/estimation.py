@@ -97,11 +97,6 @@ class CameraEstimate:
     depth_is_typical: bool = False
     """Whether the extent of depth rests on its prior and not on the tracks (`cameras.bas_relief`)."""
 
-    @property
-    def other_starts(self) -> tuple[tuple[int, Floats], ...]:
-        """K and rotations that refinement with the shapes may start from instead of these."""
-        return (*self.candidates, *self.hypotheses)
-
 
 def estimate_cameras(
     normalized: Normalized,

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pliant.solver.cameras.bas_relief import DECIDED, bulges, settled_depth
 from pliant.solver.cameras.covariance_learning import LearningData
 from pliant.solver.cameras.depth_rounds import settled, settled_again
-from pliant.solver.cameras.estimation import CameraEstimate, restarted
+from pliant.solver.cameras.estimation import MAX_HYPOTHESIS_GAP, CameraEstimate, restarted
 from pliant.solver.cameras.learned import Learned, refined, scene_at, turned
 from pliant.solver.cameras.perspective import mirrored
 from pliant.solver.cameras.scale import SCALE_ROUNDS, ScaleTrial, try_free_scales
@@ -34,8 +34,8 @@ REFINEMENT_ROUNDS = 5
 """Refinements of rotations and covariance, each with a new L-BFGS memory. EM in between would undo part of the gain,
 since it keeps modes and random walk apart."""
 
-STARTS_COMPARED, START_ROUNDS = ((40, 3), (80, 1)), 2
-"""Frames at which the starting cameras are compared, and how many are kept, in successive rounds; refinements of each."""
+START_FRAMES, START_ROUNDS = 40, 2
+"""Frames and refinements used to compare the starting cameras."""
 
 CANDIDATE_ROUNDS = 3
 """Refinements of every candidate where they are compared at settled depths."""
@@ -171,10 +171,8 @@ def _started(
     should_stop: Callable[[], bool] | None,
 ) -> _Evidence:
     """Return the most probable start, with tracks corrected for perspective where they need it."""
-    if turning and start.estimate.other_starts:
-        (frames, kept), _ = STARTS_COMPARED
-        fits = 1 + len(start.estimate.other_starts) + (kept if len(start.used) > frames else 0)
-        enter(should_stop, "starts", units=UNITS_PER_START * fits)
+    if turning and (others := len(start.estimate.hypotheses) + len(start.estimate.candidates)):
+        enter(should_stop, "starts", units=UNITS_PER_START * (1 + others))
         best = _best_start(start.estimate, start.gram, start.used, model_order, should_stop)
         start = replace(start, estimate=best)
     if start.estimate.perspective is None or normalized is None:
@@ -314,29 +312,31 @@ def _best_start(
     model_order: ModelOrder,
     should_stop: Callable[[], bool] | None,
 ) -> CameraEstimate:
-    """Return the estimate with the rotations that reach the lowest energy by successive halving: its own, a candidate's or a hypothesis's.
+    """Return the estimate with the rotations, its own or those of another start, that give the lowest energy after a short refinement.
 
     The multistart models deformation by smooth modes and moves cameras by degrees to fit it; joint refinement hardly
-    moves them back, because every mode would have to move along. A candidate that the multistart ranks lower, or the
-    unrefined cameras of a factorization, can therefore be the better start.
+    moves them back, because every mode would have to move along. The unrefined cameras of a factorization, or a candidate
+    that the multistart ranks lower, can therefore be the better start. A candidate must be better by `MAX_HYPOTHESIS_GAP`:
+    smaller differences do not tell true cameras from false ones.
     """
-    running = [estimate, *(restarted(estimate, size, rotations) for size, rotations in estimate.other_starts)]
-    for frames, kept in STARTS_COMPARED:
-        some = evenly_spread(len(used), frames)
-        part, ones = of_frames(gram, some), np.ones(len(some))
-        reached: list[tuple[float, CameraEstimate]] = []
-        for start in running:
-            if reached and should_stop is not None and should_stop():
-                break
-            found = refined(
-                part, np.asarray(start.rotations)[used[some]], ones,
-                with_scales=False, rounds=START_ROUNDS, model_order=model_order, should_stop=should_stop,
-            )  # fmt: skip
-            reached.append((found.energy, start))
-        running = [start for _, start in sorted(reached, key=lambda each: each[0])[:kept]]
-        if len(some) == len(used):
-            break
-    return running[0]
+    some = evenly_spread(len(used), START_FRAMES)
+    part, ones = of_frames(gram, some), np.ones(len(some))
+
+    def energy(start: CameraEstimate) -> float:
+        if start is not estimate and should_stop is not None and should_stop():
+            return np.inf
+        given = np.asarray(start.rotations)[used[some]]
+        return refined(
+            part, given, ones, with_scales=False, rounds=START_ROUNDS, model_order=model_order, should_stop=should_stop
+        ).energy
+
+    hypotheses, candidates = (
+        [restarted(estimate, size, rotations) for size, rotations in starts]
+        for starts in (estimate.hypotheses, estimate.candidates)
+    )
+    rated = [(energy(start), start) for start in (estimate, *hypotheses)]
+    rated += [(energy(start) + MAX_HYPOTHESIS_GAP, start) for start in candidates]
+    return min(rated, key=lambda each: each[0])[1]
 
 
 def _best_candidate(

@@ -81,9 +81,12 @@ class PlanarCameras:
 
 
 def is_planar(gram: Floats) -> bool:
-    """Whether tracks with this Gram matrix show a planar object."""
+    """Whether tracks with this Gram matrix show a planar object, or points on one line, which lie in many planes."""
     values = np.linalg.eigvalsh(gram)[::-1]
-    return len(values) >= 6 and bool(values[2] < MAX_PLANAR_RATIO * values[1])
+    if len(values) < 6:
+        return False
+    rounding = len(values) * np.finfo(np.float64).eps * values[0]
+    return bool(values[2] < max(MAX_PLANAR_RATIO * values[1], rounding))
 
 
 def planar_frames(count: int) -> slice:

@@ -48,6 +48,9 @@ NUM_MODES = 16
 UNLIKELY = 1e6
 """Energy returned where M is not numerically positive definite; the line search steps back from it."""
 
+MAX_LOG_SCALE = 100.0
+"""Bound on |log s_f|, far beyond any camera: without a prior nothing bounds the scale of a frame whose points coincide."""
+
 LOWER = np.tril_indices(3)
 
 
@@ -180,7 +183,7 @@ def cameras_and_jacobian(scene: Scene, motion: Moved) -> tuple[Floats, Floats, F
     """Return the same and the left Jacobians of the turns, shape `(F, 3, 3)`."""
     turned, jacobian = exponential_and_jacobian(motion.turns)
     logs = motion.log_scales - motion.log_scales.mean() if scene.with_scales else np.zeros(len(turned))
-    return turned @ scene.rotations, np.exp(logs), jacobian
+    return turned @ scene.rotations, np.exp(np.clip(logs, -MAX_LOG_SCALE, MAX_LOG_SCALE)), jacobian
 
 
 def covariances_of(scene: Scene, motion: Motion) -> tuple[Floats, Floats, float, float]:

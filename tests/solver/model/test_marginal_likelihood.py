@@ -33,6 +33,18 @@ def test_the_covariances_reported_are_those_of_the_energy(floor: float) -> None:
     assert energy(scene, motion)[0] == pytest.approx(expected, rel=1e-10)
 
 
+def test_scales_stay_finite_where_nothing_bounds_them() -> None:
+    rotations = np.broadcast_to(np.eye(3), (3, 3, 3))
+    scene = Scene.of(np.eye(6), rotations, with_scales=True, prior_weight=0.0, ordered=False)
+    motion = replace(start(scene, np.ones(3)), log_scales=np.array([-3000.0, 0.0, 0.0]))
+    scales = cameras_of(scene, motion)[1]
+    assert np.isfinite(scales).all()
+    assert scales[0] > 0
+    value, gradient = energy(scene, motion)
+    assert np.isfinite(value)
+    assert np.isfinite(gradient.flat()).all()
+
+
 def test_a_random_walk_that_vanishes_to_rounding_is_unlikely_instead_of_a_division_by_zero() -> None:
     random, frames = np.random.default_rng(1), 6
     tracks = random.normal(size=(2 * frames, 40))
