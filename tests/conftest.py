@@ -29,8 +29,8 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-# Every HTTP client that a test opens would read all authorities of the world, for as long as a request takes. None of them is
-# asked: a test that speaks TLS brings its own certificate.
+# An HTTP client reads the whole bundle of certificate authorities when it opens, which takes as long as a request. No test needs
+# the bundle: one that speaks TLS brings its own certificate.
 AUTHORITY = tempfile.NamedTemporaryFile(suffix=".pem")  # noqa: SIM115 - as long as the process
 AUTHORITY.write(
     certifi.contents().partition("-----END CERTIFICATE-----\n")[0].encode() + b"-----END CERTIFICATE-----\n"
