@@ -37,6 +37,10 @@ GALLERY = {
 }
 
 
+RECONSTRUCTED = ("dinosaur_real",)
+"""Sequences whose shapes are another method's reconstruction: the trajectory basis with K = 12 has them to .00002."""
+
+
 def cases(data: Path | None, *, points: int | None, visibility: str, only: list[str]) -> Iterator[Case]:
     """Go through the sequences whose name holds one of `only` (all of them if it is empty)."""
     if data is None:

@@ -10,6 +10,8 @@ import numpy as np
 from pliant.solver.evaluation.metrics import NINETY
 from pliant.solver.evaluation.trust import LOOSE_HELD_OUT, UNTOLD
 
+from benchmarks.sequences import RECONSTRUCTED
+
 BEGIN, END = "<!-- trust tables -->", "<!-- end of trust tables -->"
 """Lines of the page between which the tables stand."""
 
@@ -45,6 +47,7 @@ def written(rows: list[Row], calibration: Sequence[str], page: Path | None) -> N
 
 def tables(rows: list[Row], calibration: Sequence[str]) -> str:
     """Return the tables in Markdown."""
+    rows = with_truth(rows)
     chosen = [row for row in rows if is_of(row, calibration)]
     held = [row for row in rows if not is_of(row, calibration)]
     parts = [
@@ -56,9 +59,14 @@ def tables(rows: list[Row], calibration: Sequence[str]) -> str:
     return "\n\n".join(part for part in parts if part)
 
 
-def is_of(row: Row, calibration: Sequence[str]) -> bool:
-    """Whether a row belongs to the sequences that constants were chosen on."""
-    return any(row["sequence"].split(" with ")[0] == name for name in calibration)
+def with_truth(rows: list[Row]) -> list[Row]:
+    """Return the rows without those of sequences whose shapes are a reconstruction."""
+    return [row for row in rows if not is_of(row, RECONSTRUCTED)]
+
+
+def is_of(row: Row, names: Sequence[str]) -> bool:
+    """Whether a row belongs to one of these sequences."""
+    return any(row["sequence"].split(" with ")[0] == name for name in names)
 
 
 def confusion(title: str, rows: list[Row]) -> str:

@@ -15,6 +15,8 @@ from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from benchmarks.sequences import RECONSTRUCTED
+
 RESULTS = Path(__file__).parents[1] / "results"
 Records = list[dict[str, Any]]
 
@@ -56,8 +58,6 @@ SEQUENCES = {
     "kinect_paper_dense23": "bending paper, real",
     "hulk21_px": "comic page, real",
 }
-RECONSTRUCTED = ("dinosaur_real",)
-"""Sequences whose shapes are another method's reconstruction: the trajectory basis with K = 12 has them to .00002."""
 
 
 def main() -> None:

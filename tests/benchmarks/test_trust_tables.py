@@ -122,3 +122,10 @@ def test_other_methods_on_a_sheet_are_measured_once_and_tabulated(bench, tmp_pat
     sheets.main(given)
     assert out.read_text() == first
     assert "| rolled | clean | – | – | – |" in capsys.readouterr().out
+
+
+def test_shapes_that_are_another_methods_reconstruction_are_no_truth(bench) -> None:
+    tables = bench("trust_tables")
+    solves = [{**solve_of(name, too_small=1.0), "verdict": "good", "true": 0.01} for name in ("one", "dinosaur_real")]
+    found = tables.confusion("Others", tables.with_truth(solves))
+    assert "| below .03 | 1 | 0 | 0 |" in found
