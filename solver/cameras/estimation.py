@@ -36,7 +36,9 @@ MIN_CAMERA_TURN = np.radians(10.0)
 
 MAX_HYPOTHESIS_GAP = 0.05
 """Energy above the lowest after the first round up to which a factorization's own cameras stay a hypothesis for the
-refinement with shapes. True cameras are up to .05 above, false ones .10 and more."""
+refinement with shapes. True cameras are up to .05 above, false ones .10 and more. In that refinement another candidate must
+be better by as much: the walk and 99 face scans, whose errors rise by 21 and 13 % with the best one, gain less than .02, a
+small face, whose error falls to .4, gains .10."""
 
 MAX_START_DEPTH_VARIANCE = 4.0
 """Mean squared depth of the closed form, normalized units, above which cameras are no start because they hardly

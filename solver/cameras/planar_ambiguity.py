@@ -85,8 +85,8 @@ def is_planar(gram: Floats) -> bool:
     values = np.linalg.eigvalsh(gram)[::-1]
     if len(values) < 6:
         return False
-    rounding = len(values) * np.finfo(np.float64).eps * values[0]
-    return bool(values[2] < max(MAX_PLANAR_RATIO * values[1], rounding))
+    # Of a line, noise alone leaves the second value.
+    return bool(values[2] < MAX_PLANAR_RATIO * max(values[1], MAX_PLANAR_RATIO * values[0]))
 
 
 def planar_frames(count: int) -> slice:
