@@ -44,16 +44,15 @@ STATUS_INTERVAL = 0.25
 """Minimum seconds between two reads of the job's status."""
 
 PATIENCE = 60.0
-"""Seconds to wait for an unavailable store, before computing and when publishing the result."""
+"""Seconds to wait for an unavailable store, to claim the job, before computing and when publishing the result."""
 
 
 def run(id: str, attempt_id: str, *, settings: Settings, worker: str) -> None:
     """Run one delivered attempt; return when its outcome is recorded, or when the job belongs to another attempt."""
-    jobs = Jobs.open(settings)
+    jobs, now = Jobs.open(settings), datetime.now(UTC)
+    claim = partial(lifecycle.claim, attempt_id=attempt_id, worker=worker, now=now)
     try:
-        stored = jobs.records.update(
-            id, lambda held: lifecycle.claim(held, attempt_id=attempt_id, worker=worker, now=datetime.now(UTC))
-        )
+        stored = Patience(PATIENCE).retry(lambda: jobs.records.update(id, claim))
     except (StaleAttempt, UnknownJob) as error:
         logger.info("delivery %s dropped: %s", attempt_id, error)
         return

@@ -24,13 +24,16 @@ FINAL = (Status.SUCCEEDED, Status.FAILED, Status.CANCELLED)
 
 
 def claim(stored: Stored, *, attempt_id: str, worker: str, now: datetime) -> Stored:
-    """Start the job.
+    """Start the job. The same claim again, after its reply was lost, changes nothing.
 
     Raises
     ------
     StaleAttempt
         The job is not queued under this attempt id: a duplicate or late delivery.
     """
+    mine = stored.attempt_id == attempt_id and stored.worker == worker and stored.job.started_at == now
+    if mine and stored.job.status in ACTIVE:
+        return stored
     if stored.attempt_id != attempt_id or stored.job.status is not Status.QUEUED:
         raise StaleAttempt(stored.job.id)
     job = stored.job.model_copy(

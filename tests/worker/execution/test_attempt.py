@@ -12,13 +12,14 @@ import pytest
 from pliant.schemas.job import Artifact, Interpretation, Progress, Status
 from pliant.schemas.options import Options
 from pliant.worker.errors import Interrupted, StoreUnavailable
-from pliant.worker.execution.attempt import Attempt, work
+from pliant.worker.execution.attempt import Attempt, run, work
 from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.finished import Finished
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.jobs.submission import Submission
+from pliant.worker.records import Stored
 from pliant.worker.store.blobs import Blobs
-from worker_house import make_inputs
+from worker_house import SHORT, make_inputs
 
 
 @pytest.fixture
@@ -149,3 +150,27 @@ def test_progress_is_repeated_while_files_are_fetched_and_stored(
     assert isinstance(end, Finished)
     assert {(each.stage, each.fraction) for each in during["fetch"]} == {("loading", 0.0)}
     assert {(each.fraction, each.seconds_left) for each in during["put"]} == {(1.0, 0.0)}
+
+
+def test_a_job_runs_although_the_reply_to_its_claim_is_lost(
+    jobs: Jobs, tmp_path: Path, interpretation: Interpretation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "inputs.npz"
+    make_inputs(file, frames=4, points=20)
+    id = jobs.submit(file, Submission(options=SHORT), interpretation=interpretation).id
+    attempt_id = jobs.records.get(id).attempt_id
+    replace, lost = jobs.records.replace, []
+
+    def lose_the_first(before: Stored, after: Stored) -> bool:
+        written = replace(before, after)
+        if not lost:
+            lost.append(after)
+            raise StoreUnavailable("The job store", reason="ConnectionError")
+        return written
+
+    monkeypatch.setattr(jobs.records, "replace", lose_the_first)
+    monkeypatch.setattr(Jobs, "open", lambda _: jobs)
+    run(id, attempt_id, settings=jobs.settings, worker="w")
+    assert lost[0].job.status is Status.RUNNING
+    job = jobs.get(id)
+    assert (job.status, job.attempt) == (Status.SUCCEEDED, 1), job.error

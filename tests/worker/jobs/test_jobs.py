@@ -192,6 +192,23 @@ def test_only_the_owning_attempt_writes(jobs: Jobs, submit) -> None:  # type: ig
     assert jobs.records.get(id) == before
 
 
+def test_a_claim_whose_reply_was_lost_is_repeated(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
+    id = submit().id
+    first = claim(jobs, id)
+    assert claim(jobs, id) == first == jobs.records.get(id)
+    assert first.job.attempt == 1
+    for worker, now in (("w", NOW + timedelta(microseconds=1)), ("other", NOW)):
+        with pytest.raises(StaleAttempt):
+            jobs.records.update(
+                id, partial(lifecycle.claim, attempt_id=first.attempt_id, worker=worker, now=now)
+            )  # a second delivery
+    jobs.cancel(id)
+    assert claim(jobs, id).job.status is Status.CANCELLING
+    jobs.records.update(id, partial(lifecycle.stop, attempt_id=first.attempt_id, now=NOW, retention=0))
+    with pytest.raises(StaleAttempt):
+        claim(jobs, id)
+
+
 def test_an_attempt_stops_only_for_a_cancellation(jobs: Jobs, submit) -> None:  # type: ignore[no-untyped-def]
     own = claim(jobs, submit().id)
     with pytest.raises(StaleAttempt):
