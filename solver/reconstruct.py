@@ -12,8 +12,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
 from pliant.solver.isometry.surface import IsometricVerdict
 from pliant.solver.mesh import Mesh
 from pliant.solver.monitor import Monitor
@@ -108,8 +106,9 @@ def _solved(
     monitor.report(Step("cameras", 0.0, max_reweightings=settings.max_reweightings))
     learning = time.perf_counter() - began
     if needs_blocks(tracks, settings):
-        observations = observations.without_points()
-        cameras = replace(cameras, observations=observations)  # blocks take their points from the tracks
+        cameras = replace(
+            cameras, observations=cameras.observations.without_points()
+        )  # blocks take their points from the tracks
         solution = shapes_in_blocks(
             tracks, cameras, prior, mesh, settings, monitor, seconds={"cameras": learning}, scratch=scratch
         )
@@ -130,43 +129,17 @@ def _started(
 ) -> Start:
     """Return the start of the shapes, without gross outliers; its time is added to `seconds`."""
     monitor.enter("start")
-    began, learning = time.perf_counter(), 0.0
+    began = time.perf_counter()
     start = with_outliers_rejected(prepared(tracks, cameras, prior, mesh, settings, should_stop=monitor), monitor)
-    if start.rejected().any() and not monitor():
-        again = time.perf_counter()
-        start = _started_again(start, cameras, monitor)
-        learning = time.perf_counter() - again
-    start = with_outlier_reason(start)
-    seconds["cameras"] += learning
-    seconds["initialise"] += time.perf_counter() - began - learning
-    return start
+    seconds["initialise"] += time.perf_counter() - began
+    return with_outlier_reason(start)
 
 
 def _with_verdict(solution: Solution, verdict: IsometricVerdict, settings: Settings) -> Solution:
     return replace(solution, choices=with_verdict(solution.choices, verdict, settings))
 
 
-def _learned(
-    observations: Observations,
-    monitor: Monitor,
-    rejected: NDArray[np.bool_] | None = None,
-    before: Cameras | None = None,
-) -> tuple[Cameras, Prior | None]:
-    """Return cameras and prior; after the cameras `before`, without the rejected observations."""
-    cameras = cameras_of(
-        observations if rejected is None else observations.without(rejected), monitor,
-        rejected=rejected, previous=before, expects_second=before is None, silent=before is not None,
-    )  # fmt: skip
+def _learned(observations: Observations, monitor: Monitor) -> tuple[Cameras, Prior | None]:
+    cameras = cameras_of(observations, monitor)
     settings = observations.settings
     return cameras, prior_of(cameras, monitor, seed=settings.seed) if settings.gaussian else None
-
-
-def _started_again(start: Start, before: Cameras, monitor: Monitor) -> Start:
-    """Return the start with cameras and prior estimated anew without the rejected observations.
-
-    An unrecognised outlier biases the completion and everything after it. Faces with 10 % outliers: .072 without a second start, .059 with
-    it.
-    """
-    observations = start.observations
-    cameras, prior = _learned(observations, monitor, start.rejected(), before)
-    return prepared(observations.tracks, cameras, prior, start.mesh, start.settings, should_stop=monitor)

@@ -65,6 +65,7 @@ UNITS = {
     "perspective": (10, 360, 30.0),
     "scales": (820, 120, 0.85),
     "refinement": (1500, 360, 1.1),
+    "observations": (184, 360, 6.0),
     "covariance": (380, 360, 1.0),
     "extension": (80, 1_000_000, 3.0),
     "trust": (10, 100, 60.0),
@@ -154,7 +155,7 @@ def unseen_frames(visible: Floats) -> float:
 
 
 def learning(frames: int, *, gaussian: bool, known_cameras: bool, known_scales: bool = False) -> tuple[Stage, ...]:
-    """Return the stages of cameras and prior; they run twice where the tracks have outliers."""
+    """Return the stages of cameras and prior; where entries are hidden or outliers, others are added (`Monitor.expect`)."""
     names = ["multistart", "model_order", "starts", "perspective", "scales", "refinement", "covariance"]
     if known_cameras:
         names = ["model_order", *([] if known_scales else ["scales"]), "covariance"] if gaussian else []

@@ -44,7 +44,8 @@ ROOMS = {
 ELSEWHERE = {
     "bas_relief": ("flag",), "planar_ambiguity": ("flag",), "focal_length": ("face, lens",), "perspective": ("face, lens",),
     "depth_alternation": ("face, lens",), "depth_rounds": ("face, lens",), "lens": ("face, lens",),
-    "resection": ("face, lens",), "completion": ("face, errors",), "noise": ("face, errors",), "outlier_rejection": ("face, errors",),
+    "resection": ("face, lens",), "completion": ("face, errors",), "noise": ("face, errors",), "observation_model": ("face, errors",),
+    "observed": ("face, errors",),
 }  # fmt: skip
 """Modules whose constants only count in other cases."""
 

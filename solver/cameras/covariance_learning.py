@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pliant.solver.cameras.depth_rounds import with_depth_map
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.model.early_stopping import described, learn_with_early_stopping
-from pliant.solver.model.model_order import ModelOrder, select_model_order
+from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.monitor import enter
 from pliant.solver.records import Floats
@@ -33,9 +33,6 @@ class LearningData:
     """Indices of the frames used."""
 
     model_order: ModelOrder
-
-    selects_again: bool
-    """Whether the model order is selected again with these cameras."""
 
     stopped: ShapeCovariance | None
     """Covariance of a refinement that was stopped, to be taken as it is; None where one is to be learned."""
@@ -70,19 +67,9 @@ def learn_covariance(
         covariance, modes = data.stopped, described(data.stopped)
     else:
         # Learn from scratch: modes learned along the way to these cameras overstate their likelihood.
-        model_order = data.model_order
-        if data.selects_again:
-            model_order = select_model_order(
-                data.sample,
-                data.projections,
-                spoiled=True,
-                ordered=estimate.ordered,
-                seed=seed,
-                should_stop=should_stop,
-            )
         enter(should_stop, "covariance")
         covariance, modes = learn_with_early_stopping(
-            data.sample, data.gram, data.projections, model_order, seed=seed, should_stop=should_stop
+            data.sample, data.gram, data.projections, data.model_order, seed=seed, should_stop=should_stop
         )
     if len(data.used) < len(estimate.rotations):
         covariance = covariance.stretched(data.used, len(estimate.rotations))

@@ -16,7 +16,8 @@ from pliant.solver.cameras.bas_relief import DECIDED, bulges, settled_depth
 from pliant.solver.cameras.covariance_learning import LearningData
 from pliant.solver.cameras.depth_rounds import settled, settled_again
 from pliant.solver.cameras.estimation import MAX_HYPOTHESIS_GAP, CameraEstimate, restarted
-from pliant.solver.cameras.learned import Learned, refined, scene_at, turned
+from pliant.solver.cameras.learned import Learned, learned_at, refined, scene_at, turned
+from pliant.solver.cameras.observed import Moments, Observed, on_observations
 from pliant.solver.cameras.perspective import mirrored
 from pliant.solver.cameras.scale import SCALE_ROUNDS, ScaleTrial, try_free_scales
 from pliant.solver.model import full_mode_covariance
@@ -27,7 +28,6 @@ from pliant.solver.monitor import enter
 from pliant.solver.records import Floats, read_only
 from pliant.solver.stages import REFINEMENT_UNITS, UNITS_PER_START
 from pliant.solver.tracks.frame_selection import between, evenly_spread, of_frames, rotations_between
-from pliant.solver.tracks.noise import OUTLIER_SHARE
 from pliant.solver.tracks.normalization import Normalized
 
 REFINEMENT_ROUNDS = 5
@@ -118,15 +118,25 @@ def refine_cameras(
         Called between refinements; once it returns True, the best so far is returned.
     """
     start = _Evidence.of(estimate, np.flatnonzero(shown), np.asarray(estimate.scales))
-    model_order = _model_order(start, turning=turning, seed=seed, should_stop=should_stop)
+    enter(should_stop, "model_order")
+    model_order = select_model_order(
+        start.sample, start.projections, ordered=estimate.ordered, seed=seed, should_stop=should_stop
+    )
     unsettled, start = start, _started(start, normalized, model_order, turning=turning, should_stop=should_stop)
     estimate = start.estimate
     if not turning:
         if estimates_scales and (start.start_scales == 1).all():
             start = _with_free_scales(start, unsettled, normalized, model_order, should_stop)
             estimate = start.estimate
+        projections = start.projections
+        if normalized is not None and estimate.filling is not None:
+            found = learned_at(start.gram, start.rotations, np.ones(len(start.used)), model_order, should_stop)
+            start, found = _of_observations(
+                start, found, normalized, seed=seed, with_scales=False, turning=False, should_stop=should_stop
+            )
+            estimate = start.estimate
         return estimate, LearningData(
-            start.gram, start.sample, start.projections, start.used, model_order, selects_again=False, stopped=None,
+            start.gram, start.sample, projections, start.used, model_order, stopped=None,
             rotations=np.asarray(estimate.rotations), scales=np.asarray(estimate.scales), turned=False,
         )  # fmt: skip
     trial = None
@@ -134,32 +144,21 @@ def refine_cameras(
         enter(should_stop, "scales")
         trial = try_free_scales(start.gram, start.rotations, model_order, should_stop)
     evidence, found = _refined(start, normalized, trial, model_order, should_stop)
+    if normalized is not None and estimate.filling is not None and np.isfinite(found.energy):
+        evidence, found = _of_observations(
+            evidence, found, normalized, seed=seed, with_scales=trial is not None and trial.start is not None,
+            turning=True, should_stop=should_stop,
+        )  # fmt: skip
+        # Few modes keep deformation out of completed tracks' cameras; the moments state what they do not know.
+        model_order = replace(model_order, max_modes=MAX_MODES)
     refined_estimate, rotations = _of_all_frames(start, evidence, found, trial)
     if not evidence.bends and not bulges(found, evidence.sample, y_up=y_up):
         refined_estimate, rotations, found = _mirrored(refined_estimate, rotations, found)
     return refined_estimate, LearningData(
         evidence.gram, evidence.sample, found.rotations[:, :2] * found.scales[:, None, None], start.used, model_order,
-        selects_again=_is_spoiled(estimate), stopped=None if np.isfinite(found.energy) else found.covariance,
+        stopped=None if np.isfinite(found.energy) else found.covariance,
         rotations=rotations, scales=np.asarray(refined_estimate.scales), turned=True,
     )  # fmt: skip
-
-
-def _is_spoiled(estimate: CameraEstimate) -> bool:
-    return estimate.outliers > OUTLIER_SHARE
-
-
-def _model_order(
-    evidence: _Evidence, *, turning: bool, seed: int, should_stop: Callable[[], bool] | None
-) -> ModelOrder:
-    """Return the number of modes and the starting noise with which cameras are refined."""
-    enter(should_stop, "model_order")
-    spoiled, ordered = _is_spoiled(evidence.estimate), evidence.estimate.ordered
-    model_order = select_model_order(
-        evidence.sample, evidence.projections,
-        spoiled=spoiled and not turning, ordered=ordered, seed=seed, should_stop=should_stop,
-    )  # fmt: skip
-    # Few modes would let the cameras follow the deformation; the order is selected later, for the shapes.
-    return replace(model_order, max_modes=MAX_MODES) if spoiled and turning else model_order
 
 
 def _started(
@@ -303,6 +302,30 @@ def _of_all_frames(
     if trial is not None and trial.start is not None:
         estimate = replace(estimate, scales=_at_all_frames(used, found.scales, frames))
     return _with_rotation_reason(estimate, rotations, np.asarray(start.estimate.rotations)), rotations
+
+
+def _of_observations(
+    evidence: _Evidence,
+    found: Learned,
+    normalized: Normalized,
+    *,
+    seed: int,
+    with_scales: bool,
+    turning: bool,
+    should_stop: Callable[[], bool] | None,
+) -> tuple[_Evidence, Learned]:
+    """Return cameras and covariance of the observations themselves, where entries are hidden or replaced."""
+    estimate, used = evidence.estimate, evidence.used
+    enter(should_stop, "observations")
+    translations = np.array(estimate.translations)
+    completed = Moments(evidence.gram, evidence.sample, translations[used], estimate.outliers)
+    found, moments = on_observations(
+        Observed.of(normalized, estimate, used, seed=seed), found, completed, evidence.start_scales[used],
+        with_scales=with_scales, turning=turning, should_stop=should_stop,
+    )  # fmt: skip
+    translations[used] = moments.translations
+    estimate = replace(estimate, translations=translations)
+    return replace(evidence, estimate=estimate, gram=moments.gram, sample=moments.sample), found
 
 
 def _best_start(

@@ -57,12 +57,11 @@ def select_model_order(
     sample: Floats,
     projections: Floats,
     *,
-    spoiled: bool = False,
     ordered: bool = True,
     seed: int = 0,
     should_stop: Callable[[], bool] | None = None,
 ) -> ModelOrder:
-    """Return the order that the sample supports: no limit where there is neither noise nor remaining outliers.
+    """Return the order that the sample supports: no limit where there is no noise.
 
     Parameters
     ----------
@@ -70,8 +69,6 @@ def select_model_order(
         Some points of centred, complete tracks, normalized units.
     projections : array, shape (F, 2, 3)
         s_f times the first two rows of R_f.
-    spoiled : bool
-        Whether outliers were found; undetected ones may remain in the sample.
     ordered : bool
         False for photographs in no order.
     seed : int
@@ -80,7 +77,7 @@ def select_model_order(
         Called after every round of EM; once it returns True, orders not yet scored count as improbable.
     """
     frames, count = sample.shape[:2]
-    if count < MIN_JUDGED_POINTS or not (spoiled or typical_roughness(sample) >= NOISE_STD_FLOOR):
+    if count < MIN_JUDGED_POINTS or typical_roughness(sample) < NOISE_STD_FLOOR:
         return ModelOrder(ordered=ordered)
     used = evenly_spread(frames, JUDGED_FRAMES)
     rows = sample[used].transpose(0, 2, 1).reshape(2 * len(used), count)

@@ -69,10 +69,14 @@ class ShapeCovariance:
         walk = random_walk_at(used, len(self.modes), self.ordered)
         return np.asarray(modes @ modes.T + self.walk_variance * walk)
 
-    def of_image(self, projections: Floats) -> Floats:
-        """Return V = ΠΣΠᵀ + σ²I, shape `(2F, 2F)`; `projections` (F, 2, 3) are s_f times the first two rows of R_f."""
+    def of_image(self, projections: Floats, used: NDArray[np.intp] | None = None) -> Floats:
+        """Return V = ΠΣΠᵀ + σ²I, shape `(2F, 2F)`; `projections` (F, 2, 3) are s_f times the first two rows of R_f.
+
+        With `used` both are of these frames only.
+        """
         rows = projections.reshape(-1, 3)
-        wide = np.repeat(np.repeat(self.over_frames(), 2, axis=0), 2, axis=1)
+        over_frames = self.over_frames() if used is None else self.over_frames_at(used)
+        wide = np.repeat(np.repeat(over_frames, 2, axis=0), 2, axis=1)
         image: Floats = rows @ self.mean_covariance @ rows.T + (rows @ self.axis_covariance @ rows.T) * wide
         image[np.diag_indices(len(rows))] += self.noise_variance
         return image

@@ -152,7 +152,7 @@ def _whole(
     )  # fmt: skip
     data = LearningData(
         np.zeros((0, 0)), sample, rotations[:, :2] * scales[:, None, None], np.arange(len(rotations)),
-        ModelOrder(ordered=covariance.ordered), selects_again=False, stopped=whole,
+        ModelOrder(ordered=covariance.ordered), stopped=whole,
         rotations=rotations, scales=scales, turned=False,
     )  # fmt: skip
     return estimate, data

@@ -31,7 +31,7 @@ class Observations:
     """As given."""
 
     normalized: Normalized
-    """The tracks in normalized units, with rejected observations hidden."""
+    """The tracks in normalized units."""
 
     settings: Settings
     """With `order` `film` or `any`."""
@@ -47,22 +47,14 @@ class Observations:
         """Whether rotations are estimated and refined."""
         return self.known is None and self.settings.refine_rotations
 
-    def without(self, rejected: NDArray[np.bool_]) -> Observations:
-        """Return the same observations with those where `rejected`, shape `(F, P)`, hidden.
+    def without(self, outliers: NDArray[np.bool_]) -> Observations:
+        """Return the same observations with those where `outliers`, shape `(F, P)`, hidden: they have no part in unit and centroids."""
+        kept = normalize(Tracks.from_arrays(self.tracks.points, np.where(outliers, 0.0, self.tracks.visible)))
+        return replace(self, normalized=kept, lens=given_lens(self.tracks, kept, self.settings, self.known))
 
-        Raises
-        ------
-        InvalidInput
-            The shape differs from that of the tracks, or nothing visible is left.
-        """
-        if rejected.shape != self.tracks.visible.shape:
-            raise InvalidInput(
-                "wrong_shape", field="rejected", expected=f"{self.tracks.visible.shape}, as the visibility", got=f"{rejected.shape}",
-                hint="Mark observations by frame and point.",
-            )  # fmt: skip
-        kept = Tracks.from_arrays(self.tracks.points, np.where(rejected, 0.0, self.tracks.visible))
-        normalized = normalize(kept)
-        return replace(self, normalized=normalized, lens=given_lens(self.tracks, normalized, self.settings, self.known))
+    def with_all(self) -> Observations:
+        """Return the observations with those that were hidden, in the same unit and about the same centroids."""
+        return replace(self, normalized=in_units_of(self.normalized, self.tracks))
 
     def without_points(self) -> Observations:
         """Return what the same tracks, or others of their frames, are normalized with, without the points themselves."""

@@ -132,7 +132,7 @@ def _with_learning_data(tracks: Tracks, cameras: Cameras, should_stop: ShouldSto
     camera = cameras.camera
     centre = None if camera.focal is None else (float(camera.principal_point[0]), float(camera.principal_point[1]))
     known = KnownCamera(camera.rotations, camera.scales, camera.focal, centre)
-    return estimate_cameras(tracks, known, settings=settings, rejected=cameras.rejected, should_stop=should_stop)
+    return estimate_cameras(tracks, known, settings=settings, should_stop=should_stop)
 
 
 def prior_of(cameras: Cameras, monitor: Monitor, *, seed: int) -> Prior:

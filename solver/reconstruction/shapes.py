@@ -6,10 +6,9 @@ import time
 from dataclasses import replace
 
 import numpy as np
-from pliant.solver.cameras.camera_choice import with_camera_choice
 from pliant.solver.energy.problem import Problem
 from pliant.solver.monitor import Monitor
-from pliant.solver.reconstruction.observations import in_units_of
+from pliant.solver.reconstruction.camera_choice import with_camera_choice
 from pliant.solver.reconstruction.solution import finish
 from pliant.solver.reconstruction.start import Start
 from pliant.solver.records import Floats, Step
@@ -111,9 +110,6 @@ def _finished(
     """Return the solution in the tracks' unit, with its standard deviations, probabilities and verdict."""
     observations, estimate, problem = start.observations, start.estimate, start.problem
     tracks, normalized = observations.tracks, observations.normalized
-    if normalized.visible is not tracks.visible:  # outliers are reported, not hidden
-        normalized = in_units_of(normalized, tracks)
-        problem = replace(problem, points=_rows(normalized.points, problem))
     outcome = Outcome.STOPPED if monitor() else outcome
     choices = with_camera_choice(
         start.choices, estimate.perspective, start.settings, unit=normalized.unit, given=observations.known is not None

@@ -15,7 +15,6 @@ from pliant.solver.reconstruction.prior import Prior
 from pliant.solver.reconstruction.shapes import shapes_from
 from pliant.solver.reconstruction.start import (
     check_shapes,
-    hides_some,
     prepared,
     warm,
     with_outlier_reason,
@@ -41,8 +40,7 @@ def solve_shapes(
 ) -> Solution:
     """Solve for the shape of every frame: the last stage of `solve`.
 
-    Gross outliers are rejected, unless the cameras were estimated with rejected observations, which are left out here as well.
-    More than `limits.BLOCK_OBSERVATIONS` are solved in blocks of points, as by `solve`; not where observations are left out.
+    Gross outliers are left out. More than `limits.BLOCK_OBSERVATIONS` are solved in blocks of points, as by `solve`.
 
     Parameters
     ----------
@@ -86,7 +84,7 @@ def solve_shapes(
     settings = without_learned_prior(settings) if prior is None else settings
     monitor = monitored(tracks, None, settings, on_step, should_stop, only=("shapes", "finish", "trust"))
     with pulses_to(monitor.pulse):
-        if needs_blocks(tracks, settings) and not hides_some(observations):
+        if needs_blocks(tracks, settings):
             return shapes_in_blocks(
                 tracks, cameras, prior, mesh, settings, monitor, seconds={}, start=first, scratch=scratch
             )

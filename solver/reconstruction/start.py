@@ -17,15 +17,14 @@ from pliant.solver.pulse import pulses_to
 from pliant.solver.reconstruction.cameras import Cameras
 from pliant.solver.reconstruction.observations import Observations, OnStep, ShouldStop, check_fit, monitored
 from pliant.solver.reconstruction.prior import Prior, estimate_with
-from pliant.solver.records import MIN_POINTS, Choices, Floats, Step, Tracks
+from pliant.solver.records import Choices, Floats, Step, Tracks
 from pliant.solver.settings import Settings
 from pliant.solver.shapes.initialization import pseudo_inverse, uniform_solution
 from pliant.solver.shapes.irls import init
-from pliant.solver.shapes.outlier_rejection import reject_outliers
+from pliant.solver.shapes.outlier_rejection import gross_outliers
 from pliant.solver.shapes.setup import build_problem, with_bending
 from pliant.solver.shapes.sparsely_observed import WellObserved, well_observed
 from pliant.solver.shapes.state import State
-from pliant.solver.tracks.completion import seen_again
 from pliant.solver.tracks.noise import OUTLIER_SHARE
 from pliant.solver.tracks.normalization import Normalized
 
@@ -45,7 +44,7 @@ class Start:
     covariance: ShapeCovariance | None
 
     outliers: float
-    """Share of gross outliers among the visible observations, as it was estimated before any was rejected."""
+    """Estimated share of gross outliers among the visible observations."""
 
     part: WellObserved | None
     """The well-observed points, to which the problem is restricted; None for all points."""
@@ -67,13 +66,8 @@ class Start:
         return visible
 
     def rejected(self) -> NDArray[np.bool_]:
-        """Return the observations to leave out of another estimate of the cameras, shape `(F, P)`.
-
-        None are where too few points would remain.
-        """
-        kept = self.confidence()
-        found = (self.observations.tracks.visible > 0) & (kept == 0)
-        return np.asarray(found if seen_again(kept) >= MIN_POINTS else np.zeros_like(found))
+        """Return the observations that are not used, shape `(F, P)`."""
+        return np.asarray((self.observations.tracks.visible > 0) & (self.confidence() == 0))
 
 
 def find_outliers(
@@ -86,10 +80,9 @@ def find_outliers(
     on_step: OnStep | None = None,
     should_stop: ShouldStop | None = None,
 ) -> NDArray[np.bool_]:
-    """Find the observations that are gross outliers, by a fit whose prior is too stiff to follow them.
+    """Find the observations that are gross outliers: those that the others of their point make less probable than an outlier.
 
-    `solve` estimates cameras and prior again without them: an outlier that is not recognised biases the completion of hidden entries and
-    everything after it.
+    `solve_shapes` leaves them out.
 
     Parameters
     ----------
@@ -238,28 +231,25 @@ def without_learned_prior(settings: Settings) -> Settings:
 
 
 def with_outliers_rejected(start: Start, monitor: Monitor) -> Start:
-    """Return the start without gross outliers, where there are any and the prior resists them.
-
-    Nothing is rejected twice: not with cameras that were estimated without rejected observations.
-    """
-    problem = start.problem
-    resists = problem.quadratic is not None and problem.weights.temporal > 0
-    if start.outliers <= OUTLIER_SHARE or not resists or hides_some(start.observations):
+    """Return the start without gross outliers, where there are any and a learned prior tells them."""
+    problem, covariance, filling = start.problem, start.covariance, start.estimate.filling
+    if covariance is None or filling is None or problem.weights.temporal == 0 or start.outliers <= OUTLIER_SHARE:
         return start
-    kept, state = reject_outliers(problem, start.state, start.outliers, should_stop=monitor)
-    return replace(start, problem=kept, state=state)
-
-
-def hides_some(observations: Observations) -> bool:
-    """Return whether visible observations are left out as outliers."""
-    return observations.normalized.visible is not observations.tracks.visible
+    estimate = start.estimate
+    found = gross_outliers(
+        start.flat if start.part is None else start.part.normalized,
+        np.asarray(estimate.rotations)[:, :2] * np.asarray(estimate.scales)[:, None, None],
+        np.asarray(estimate.translations), covariance, filling, share=start.outliers, should_stop=monitor,
+    )  # fmt: skip
+    without = replace(problem, confidence=np.where(found, 0, problem.confidence).astype(problem.confidence.dtype))
+    return replace(start, problem=without, state=init(without, start.state.shapes, start.state.translations))
 
 
 def with_outlier_reason(start: Start) -> Start:
     """Return the start with a sentence about the share of rejected observations, where outliers were looked for."""
     outliers = start.outliers
-    if outliers <= OUTLIER_SHARE or start.problem.quadratic is None or not start.problem.weights.temporal > 0:
+    if start.covariance is None or start.problem.weights.temporal == 0 or outliers <= OUTLIER_SHARE:
         return start
     share = 1 - np.count_nonzero(start.confidence()) / np.count_nonzero(start.observations.tracks.visible)
-    reason = f"{share:.1%} of the visible observations are rejected as gross outliers; {outliers:.1%} looked like outliers before the fit."
+    reason = f"{share:.1%} of the visible observations are rejected as gross outliers; {outliers:.1%} were expected."
     return replace(start, choices=replace(start.choices, reasons={**start.choices.reasons, "outliers": reason}))

@@ -30,7 +30,6 @@ from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.operators.mesh_laplacian import Matrix
 from pliant.solver.records import MIN_POINTS, Floats
 from pliant.solver.shapes.irls import init
-from pliant.solver.shapes.outlier_rejection import MIN_OUTLIER_DISTANCE
 from pliant.solver.shapes.state import State
 from pliant.solver.threads import over_ranges
 from pliant.solver.tracks.normalization import Normalized
@@ -40,6 +39,9 @@ from scipy.sparse.linalg import splu
 WELL_OBSERVED_SHARE = 0.25
 """Minimum share of the frames in which a well-observed point is visible. On rotating bodies .15 to .35 give about the
 same error."""
+
+MIN_OUTLIER_DISTANCE = 0.05
+"""Distance from its prediction, normalized units, below which an observation is never rejected."""
 
 MAX_SPARSE_SHARE = 0.5
 """Share of sparsely observed points above which all points are fitted together, since tracks then start and end

@@ -70,6 +70,10 @@ class Filling:
     scale: float
     """Standard deviation of the residuals, normalized units."""
 
+    def outliers(self, points: Floats, weight: Floats) -> NDArray[np.bool_]:
+        """Return which observations `(F, P, 2)` of confidence `(F, P)` are gross outliers, shape `(F, P)`."""
+        return _filled(points, weight, self.basis, self.spread, self.scale)[1]
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Completed:
@@ -276,12 +280,19 @@ def fill(points: Floats, weight: Floats, basis: Floats, spread: Floats, scale: f
     An entry with confidence 0 < c < 1 becomes c times itself plus 1 − c times its prediction: the EM completion of an
     observation whose noise variance is larger by 1/c.
     """
-    coefficients, _ = coefficients_of(points, weight, basis, spread, scale, sweeps=4, with_moment=False)
-    predicted = predict(basis, coefficients)
-    wrong = gross(points, weight, predicted, scale)
+    predicted, wrong = _filled(points, weight, basis, spread, scale)
     trust = np.where(wrong, 0.0, weight)[..., None]
     filled = np.where(trust == 1, points, predicted + trust * (points - predicted))
     return filled, float(weight[wrong].sum() / max(weight.sum(), np.finfo(float).tiny))
+
+
+def _filled(
+    points: Floats, weight: Floats, basis: Floats, spread: Floats, scale: float
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return the predictions, shape `(F, P, 2)`, and which visible entries are gross outliers, shape `(F, P)`."""
+    coefficients, _ = coefficients_of(points, weight, basis, spread, scale, sweeps=4, with_moment=False)
+    predicted = predict(basis, coefficients)
+    return predicted, gross(points, weight, predicted, scale)
 
 
 def gross(points: Floats, weight: Floats, predicted: Floats, scale: float) -> NDArray[np.bool_]:

@@ -61,11 +61,9 @@ def composed(tracks: Tracks, known: KnownCamera | None, settings: Settings) -> S
     if not settings.gaussian:
         return solve_shapes(tracks, cameras, mesh=MADE.mesh)
     prior = learn_prior(tracks, cameras)
-    rejected = find_outliers(tracks, cameras, prior, MADE.mesh)
-    if rejected.any():
-        cameras = estimate_cameras(tracks, known, settings=settings, rejected=rejected, previous=cameras)
-        prior = learn_prior(tracks, cameras)
-    return solve_shapes(tracks, cameras, prior, MADE.mesh)
+    found = solve_shapes(tracks, cameras, prior, MADE.mesh)
+    np.testing.assert_array_equal(find_outliers(tracks, cameras, prior, MADE.mesh), found.inlier_probability == 0)
+    return found
 
 
 @pytest.mark.parametrize(
@@ -202,7 +200,14 @@ def test_the_seed_reaches_every_random_choice(monkeypatch: pytest.MonkeyPatch) -
         cameras=KnownCamera.from_arrays(many.rotations, many.scales), settings=settings,
     )  # fmt: skip
     assert {seed for _, seed in made} == {7}
-    assert {name for name, _ in made} == {"completion", "model_order", "early_stopping", "uncertainty", "aggregation"}
+    assert {name for name, _ in made} == {
+        "completion",
+        "model_order",
+        "early_stopping",
+        "uncertainty",
+        "aggregation",
+        "observed",
+    }
 
 
 def test_inputs_that_do_not_belong_together_are_refused(cameras: Cameras, prior: Prior, solution: Solution) -> None:
@@ -215,7 +220,6 @@ def test_inputs_that_do_not_belong_together_are_refused(cameras: Cameras, prior:
         ("prior", lambda: solve_shapes(tracks, cameras, learn_prior(fewer, short))),
         ("start", lambda: solve_shapes(tracks, cameras, prior, start=solution.shapes[:, :5])),
         ("start", lambda: solve_shapes(tracks, cameras, prior, start=solution.shapes * np.nan)),
-        ("rejected", lambda: estimate_cameras(tracks, KNOWN, rejected=np.zeros((8, 3), dtype=bool))),
         ("rotations", lambda: estimate_cameras(fewer, KNOWN)),
     ):
         with pytest.raises(InvalidInput) as caught:

@@ -6,11 +6,8 @@ import numpy as np
 import pytest
 from learning import learn
 from pliant.solver import Settings, gallery
-from pliant.solver.cameras import joint_refinement
 from pliant.solver.cameras.estimation import MAX_START_DEPTH_VARIANCE, CameraEstimate, estimate_cameras, restarted
 from pliant.solver.cameras.multistart import CANDIDATES, SMOOTH_STARTS, depth
-from pliant.solver.model.expectation_maximisation import MAX_MODES
-from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.so3 import angles_between, exponential, nearest
 from pliant.solver.tracks.normalization import normalize
 
@@ -81,34 +78,6 @@ def test_the_start_that_leads_to_the_higher_likelihood_is_chosen(
     assert np.degrees(angles_between(found.rotations @ common, true)).mean() < 0.1
     assert found.basis_size == (7 if better == "rival" else 1)
     assert ("other rotations, from K = 7" in found.reasons.get("basis_size", "")) == (better == "rival")
-
-
-@pytest.mark.parametrize("outliers", [0.0, 0.1])
-def test_with_outliers_cameras_keep_all_modes_and_shapes_the_validated_ones(
-    outliers: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    random, time = np.random.default_rng(2), np.linspace(0, 1, FRAMES)
-    true = exponential(time[:, None] * np.array([0.3, 1.0, 0.1]))
-    mode = 0.3 * np.cos(np.pi * time)  # slow, or the tracks would be taken for noisy ones
-    shapes = mode[:, None, None] * random.normal(size=(3, 40)) + random.normal(size=(3, 40))
-    tracks = np.einsum("fij,fjp->fpi", true[:, :2], shapes)
-    wrong = random.random((FRAMES, 40)) < 0.02
-    tracks[wrong] += random.normal(0, 0.1, (wrong.sum(), 2))
-    rows = tracks.transpose(0, 2, 1).reshape(2 * FRAMES, -1)
-    estimate = CameraEstimate(
-        true, np.ones(FRAMES), np.zeros((FRAMES, 2)), 1, rows @ rows.T / 40, tracks, outliers=outliers
-    )
-    asked: list[int] = []
-    refined = joint_refinement.refined
-
-    def spied(*given: object, model_order: ModelOrder, **more: object) -> object:
-        asked.append(model_order.max_modes)
-        return refined(*given, model_order=model_order, **more)  # type: ignore[arg-type]
-
-    monkeypatch.setattr("pliant.solver.cameras.joint_refinement.refined", spied)
-    _, covariance = learn(estimate, np.ones(FRAMES, dtype=bool), turning=True)
-    assert set(asked) == {MAX_MODES}
-    assert (covariance.modes.shape[1] <= 4) == (outliers > 0)
 
 
 def test_a_chosen_candidate_with_little_rotation_gives_a_warning() -> None:

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from pliant.solver import KnownCamera, Mesh, Settings, Tracks, gallery, solve
 from pliant.solver.evaluation import metrics
 from pliant.solver.model.shape_covariance import ShapeCovariance
-from pliant.solver.shapes.outlier_rejection import MIN_OUTLIER_DISTANCE
 from pliant.solver.shapes.sparsely_observed import (
     MAX_DEVIATION,
+    MIN_OUTLIER_DISTANCE,
     SURFACE_RIDGE,
     WELL_OBSERVED_SHARE,
     Kriging,

@@ -110,14 +110,6 @@ def test_without_noise_or_with_few_points_the_order_is_not_limited() -> None:
     assert select_model_order(tracks(MIN_JUDGED_POINTS - 1, modes=2, sigma=SIGMA), PAIRS) == ModelOrder()
 
 
-def test_remaining_outliers_are_not_learned_as_modes() -> None:
-    random, sample = np.random.default_rng(0), tracks(40, modes=2, sigma=0.0).copy()
-    wrong = random.random(sample.shape[:2]) < 0.02
-    sample[wrong] += random.normal(0, 0.1, (wrong.sum(), 2))
-    assert select_model_order(sample, PAIRS) == ModelOrder()
-    assert select_model_order(sample, PAIRS, spoiled=True) == ModelOrder(2, noisy_start=True)
-
-
 @pytest.mark.parametrize("points", [40, pytest.param(400, marks=pytest.mark.long)])
 @pytest.mark.parametrize("known", [True, False])
 @pytest.mark.slow

@@ -1,0 +1,194 @@
+"""Cameras and shape covariance from the observations themselves: hidden entries and outliers by expectation.
+
+The completion of `tracks.completion` knows nothing of cameras and shapes, takes its predictions for observations, and follows some
+outliers. `cross_fitted` finds these outliers with a covariance that was learned from other points, and `on_observations` ends the estimate
+of the cameras: expected moments of the complete tracks (`model.observation_model`) and cameras by turns, which is expectation maximisation
+with L-BFGS on the marginal likelihood as its second step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from pliant.solver.cameras.estimation import CameraEstimate
+from pliant.solver.cameras.learned import START_EM_ROUNDS, Learned, turned_once
+from pliant.solver.cameras.perspective import Perspective, corrected, depth_map
+from pliant.solver.model.expectation_maximisation import learned
+from pliant.solver.model.observation_model import ImageDensity, inlier_probabilities
+from pliant.solver.records import Floats
+from pliant.solver.tracks.completion import choose_points
+from pliant.solver.tracks.normalization import Normalized
+
+ROUNDS = 3
+"""Updates of expected moments and cameras."""
+
+FOLDS = 2
+"""Parts of the points, each judged by a covariance that was learned from the others."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observed:
+    """What was observed of the sampled points, in the frames used."""
+
+    points: Floats
+    """Shape `(F', S, 2)`, normalized units, about the centroids of the visible points."""
+
+    confidence: Floats
+    """v, shape `(F', S)`, at most 1; 0 where hidden."""
+
+    weight: Floats
+    """v without what completion replaced as outliers, shape `(F', S)`."""
+
+    chosen: NDArray[np.intp]
+    """Indices of the sampled points, shape `(S,)`."""
+
+    view: Perspective | None
+    """Perspective at the frames used; None where tracks are not corrected."""
+
+    @classmethod
+    def of(cls, normalized: Normalized, estimate: CameraEstimate, used: NDArray[np.intp], *, seed: int) -> Observed:
+        """Return the observations of the points that completion sampled with this seed."""
+        assert estimate.filling is not None
+        chosen = choose_points(normalized.visible, np.random.default_rng(seed))
+        points, confidence = normalized.points[:, chosen], normalized.visible[:, chosen] / normalized.visible.max()
+        weight = np.where(estimate.filling.outliers(points, confidence), 0.0, confidence)
+        view = estimate.perspective
+        view = replace(view, offsets=view.offsets[used]) if view is not None and view.bends else None
+        return cls(points[used], confidence[used], weight[used], chosen, view)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Moments:
+    """Expected complete tracks of the sampled points, divided by the scales of the start."""
+
+    gram: Floats
+    """Expectation of W Wᵀ / S about the centroids, shape `(2F', 2F')`."""
+
+    sample: Floats
+    """Expected tracks about the centroids, shape `(F', S, 2)`."""
+
+    translations: Floats
+    """Centroids, normalized units, shape `(F', 2)`."""
+
+    outliers: float
+    """α, the share of outliers."""
+
+
+def cross_fitted(
+    observed: Observed,
+    estimate: CameraEstimate,
+    used: NDArray[np.intp],
+    *,
+    seed: int,
+    should_stop: Callable[[], bool] | None = None,
+) -> tuple[Floats, float]:
+    """Return the probability that an observation is an inlier, shape `(F', S)`, and the share of outliers.
+
+    Points are judged by a covariance of the others: one that was learned from a point with outliers has modes that follow them.
+
+    Parameters
+    ----------
+    observed : Observed
+        Of the same frames.
+    estimate : CameraEstimate
+        First cameras, and the completed tracks; no perspective is corrected yet.
+    used : array of int, shape (F',)
+        Frames.
+    seed : int
+        Of the parts.
+    should_stop : callable, optional
+        Called between rounds of EM.
+    """
+    scales = np.asarray(estimate.scales)[used]
+    projections = np.asarray(estimate.rotations)[used, :2] * scales[:, None, None]
+    points = observed.points - np.asarray(estimate.translations)[used, None]
+    points = np.where(observed.confidence[..., None] > 0, points, 0.0)
+    part = np.random.default_rng(seed).permutation(points.shape[1]) % FOLDS
+    found, shares = np.zeros(observed.confidence.shape), []
+    for fold in range(FOLDS):
+        others, own = estimate.sample[used][:, part != fold], part == fold
+        rows = others.transpose(0, 2, 1).reshape(2 * len(used), -1)
+        covariance = learned(
+            rows @ rows.T / rows.shape[1], projections, iterations=START_EM_ROUNDS, ordered=estimate.ordered, should_stop=should_stop
+        )  # fmt: skip
+        image, weight, share = covariance.of_image(projections), observed.weight[:, own], estimate.outliers
+        for _ in range(2):  # the second time without what the first one found
+            found[:, own], share = inlier_probabilities(
+                image, covariance.noise_variance, points[:, own], observed.confidence[:, own], weight, share=share
+            )
+            weight = observed.confidence[:, own] * found[:, own]
+        shares.append(share)
+    return found, float(np.mean(shares))
+
+
+def on_observations(
+    observed: Observed,
+    found: Learned,
+    completed: Moments,
+    start_scales: Floats,
+    *,
+    with_scales: bool,
+    turning: bool,
+    should_stop: Callable[[], bool] | None = None,
+) -> tuple[Learned, Moments]:
+    """Return cameras and covariance of the observations, and the moments that they belong to.
+
+    Parameters
+    ----------
+    observed : Observed
+        Of the frames used.
+    found : Learned
+        Cameras and covariance to start from.
+    completed : Moments
+        Of the completed tracks.
+    start_scales : array, shape (F',)
+        Scales that the cameras are relative to.
+    with_scales : bool
+        Whether scales are refined.
+    turning : bool
+        False keeps the rotations.
+    should_stop : callable, optional
+        Called between units of work; once it returns True, the best so far is returned.
+    """
+    moments = _expected(observed, found, completed, start_scales)
+    for _ in range(ROUNDS):
+        if should_stop is not None and should_stop():
+            break
+        found = turned_once(moments.gram, found, with_scales=with_scales, turning=turning, should_stop=should_stop)
+        moments = _expected(observed, found, moments, start_scales)
+    return found, moments
+
+
+def _expected(observed: Observed, found: Learned, before: Moments, start_scales: Floats) -> Moments:
+    """Return the moments under these cameras and this covariance; `before` has the depths by which tracks are corrected."""
+    points = _corrected(observed, found, before, start_scales) - before.translations[:, None]
+    points = np.where(observed.confidence[..., None] > 0, points / start_scales[:, None, None], 0.0)
+    projections = found.rotations[:, :2] * found.scales[:, None, None]
+    image, noise = found.covariance.of_image(projections), found.covariance.noise_variance
+    probability, share = inlier_probabilities(
+        image, noise, points, observed.confidence, observed.weight, share=before.outliers
+    )
+    means, covariance = ImageDensity.of(image, noise).moments(points, observed.confidence * probability)
+    middle = means.mean(axis=1)
+    means -= middle[:, None]
+    frames, count = points.shape[:2]
+    moved = middle.reshape(frames, 2) * start_scales[:, None]
+    return Moments(
+        (means @ means.T + covariance) / count, means.reshape(frames, 2, count).transpose(0, 2, 1),
+        before.translations + moved, share,
+    )  # fmt: skip
+
+
+def _corrected(observed: Observed, found: Learned, before: Moments, start_scales: Floats) -> Floats:
+    """Return the observations corrected for perspective, about the centroids of the visible points, `(F', S, 2)`."""
+    view = observed.view
+    if view is None:
+        return observed.points
+    complete = before.sample * start_scales[:, None, None]
+    depth = depth_map(found.rotations, found.scales * start_scales, found.covariance)
+    depths = depth @ complete.transpose(0, 2, 1).reshape(2 * len(complete), -1)
+    depths -= depths.mean(axis=1, keepdims=True)
+    return corrected(observed.points + view.offsets[:, None], depths, view.curvature) - view.offsets[:, None]

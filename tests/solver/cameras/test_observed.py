@@ -1,0 +1,128 @@
+"""Cameras and covariance from the observations themselves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pliant.solver import KnownCamera, Settings, Tracks, estimate_cameras, gallery
+from pliant.solver.cameras.estimation import given_cameras
+from pliant.solver.cameras.joint_refinement import refine_cameras
+from pliant.solver.cameras.learned import learned_at
+from pliant.solver.cameras.observed import Moments, Observed, cross_fitted, on_observations
+from pliant.solver.cameras.perspective import Perspective, corrected
+from pliant.solver.model.expectation_maximisation import MAX_MODES
+from pliant.solver.model.model_order import ModelOrder
+from pliant.solver.records import Floats
+from pliant.solver.tracks.normalization import normalize
+
+MADE = gallery.face(20, 60, degrees=60)
+KNOWN = KnownCamera.from_arrays(MADE.rotations, MADE.scales)
+USED = np.arange(20)
+ONES = np.ones(20)
+
+
+def begun(tracks: Tracks) -> tuple[Observed, object, Moments]:
+    normalized = normalize(tracks)
+    estimate = given_cameras(normalized, KNOWN, Settings())
+    observed = Observed.of(normalized, estimate, USED, seed=0)
+    completed = Moments(estimate.gram, estimate.sample, np.asarray(estimate.translations), estimate.outliers)
+    return observed, estimate, completed
+
+
+def true_sample(unit: float) -> Floats:
+    points = np.asarray(MADE.tracks.points)
+    return np.asarray((points - points.mean(axis=1, keepdims=True)) / unit)
+
+
+def test_a_point_is_judged_by_a_covariance_of_the_others() -> None:
+    """One point that jumps about fills modes of its own, if it is learned from; the others do not predict it."""
+    points = np.array(MADE.tracks.points)
+    random = np.random.default_rng(0)
+    wild = random.random(20) < 0.6
+    points[wild, 7] = random.uniform(points.min(), points.max(), (wild.sum(), 2))
+    visible = random.random(points.shape[:2]) > 0.05
+    visible[:, 7] = True
+    observed, estimate, _ = begun(Tracks.from_arrays(points, visible))
+    probability, share = cross_fitted(observed, estimate, USED, seed=0)  # type: ignore[arg-type]
+    apart = np.linalg.norm(points - MADE.tracks.points, axis=2) > 0.2 * normalize(MADE.tracks).unit
+    assert (probability[apart] < 0.5).mean() > 0.8
+    others = np.delete(np.where(observed.confidence > 0, probability, 1.0), 7, axis=1)
+    assert (others < 0.5).mean() < 0.01
+    assert share < 0.03
+
+
+@pytest.mark.parametrize("outliers", [0.0, 0.05])
+def test_expected_moments_are_nearer_to_the_truth_than_completed_tracks(outliers: float) -> None:
+    tracks = gallery.corrupt(MADE, noise=0.005, hidden=0.4, outliers=outliers, seed=2).tracks
+    observed, _, completed = begun(tracks)
+    start = learned_at(completed.gram, np.asarray(KNOWN.rotations), ONES, ModelOrder(), None)
+    found, moments = on_observations(observed, start, completed, ONES, with_scales=False, turning=False)
+    np.testing.assert_array_equal(found.rotations, KNOWN.rotations)
+    true = true_sample(normalize(tracks).unit)
+    hidden = observed.confidence == 0
+    error, before = (np.linalg.norm((each.sample - true)[hidden]) for each in (moments, completed))
+    assert error < before
+    flat = true.transpose(0, 2, 1).reshape(40, -1)
+    gram = flat @ flat.T / flat.shape[1]
+    assert np.linalg.norm(moments.gram - gram) < np.linalg.norm(completed.gram - gram)
+    assert moments.outliers == pytest.approx(outliers, abs=0.012)
+
+
+def test_perspective_is_corrected_with_the_depths_of_the_expected_tracks() -> None:
+    """Tracks of a pinhole give the moments that the same tracks give under orthography."""
+    tracks = gallery.corrupt(MADE, hidden=0.2, seed=2).tracks
+    observed, _, completed = begun(tracks)
+    start = learned_at(completed.gram, np.asarray(KNOWN.rotations), ONES, ModelOrder(), None)
+    _, flat = on_observations(observed, start, completed, ONES, with_scales=False, turning=False)
+    unit, curvature = normalize(tracks).unit, 0.1
+    depths = np.einsum("fj,fpj->fp", MADE.rotations[:, 2], MADE.shapes) / unit
+    depths -= depths.mean(axis=1, keepdims=True)
+    bent = np.asarray(corrected(observed.points, np.zeros_like(depths), 0.0)) / (1 + curvature * depths)[..., None]
+    view = Perspective(np.zeros((20, 2)), np.zeros(2), curvature=curvature)
+    pinhole = replace(observed, points=bent, view=view)
+    _, moments = on_observations(pinhole, start, completed, ONES, with_scales=False, turning=False)
+    uncorrected = replace(pinhole, view=None)
+    _, wrong = on_observations(uncorrected, start, completed, ONES, with_scales=False, turning=False)
+    error, least = (np.linalg.norm(each.sample - flat.sample) for each in (wrong, moments))
+    assert least < 0.25 * error
+
+
+def test_a_stop_leaves_the_cameras() -> None:
+    tracks = gallery.corrupt(MADE, hidden=0.2, seed=2).tracks
+    observed, _, completed = begun(tracks)
+    start = learned_at(completed.gram, np.asarray(KNOWN.rotations), ONES, ModelOrder(), None)
+    found, moments = on_observations(
+        observed, start, completed, ONES, with_scales=False, turning=True, should_stop=lambda: True
+    )
+    assert found is start
+    assert np.isfinite(moments.gram).all()
+
+
+@pytest.mark.parametrize("turning", [True, False])
+def test_cameras_are_refined_on_the_observations_where_entries_are_hidden(turning: bool) -> None:
+    """The completed tracks of noisy points allow few modes; the moments, which state what they do not know, all."""
+    tracks = gallery.corrupt(MADE, noise=0.01, hidden=0.3, seed=2).tracks
+    normalized = normalize(tracks)
+    estimate = given_cameras(normalized, KNOWN, Settings())
+    found, data = refine_cameras(estimate, np.ones(20, dtype=bool), turning=turning, normalized=normalized)
+    assert np.abs(data.gram - estimate.gram).max() > 1e-5
+    assert np.abs(data.sample - estimate.sample)[normalized.visible == 0].max() > 1e-3
+    assert np.abs(np.asarray(found.translations) - estimate.translations).max() > 1e-5
+    assert (data.model_order.max_modes == MAX_MODES) == turning
+    assert np.array_equal(found.rotations, estimate.rotations) != turning
+
+
+@pytest.mark.slow
+def test_outliers_have_no_part_in_the_unit_of_the_tracks() -> None:
+    points, random = np.array(MADE.tracks.points), np.random.default_rng(1)
+    wrong = random.random(points.shape[:2]) < 0.1
+    points[wrong] += random.uniform(-400, 400, (wrong.sum(), 2))
+    tracks = Tracks.from_arrays(points)
+    found = estimate_cameras(tracks, KNOWN)
+    clean = normalize(MADE.tracks).unit
+    assert normalize(tracks).unit > 1.05 * clean
+    assert found.observations.normalized.unit == pytest.approx(clean, rel=0.02)
+    assert found.outliers == pytest.approx(wrong.mean(), abs=0.015)
+    assert (found.observations.normalized.visible == tracks.visible).all()
