@@ -14,6 +14,7 @@ from pliant.solver.cameras.observed import Moments, Observed, cross_fitted, on_o
 from pliant.solver.cameras.perspective import Perspective, corrected
 from pliant.solver.model.expectation_maximisation import MAX_MODES
 from pliant.solver.model.model_order import ModelOrder
+from pliant.solver.reconstruction import cameras as reconstruction
 from pliant.solver.records import Floats
 from pliant.solver.tracks.normalization import normalize
 
@@ -112,6 +113,15 @@ def test_cameras_are_refined_on_the_observations_where_entries_are_hidden(turnin
     assert np.abs(np.asarray(found.translations) - estimate.translations).max() > 1e-5
     assert (data.model_order.max_modes == MAX_MODES) == turning
     assert np.array_equal(found.rotations, estimate.rotations) != turning
+
+
+def test_where_too_little_would_be_left_nothing_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    tracks = gallery.corrupt(MADE, outliers=0.1, seed=1).tracks
+    nothing = np.zeros(tracks.visible.shape)
+    monkeypatch.setattr(reconstruction, "cross_fitted", lambda *_, **__: (nothing, 0.5))
+    found = estimate_cameras(tracks, KNOWN)
+    assert np.array_equal(found.observations.normalized.points, normalize(tracks).points)
+    assert 0.05 < found.outliers < 0.15
 
 
 @pytest.mark.slow
