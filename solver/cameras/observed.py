@@ -23,10 +23,10 @@ from pliant.solver.tracks.completion import choose_points
 from pliant.solver.tracks.normalization import Normalized
 
 ROUNDS = 3
-"""Updates of expected moments and cameras."""
+"""Updates of expected moments and cameras; other numbers were not tried."""
 
 FOLDS = 2
-"""Parts of the points, each judged by a covariance that was learned from the others."""
+"""Parts of the points, each judged by a covariance that was learned from the others; other numbers were not tried."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

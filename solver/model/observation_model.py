@@ -32,7 +32,7 @@ from scipy import linalg
 from scipy.special import expit
 
 MIN_INLIER_PROBABILITY = 1e-3
-"""Floor of π where an observation is predicted from the others: keeps its own noise finite."""
+"""Floor of π where an observation is predicted from the others: keeps its own noise finite. Not tuned."""
 
 SHARE_BOUNDS = (1e-3, 0.5)
 """Bounds of α: at 0 no observation could be an outlier any more, and beyond half the inliers are not the majority."""

@@ -62,6 +62,7 @@ def scene(
 
 SCENE = scene()
 TRIANGLES = scene(mesh="triangles")
+COMPLETE = scene(outliers=0.0, hidden=0.0)
 
 
 def assert_same(found: np.ndarray, expected: np.ndarray, close: float = CLOSE) -> None:
@@ -158,10 +159,15 @@ def test_where_the_object_stands_in_the_image_does_not_matter(prior: str) -> Non
     )
 
 
-@pytest.mark.parametrize("factor", [2.0**-20, pytest.param(2.0**-1, marks=LONG), 2.0**20])
-def test_the_unit_scales_the_shapes_and_nothing_else(factor: float) -> None:
-    """Powers of two, which round nothing: the steps of the cameras multiply rounding by up to 1e5."""
-    plain, scaled = (each.solved() for each in (SCENE, replace(SCENE, points=SCENE.points * factor)))
+@pytest.mark.parametrize(
+    ("given", "factor"),
+    [(SCENE, 2.0**-20), pytest.param(SCENE, 0.5, marks=LONG), (SCENE, 2.0**20),
+     (COMPLETE, 1e-6), pytest.param(COMPLETE, 0.37, marks=LONG), (COMPLETE, 1e6)],
+    ids=["2^-20", "2^-1", "2^20", "complete-1e-6", "complete-0.37", "complete-1e6"],
+)  # fmt: skip
+def test_the_unit_scales_the_shapes_and_nothing_else(given: Scene, factor: float) -> None:
+    """Where entries are hidden, by powers of two, which round nothing: refinement on the observations multiplies rounding."""
+    plain, scaled = (each.solved() for each in (given, replace(given, points=given.points * factor)))
     assert_same(scaled.shapes / factor, plain.shapes, 1e-6)
     assert_same(scaled.residuals / factor, plain.residuals, 1e-5)
     np.testing.assert_allclose(scaled.weights, plain.weights, atol=1e-4)  # steep: a residual's rounding over ε
