@@ -51,7 +51,9 @@ def warnings_of(tracks: NDArray[np.float32], visible: NDArray[np.bool_], templat
     """Judge the tracks: motion and hidden share."""
     notes = []
     size = float(np.hypot(*np.ptp(tracks[template], axis=0)))
-    moved = np.where(visible, np.linalg.norm(tracks - tracks[template], axis=2), 0).max(axis=0)
+    moved = np.zeros(visible.shape[1])
+    for points, seen in zip(tracks, visible, strict=True):  # one frame at a time, for their memory
+        np.maximum(moved, np.linalg.norm(points - tracks[template], axis=1), out=moved, where=seen)
     if np.median(moved) < STILL_SHARE * size:
         notes.append(
             "Nothing moves in this film, so it holds no information about depth. Turn the thing by 30° or more to both sides, "

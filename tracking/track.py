@@ -203,7 +203,7 @@ def _track(run: _Run, found: Survey, plan: _Plan, step: float | None, *, whole: 
         read, length, plan.template - plan.start, appearance, registration,
         pool=run.pool, on_frame=on_frame, should_stop=run.should_stop,
     )  # fmt: skip
-    chained = track_again(
+    track_again(
         read, chained, plan.template - plan.start, appearance, registration,
         pool=run.pool, on_frame=on_frame, should_stop=run.should_stop,
     )  # fmt: skip
@@ -232,7 +232,9 @@ def _assemble(
     width, height = run.film.size
     indices, times = found.indices[rows], found.times[rows]
     visible = chained.visible[:, kept]
-    tracks = _in_film(chained.points[:, kept], found.scale)
+    tracks = np.zeros((len(indices), len(kept), 2), dtype=np.float32)
+    for t, points in enumerate(chained.points):  # one frame at a time, for their memory
+        tracks[t] = _in_film(points[kept], found.scale)
     confidence = chained.confidence[:, kept]
     template = plan.template - plan.start
     picked = np.unique(np.linspace(0, len(indices) - 1, THUMBNAILS).round().astype(np.int64))

@@ -8,8 +8,10 @@ looked for again where they had been lost.
 
 from __future__ import annotations
 
+import itertools
+from collections import deque
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
 from pliant.solver import Tracks
@@ -21,20 +23,31 @@ from pliant.tracking.errors import TrackingStopped
 from pliant.tracking.flow import Bools, Floats
 from pliant.tracking.registration import Registration
 
+POINTS_AT_ONCE = 512
+"""Points whose paths are computed together; all at once, in double precision, take six times the tracks' memory."""
+
+FRAMES_AHEAD = 8
+"""Frames whose registration waits or runs: two for each of the default's four threads at most."""
+
 
 def expected(chained: Chain) -> Floats:
     """Return where the paths of all points in a space of few dimensions lead, shape `(F, P, 2)`, from places weighted by their confidence.
 
-    The number of dimensions is the one that predicts held-out places best.
+    The space is fitted to a sample of the points. The number of its dimensions is the one that predicts held-out places best.
     """
-    normalized = normalize(Tracks.from_arrays(chained.points, chained.confidence))
-    points, weight = normalized.points, np.asarray(normalized.visible)
-    random = np.random.default_rng(0)
+    weight, random = chained.confidence, np.random.default_rng(0)
     chosen = choose_points(weight, random)
-    basis, spread, scale = fit_basis(points[:, chosen], weight[:, chosen], random)
-    coefficients, _ = coefficients_of(points, weight, basis, spread, scale, sweeps=4, with_moment=False)
-    paths = predict(basis, coefficients) * normalized.unit + normalized.centroid[:, None]
-    return np.asarray(paths, dtype=np.float32)
+    sample = normalize(Tracks.from_arrays(chained.points[:, chosen], weight[:, chosen]))
+    basis, spread, scale = fit_basis(sample.points, np.asarray(sample.visible), random)
+    centre, paths = sample.centroid[:, None], np.zeros_like(chained.points)
+    for start in range(0, weight.shape[1], POINTS_AT_ONCE):
+        part = slice(start, start + POINTS_AT_ONCE)
+        points = (chained.points[:, part] - centre) / sample.unit
+        coefficients, _ = coefficients_of(
+            points, weight[:, part].astype(np.float64), basis, spread, scale, sweeps=4, with_moment=False
+        )
+        paths[:, part] = predict(basis, coefficients) * sample.unit + centre
+    return paths
 
 
 def track_again(
@@ -47,13 +60,13 @@ def track_again(
     pool: ThreadPoolExecutor,
     on_frame: OnFrame,
     should_stop: Callable[[], bool],
-) -> Chain:
+) -> None:
     """Register every frame again from the expected places; points that look like the template there are visible again.
 
     Parameters
     ----------
     chained
-        From `chain`, whose other arguments these are.
+        From `chain`, whose other arguments these are. Its arrays are overwritten.
 
     Raises
     ------
@@ -70,16 +83,18 @@ def track_again(
         points, variance = registration.refine(frame, paths[t], chained.variance[t], like | chained.visible[t])
         return points, appearance.agrees(frame, points, like | chained.visible[t]), variance
 
-    result = Chain(chained.points.copy(), chained.visible.copy(), chained.variance.copy())
-    found = {t: pool.submit(again, t) for t in range(len(paths)) if t != template}
+    ahead: deque[tuple[int, Future[tuple[Floats, Bools, Floats]]]] = deque()
+    frames = (t for t in range(len(paths)) if t != template)
     try:
-        for t, future in found.items():
+        ahead.extend((t, pool.submit(again, t)) for t in itertools.islice(frames, FRAMES_AHEAD))
+        while ahead:
             if should_stop():
                 raise TrackingStopped
+            t, future = ahead.popleft()
             points, visible, variance = future.result()
-            result.points[t], result.visible[t], result.variance[t] = points, visible, variance
+            ahead.extend((t, pool.submit(again, t)) for t in itertools.islice(frames, 1))
+            chained.points[t], chained.visible[t], chained.variance[t] = points, visible, variance
             on_frame(t, points, visible)
     finally:
-        for future in found.values():
+        for _, future in ahead:
             future.cancel()
-    return result

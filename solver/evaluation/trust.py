@@ -158,8 +158,10 @@ def assess(
         _sign(-turn, -NARROW, -STILL, f"The camera turned by {turn:.0f}° only; depth needs {NARROW:.0f}° or more."),
         _sign(hidden, HIDDEN_SHARE, UNSEEN_SHARE, unseen),
     ]
-    if interval is not None:
-        found.append(_sign(interval[1], POOR, BAD, f"The error may be as large as {_share(interval[1])}."))
+    if expected is not None:
+        upper = INTERVAL[1] * expected
+        large = f"may be as large as {_share(upper)}" if bounded else f"is expected to be at least {_share(expected)}"
+        found.append(_sign(upper, POOR, BAD, f"The error {large}."))
     if held_out_error is not None:
         far = f"{_percent(held_out_error)} of the object's size"
         sentence = f"Observations that were left out are {far} from where the others predict them."

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -144,7 +145,7 @@ def seen_again(visible: Floats) -> int:
     return int(((visible > 0).sum(axis=0) >= 2).sum())
 
 
-def choose_points(visible: Floats, random: np.random.Generator) -> NDArray[np.intp]:
+def choose_points(visible: NDArray[np.floating[Any]], random: np.random.Generator) -> NDArray[np.intp]:
     """Return the sorted indices of at most `MAX_SAMPLE_POINTS` points, half of them visible more often than the median."""
     seen = (visible > 0).sum(axis=0)
     usable = np.flatnonzero(seen >= min(2, int(seen.max())))

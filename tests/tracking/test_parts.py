@@ -23,7 +23,6 @@ from pliant.tracking.registration import Registration
 from pliant.tracking.rendering import Truth, render_film
 from pliant.tracking.seeding import keep, neighbours, place, quads
 from pliant.tracking.survey import find_cuts, sharpest, tracking_scale
-from scipy import sparse
 
 
 def grey(count: int = 2, step: int = 2) -> list[np.ndarray]:
@@ -248,8 +247,9 @@ def test_registration_of_a_frame_with_itself_moves_nothing() -> None:
 
 def test_a_cell_moves_bilinearly_and_a_plane_does_not_bend() -> None:
     registration, *_ = registered()
-    corner = registration.points[registration.corners]
-    places = registration.between @ registration.points
+    cells, count = registration.cells, len(registration.points)
+    corner = registration.points[cells.corners]
+    places = cells.places(registration.points)
     inside = places.reshape(len(corner), -1, 2)
     np.testing.assert_allclose(inside.mean(axis=1), corner.mean(axis=1), rtol=1e-5)
     assert (inside.min(axis=1) > corner.min(axis=1)).all()
@@ -257,11 +257,17 @@ def test_a_cell_moves_bilinearly_and_a_plane_does_not_bend() -> None:
     affine = registration.points @ np.array([[1.1, 0.3], [-0.2, 0.9]], np.float32) + 5
     np.testing.assert_allclose(registration.bending @ affine, 0, atol=1e-4)
     assert np.abs(registration.bending @ registration.points**2).max() > 1
-    columns, pointers = registration.pattern
-    weights = np.random.default_rng(0).random(len(registration.template)).astype(np.float32)
-    sums = sparse.csr_array((registration.products @ weights, columns, pointers)).toarray()
-    dense = registration.between.toarray()
-    np.testing.assert_allclose(sums, dense.T @ (weights[:, None] * dense), atol=1e-4)
+    rng = np.random.default_rng(0)
+    weight = rng.random(len(registration.template)).astype(np.float32)
+    slopes = rng.normal(size=(len(weight), 2)).astype(np.float32)
+    dense = np.zeros((len(weight), count))
+    np.put_along_axis(
+        dense, np.repeat(cells.corners, len(cells.weights), axis=0), np.tile(cells.weights, (len(corner), 1)), axis=1
+    )
+    np.testing.assert_allclose(cells.sums(weight), dense.T @ weight, rtol=1e-4)
+    jacobian = np.einsum("sp,sc->spc", dense, slopes).reshape(len(weight), -1)
+    expected = jacobian.T @ (weight[:, None] * jacobian)
+    np.testing.assert_allclose(cells.normal(weight, slopes).toarray(), expected, atol=1e-4)
 
 
 def test_the_error_of_a_film_is_that_of_every_frame_after_one_scale() -> None:

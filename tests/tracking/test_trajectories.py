@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -37,6 +38,21 @@ def test_expected_places_overrule_uncertain_ones_and_fill_hidden_ones() -> None:
     assert np.median(error) < 0.02
 
 
+def test_expected_places_need_little_more_memory_than_themselves() -> None:
+    frames, count = 300, 4000
+    drift = np.arange(frames, dtype=np.float32)[:, None, None] * np.float32([0.1, 0.05])
+    points = np.random.default_rng(0).uniform(0, 300, (count, 2)).astype(np.float32) + drift
+    chained = Chain(points, np.ones((frames, count), bool), np.ones((frames, count), np.float32))
+    tracemalloc.start()
+    try:
+        paths = expected(chained)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert np.abs(paths - points).max() < 0.01
+    assert peak < 3.5 * paths.nbytes
+
+
 def film() -> tuple[np.ndarray, np.ndarray, Appearance, Registration]:
     """Return frames of a texture that drifts, the true paths, and what a tracker compares with the first frame."""
     cv2 = pytest.importorskip("cv2")
@@ -57,15 +73,15 @@ def film() -> tuple[np.ndarray, np.ndarray, Appearance, Registration]:
 
 
 def again(chained: Chain, *, stop: bool = False) -> tuple[Chain, np.ndarray, list[int]]:
-    """Track the film again from given tracks; return the result, the true paths, and the frames that were reported."""
+    """Track the film again from given tracks; return them, the true paths, and the frames that were reported."""
     grey, true, appearance, registration = film()
     seen: list[int] = []
     with ThreadPoolExecutor(2) as pool:
-        result = track_again(
+        track_again(
             lambda t: grey[t], chained, 0, appearance, registration,
             pool=pool, on_frame=lambda t, points, visible: seen.append(t), should_stop=lambda: stop and len(seen) == 2,
         )  # fmt: skip
-    return result, true, seen
+    return chained, true, seen
 
 
 def spoiled() -> Chain:

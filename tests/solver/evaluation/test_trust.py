@@ -127,6 +127,13 @@ def test_opposite_viewing_directions_count_as_one() -> None:
     assert turned(rotations) == pytest.approx(0, abs=1e-5)
 
 
+def test_an_expected_error_without_an_interval_counts_as_well() -> None:
+    trust = judged(shapes_std=np.full((FRAMES, POINTS), 0.9), depth_is_typical=True)
+    assert trust.interval is None
+    assert trust.verdict is Verdict.DO_NOT_USE
+    assert trust.reasons[0] == "The error is expected to be at least 55 % of the object's size."
+
+
 @pytest.mark.slow
 def test_a_face_is_good_and_its_error_lies_in_the_interval() -> None:
     made = gallery.corrupt(gallery.face(20, 150), noise=0.01, seed=1)
