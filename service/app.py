@@ -34,7 +34,6 @@ from pliant.worker.tokens import Tokens
 from pliant.worker.uploads.shared import open_uploads
 from starlette.middleware import Middleware
 from starlette.middleware.cors import CORSMiddleware
-from starlette.requests import ClientDisconnect
 
 ROUTES = (
     jobs, outputs, shares, inspection, uploads, artifacts, events, meta, metrics_route, examples, error_pages,
@@ -59,7 +58,6 @@ STATUS_OF: dict[type[Exception], int] = {
     errors.QuotaExceeded: 507,
     errors.StoreUnavailable: 503,
     errors.WorkerError: 500,
-    ClientDisconnect: 400,  # for the log: nobody is left to read it
 }
 """HTTP status of each error; a subclass that is not listed uses its nearest base's."""
 

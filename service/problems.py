@@ -21,6 +21,7 @@ from pliant.schemas.problems import ProblemCode
 from pliant.schemas.validation import expectation
 from pydantic import ValidationError
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 from starlette.types import Receive, Scope, Send
 
 MEDIA_TYPE = "application/problem+json"
@@ -192,6 +193,7 @@ def install(app: FastAPI, table: Mapping[type[Exception], int], *, security_head
     app.add_exception_handler(Refusal, _of_refusal)
     app.add_exception_handler(HTTPException, _of_http)
     app.add_exception_handler(RequestValidationError, _of_validation)
+    app.add_exception_handler(ClientDisconnect, _of_disconnect)
     app.add_exception_handler(OSError, partial(_of_disk, security_headers=security_headers))
     app.add_exception_handler(Exception, partial(_unforeseen, security_headers=security_headers))
     for kind in table:
@@ -215,6 +217,13 @@ async def _of_http(_: Request, error: Exception) -> Response:
 async def _of_validation(request: Request, error: Exception) -> Response:
     assert isinstance(error, (RequestValidationError, ValidationError))
     return await _of_refusal(request, from_validation(error.errors()))
+
+
+async def _of_disconnect(_: Request, __: Exception) -> Response:
+    # For the access log: nobody is left to read the answer.
+    return answer(
+        ProblemCode.BAD_REQUEST, detail="The connection closed before the body was complete. Nothing was kept."
+    )
 
 
 async def _of_ours(_: Request, error: Exception, table: Mapping[type[Exception], int]) -> Response:

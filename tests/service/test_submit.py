@@ -178,11 +178,12 @@ def test_a_stalled_body_is_rejected(serve: Serve) -> None:
     assert hasty.left_on_disk == []
 
 
-def test_nothing_is_kept_of_a_client_that_disconnects(running: Running) -> None:
+def test_nothing_is_kept_of_a_client_that_disconnects(running: Running, caplog: pytest.LogCaptureFixture) -> None:
     connection = _begun(running.url, declared=10_000_000, sent=b"x" * 3_000_000)
     until(lambda: any(path.is_file() and path.stat().st_size > 0 for path in running.left_on_disk))
     connection.close()
     until(lambda: running.left_on_disk == [])
+    until(lambda: "code=bad_request" in caplog.text)  # and not `internal_error`
     assert running.server.started
 
 

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from hashlib import sha256
+from itertools import chain
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -42,12 +43,12 @@ class Running:
 
     @property
     def left_on_disk(self) -> list[Path]:
-        """Everything in the incoming folder but the process's own lock and empty folder."""
-        return [
-            path
-            for path in self.jobs.settings.incoming.rglob("*")
-            if len(path.relative_to(self.jobs.settings.incoming).parts) > 1
-        ]
+        """Everything in the incoming folder but the process's own lock and empty folder.
+
+        What vanishes meanwhile is not counted: `Path.rglob` would raise there.
+        """
+        held = [Path(folder, name) for folder, *names in os.walk(self.jobs.settings.incoming) for name in chain(*names)]
+        return [path for path in held if len(path.relative_to(self.jobs.settings.incoming).parts) > 1]
 
     def client(self, *scopes: Scope, name: str = "somebody", **more: Any) -> httpx.Client:
         """Return a client with a new token of its own."""
