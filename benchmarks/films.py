@@ -215,7 +215,7 @@ def main(arguments: list[str] | None = None) -> None:
     one.add_argument("--only", action="append", default=[], help="names that hold this word")
     one.add_argument("--frames", type=int, default=30)
     one.add_argument("--size", default="640x480")
-    one.add_argument("--points", type=int, default=800, help="points that are solved, at most")
+    one.add_argument("--points", type=int, default=4000, help="points that are solved, at most")
     one.set_defaults(run=rendered)
     two = commands.add_parser("recorded")
     two.add_argument("folder", type=Path)

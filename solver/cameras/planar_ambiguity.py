@@ -25,7 +25,7 @@ from pliant.solver.cameras.multistart import carried, gram_of
 from pliant.solver.cameras.scale import rigid_scales
 from pliant.solver.model.marginal_likelihood import Motion, Scene, cameras_of, fit, start
 from pliant.solver.model.so3 import MIRROR, angles_between, from_rows, start_at_identity
-from pliant.solver.records import Floats
+from pliant.solver.records import Floats, Tracks
 from scipy.optimize import minimize
 
 PoseSigns = NDArray[np.bool_]
@@ -87,6 +87,17 @@ def is_planar(gram: Floats) -> bool:
         return False
     # Of a line, noise alone leaves the second value.
     return bool(values[2] < MAX_PLANAR_RATIO * max(values[1], MAX_PLANAR_RATIO * values[0]))
+
+
+def on_one_line(tracks: Tracks) -> bool:
+    """Whether the points lie on one line in most pictures; corrected for perspective they may not, so that `is_planar` misses it."""
+    flat = []
+    for points, visible in zip(tracks.points, tracks.visible, strict=True):
+        shown = points[visible > 0]
+        if len(shown) >= 3:
+            values = np.linalg.eigvalsh(np.cov(shown.T))
+            flat.append(bool(values[0] <= MAX_PLANAR_RATIO**2 * values[1]))
+    return bool(flat) and sum(flat) > len(flat) / 2
 
 
 def planar_frames(count: int) -> slice:

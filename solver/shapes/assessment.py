@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 from pliant.solver.cameras.estimation import CameraEstimate
-from pliant.solver.cameras.planar_ambiguity import is_planar
+from pliant.solver.cameras.planar_ambiguity import is_planar, on_one_line
 from pliant.solver.energy.hyperparameters import noise_std
 from pliant.solver.evaluation.trust import assess
 from pliant.solver.model.shape_covariance import ShapeCovariance
@@ -94,7 +94,7 @@ def assessed(
         shapes_std=std,
         held_out_error=held_out,
         ordered=estimate.ordered,
-        planar=is_planar(estimate.gram),
+        planar=is_planar(estimate.gram) or on_one_line(tracks),
         modes=modes,
         depth_is_typical=estimate.depth_is_typical,
     )

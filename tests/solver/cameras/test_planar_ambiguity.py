@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from camera_errors import degrees_apart
-from pliant.solver import Settings, gallery, solve
+from pliant.solver import Settings, Tracks, gallery, solve
 from pliant.solver.cameras.planar_ambiguity import (
     fitted,
     is_planar,
+    on_one_line,
     poses,
     resolve_pose_signs,
     reversed_at,
@@ -77,6 +78,20 @@ def test_points_on_one_line_lie_in_a_plane_whatever_noise_is_left(noise: float) 
     assert is_planar(np.ones((6, 6)) + noise * np.diag([0.0, 5.0, 4.0, 3.0, 2.0, 1.0]))
     assert not is_planar(np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0]))
     assert not is_planar(np.zeros((0, 0)))
+
+
+def test_points_on_one_line_in_most_pictures_are_recognised() -> None:
+    along, angle = np.linspace(-1, 1, 9)[None, :], np.linspace(0, 3, 7)[:, None]
+    points = 300 + 100 * np.stack([along * np.cos(angle), along * np.sin(angle)], axis=2)
+    visible = np.ones((7, 9))
+    assert on_one_line(Tracks.from_arrays(points, visible))
+    visible[:2, 2:] = 0  # frames that show too little say nothing
+    points[2:4] = np.random.default_rng(0).normal(size=(2, 9, 2))
+    assert on_one_line(Tracks.from_arrays(points, visible))
+    points[4] = points[2]
+    assert not on_one_line(Tracks.from_arrays(points, visible))
+    assert not on_one_line(Tracks.from_arrays(points, np.eye(7, 9)))
+    assert not on_one_line(gallery.flag(12, 150).tracks)
 
 
 @pytest.fixture(scope="module")

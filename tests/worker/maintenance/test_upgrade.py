@@ -107,7 +107,8 @@ def test_data_of_a_newer_version_is_refused_by_every_process(
     client.close()
     for name, value in old.to_environment().items():
         monkeypatch.setenv(name, value)
-    monkeypatch.setattr(service, "configure_logging", lambda *_: None)
+    for process in (service, worker):
+        monkeypatch.setattr(process, "configure_logging", lambda *_: None)
     for main in (service.main, worker.main):
         assert main([]) in (1, 2)
         assert "written by a newer Pliant" in capsys.readouterr().err
