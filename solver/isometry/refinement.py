@@ -152,6 +152,7 @@ def _lower(graph: SurfaceGraph, here: _Point, damping: float, ease: float) -> tu
     weighted = sparse.csr_matrix(sparse.diags(weight) @ here.jacobian)
     normal = (here.jacobian.T @ weighted).tocsr()
     gradient = weighted.T @ here.residuals
+    factor = 0.1  # after a step that failed, the damping that succeeded is kept
     while damping <= MOST_DAMPED:
         move = _step(normal, gradient, damping, graph.seen.sum(axis=1))
         log_depths = here.log_depths + move[: len(here.log_depths)]
@@ -161,8 +162,8 @@ def _lower(graph: SurfaceGraph, here: _Point, damping: float, ease: float) -> tu
             scale = float(here.lengths.sum()) / total
             after = _at(graph, log_depths + np.log(scale), lengths * scale, ease)
             if after.cost < here.cost:
-                return after, max(damping / 10, 1e-8)
-        damping *= 10
+                return after, max(factor * damping, 1e-8)
+        damping, factor = 10 * damping, 1.0
     return None, damping
 
 

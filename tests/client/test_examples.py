@@ -69,7 +69,7 @@ def test_from_tapnext(run, tmp_path: Path, model: str) -> None:
 
 
 def test_from_alltracker(run, tmp_path: Path) -> None:
-    frames, height, width = 8, 24, 32
+    frames, height, width = 5, 24, 32
     row, column = np.mgrid[:height, :width].astype(np.float32)
     centred = np.stack([column - width / 2, row - height / 2])
     bulge = 6 - (centred**2).sum(axis=0) / 40
