@@ -96,7 +96,7 @@ def on_one_line(tracks: Tracks) -> bool:
         shown = points[visible > 0]
         if len(shown) >= 3:
             values = np.linalg.eigvalsh(np.cov(shown.T))
-            flat.append(bool(values[0] <= MAX_PLANAR_RATIO**2 * values[1]))
+            flat.append(bool(values[0] <= MAX_PLANAR_RATIO**2 * values[1]))  # the bound of a line in `is_planar`
     return bool(flat) and sum(flat) > len(flat) / 2
 
 

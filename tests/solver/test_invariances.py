@@ -212,7 +212,7 @@ TRANSFORMED = {
     "in another unit": in_another_unit(NOISY),
     "moved, mirrored and in another unit": in_another_unit(mirrored(moved(NOISY))),
 }
-QUICK = ("askew", "moved, mirrored and in another unit")
+QUICK = ("askew", "permuted", "moved, mirrored and in another unit")
 
 
 @pytest.fixture(scope="module")
