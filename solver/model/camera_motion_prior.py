@@ -24,10 +24,14 @@ SCALE_FLOOR = 0.002
 """Floor of the change of log s between frames: smaller changes are not rewarded."""
 
 
+STEADY = 0.5 * float(np.log(SCALE_FLOOR**2))
+"""The penalty on scales that are all equal."""
+
+
 def rotation_roughness(rotations: Floats) -> tuple[float, Floats]:
     """Return the penalty on rotations of shape `(F, 3, 3)` and its gradient with respect to all nine entries of each."""
     turns = rotations[1:] @ np.swapaxes(rotations[:-1], 1, 2)
-    changes = np.diff(turns, axis=0)
+    changes = turns[1:] - turns[:-1]
     count = max(len(changes), 1)
     variance = TURN_FLOOR**2 + 0.5 * float((changes**2).sum()) / count
     by_turns = np.zeros_like(turns)
@@ -42,8 +46,8 @@ def rotation_roughness(rotations: Floats) -> tuple[float, Floats]:
 
 def scale_roughness(logs: Floats) -> tuple[float, Floats]:
     """Return the penalty on the logarithms of the scales, shape `(F,)`, and its gradient."""
-    steps = np.diff(logs)
-    variance = SCALE_FLOOR**2 + float((steps**2).mean())
+    steps = logs[1:] - logs[:-1]
+    variance = SCALE_FLOOR**2 + float((steps**2).sum() / len(steps))
     gradient = np.zeros_like(logs)
     gradient[1:] += steps
     gradient[:-1] -= steps

@@ -18,7 +18,7 @@ from pliant.solver.model.random_walk import WalkPosterior, coloured, walk_bands,
 from pliant.solver.model.shape_covariance import AXIS_VARIANCE_FLOOR, NOISE_VARIANCE_FLOOR, ShapeCovariance
 from pliant.solver.records import Floats
 from pliant.solver.tracks.noise import roughness
-from scipy import linalg
+from scipy.linalg import lapack
 
 MAX_ITERATIONS, MIN_ITERATIONS, ITERATION_FRAMES = 150, 60, 18_000
 """EM rounds from scratch: min(MAX_ITERATIONS, max(MIN_ITERATIONS, ITERATION_FRAMES // F)), since a round costs F³.
@@ -387,11 +387,12 @@ def _split(over_frames: Floats, floor: float, max_modes: int, *, ordered: bool) 
     values, vectors = np.linalg.eigh(_symmetric(root.T @ over_frames @ root))
     values, vectors = values[::-1], vectors[:, ::-1]
     max_modes = min(max_modes, frames - 1)
-    walk_variance = max(float(values[max_modes:].mean()), floor)
+    walk_variance = max(float(values[max_modes:].sum() / (frames - max_modes)), floor)
     count = min(max_modes, int((values > MODE_VARIANCE_RATIO * walk_variance).sum()))
-    walk_variance = max(float(values[count:].mean()), floor)
+    walk_variance = max(float(values[count:].sum() / (frames - count)), floor)
     scaled = vectors[:, :count] * np.sqrt(np.maximum(values[:count] - walk_variance, 0.0))
-    return linalg.solve_triangular(root, scaled, lower=True, trans="T"), walk_variance
+    modes = lapack.dtrtrs(root.T, scaled)[0] if count else scaled  # LAPACK refuses an array without columns
+    return np.asarray(modes), walk_variance
 
 
 def _symmetric(matrix: Floats) -> Floats:

@@ -24,7 +24,7 @@ from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
-from pliant.solver.model.camera_motion_prior import rotation_roughness, scale_roughness
+from pliant.solver.model.camera_motion_prior import STEADY, rotation_roughness, scale_roughness
 from pliant.solver.model.frame_metric import FrameMetric
 from pliant.solver.model.image_density import ImageModel, factor_of, inverted, terms
 from pliant.solver.model.so3 import exponential_and_jacobian, vee
@@ -182,8 +182,11 @@ def cameras_of(scene: Scene, motion: Moved) -> tuple[Floats, Floats]:
 def cameras_and_jacobian(scene: Scene, motion: Moved) -> tuple[Floats, Floats, Floats]:
     """Return the same and the left Jacobians of the turns, shape `(F, 3, 3)`."""
     turned, jacobian = exponential_and_jacobian(motion.turns)
-    logs = motion.log_scales - motion.log_scales.mean() if scene.with_scales else np.zeros(len(turned))
-    return turned @ scene.rotations, np.exp(np.clip(logs, -MAX_LOG_SCALE, MAX_LOG_SCALE)), jacobian
+    rotations = turned @ scene.rotations
+    if not scene.with_scales:
+        return rotations, np.ones(len(turned)), jacobian
+    logs = motion.log_scales - motion.log_scales.mean()
+    return rotations, np.exp(np.clip(logs, -MAX_LOG_SCALE, MAX_LOG_SCALE)), jacobian
 
 
 def covariances_of(scene: Scene, motion: Motion) -> tuple[Floats, Floats, float, float]:
@@ -244,15 +247,18 @@ def energy(scene: Scene, motion: Motion) -> tuple[float, Motion]:
     by_walk = found.by_walk + np.einsum("fk,fikc->fic", motion.modes, by_columns[:, :, 1:])
     by_projections = by_columns[:, :, 0] @ root0.T + by_walk @ root1.T
     rough, by_modes = _roughness(motion.modes, scene.smoothness / frames)
-    rough_scales, by_logs = scale_roughness(np.log(scales))
-    by_logs = scene.prior_weight * by_logs + np.einsum("fij,fij->f", by_projections, projections)
+    rough_scales, by_logs = STEADY, np.zeros(frames)
+    if scene.with_scales:
+        rough_scales, by_logs = scale_roughness(np.log(scales))
+        by_logs = scene.prior_weight * by_logs + np.einsum("fij,fij->f", by_projections, projections)
+        by_logs -= by_logs.mean()
     rough_rotations, by_rotations = rotation_roughness(rotations)
     by_rotations *= scene.prior_weight
     by_rotations[:, :2] += by_projections * scales[:, None, None]
     turned = vee(by_rotations @ np.swapaxes(rotations, 1, 2))
     gradient = Motion(
         np.einsum("fji,fj->fi", jacobian, turned),
-        (by_logs - by_logs.mean()) * scene.with_scales,
+        by_logs,
         by_modes + np.einsum("fikc,fic->fk", by_columns[:, :, 1:], model.walk),
         np.einsum("fic,fid->cd", projections, by_columns[:, :, 0])[LOWER],
         np.einsum("fic,fid->cd", projections, by_walk)[LOWER],
@@ -342,7 +348,9 @@ def _root(lower: Floats) -> Floats:
 
 def _roughness(values: Floats, weight: float) -> tuple[float, Floats]:
     """Return weight/2 ‖H x‖² and its gradient, H the first difference over frames."""
-    steps = np.diff(values, axis=0)
+    if weight == 0:
+        return 0.0, np.zeros_like(values)
+    steps = values[1:] - values[:-1]
     gradient = np.zeros_like(values)
     gradient[1:] += weight * steps
     gradient[:-1] -= weight * steps

@@ -22,12 +22,12 @@ def hat(vectors: Floats) -> Floats:
 def vee(matrices: Floats) -> Floats:
     """Return u with ⟨X, [v]×⟩ = uᵀv for every v: the gradient with respect to v of a function whose gradient is X."""
     flipped = matrices - np.swapaxes(matrices, -1, -2)
-    return np.stack([flipped[..., 2, 1], flipped[..., 0, 2], flipped[..., 1, 0]], axis=-1)
+    return flipped[..., [2, 0, 1], [1, 2, 0]]
 
 
 def _coefficients(vectors: Floats) -> tuple[Floats, Floats, Floats]:
     """Return sin θ/θ, (1 − cos θ)/θ², (θ − sin θ)/θ³ of the angles, shape `(..., 1, 1)` each."""
-    angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
+    angle = np.sqrt((vectors * vectors).sum(axis=-1))[..., None, None]
     small = angle < SMALL_ANGLE
     safe = np.where(small, 1.0, angle)
     square = angle**2
