@@ -44,7 +44,7 @@ def main() -> None:
     work = Workload(
         data=options.data, only=options.only, kind=options.kind, frames=options.frames, points=options.points, outliers=options.outliers,
         noise=options.noise, known=options.cameras == "true", settings=options.settings,
-        start=options.start,
+        start=options.start, scratch=options.scratch,
     )  # fmt: skip
     if options.what == "compare":
         compare(work, names=options.baselines, cap=options.cap, limit=int(options.memory * 1e9))
@@ -107,6 +107,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--against-frames", type=sizes, default=FRAMES, help="values of F for growth")
     parser.add_argument("--fixed-frames", type=int, default=FIXED_FRAMES, help="F of the growth with P")
     parser.add_argument("--fixed-points", type=int, default=FIXED_POINTS, help="P of the growth with F")
+    parser.add_argument("--scratch", type=Path, help="folder for the file that holds the result of a large solve")
     parser.add_argument("--results", type=Path, help="file that growth appends its measurements to")
     return parser
 

@@ -47,6 +47,8 @@ class Workload:
     settings: str = "prior=smooth"
     start: str = "tracks"
     """What the baselines begin with: `tracks`, the pseudo-inverse R†(W − t), or `ours`, the solver's own start."""
+    scratch: Path | None = None
+    """Folder for the temporary file that holds the result of a large solve; None holds it in memory."""
 
     def case(self) -> Case:
         """Read the sequence, or make a gallery face, and spoil it."""
@@ -95,7 +97,7 @@ def run_ours(watch: Stopwatch, work: Workload) -> Ours:
     del normalized
     watch.start()
     solution = solve(
-        case.tracks, case.mesh, cameras=case.cameras if work.known else None, settings=work.chosen(),
+        case.tracks, case.mesh, cameras=case.cameras if work.known else None, settings=work.chosen(), scratch=work.scratch,
         on_step=lambda step: history.append((time.perf_counter() - watch.began, time.process_time() - watch.cpu, step.objective)),
     )  # fmt: skip
     moments = [0.0, *(wall for wall, _, _ in history), time.perf_counter() - watch.began]

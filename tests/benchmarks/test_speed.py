@@ -70,7 +70,7 @@ def test_measurements_of_growth_are_appended_to_a_file(tmp_path):
     results.write_text('{"measured": "before"}\n')
     speed(
         "growth", "--kind", "face", "--cameras", "true", "--settings", "prior=smooth", "--outliers", "0",
-        "--against-points", "", "--against-frames", "5", "--fixed-points", "40", "--results", str(results),
+        "--against-points", "", "--against-frames", "5", "--fixed-points", "40", "--scratch", str(tmp_path), "--results", str(results),
     )  # fmt: skip
     before, row = (json.loads(line) for line in results.read_text().splitlines())
     assert before == {"measured": "before"}
