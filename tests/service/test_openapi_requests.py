@@ -8,6 +8,8 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import httpx
@@ -39,8 +41,11 @@ UNASKED = [
 
 schemathesis.openapi.format("binary", st.one_of(st.just(tracks()), st.binary(max_size=300)).map(Binary))
 
-OF_WORKER = Settings()
-DOCUMENT: dict[str, Any] = create_app(Jobs.open(OF_WORKER), ServiceSettings(), tokens=Tokens.open(OF_WORKER)).openapi()
+with TemporaryDirectory() as _data:
+    _of_worker = Settings(data=Path(_data))
+    DOCUMENT: dict[str, Any] = create_app(
+        Jobs.open(_of_worker), ServiceSettings(), tokens=Tokens.open(_of_worker)
+    ).openapi()
 OPERATIONS = [(method.upper(), path) for path, methods in DOCUMENT["paths"].items() for method in methods]
 
 

@@ -304,7 +304,7 @@ def test_a_service_without_a_valid_token_does_not_start(valkey_url: str, caplog:
     process.check_access(strict, Tokens(connect("unix:///nonexistent/x.sock", decode=True, retries=0), prefix="x"))
 
 
-def test_with_tokens_off_a_sent_token_is_ignored(running: Running, http: httpx.Client) -> None:
+def test_with_tokens_off_a_sent_token_is_ignored(running: Running, http: httpx.Client, tmp_path: Path) -> None:
     job = submit(http, name="anybody's")
     assert http.get(f"/v1/jobs/{job.id}", headers={"Authorization": "Bearer nonsense"}).status_code == 200
-    assert Jobs.open(Settings(data=Path("x"), redis_url="unix:///x")).owner is None
+    assert Jobs.open(Settings(data=tmp_path / "x", redis_url="unix:///x")).owner is None
