@@ -23,9 +23,8 @@ TURN_FLOOR = np.radians(0.2)
 SCALE_FLOOR = 0.002
 """Floor of the change of log s between frames: smaller changes are not rewarded."""
 
-
 STEADY = 0.5 * float(np.log(SCALE_FLOOR**2))
-"""The penalty on scales that are all equal."""
+"""The penalty on scales that are all equal: it counts where scales are fixed, so that energies with fixed and free ones compare."""
 
 
 def rotation_roughness(rotations: Floats) -> tuple[float, Floats]:
@@ -47,7 +46,7 @@ def rotation_roughness(rotations: Floats) -> tuple[float, Floats]:
 def scale_roughness(logs: Floats) -> tuple[float, Floats]:
     """Return the penalty on the logarithms of the scales, shape `(F,)`, and its gradient."""
     steps = logs[1:] - logs[:-1]
-    variance = SCALE_FLOOR**2 + float((steps**2).sum() / len(steps))
+    variance = SCALE_FLOOR**2 + float((steps**2).mean())
     gradient = np.zeros_like(logs)
     gradient[1:] += steps
     gradient[:-1] -= steps
