@@ -70,7 +70,7 @@ def test_measurements_of_growth_are_appended_to_a_file(tmp_path):
     results.write_text('{"measured": "before"}\n')
     speed(
         "growth", "--kind", "face", "--cameras", "true", "--settings", "prior=smooth", "--outliers", "0",
-        "--against-points", "", "--against-frames", "5", "--fixed-points", "40", "--scratch", str(tmp_path), "--results", str(results),
+        "--against-points", "", "--against-frames", "5", "--fixed-points", "40", "--results", str(results),
     )  # fmt: skip
     before, row = (json.loads(line) for line in results.read_text().splitlines())
     assert before == {"measured": "before"}
@@ -93,6 +93,23 @@ def test_a_mesh_is_timed_against_a_grid():
 def test_bandwidth_and_profile_run():
     assert any(line.startswith("ratio: ") for line in speed("bandwidth", "--frames", "6", "--points", "100"))
     assert any("block_tridiagonal.py" in line for line in speed("profile", "--frames", "12", "--points", "1500"))
+
+
+def test_the_result_of_a_large_solve_lies_in_the_given_folder(bench, tmp_path, monkeypatch):
+    monkeypatch.setattr("pliant.solver.reconstruction.blocks.BLOCK_OBSERVATIONS", 100)
+    side_by_side = bench("speed.side_by_side")
+    solved, places = side_by_side.solve, []
+
+    def watched(*arguments, **options):
+        solution = solved(*arguments, **options)
+        if options.get("scratch"):
+            places.append((options["scratch"], isinstance(solution.shapes.base, np.memmap)))
+        return solution
+
+    monkeypatch.setattr(side_by_side, "solve", watched)
+    work = side_by_side.Workload(frames=4, points=60, outliers=0.0, scratch=tmp_path)
+    side_by_side.run_ours(bench("speed.apart").Stopwatch(), work)
+    assert places == [(tmp_path, True)]
 
 
 def test_exponent_of_a_known_law(bench):

@@ -41,11 +41,14 @@ UNASKED = [
 
 schemathesis.openapi.format("binary", st.one_of(st.just(tracks()), st.binary(max_size=300)).map(Binary))
 
-with TemporaryDirectory() as _data:
-    _of_worker = Settings(data=Path(_data))
-    DOCUMENT: dict[str, Any] = create_app(
-        Jobs.open(_of_worker), ServiceSettings(), tokens=Tokens.open(_of_worker)
-    ).openapi()
+
+def _document() -> dict[str, Any]:
+    with TemporaryDirectory() as data:
+        of_worker = Settings(data=Path(data))
+        return create_app(Jobs.open(of_worker), ServiceSettings(), tokens=Tokens.open(of_worker)).openapi()
+
+
+DOCUMENT = _document()
 OPERATIONS = [(method.upper(), path) for path, methods in DOCUMENT["paths"].items() for method in methods]
 
 

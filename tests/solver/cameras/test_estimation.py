@@ -9,7 +9,13 @@ from pliant.solver import KnownCamera, Settings, Tracks, gallery
 from pliant.solver.cameras.estimation import estimate_cameras, given_cameras
 from pliant.solver.cameras.factorization import upgrade
 from pliant.solver.cameras.multistart import carried
-from pliant.solver.model.camera_motion_prior import SCALE_FLOOR, TURN_FLOOR, rotation_roughness, scale_roughness
+from pliant.solver.model.camera_motion_prior import (
+    SCALE_FLOOR,
+    STEADY,
+    TURN_FLOOR,
+    rotation_roughness,
+    scale_roughness,
+)
 from pliant.solver.model.marginal_likelihood import Motion, Scene, energy, start
 from pliant.solver.model.so3 import (
     exponential,
@@ -153,7 +159,7 @@ def test_the_camera_motion_prior_penalises_changes_of_velocity_only() -> None:
     jitter = rotation_roughness(exponential(random.normal(0, 0.01, (30, 3))) @ spin)[0]
     jolts = rotation_roughness(exponential(random.normal(0, 0.1, (30, 3))) @ spin)[0]
     assert floor + 2 < jitter < jolts - 5
-    assert scale_roughness(np.linspace(0, 0, 9))[0] == pytest.approx(np.log(SCALE_FLOOR))
+    assert scale_roughness(np.linspace(0, 0, 9))[0] == STEADY == pytest.approx(np.log(SCALE_FLOOR))
 
 
 def test_corrections_are_carried_to_the_frames_between() -> None:
