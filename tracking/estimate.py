@@ -7,15 +7,17 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from pliant.tracking.chaining import DELTAS
+from pliant.tracking.appearance import Appearance
+from pliant.tracking.chaining import FIRST_STEPS, FLOW_MARGIN
 from pliant.tracking.decoding.film import Film
 from pliant.tracking.flow import Grey, dense_flow, opencv_serial
 from pliant.tracking.region import Region, read_region
-from pliant.tracking.seeding import default_step, place
+from pliant.tracking.registration import STEPS, Registration
+from pliant.tracking.seeding import Seeds, default_step, neighbours, place
 from pliant.tracking.survey import tracking_scale
 
-FLOWS = 2 * (1 + len(DELTAS))
-"""Flows for each frame: there and back, from the template and from each earlier frame."""
+FLOWS = 4
+"""Flows for each frame: there and back, from the template and from the frame before."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +28,7 @@ class Estimate:
     """Points that would be followed, before those that are soon lost are dropped."""
 
     seconds: float
-    """Wall time of the flows, which is nearly all; 0 where the film states no number of frames."""
+    """Wall time of flow and registration, which is nearly all; 0 where the film states no number of frames."""
 
 
 def estimate(
@@ -38,7 +40,7 @@ def estimate(
     longest_side: int,
     threads: int,
 ) -> Estimate:
-    """Place the points in the region's frame and time one flow of the region's size.
+    """Place the points in the region's frame; time one flow of the region's size, and what else a frame takes.
 
     Parameters
     ----------
@@ -59,7 +61,9 @@ def estimate(
     seeds, _ = place(grey, mask, step=default_step(mask) if grid_step is None else grid_step * scale)
     start, stop, step = film.selection
     count = len(range(film.stated_frames)[start:stop:step])
-    return Estimate(len(seeds.points), count * FLOWS * _flow_seconds(grey, mask) / max(threads, 1))
+    with opencv_serial():
+        seconds = FLOWS * _flow_seconds(grey, mask) + _rounds_seconds(grey, seeds)
+    return Estimate(len(seeds.points), count * seconds / max(threads, 1))
 
 
 def _frame(film: Film, index: int, longest_side: int) -> tuple[Grey, float]:
@@ -80,10 +84,22 @@ def _flow_seconds(grey: Grey, mask: np.ndarray[tuple[int, ...], np.dtype[np.bool
     """Time the flow inside the region's box between the frame and the frame moved by a pixel."""
     row, column = np.nonzero(mask)
     box = np.s_[row.min() : row.max() + 1, column.min() : column.max() + 1]
-    first = np.ascontiguousarray(np.pad(grey[box], 16, mode="edge"))
+    first = np.ascontiguousarray(np.pad(grey[box], FLOW_MARGIN, mode="edge"))
     second = np.ascontiguousarray(np.roll(first, 1, axis=1))
-    with opencv_serial():
-        dense_flow(first, second)  # the first call sets up the library
-        began = time.perf_counter()
-        dense_flow(first, second)
-        return time.perf_counter() - began
+    dense_flow(first, second)  # the first call sets up the library
+    began = time.perf_counter()
+    dense_flow(first, second)
+    return time.perf_counter() - began
+
+
+def _rounds_seconds(grey: Grey, seeds: Seeds) -> float:
+    """Time what both rounds do in a frame besides flow, on the frame itself, from half a pixel beside every point."""
+    appearance = Appearance.of(grey, seeds.points, neighbours(seeds.grid, len(seeds.points)))
+    registration = Registration.of(grey, seeds.points, seeds.grid, noise=appearance.noise)
+    beside, visible = seeds.points + np.float32(0.5), np.ones(len(seeds.points), dtype=bool)
+    began = time.perf_counter()
+    for steps, comparisons in ((FIRST_STEPS, 1), (STEPS, 2)):
+        registration.refine(grey, beside, np.ones_like(beside[:, 0]), visible, steps=steps)
+        for _ in range(comparisons):
+            appearance.agrees(grey, beside, visible)
+    return time.perf_counter() - began

@@ -72,16 +72,14 @@ def dense_flow(first: Grey, second: Grey) -> Floats:
     return np.asarray(search.calc(first, second, None), dtype=np.float32)  # type: ignore[call-overload]
 
 
-def match(first: Grey, second: Grey, points: Floats) -> Match:
-    """Carry points `(P, 2)` from one frame to another of the same size and test the way back."""
-    forward = dense_flow(first, second)
-    backward = dense_flow(second, first)
+def match(forward: Floats, backward: Floats, points: Floats) -> Match:
+    """Carry points `(P, 2)` along the flow from one frame to another, `(H, W, 2)`, and test the way back."""
     step = sample(forward, points)
     landed = points + step
     back = sample(backward, landed)
     gap = ((step + back) ** 2).sum(axis=1)
     lengths = (step**2).sum(axis=1) + (back**2).sum(axis=1)
-    height, width = first.shape
+    height, width = forward.shape[:2]
     outside = (landed < 0).any(axis=1) | (landed > (width - 1, height - 1)).any(axis=1)
     return Match(
         landed, gap, (gap >= CYCLE_RATIO * lengths + CYCLE_FLOOR) | outside, _on_boundary(backward, landed, back)

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image, UnidentifiedImageError
 from pliant.tracking.appearance import Appearance
 from pliant.tracking.errors import FilmError, TrackingStopped
-from pliant.tracking.flow import Bools, Floats, Grey, match
+from pliant.tracking.flow import Bools, Floats, Grey, dense_flow, match
 from pliant.tracking.records import OnStep, TrackingStep
 from pliant.tracking.seeding import Seeds, neighbours, quads
 
@@ -81,7 +81,10 @@ def transport(
             raise TrackingStopped
         ways = [(start, seeds.points, np.ones_like(seen), np.zeros_like(variance)), (before, points, seen, variance)]
         frame = read(here)
-        found = [done.result() for done in [pool.submit(match, read(way[0]), frame, way[1]) for way in ways]]
+        flows = [
+            (pool.submit(dense_flow, read(way[0]), frame), pool.submit(dense_flow, frame, read(way[0]))) for way in ways
+        ]
+        found = [match(there.result(), back.result(), way[1]) for way, (there, back) in zip(ways, flows, strict=True)]
         sees = np.stack([way[2] & ~m.lost for way, m in zip(ways, found, strict=True)])
         sums = np.stack([way[3] + m.gap for way, m in zip(ways, found, strict=True)])
         best = np.lexsort((sums, ~sees), axis=0)[0]

@@ -16,7 +16,7 @@ from pliant.solver.gallery import sphere
 from pliant.tracking import FilmError
 from pliant.tracking.appearance import Appearance, noise_variance
 from pliant.tracking.decoding.pictures import natural
-from pliant.tracking.flow import match, opencv_serial, sample
+from pliant.tracking.flow import dense_flow, match, opencv_serial, sample
 from pliant.tracking.frame_store import CACHED, FrameStore
 from pliant.tracking.region import read_region
 from pliant.tracking.registration import Registration
@@ -106,7 +106,7 @@ def test_matches_follow_the_motion_and_detect_lost_points() -> None:
     first, second = grey()
     points = np.array([[30.0, 30.0], [50.5, 40.25], [94.5, 40.0]], np.float32)
     with opencv_serial():
-        found = match(first, second, points)
+        found = match(dense_flow(first, second), dense_flow(second, first), points)
     np.testing.assert_allclose(found.points[:2] - points[:2], [[2, 0], [2, 0]], atol=0.15)
     np.testing.assert_array_equal(found.lost, [False, False, True])
 
