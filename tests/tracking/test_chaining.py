@@ -1,0 +1,84 @@
+"""The first round: tracks from flow, frame by frame."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+from pliant.tracking.appearance import Appearance
+from pliant.tracking.chaining import Chain, chain
+from pliant.tracking.registration import Registration
+from pliant.tracking.seeding import neighbours, place
+
+cv2 = pytest.importorskip("cv2")
+
+FRAMES = 8
+
+
+def texture(size: tuple[int, int], seed: int) -> np.ndarray:
+    """Return blurred noise, grey levels."""
+    noise = np.random.default_rng(seed).standard_normal(size[::-1]).astype(np.float32)
+    fine, coarse = (cv2.GaussianBlur(noise, (0, 0), sigma) for sigma in (1.5, 8.0))
+    return np.clip(128 + 30 * fine / fine.std() + 30 * coarse / coarse.std(), 0, 255).astype(np.uint8)
+
+
+def followed(
+    speed: float, *, template: int = 0, hidden: range = range(0), covered: slice = slice(0, 120)
+) -> tuple[Chain, np.ndarray, list[int]]:
+    """Follow a square of texture that moves to the right at `speed` pixels a frame, and return the true paths and the frames in order.
+
+    In the frames `hidden` another texture covers some of its columns.
+    """
+    width = 304 + round(speed * FRAMES)
+    behind, thing, cover = texture((width, 304), 0), texture((240, 240), 1), texture((240, 240), 2)
+    frames = []
+    for t in range(FRAMES):
+        picture, shown, left = behind.copy(), thing.copy(), 32 + round(speed * t)
+        if t in hidden:
+            shown[:, covered] = cover[:, covered]
+        picture[32:272, left : left + 240] = shown
+        frames.append(picture)
+    region = np.zeros((304, width), bool)
+    start = 32 + round(speed * template)
+    region[40:264, start + 8 : start + 232] = True
+    seeds, _ = place(frames[template], region, step=8)
+    appearance = Appearance.of(frames[template], seeds.points, neighbours(seeds.grid, len(seeds.points)))
+    registration = Registration.of(frames[template], seeds.points, seeds.grid, noise=appearance.noise)
+    order: list[int] = []
+    with ThreadPoolExecutor(2) as pool:
+        result = chain(
+            lambda t: frames[t], FRAMES, template, appearance, registration,
+            pool=pool, on_frame=lambda t, points, visible: order.append(t), should_stop=lambda: False,
+        )  # fmt: skip
+    moved = np.stack([speed * (np.arange(FRAMES) - template), np.zeros(FRAMES)], axis=1)
+    return result, seeds.points + moved[:, None].astype(np.float32), order
+
+
+def test_both_ends_are_reached_from_the_template() -> None:
+    result, true, order = followed(2, template=3)
+    assert order == [4, 5, 6, 7, 2, 1, 0]
+    assert result.visible.mean() > 0.97
+    assert np.linalg.norm(result.points - true, axis=2)[result.visible].max() < 0.5
+
+
+def test_flow_covers_what_moves_on_while_it_is_computed() -> None:
+    result, true, _ = followed(26)
+    assert result.visible[2:].mean() > 0.9
+    assert np.median(np.linalg.norm(result.points - true, axis=2)[2:]) < 0.1
+
+
+def test_points_that_were_hidden_are_seen_again() -> None:
+    result, true, _ = followed(1, hidden=range(3, 5))
+    left = true[0, :, 0] < 32 + 112
+    assert result.visible[3:5, left].mean() < 0.1
+    assert result.visible[5:, left].mean() > 0.9
+    assert np.percentile(np.linalg.norm(result.points - true, axis=2)[5:, left], 90) < 0.3
+
+
+def test_points_lost_far_from_the_template_are_seen_again() -> None:
+    result, true, _ = followed(26, hidden=range(4, 5), covered=slice(104, 112))
+    covered = np.abs(true[0, :, 0] - (32 + 108)) < 5
+    assert result.visible[4, covered].mean() < 0.7
+    assert result.visible[5:, covered].mean() > 0.8
+    assert np.median(np.linalg.norm(result.points - true, axis=2)[5:, covered]) < 0.1
