@@ -227,15 +227,14 @@ def _assemble(
     kept: NDArray[np.int64],
     notes: list[str],
 ) -> TrackedFilm:
-    """Return to the film's own pixels and add pictures and warnings."""
+    """Return to the film's own pixels, in the chain's memory, and add pictures and warnings."""
     rows = slice(plan.start, plan.stop)
     width, height = run.film.size
     indices, times = found.indices[rows], found.times[rows]
-    visible = chained.visible[:, kept]
-    tracks = np.zeros((len(indices), len(kept), 2), dtype=np.float32)
-    for t, points in enumerate(chained.points):  # one frame at a time, for their memory
-        tracks[t] = _in_film(points[kept], found.scale)
-    confidence = chained.confidence[:, kept]
+    visible, confidence = chained.visible[:, kept], chained.confidence[:, kept]
+    for points in chained.points:
+        points[: len(kept)] = _in_film(points[kept], found.scale)
+    tracks = chained.points[:, : len(kept)]
     template = plan.template - plan.start
     picked = np.unique(np.linspace(0, len(indices) - 1, THUMBNAILS).round().astype(np.int64))
     image, thumbnails = _pictures(run, indices, template, picked)

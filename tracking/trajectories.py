@@ -30,8 +30,8 @@ FRAMES_AHEAD = 8
 """Frames whose registration waits or runs: two for each of the default's four threads at most."""
 
 
-def expected(chained: Chain) -> Floats:
-    """Return where the paths of all points in a space of few dimensions lead, shape `(F, P, 2)`, from places weighted by their confidence.
+def move_to_expected(chained: Chain) -> None:
+    """Put all points where their paths in a space of few dimensions lead, fitted to their places weighted by confidence.
 
     The space is fitted to a sample of the points. The number of its dimensions is the one that predicts held-out places best.
     """
@@ -39,15 +39,14 @@ def expected(chained: Chain) -> Floats:
     chosen = choose_points(weight, random)
     sample = normalize(Tracks.from_arrays(chained.points[:, chosen], weight[:, chosen]))
     basis, spread, scale = fit_basis(sample.points, np.asarray(sample.visible), random)
-    centre, paths = sample.centroid[:, None], np.zeros_like(chained.points)
+    centre = sample.centroid[:, None]
     for start in range(0, weight.shape[1], POINTS_AT_ONCE):
         part = slice(start, start + POINTS_AT_ONCE)
         points = (chained.points[:, part] - centre) / sample.unit
         coefficients, _ = coefficients_of(
             points, weight[:, part].astype(np.float64), basis, spread, scale, sweeps=4, with_moment=False
         )
-        paths[:, part] = predict(basis, coefficients) * sample.unit + centre
-    return paths
+        chained.points[:, part] = predict(basis, coefficients) * sample.unit + centre
 
 
 def track_again(
@@ -75,16 +74,17 @@ def track_again(
     """
     if should_stop():
         raise TrackingStopped
-    paths = expected(chained)
+    move_to_expected(chained)
+    chained.points[template] = appearance.points
 
     def again(t: int) -> tuple[Floats, Bools, Floats]:
-        frame = read(t)
-        like = appearance.agrees(frame, paths[t], np.ones(len(paths[t]), dtype=bool))
-        points, variance = registration.refine(frame, paths[t], chained.variance[t], like | chained.visible[t])
+        frame, path = read(t), chained.points[t]
+        like = appearance.agrees(frame, path, np.ones(len(path), dtype=bool))
+        points, variance = registration.refine(frame, path, chained.variance[t], like | chained.visible[t])
         return points, appearance.agrees(frame, points, like | chained.visible[t]), variance
 
     ahead: deque[tuple[int, Future[tuple[Floats, Bools, Floats]]]] = deque()
-    frames = (t for t in range(len(paths)) if t != template)
+    frames = (t for t in range(len(chained.points)) if t != template)
     try:
         ahead.extend((t, pool.submit(again, t)) for t in itertools.islice(frames, FRAMES_AHEAD))
         while ahead:
