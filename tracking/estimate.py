@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from pliant.tracking.appearance import Appearance
-from pliant.tracking.chaining import FIRST_STEPS, FLOW_MARGIN
+from pliant.tracking.chaining import DELTAS, FIRST_STEPS, FLOW_MARGIN
 from pliant.tracking.decoding.film import Film
 from pliant.tracking.flow import Grey, dense_flow, opencv_serial
 from pliant.tracking.region import Region, read_region
@@ -16,8 +16,8 @@ from pliant.tracking.registration import STEPS, Registration
 from pliant.tracking.seeding import Seeds, default_step, neighbours, place
 from pliant.tracking.survey import tracking_scale
 
-FLOWS = 4
-"""Flows for each frame: there and back, from the template and from the frame before."""
+FLOWS = 2 * (1 + len(DELTAS))
+"""Flows for each frame: there and back, from the template and from each earlier frame."""
 
 
 @dataclass(frozen=True, slots=True)
