@@ -120,17 +120,15 @@ def chain(
             if should_stop():
                 raise TrackingStopped
             ahead = {} if following is None else _links(read, following, direction, template, first.points, near, pool)
-            before, recent[t] = (
-                recent[t - direction],
-                _advance(read(t), links, recent, template, appearance, registration, pool),
-            )
-            _store(result, t, recent[t])
-            # Nearly all points move about alike in the two frames that the next flow is computed ahead.
-            drift = 2 * np.median(recent[t].points - before.points, axis=0)
-            near = np.concatenate([recent[t].points, recent[t].points + drift])
+            found = _advance(read(t), links, recent, template, appearance, registration, pool)
+            _store(result, t, found)
+            on_frame(t, found.points, found.visible)
+            # Flow is computed up to two frames ahead, in which nearly all points move about alike.
+            drift = 2 * np.median(found.points - recent[t - direction].points, axis=0)
+            near = np.concatenate([found.points, found.points + drift])
+            recent[t] = found
             recent = {s: state for s, state in recent.items() if s == template or abs(t - s) < max(DELTAS)}
             links = ahead
-            on_frame(t, recent[t].points, recent[t].visible)
     return result
 
 

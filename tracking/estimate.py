@@ -28,7 +28,7 @@ class Estimate:
     """Points that would be followed, before those that are soon lost are dropped."""
 
     seconds: float
-    """Wall time of flow and registration, which is nearly all; 0 where the film states no number of frames."""
+    """Wall time of flow and registration, which is nearly all; 0 without points or where the film states no number of frames."""
 
 
 def estimate(
@@ -61,6 +61,8 @@ def estimate(
     seeds, _ = place(grey, mask, step=default_step(mask) if grid_step is None else grid_step * scale)
     start, stop, step = film.selection
     count = len(range(film.stated_frames)[start:stop:step])
+    if len(seeds.points) == 0:
+        return Estimate(0, 0.0)
     with opencv_serial():
         seconds = FLOWS * _flow_seconds(grey, mask) + _rounds_seconds(grey, seeds)
     return Estimate(len(seeds.points), count * seconds / max(threads, 1))

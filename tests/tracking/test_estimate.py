@@ -1,0 +1,48 @@
+"""What tracking a film would take."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import films
+import numpy as np
+import pytest
+from pliant.tracking import open_film, track_film
+from pliant.tracking.estimate import Estimate, estimate
+
+SIZE = (96, 72)
+
+
+def taken(path: Path, region: np.ndarray | None = None, *, frames: str | None = None, threads: int = 1) -> Estimate:
+    """Estimate what tracking a film would take, every 3 pixels."""
+    opened = open_film(path, frames=frames)
+    return estimate(opened, region=region, region_frame=0, grid_step=3, longest_side=960, threads=threads)
+
+
+@pytest.fixture(scope="module")
+def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    pictures = films.textured_pictures(40, SIZE)
+    for picture in pictures:
+        picture[:, 60:] = 120
+    return films.write_film(tmp_path_factory.mktemp("films") / "film.mkv", pictures)
+
+
+def test_points_are_those_that_tracking_begins_with(film: Path) -> None:
+    region = np.zeros(SIZE[::-1], bool)
+    region[12:60, 9:51] = True
+    tracked = track_film(film, region=region, grid_step=3, frames=":4")
+    assert taken(film, region).points == tracked.tracks.shape[1]
+    assert taken(film).points > 1.2 * taken(film, region).points
+
+
+def test_time_grows_with_the_frames_and_falls_with_the_threads(film: Path) -> None:
+    whole = min(taken(film).seconds for _ in range(3))
+    assert whole > 0
+    assert min(taken(film, frames=":4").seconds for _ in range(3)) < whole / 3
+    assert min(taken(film, threads=8).seconds for _ in range(3)) < whole / 3
+
+
+def test_without_texture_there_is_nothing_to_track(film: Path) -> None:
+    region = np.zeros(SIZE[::-1], bool)
+    region[12:60, 66:90] = True
+    assert taken(film, region) == Estimate(0, 0.0)
