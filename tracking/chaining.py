@@ -4,7 +4,7 @@ After MFT (Neoral, Šerých, Matas, WACV 2024): a point of the template reaches 
 frame shortly before t. Variances add along the way, a point that one link loses is lost for that candidate, and the
 candidate of least variance among those that see the point is taken.
 
-Flow needs pictures, not points, so that of the next frame is computed while the points of this one are registered.
+Flow between two frames does not depend on the points, so it is computed for the next frame while those of this one are registered.
 """
 
 from __future__ import annotations
@@ -158,7 +158,11 @@ class _Link:
 def _links(
     read: Read, t: int, direction: int, template: int, first: Floats, near: Floats, pool: ThreadPoolExecutor
 ) -> dict[int, _Link]:
-    """Begin to compute the flows to frame t, by the frame they come from: where the template's points are and those near t, no further."""
+    """Begin to compute the flows to frame t, by the frame that they come from.
+
+    Flow is computed around the places `near` t, and for the template around its own points as well; elsewhere it costs time and
+    decides nothing.
+    """
     frame = read(t)
     short, long = _box(near, frame.shape), _box(np.concatenate([first, near]), frame.shape)
     earlier = [t - direction * delta for delta in DELTAS if abs(t - template) > delta]
