@@ -4,7 +4,8 @@ After MFT (Neoral, Šerých, Matas, WACV 2024): a point of the template reaches 
 frame shortly before t. Variances add along the way, a point that one link loses is lost for that candidate, and the
 candidate of least variance among those that see the point is taken.
 
-Flow between two frames does not depend on the points, so it is computed for the next frame while those of this one are registered.
+Flow depends on the points only by the box in which it is computed. That to the next frame is computed while this frame's points are
+registered.
 """
 
 from __future__ import annotations
@@ -115,17 +116,15 @@ def chain(
     for direction, end in ((1, num_frames), (-1, -1)):
         frames = range(template + direction, end, direction)
         recent, near = {template: first}, first.points
-        links = _links(read, frames[0], direction, template, first.points, near, pool) if frames else {}
+        links = _links(read, frames[0], direction, template, recent, near, pool) if frames else {}
         for t, following in itertools.zip_longest(frames, frames[1:]):
             if should_stop():
                 raise TrackingStopped
-            ahead = {} if following is None else _links(read, following, direction, template, first.points, near, pool)
+            ahead = {} if following is None else _links(read, following, direction, template, recent, near, pool)
             found = _advance(read(t), links, recent, template, appearance, registration, pool)
             _store(result, t, found)
             on_frame(t, found.points, found.visible)
-            # Flow is computed up to two frames ahead, in which nearly all points move about alike.
-            drift = 2 * np.median(found.points - recent[t - direction].points, axis=0)
-            near = np.concatenate([found.points, found.points + drift])
+            near = _two_frames_on(recent[t - direction], found) if found.visible.any() else first.points
             recent[t] = found
             recent = {s: state for s, state in recent.items() if s == template or abs(t - s) < max(DELTAS)}
             links = ahead
@@ -156,26 +155,43 @@ class _Link:
 
 
 def _links(
-    read: Read, t: int, direction: int, template: int, first: Floats, near: Floats, pool: ThreadPoolExecutor
+    read: Read,
+    t: int,
+    direction: int,
+    template: int,
+    recent: dict[int, _State],
+    near: Floats,
+    pool: ThreadPoolExecutor,
 ) -> dict[int, _Link]:
     """Begin to compute the flows to frame t, by the frame that they come from.
 
-    Flow is computed around the places `near` t, and for the template around its own points as well; elsewhere it costs time and
-    decides nothing.
+    Flow is computed around the visible points of that frame, where they are known yet, and the places `near` t: elsewhere it costs
+    time and decides nothing.
     """
-    frame = read(t)
-    short, long = _box(near, frame.shape), _box(np.concatenate([first, near]), frame.shape)
-    earlier = [t - direction * delta for delta in DELTAS if abs(t - template) > delta]
-    boxes = {template: long} | dict.fromkeys(earlier, short)
-    return {s: _Link.of(read(s), frame, box, pool) for s, box in boxes.items()}
+    frame, links = read(t), {}
+    for s in (template, *(t - direction * delta for delta in DELTAS if abs(t - template) > delta)):
+        around = np.concatenate([recent[s].points[recent[s].visible], near]) if s in recent else near
+        links[s] = _Link.of(read(s), frame, _box(around, frame.shape), pool)
+    return links
+
+
+def _two_frames_on(before: _State, latest: _State) -> Floats:
+    """Return where the visible points are and, as nearly all move about alike, where they will be after two more frames."""
+    seen = latest.points[latest.visible]
+    drift = 2 * np.median(seen - before.points[latest.visible], axis=0)
+    return np.concatenate([seen, seen + drift])
 
 
 def _box(points: Floats, shape: tuple[int, ...]) -> tuple[slice, slice]:
-    """Return rows and columns of a frame around points, with a margin; multiples of 16 keep the pyramid's levels on whole pixels."""
+    """Return rows and columns of a frame around points, with a margin; multiples of 16 keep the pyramid's levels on whole pixels.
+
+    A margin of `FLOW_MARGIN` alone takes 5 % less time, but loses 7 % more of the observations of a talking head.
+    """
     height, width = shape
     inside = np.clip(points, 0, (width - 1, height - 1))
-    left, top = (np.maximum(inside.min(axis=0) - FLOW_MARGIN, 0) // 16 * 16).astype(int)
-    right, bottom = np.ceil(np.minimum(inside.max(axis=0) + FLOW_MARGIN, (width, height)) / 16).astype(int) * 16
+    margin = FLOW_MARGIN + 0.1 * np.ptp(inside, axis=0).max()
+    left, top = (np.maximum(inside.min(axis=0) - margin, 0) // 16 * 16).astype(int)
+    right, bottom = np.ceil(np.minimum(inside.max(axis=0) + margin, (width, height)) / 16).astype(int) * 16
     return slice(int(top), int(bottom)), slice(int(left), int(right))
 
 

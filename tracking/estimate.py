@@ -28,7 +28,8 @@ class Estimate:
     """Points that would be followed, before those that are soon lost are dropped."""
 
     seconds: float
-    """Wall time of flow and registration, which is nearly all; 0 without points or where the film states no number of frames."""
+    """Wall time of flow, registration and comparison; decoding, and fitting the paths of all points, come on top. 0 without points or where
+    the film states no number of frames."""
 
 
 def estimate(
