@@ -61,7 +61,7 @@ GRAM_SECONDS = 1e-9
 UNITS = {
     "multistart": (1600, 120, 1.3),
     "model_order": (1000, 360, 0.6),
-    "starts": (3480, 40, 0.8),
+    "starts": (2140, 40, 0.85),
     "perspective": (10, 360, 30.0),
     "scales": (820, 120, 0.85),
     "refinement": (1500, 360, 1.1),
@@ -94,8 +94,8 @@ GIVEN_ROTATIONS = (1.56, 1.6)
 """Units of the stage `scales` where rotations are given, which has a third start, against those where they are estimated, and time of a
 unit against one there: 1,283 units; measured for 30, 60 and 99 frames."""
 
-UNITS_PER_START = 348
-"""Units that one starting point of the stage `starts` takes."""
+UNITS_PER_START = 195
+"""Units that one of eleven starting points of the stage `starts` takes, with the second refinement of the best."""
 
 
 def planned(

@@ -69,7 +69,7 @@ class CameraEstimate:
     needed."""
 
     hypotheses: tuple[tuple[int, Floats], ...] = ()
-    """K and rotations `(F, 3, 3)`, not refined, of factorizations that are about as probable."""
+    """K and rotations `(F, 3, 3)` that are about as probable: of factorizations, not refined, or of a sheet with other pose signs."""
 
     outliers: float = 0.0
     """Share of the visible entries that completion replaced as gross outliers."""
@@ -140,11 +140,14 @@ def estimate_cameras(
     own = next(each for each in factorized if each.basis_size == best.basis_size)
     report(Step("cameras", 0.8 * PROGRESS_SHARE))
     rotations, refined = _everywhere(own.rotations, best, used, settings)
+    alternative = None
     if planar := settings.refine_rotations and is_planar(gram):
-        rotations, pose_signs = resolve_pose_signs(gram, rotations, ordered=ordered, should_stop=should_stop)
-        refined = f"{refined} {pose_signs}"
+        rotations, alternative, sides = resolve_pose_signs(gram, rotations, ordered=ordered, should_stop=should_stop)
+        refined = f"{refined} {sides}"
     compared = ran if settings.refine_rotations and not planar else []
     hypotheses = _hypotheses(factorized, compared, part, used)
+    if alternative is not None:
+        hypotheses = ((best.basis_size, alternative),)
     candidates = tuple((each.basis_size, _everywhere(own.rotations, each, used, settings)[0]) for each in compared)
     read_only(rotations)
     read_only(scales)

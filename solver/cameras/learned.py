@@ -103,15 +103,17 @@ def learned_at(
     scales: Floats,
     model_order: ModelOrder,
     should_stop: Callable[[], bool] | None,
+    *,
+    iterations: int = START_EM_ROUNDS,
 ) -> Learned:
-    """Return given cameras and the covariance learned with them from scratch."""
+    """Return given cameras and the covariance learned with them from scratch, in `iterations` rounds of EM at most."""
     covariance = learned(
         gram,
         rotations[:, :2] * scales[:, None, None],
         max_modes=model_order.max_modes,
         noisy_start=model_order.noisy_start,
         ordered=model_order.ordered,
-        iterations=START_EM_ROUNDS,
+        iterations=iterations,
         should_stop=should_stop,
     )
     return Learned(rotations, scales, covariance, np.inf)

@@ -7,8 +7,8 @@ not leave these signs, since a high ridge separates the two poses. The correct s
 deformation explain the tracks.
 
 For tracks of nearly rank two, the poses of a plane are computed in closed form up to their signs. The starts are the
-given signs and those with the smoothest camera, of first and of second order. From the best start, frames and runs of
-frames are reversed while the likelihood with few modes improves. Scales stay free, because the larger singular value
+cameras known otherwise, these poses, and those with the smoothest camera, of first and of second order. From the best start,
+frames and runs of frames are reversed while the likelihood with few modes improves. Scales stay free, because the larger singular value
 of a plane's image is its scale.
 """
 
@@ -107,8 +107,11 @@ def planar_frames(count: int) -> slice:
 
 def resolve_pose_signs(
     gram: Floats, rotations: Floats, *, ordered: bool = True, should_stop: Callable[[], bool] | None = None
-) -> tuple[Floats, str]:
-    """Return the rotations of a planar object, given or with more probable pose signs, and a sentence.
+) -> tuple[Floats, Floats | None, str]:
+    """Return the rotations of a planar object, given or with more probable pose signs; an alternative; and a sentence.
+
+    The alternative is the given rotations with some poses reversed, where they are the best start and few modes then explain the tracks
+    better. That may be right for a sheet and wrong for a shallow solid: the likelihood with the shapes must decide.
 
     Parameters
     ----------
@@ -124,75 +127,44 @@ def resolve_pose_signs(
     used = planar_frames(len(rotations))
     part, given = gram_of(gram, used), rotations[used]
     planes, scales = poses(gram)
-    baseline = fitted(
-        part,
-        given,
-        rigid_scales(part, given),
-        np.zeros(len(given), dtype=bool),
-        ordered=ordered,
-        should_stop=should_stop,
-    )
-    found = search_pose_signs(part, planes[used], scales[used], ordered=ordered, should_stop=should_stop)
-    if found.energy >= baseline.energy:
-        return rotations, "The tracks are those of a sheet; its sides are as they were."
-    pose_signs = np.repeat(found.pose_signs, used.step)[: len(rotations)]
-    after = start_at_identity(carried(reversed_at(planes, MIRROR, pose_signs), found.rotations, used))
+    starts = [(rotations, rigid_scales(part, given))]
+    starts += [
+        (reversed_at(planes, MIRROR, _of_all_frames(pose_signs, used, len(planes))), scales[used])
+        for pose_signs in _starts(planes[used], ordered=ordered)
+    ]
+    fits: list[PlanarCameras] = []
+    for begun, sizes in starts:
+        if fits and should_stop is not None and should_stop():
+            break
+        fits.append(fitted(part, begun[used], sizes, ordered=ordered, should_stop=should_stop))
+    best = min(fits, key=lambda each: each.energy)
+    found = _reverse_greedily(part, best, should_stop, ordered=ordered)
+    as_before = "The tracks are those of a sheet; its sides are as they were."
+    if found is fits[0]:
+        return rotations, None, as_before
+    begun, _ = starts[fits.index(best)]
+    pose_signs = _of_all_frames(found.pose_signs, used, len(planes))
+    before = reversed_at(begun, _plane(found.motion)[0], pose_signs)
+    after = start_at_identity(carried(before, found.rotations, used))
+    if best is fits[0]:
+        return rotations, after, as_before
     turn = float(np.degrees(angles_between(after, rotations).mean()))
-    return (
-        after,
-        f"The tracks are those of a sheet; other sides of it are more probable and turn it by {turn:.1f}° on average.",
-    )
-
-
-def search_pose_signs(
-    gram: Floats,
-    rotations: Floats,
-    scales: Floats,
-    *,
-    ordered: bool = True,
-    should_stop: Callable[[], bool] | None = None,
-) -> PlanarCameras:
-    """Return the cameras with the most probable pose signs.
-
-    Parameters
-    ----------
-    gram : shape (2F, 2F)
-        W Wᵀ / P of centred, complete tracks.
-    rotations, scales
-        From `poses`.
-    ordered : bool
-        As for `resolve_pose_signs`.
-    should_stop : callable, optional
-        Called before every fit; once it returns True, the best so far is returned.
-    """
-    best: PlanarCameras | None = None
-    for pose_signs in _starts(rotations, ordered=ordered):
-        if best is not None and should_stop is not None and should_stop():
-            return best
-        found = fitted(
-            gram,
-            reversed_at(rotations, MIRROR, pose_signs),
-            scales,
-            pose_signs,
-            ordered=ordered,
-            should_stop=should_stop,
-        )
-        best = found if best is None or found.energy < best.energy else best
-    assert best is not None
-    return _reverse_greedily(gram, best, should_stop, ordered=ordered)
+    why = f"other sides of it are more probable and turn it by {turn:.1f}° on average."
+    return after, None, f"The tracks are those of a sheet; {why}"
 
 
 def fitted(
     gram: Floats,
     rotations: Floats,
     scales: Floats,
-    pose_signs: PoseSigns,
     *,
+    pose_signs: PoseSigns | None = None,
     iterations: int = FULL_ITERATIONS,
     ordered: bool = True,
     should_stop: Callable[[], bool] | None = None,
 ) -> PlanarCameras:
-    """Return the cameras of highest likelihood near the given ones."""
+    """Return the cameras of highest likelihood near the given ones, whose pose signs are carried along; None for no reversal."""
+    pose_signs = np.zeros(len(rotations), dtype=bool) if pose_signs is None else pose_signs
     scene = Scene(
         gram, rotations, with_scales=True, prior_weight=PLANAR_PRIOR_WEIGHT * ordered,
         noise_std_floor=PLANAR_NOISE_STD, smoothness=0.0, ordered=ordered,
@@ -227,6 +199,11 @@ def poses(gram: Floats) -> tuple[Floats, Floats]:
     flat = (left * np.stack([np.ones_like(cosine), cosine], axis=1)[:, None]) @ right
     rows = np.concatenate([flat, across[..., None]], axis=2)
     return from_rows(rows), np.exp(np.log(values[:, 0]) - np.log(values[:, 0]).mean())
+
+
+def _of_all_frames(pose_signs: PoseSigns, used: slice, frames: int) -> PoseSigns:
+    """Return the pose signs of the frames used for the frames after them as well, shape `(F,)`."""
+    return np.asarray(np.repeat(pose_signs, used.step)[:frames], dtype=bool)
 
 
 def reversed_at(rotations: Floats, plane: Floats, pose_signs: PoseSigns) -> Floats:
@@ -286,7 +263,7 @@ def _reverse_greedily(
                     gram,
                     turned,
                     found.scales,
-                    found.pose_signs ^ run,
+                    pose_signs=found.pose_signs ^ run,
                     iterations=TRIAL_ITERATIONS,
                     ordered=ordered,
                     should_stop=should_stop,
@@ -295,7 +272,9 @@ def _reverse_greedily(
         tried.sort(key=lambda each: each.energy)
         better = None
         for each in tried[:MAX_FULL_FITS]:
-            deep = fitted(gram, each.rotations, each.scales, each.pose_signs, ordered=ordered, should_stop=should_stop)
+            deep = fitted(
+                gram, each.rotations, each.scales, pose_signs=each.pose_signs, ordered=ordered, should_stop=should_stop
+            )
             if deep.energy < found.energy - MIN_REVERSAL_GAIN:
                 better = deep
                 break

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from camera_errors import degrees_apart
 from pliant.solver import Settings, Tracks, gallery, solve
+from pliant.solver.cameras.estimation import estimate_cameras
 from pliant.solver.cameras.planar_ambiguity import (
     fitted,
     is_planar,
@@ -13,7 +14,6 @@ from pliant.solver.cameras.planar_ambiguity import (
     poses,
     resolve_pose_signs,
     reversed_at,
-    search_pose_signs,
     smoothest_signs,
 )
 from pliant.solver.evaluation import metrics
@@ -111,8 +111,8 @@ def test_the_pose_signs_of_a_flag_are_found(flag: gallery.Sequence) -> None:
 
 def test_correct_pose_signs_are_kept(flag: gallery.Sequence) -> None:
     gram, truth = complete(normalize(flag.tracks)).gram, np.asarray(flag.rotations)
-    best = fitted(gram, truth, np.ones(24), np.zeros(24, dtype=bool), iterations=400)
-    kept, sentence = resolve_pose_signs(gram, best.rotations, should_stop=lambda: True)
+    best = fitted(gram, truth, np.ones(24), iterations=400)
+    kept, _, sentence = resolve_pose_signs(gram, best.rotations, should_stop=lambda: True)
     assert ("as they were" in sentence) == (kept is best.rotations)
 
 
@@ -121,19 +121,31 @@ def test_pose_signs_of_a_long_sequence_are_found_on_a_subset_of_frames(monkeypat
     monkeypatch.setattr("pliant.solver.cameras.planar_ambiguity.PLANAR_FRAMES", 20)
     long = gallery.flag(50, 200, degrees=40)
     gram = complete(normalize(long.tracks)).gram
-    found, _ = resolve_pose_signs(gram, np.broadcast_to(np.eye(3), (50, 3, 3)))
+    found, _, _ = resolve_pose_signs(gram, np.broadcast_to(np.eye(3), (50, 3, 3)))
     assert found.shape == (50, 3, 3)
     steps = np.degrees(angles_between(found[1:], found[:-1]))
     assert steps.max() < 20
 
 
 @pytest.mark.slow
-def test_a_stop_returns_the_best_so_far(flag: gallery.Sequence) -> None:
+def test_given_cameras_that_reversals_make_more_probable_get_an_alternative() -> None:
+    small = gallery.flag(16, 100)
+    found = estimate_cameras(normalize(small.tracks), Settings())
+    assert "as they were" in found.reasons["rotations"]
+    ((_, alternative),) = found.hypotheses
+    given, other = (fitted(found.gram, each, np.ones(16)).energy for each in (found.rotations, alternative))
+    assert other < given - 0.1
+    solution = solve(small.tracks)  # with the given cameras the error is .52
+    assert metrics.e3d_frame(solution.shapes, small.shapes) < 0.2
+
+
+def test_a_stop_keeps_the_given_cameras(flag: gallery.Sequence) -> None:
     gram = complete(normalize(flag.tracks)).gram
-    rotations, scales = poses(gram)
-    stopped = search_pose_signs(gram, rotations, scales, should_stop=lambda: True)
-    assert not stopped.pose_signs.any()
-    assert search_pose_signs(gram, rotations, scales).energy < stopped.energy
+    given = np.broadcast_to(np.eye(3), (24, 3, 3))
+    kept, none, sentence = resolve_pose_signs(gram, given, should_stop=lambda: True)
+    assert kept is given
+    assert none is None
+    assert "as they were" in sentence
 
 
 @pytest.mark.slow
