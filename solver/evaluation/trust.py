@@ -18,7 +18,7 @@ from pliant.solver.records import Floats
 
 INTERVAL = (0.35, 3.6)
 """Factors around the expected error: about the 10 and 90 % quantiles of true over expected error on the sequences for calibration of
-`benchmarks.trust`, of which they hold 44 in 56; they hold 61 in 77 of the others, where the expected error is more often too large."""
+`benchmarks.trust`, of which they hold 45 in 56; they hold 55 in 71 of the others, where the expected error is more often too large."""
 
 POOR, BAD = 0.2, 1.8
 """Upper end of the expected error, share of the size, from which a result is to be used with care, and not to be used. With the first no
