@@ -254,7 +254,8 @@ class Options(BaseModel):
     )
     grid_step: Annotated[float, Field(ge=1, le=100, allow_inf_nan=False)] | None = Field(
         None,
-        description="For a film: distance of neighbouring points in the film's pixels; null: about 4,000 points in the region.",
+        description="For a film: distance of neighbouring points in the film's pixels; null: 4 to 8 in the tracked frames, chosen for "
+        "about 4,000 points.",
     )
     longest_side: int = Field(
         960,

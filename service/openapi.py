@@ -14,7 +14,7 @@ from pliant.schemas.shares import ShareRequest
 from pliant.service.middleware.auth import is_public
 from pliant.service.problems import MEDIA_TYPE
 
-SUMMARY = "Dense 2-D point tracks of a deforming object in, a moving 3-D mesh out."
+SUMMARY = "Films, or dense 2-D point tracks, of a deforming object in, a moving 3-D mesh out."
 DESCRIPTION = """Submit a job with `POST /v1/jobs`, follow it, download its files.
 
 Every error is `application/problem+json` (RFC 9457) with a stable `code`, a `type` that links to its explanation, a `detail` that

@@ -365,9 +365,9 @@ def _best_start(
     """Return the estimate with the rotations, its own or those of another start, that give the lowest energy after a short refinement.
 
     The multistart models deformation by smooth modes and moves cameras by degrees to fit it; joint refinement hardly
-    moves them back, because every mode would have to move along. The unrefined cameras of a factorization, those with other
-    pose signs of a sheet, or a candidate that the multistart ranks lower, can therefore be the better start. A candidate must be better by `MAX_HYPOTHESIS_GAP`:
-    smaller differences do not tell true cameras from false ones.
+    moves them back, because every mode would have to move along. The unrefined cameras of a factorization, those with
+    other pose signs of a sheet, or a candidate that the multistart ranks lower, can therefore be the better start. A
+    candidate must be better by `MAX_HYPOTHESIS_GAP`: smaller differences do not tell true cameras from false ones.
     """
     some = evenly_spread(len(used), START_FRAMES)
     part, ones = of_frames(gram, some), np.ones(len(some))

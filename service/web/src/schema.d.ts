@@ -734,7 +734,7 @@ export interface components {
             template_frame: number | null;
             /**
              * Grid Step
-             * @description For a film: distance of neighbouring points in the film's pixels; null: about 4,000 points in the region.
+             * @description For a film: distance of neighbouring points in the film's pixels; null: 4 to 8 in the tracked frames, chosen for about 4,000 points.
              * @default null
              */
             grid_step: number | null;
