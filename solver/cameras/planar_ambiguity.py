@@ -147,7 +147,7 @@ def resolve_pose_signs(
     before = reversed_at(begun, _plane(found.motion)[0], pose_signs)
     after = start_at_identity(carried(before, found.rotations, used))
     if best is fits[0]:
-        return rotations, after, as_before
+        return rotations, after, f"{as_before} With some of them reversed, the cameras are a further start."
     turn = float(np.degrees(angles_between(after, rotations).mean()))
     why = f"other sides of it are more probable and turn it by {turn:.1f}° on average."
     return after, None, f"The tracks are those of a sheet; {why}"

@@ -131,7 +131,7 @@ def test_pose_signs_of_a_long_sequence_are_found_on_a_subset_of_frames(monkeypat
 def test_given_cameras_that_reversals_make_more_probable_get_an_alternative() -> None:
     small = gallery.flag(16, 100)
     found = estimate_cameras(normalize(small.tracks), Settings())
-    assert "as they were" in found.reasons["rotations"]
+    assert "as they were. With some of them reversed" in found.reasons["rotations"]
     ((_, alternative),) = found.hypotheses
     given, other = (fitted(found.gram, each, np.ones(16)).energy for each in (found.rotations, alternative))
     assert other < given - 0.1
