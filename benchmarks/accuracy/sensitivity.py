@@ -30,6 +30,7 @@ RESULTS = Path(__file__).parent.parent / "results" / "sensitivity.jsonl"
 
 ROOMS = {
     "solver/cameras": ("face", "face, given cameras"),
+    "solver/refinement": ("face", "face, given cameras"),
     "solver/model": ("face", "face, given cameras"),
     "solver/energy": ("face, given cameras",),
     "solver/linear": ("face, given cameras",),

@@ -97,7 +97,7 @@ class CameraEstimate:
     """K and rotations `(F, 3, 3)` of all candidates of the multistart, which refinement with the shapes may rank otherwise."""
 
     depth_is_typical: bool = False
-    """Whether the extent of depth rests on its prior and not on the tracks (`cameras.bas_relief`)."""
+    """Whether the extent of depth rests on its prior and not on the tracks (`refinement.bas_relief`)."""
 
 
 def estimate_cameras(
@@ -231,7 +231,7 @@ def given_cameras(normalized: Normalized, known: KnownCamera, settings: Settings
 
     Estimated scales are those with which one rigid shape explains the tracks best: Σ_f ‖W_f − s_f R_f S‖² is least. A
     common factor of all scales has no effect, because S compensates it. With the Gaussian prior they are 1 here, and
-    `joint_refinement.refine_cameras` frees them where the likelihood gains, because a rigid shape takes deformation for scale.
+    `refinement.joint_refinement` frees them where the likelihood gains, because a rigid shape takes deformation for scale.
 
     Where scales are known, the prior does not need the tracks' Gram matrix and translations are estimated with the
     shapes, completion is skipped, because it could take longer than the shapes. `rank` is as for `estimate_cameras`.

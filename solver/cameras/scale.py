@@ -1,23 +1,16 @@
 """The scale of every frame, for a camera that zooms or moves in depth.
 
-A uniform change of size is also a deformation, so scales that reduce the residual are no evidence by themselves. Scales
-are adopted in two cases: if one rigid shape explains almost all of the tracks (`rigid_evidence`), or if the likelihood of
-the tracks, which penalises each mode of deformation, is clearly higher with scales (`try_free_scales`).
+A uniform change of size is also a deformation, so scales that reduce the residual are no evidence by themselves. They are
+adopted here if one rigid shape explains almost all of the tracks; `refinement.free_scales` adopts them if the likelihood of
+the tracks, which penalises each mode of deformation, is clearly higher with scales.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-
 import numpy as np
 from pliant.solver.cameras.factorization import upgrade
-from pliant.solver.cameras.learned import Learned, learned_at, turned
-from pliant.solver.model.marginal_likelihood import Scene, cameras_of, fit, start
-from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.records import Floats
 from pliant.solver.settings import Settings
-from pliant.solver.tracks.frame_selection import between, evenly_spread, of_frames
 
 SCALE_SHARE = 0.85
 """Minimum share of the residual of a rigid shape under orthography, beyond that of an affine camera, that scales must
@@ -29,26 +22,6 @@ RIGID_ENOUGH = 0.01
 
 WIDEST = 0.3
 """Maximum standard deviation of the logarithm of the scales for them to be adopted."""
-
-SCALE_FRAMES = 120
-"""Frames used to decide whether scales are free; with 60 instead of 120 chance gains of fixed scales reach .054."""
-
-SMOOTH_ITERATIONS = 120
-"""L-BFGS iterations for the scales of smooth modes, as many as those of `SCALE_ROUNDS`."""
-
-SCALE_ROUNDS = 2
-"""Refinements used to decide whether scales are free."""
-
-MIN_SCALE_GAIN = 0.12
-"""Decrease of the energy, per point and frame, required to free scales that vary from frame to frame. BIC for one
-parameter per frame gives .075; fixed scales gain up to .08 by chance, real scale changes .23 and more."""
-
-SMOOTH_SCALE_SHARE = 0.4
-"""Share of `MIN_SCALE_GAIN` required of slowly varying scales, which need fewer parameters: a swing of .05 over 60
-frames gains .058, none up to .04."""
-
-MIN_SCALE_STD = 0.01
-"""Standard deviation of log s below which scales stay 1."""
 
 
 def rigid_evidence(gram: Floats, settings: Settings) -> tuple[Floats, str]:
@@ -95,79 +68,3 @@ def rigid_scales(gram: Floats, rotations: Floats, *, rounds: int = 30) -> Floats
         scales = np.clip(scales, 1e-2 * typical + 1e-12, 1e2 * typical + 1e-12)
         scales = np.asarray(scales / np.exp(np.log(scales).mean()))
     return scales
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ScaleTrial:
-    """What freeing the scales of some frames gained."""
-
-    start: Floats | None
-    """Scales of all frames to start from, mean logarithm 0; None where free scales gain no more than chance."""
-
-    reason: str
-    """A sentence."""
-
-    fixed: Learned
-    """Cameras and covariance of the frames compared, with scales of 1."""
-
-
-def try_free_scales(
-    gram: Floats,
-    rotations: Floats,
-    model_order: ModelOrder,
-    should_stop: Callable[[], bool] | None,
-    *,
-    turning: bool = True,
-) -> ScaleTrial:
-    """Compare free scales with scales of 1 on a subset of the frames.
-
-    Scales are free from two starts, 1 and those of a rigid shape. Deformation that is mistaken for scale ends in a worse
-    minimum than fixed scales, or in one with nearly constant scales. With `turning` False the rotations are kept. The scales of
-    a rigid shape are then a poor start, because nothing but the scales can absorb the deformation; those found with smooth
-    modes are a third one.
-    """
-    used = evenly_spread(len(rotations), SCALE_FRAMES)
-    part, given, none = of_frames(gram, used), rotations[used], np.ones(len(used))
-
-    def turned_some(begun: Learned, *, with_scales: bool) -> Learned:
-        return turned(
-            part, begun, with_scales=with_scales, rounds=SCALE_ROUNDS, turning=turning, should_stop=should_stop
-        )
-
-    starts = [none, rigid_scales(part, given)]
-    if not turning:
-        starts.append(_smooth_scales(part, given, ordered=model_order.ordered, should_stop=should_stop))
-    even, *others = (learned_at(part, given, scales, model_order, should_stop) for scales in starts)
-    fixed, runs = (
-        turned_some(even, with_scales=False),
-        [turned_some(each, with_scales=True) for each in (even, *others)],
-    )
-    best = min(runs, key=lambda run: run.energy)
-    gain, logs = fixed.energy - best.energy, np.log(best.scales)
-    extent = f"from {best.scales.min():.3f} to {best.scales.max():.3f}"
-    if logs.std() > WIDEST:
-        return ScaleTrial(None, f"Every scale is 1: those found, {extent}, are wider apart than any camera's.", fixed)
-    share = _scale_gain_share(logs) if model_order.ordered else 1.0
-    if not (gain > MIN_SCALE_GAIN * share and logs.std() > MIN_SCALE_STD):
-        reason = (
-            f"Every scale is 1: free ones, {extent}, would gain {gain:.3f} in the logarithm of the "
-            "likelihood, no more than deformation alone does."
-        )
-        return ScaleTrial(None, reason, fixed)
-    logs = between(used, logs[:, None], len(rotations))[:, 0]
-    reason = f"Scales {extent} gain {gain:.3f} in the logarithm of the likelihood, per point and frame."
-    return ScaleTrial(np.exp(logs - logs.mean()), reason, fixed)
-
-
-def _smooth_scales(gram: Floats, rotations: Floats, *, ordered: bool, should_stop: Callable[[], bool] | None) -> Floats:
-    """Return the most probable scales of given rotations where the modes are smooth and the noise is large, shape `(F,)`."""
-    scene = Scene.of(gram, rotations, with_scales=True, ordered=ordered)
-    begun = start(scene, np.ones(len(rotations)))
-    moved, _ = fit(scene, begun, iterations=SMOOTH_ITERATIONS, turning=False, should_stop=should_stop)
-    return cameras_of(scene, moved)[1]
-
-
-def _scale_gain_share(logs: Floats) -> float:
-    """Return the share of `MIN_SCALE_GAIN` required: `SMOOTH_SCALE_SHARE` for slowly varying scales, up to 1 for independent ones."""
-    rough = float(np.diff(logs).var()) / max(2 * float(logs.var()), np.finfo(float).tiny)
-    return float(np.clip(3 * rough, SMOOTH_SCALE_SHARE, 1.0))

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from pliant.solver.cameras.focal_length import MIN_PERSPECTIVE_GAIN
 from pliant.solver.cameras.perspective import Perspective
 from pliant.solver.records import Choices, FocalCandidate
+from pliant.solver.refinement.focal_length import MIN_PERSPECTIVE_GAIN
 from pliant.solver.settings import Settings
 
 

@@ -7,11 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.cameras import estimation
-from pliant.solver.cameras.covariance_learning import LearningData, learn_covariance
-from pliant.solver.cameras.depth_rounds import settled
 from pliant.solver.cameras.estimation import CameraEstimate, given_cameras
-from pliant.solver.cameras.joint_refinement import refine_cameras
-from pliant.solver.cameras.observed import Observed, cross_fitted
 from pliant.solver.cameras.planar_ambiguity import is_planar
 from pliant.solver.limits import LEARNED_FRAMES
 from pliant.solver.model.model_order import ModelOrder
@@ -20,6 +16,10 @@ from pliant.solver.pulse import pulses_to
 from pliant.solver.reconstruction.long_films import extended
 from pliant.solver.reconstruction.observations import Observations, OnStep, ShouldStop, check_fit, monitored, observe
 from pliant.solver.records import MIN_POINTS, Camera, Floats, KnownCamera, Step, Tracks, read_only
+from pliant.solver.refinement.covariance_learning import LearningData, learn_covariance
+from pliant.solver.refinement.depth_rounds import settled
+from pliant.solver.refinement.joint_refinement import refine_cameras
+from pliant.solver.refinement.observed import Observed, cross_fitted
 from pliant.solver.settings import Settings
 from pliant.solver.stages import stage_of
 from pliant.solver.tracks.completion import seen_again

@@ -13,9 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.solver.cameras.covariance_learning import LearningData
 from pliant.solver.cameras.estimation import CameraEstimate
-from pliant.solver.cameras.learned import Learned, turned_once
 from pliant.solver.cameras.perspective import Perspective, centred, columns, corrected, depth_map
 from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.resection import MeanShapes, Poses, Views, interpolated, predicted, resected
@@ -24,6 +22,8 @@ from pliant.solver.model.so3 import angles_between, start_at_identity
 from pliant.solver.monitor import enter
 from pliant.solver.reconstruction.observations import Observations
 from pliant.solver.records import Floats, read_only
+from pliant.solver.refinement.covariance_learning import LearningData
+from pliant.solver.refinement.learned import Learned, turned_once
 from pliant.solver.tracks.completion import Filling, choose_points, gross
 
 PREDICTED_TOGETHER = 256

@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from pliant.solver.cameras.covariance_learning import learn_covariance
-from pliant.solver.cameras.depth_rounds import with_depth_map
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.energy.hyperparameters import noise_std
 from pliant.solver.errors import InvalidInput
@@ -16,6 +14,8 @@ from pliant.solver.pulse import pulses_to
 from pliant.solver.reconstruction.cameras import Cameras, estimate_cameras
 from pliant.solver.reconstruction.observations import OnStep, ShouldStop, monitored
 from pliant.solver.records import Floats, KnownCamera, Step, Tracks
+from pliant.solver.refinement.covariance_learning import learn_covariance
+from pliant.solver.refinement.depth_rounds import with_depth_map
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

@@ -22,13 +22,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.cameras.estimation import CameraEstimate
-from pliant.solver.cameras.learned import Learned, motion_of, moved_to, scene_at
 from pliant.solver.cameras.perspective import centred, columns, depth_map
 from pliant.solver.evaluation.alignment import procrustes
 from pliant.solver.model.expectation_maximisation import improve
 from pliant.solver.model.marginal_likelihood import fit
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.records import Floats
+from pliant.solver.refinement.learned import Learned, motion_of, moved_to, scene_at
 from pliant.solver.tracks.frame_selection import between, evenly_spread
 from scipy.spatial import cKDTree
 

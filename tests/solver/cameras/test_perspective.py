@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from pliant.solver import Camera, InvalidInput, InvalidSettings, KnownCamera, Settings, Solution, Tracks, gallery, solve
-from pliant.solver.cameras.focal_length import corrected_energy
-from pliant.solver.cameras.learned import Learned, motion_of
 from pliant.solver.cameras.lens import given_lens
 from pliant.solver.cameras.perspective import corrected, density, depth_map, depths_of, mirrored
 from pliant.solver.evaluation.metrics import e3d_frame_scaled, focal_error, reprojection
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import exponential
+from pliant.solver.refinement.focal_length import corrected_energy
+from pliant.solver.refinement.learned import Learned, motion_of
 from pliant.solver.shapes import perspective_shapes
 from pliant.solver.tracks.normalization import normalize
 

@@ -40,7 +40,8 @@ def test_a_camera_that_does_not_zoom_has_scales_of_one(name: str) -> None:
 def test_implausibly_large_scale_changes_are_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
     film = gallery.face(10, 50, scale_change=0.1)
     # Neither the rigid scales nor those found with the shapes may vary more.
-    monkeypatch.setattr("pliant.solver.cameras.scale.WIDEST", 0.02)
+    for module in ("cameras.scale", "refinement.free_scales"):
+        monkeypatch.setattr(f"pliant.solver.{module}.WIDEST", 0.02)
     found = solve(film.tracks, settings=Settings(max_reweightings=1))
     assert (found.camera.scales == 1).all()
     assert "wider apart than any camera's" in found.choices.reasons["scales"]

@@ -191,7 +191,7 @@ def test_a_stop_leaves_the_rotations_of_the_start(face: gallery.Sequence) -> Non
     shown = np.ones(24, dtype=bool)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
-            "pliant.solver.cameras.covariance_learning.learn_with_early_stopping", None
+            "pliant.solver.refinement.covariance_learning.learn_with_early_stopping", None
         )  # a stop learns nothing more
         stopped, _ = learn(estimate, shown, turning=True, should_stop=lambda: True)
     np.testing.assert_allclose(

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from pliant.solver.cameras.covariance_learning import learn_covariance
 from pliant.solver.cameras.estimation import CameraEstimate
-from pliant.solver.cameras.joint_refinement import refine_cameras
 from pliant.solver.model.shape_covariance import ShapeCovariance
+from pliant.solver.refinement.covariance_learning import learn_covariance
+from pliant.solver.refinement.joint_refinement import refine_cameras
 
 
 def learn(estimate: CameraEstimate, shown: np.ndarray, **more: Any) -> tuple[CameraEstimate, ShapeCovariance]:

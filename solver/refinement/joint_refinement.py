@@ -8,107 +8,36 @@ modes, which the random walk replaces); they are improved alternately.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.solver.cameras.bas_relief import DECIDED, bulges, settled_depth
-from pliant.solver.cameras.covariance_learning import LearningData
-from pliant.solver.cameras.depth_rounds import settled, settled_again
-from pliant.solver.cameras.estimation import MAX_HYPOTHESIS_GAP, CameraEstimate, restarted
-from pliant.solver.cameras.learned import Learned, learned_at, refined, scene_at, turned, turned_once
-from pliant.solver.cameras.observed import Moments, Observed, on_observations
+from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.cameras.perspective import mirrored
-from pliant.solver.cameras.scale import SCALE_ROUNDS, ScaleTrial, try_free_scales
 from pliant.solver.model import full_mode_covariance
 from pliant.solver.model.expectation_maximisation import MAX_MODES
 from pliant.solver.model.model_order import ModelOrder, select_model_order
 from pliant.solver.model.so3 import MIRROR, angles_between
 from pliant.solver.monitor import enter
 from pliant.solver.records import Floats, read_only
+from pliant.solver.refinement.bas_relief import DECIDED, bulges, settled_depth
+from pliant.solver.refinement.covariance_learning import LearningData
+from pliant.solver.refinement.depth_rounds import settled, settled_again
+from pliant.solver.refinement.evidence import Evidence
+from pliant.solver.refinement.free_scales import SCALE_ROUNDS, ScaleTrial, try_free_scales
+from pliant.solver.refinement.learned import Learned, learned_at, refined, scene_at, turned
+from pliant.solver.refinement.observed import Moments, Observed, on_observations
+from pliant.solver.refinement.starts import best_candidate, best_start
 from pliant.solver.stages import REFINEMENT_UNITS, UNITS_PER_START
-from pliant.solver.tracks.frame_selection import between, evenly_spread, of_frames, rotations_between
+from pliant.solver.tracks.frame_selection import between, rotations_between
 from pliant.solver.tracks.normalization import Normalized
 
 REFINEMENT_ROUNDS = 5
 """Refinements of rotations and covariance, each with a new L-BFGS memory. EM in between would undo part of the gain,
 since it keeps modes and random walk apart."""
 
-START_FRAMES, COMPARED_EM_ROUNDS, FINALISTS = 40, 45, 3
-"""Frames and rounds of EM with which starting cameras are compared, and how many of the others get a second refinement. On eleven
-sequences the most probable after two refinements is the estimate itself or among the first two after one; with 90 rounds of EM
-it is the same, or as probable to .03; with 30, the cameras of a small face are worse."""
-
 COUPLED_ROUNDS = 2
 """Refinements after that of the coupled modes."""
-
-CANDIDATE_ROUNDS = 3
-"""Refinements of every candidate where they are compared at settled depths."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Evidence:
-    """An estimate, and the completed tracks of the frames used, divided by the scales of the start."""
-
-    estimate: CameraEstimate
-
-    used: NDArray[np.intp]
-    """Shape `(F',)`, increasing."""
-
-    start_scales: Floats
-    """Of all frames, shape `(F,)`."""
-
-    gram: Floats
-    """Shape `(2F', 2F')`."""
-
-    sample: Floats
-    """Shape `(F', S, 2)`."""
-
-    @classmethod
-    def of(cls, estimate: CameraEstimate, used: NDArray[np.intp], start_scales: Floats) -> _Evidence:
-        wide = np.repeat(start_scales, 2)
-        gram = of_frames(estimate.gram / np.outer(wide, wide), used)
-        return cls(estimate, used, start_scales, gram, (estimate.sample / start_scales[:, None, None])[used])
-
-    def corrected(self, estimate: CameraEstimate) -> _Evidence:
-        """Return an estimate whose tracks are corrected for other depths, at the same frames."""
-        return _Evidence.of(estimate, self.used, self.start_scales)
-
-    @property
-    def bends(self) -> bool:
-        """Whether perspective is found, which distinguishes the signs of depth."""
-        return self.estimate.perspective is not None and self.estimate.perspective.bends
-
-    @property
-    def rotations(self) -> Floats:
-        """Of the frames used, shape `(F', 3, 3)`."""
-        return np.asarray(self.estimate.rotations)[self.used]
-
-    @property
-    def projections(self) -> Floats:
-        """Their first two rows, shape `(F', 2, 3)`."""
-        return np.asarray(self.estimate.rotations)[self.used, :2]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Trial:
-    """Cameras to start from, and what a short refinement makes of them."""
-
-    estimate: CameraEstimate
-
-    margin: float
-    """By how much it must be better than another start."""
-
-    found: Learned
-
-    @property
-    def energy(self) -> float:
-        """Of the refined cameras, with the margin."""
-        return self.found.energy + self.margin
-
-    def refined(self, gram: Floats, should_stop: Callable[[], bool] | None) -> _Trial:
-        """Return the trial after one more refinement."""
-        return replace(self, found=turned_once(gram, self.found, with_scales=False, should_stop=should_stop))
 
 
 def refine_cameras(
@@ -143,7 +72,7 @@ def refine_cameras(
     should_stop : callable, optional
         Called between refinements; once it returns True, the best so far is returned.
     """
-    start = _Evidence.of(estimate, np.flatnonzero(shown), np.asarray(estimate.scales))
+    start = Evidence.of(estimate, np.flatnonzero(shown), np.asarray(estimate.scales))
     enter(should_stop, "model_order")
     model_order = select_model_order(
         start.sample, start.projections, ordered=estimate.ordered, seed=seed, should_stop=should_stop
@@ -189,17 +118,17 @@ def refine_cameras(
 
 
 def _started(
-    start: _Evidence,
+    start: Evidence,
     normalized: Normalized | None,
     model_order: ModelOrder,
     *,
     turning: bool,
     should_stop: Callable[[], bool] | None,
-) -> _Evidence:
+) -> Evidence:
     """Return the most probable start, with tracks corrected for perspective where they need it."""
     if turning and (others := len(start.estimate.hypotheses) + len(start.estimate.candidates)):
         enter(should_stop, "starts", units=UNITS_PER_START * (1 + others))
-        best = _best_start(start.estimate, start.gram, start.used, model_order, should_stop)
+        best = best_start(start.estimate, start.gram, start.used, model_order, should_stop)
         start = replace(start, estimate=best)
     if start.estimate.perspective is None or normalized is None:
         return start
@@ -212,12 +141,12 @@ def _started(
 
 
 def _with_free_scales(
-    settled: _Evidence,
-    unsettled: _Evidence,
+    settled: Evidence,
+    unsettled: Evidence,
     normalized: Normalized | None,
     model_order: ModelOrder,
     should_stop: Callable[[], bool] | None,
-) -> _Evidence:
+) -> Evidence:
     """Return the evidence with scales of given rotations, where free ones gain more likelihood than chance.
 
     `unsettled` has the tracks as they are, to be corrected for perspective with these scales.
@@ -228,7 +157,7 @@ def _with_free_scales(
         return replace(settled, estimate=_with_scale_reason(settled.estimate, trial))
     scales = _at_all_frames(settled.used, trial.start, len(settled.start_scales))
     estimate = replace(_with_scale_reason(unsettled.estimate, trial), scales=scales)
-    again = _Evidence.of(estimate, settled.used, scales)
+    again = Evidence.of(estimate, settled.used, scales)
     return _started(again, normalized, model_order, turning=False, should_stop=should_stop)
 
 
@@ -245,12 +174,12 @@ def _at_all_frames(used: NDArray[np.intp], scales: Floats, frames: int) -> Float
 
 
 def _refined(
-    evidence: _Evidence,
+    evidence: Evidence,
     normalized: Normalized | None,
     trial: ScaleTrial | None,
     model_order: ModelOrder,
     should_stop: Callable[[], bool] | None,
-) -> tuple[_Evidence, Learned]:
+) -> tuple[Evidence, Learned]:
     """Return the refined cameras and covariance of the frames used, and the tracks as their depths correct them."""
     estimate, with_scales, bends = evidence.estimate, trial is not None and trial.start is not None, evidence.bends
     may_couple = model_order == ModelOrder(ordered=estimate.ordered)
@@ -268,7 +197,7 @@ def _refined(
 
 
 def _first_rounds(
-    evidence: _Evidence, trial: ScaleTrial | None, model_order: ModelOrder, should_stop: Callable[[], bool] | None
+    evidence: Evidence, trial: ScaleTrial | None, model_order: ModelOrder, should_stop: Callable[[], bool] | None
 ) -> Learned:
     """Return cameras and covariance after `REFINEMENT_ROUNDS`, of which the trial of scales may have done some."""
     count = len(evidence.used)
@@ -283,12 +212,12 @@ def _first_rounds(
 
 
 def _with_settled_depths(
-    evidence: _Evidence,
+    evidence: Evidence,
     normalized: Normalized | None,
     found: Learned,
     model_order: ModelOrder,
     should_stop: Callable[[], bool] | None,
-) -> tuple[_Evidence, Learned]:
+) -> tuple[Evidence, Learned]:
     """Return the tracks corrected with the depths of the cameras and the covariance found, and both refined once more."""
     assert normalized is not None
     used = evidence.used
@@ -300,13 +229,13 @@ def _with_settled_depths(
 
 
 def _with_probable_depth(
-    evidence: _Evidence, found: Learned, model_order: ModelOrder, should_stop: Callable[[], bool] | None
-) -> tuple[_Evidence, Learned]:
+    evidence: Evidence, found: Learned, model_order: ModelOrder, should_stop: Callable[[], bool] | None
+) -> tuple[Evidence, Learned]:
     """Return cameras and covariance at the most probable depth; where the tracks hardly determine it, the best of all candidates."""
     found, stretch = settled_depth(evidence.gram, found)
     estimate = _with_depth_choice(evidence.estimate, stretch)
     if estimate.depth_is_typical:
-        found = _best_candidate(estimate, evidence.gram, evidence.used, found, model_order, should_stop)
+        found = best_candidate(estimate, evidence.gram, evidence.used, found, model_order, should_stop)
     return replace(evidence, estimate=estimate), found
 
 
@@ -319,7 +248,7 @@ def _mirrored(estimate: CameraEstimate, rotations: Floats, found: Learned) -> tu
 
 
 def _of_all_frames(
-    start: _Evidence, evidence: _Evidence, found: Learned, trial: ScaleTrial | None
+    start: Evidence, evidence: Evidence, found: Learned, trial: ScaleTrial | None
 ) -> tuple[CameraEstimate, Floats]:
     """Return the estimate with the cameras found, interpolated to all frames, and its rotations in the axes of `found`."""
     estimate, used, frames = evidence.estimate, evidence.used, len(evidence.start_scales)
@@ -332,7 +261,7 @@ def _of_all_frames(
 
 
 def _of_observations(
-    evidence: _Evidence,
+    evidence: Evidence,
     found: Learned,
     normalized: Normalized,
     *,
@@ -340,7 +269,7 @@ def _of_observations(
     with_scales: bool,
     turning: bool,
     should_stop: Callable[[], bool] | None,
-) -> tuple[_Evidence, Learned]:
+) -> tuple[Evidence, Learned]:
     """Return cameras and covariance of the observations themselves, where entries are hidden or replaced."""
     estimate, used = evidence.estimate, evidence.used
     enter(should_stop, "observations")
@@ -353,66 +282,6 @@ def _of_observations(
     translations[used] = moments.translations
     estimate = replace(estimate, translations=translations)
     return replace(evidence, estimate=estimate, gram=moments.gram, sample=moments.sample), found
-
-
-def _best_start(
-    estimate: CameraEstimate,
-    gram: Floats,
-    used: NDArray[np.intp],
-    model_order: ModelOrder,
-    should_stop: Callable[[], bool] | None,
-) -> CameraEstimate:
-    """Return the estimate with the rotations, its own or those of another start, that give the lowest energy after a short refinement.
-
-    The multistart models deformation by smooth modes and moves cameras by degrees to fit it; joint refinement hardly
-    moves them back, because every mode would have to move along. The unrefined cameras of a factorization, those with
-    other pose signs of a sheet, or a candidate that the multistart ranks lower, can therefore be the better start. A
-    candidate must be better by `MAX_HYPOTHESIS_GAP`: smaller differences do not tell true cameras from false ones.
-    """
-    some = evenly_spread(len(used), START_FRAMES)
-    part, ones = of_frames(gram, some), np.ones(len(some))
-
-    def begun(start: CameraEstimate, margin: float) -> _Trial:
-        given = np.asarray(start.rotations)[used[some]]
-        found = learned_at(part, given, ones, model_order, should_stop, iterations=COMPARED_EM_ROUNDS)
-        return _Trial(start, margin, found).refined(part, should_stop)
-
-    own, others = begun(estimate, 0.0), []
-    for starts, margin in ((estimate.hypotheses, 0.0), (estimate.candidates, MAX_HYPOTHESIS_GAP)):
-        for size, rotations in starts:
-            if should_stop is not None and should_stop():
-                return estimate
-            others.append(begun(restarted(estimate, size, rotations), margin))
-    others.sort(key=lambda trial: trial.energy)
-    finals = [trial.refined(part, should_stop) for trial in (own, *others[:FINALISTS])]
-    return min(finals, key=lambda trial: trial.energy).estimate
-
-
-def _best_candidate(
-    estimate: CameraEstimate,
-    gram: Floats,
-    used: NDArray[np.intp],
-    found: Learned,
-    model_order: ModelOrder,
-    should_stop: Callable[[], bool] | None,
-) -> Learned:
-    """Return the most probable cameras among `found` and those from every candidate of the multistart, each at its settled depth.
-
-    The prior on camera motion prefers rotations that are too small, whatever their direction. Only at comparable depths does it distinguish
-    a turn of the object from its deformation.
-    """
-    for _, rotations in estimate.candidates:
-        if should_stop is not None and should_stop():
-            break
-        other = refined(
-            gram, np.asarray(rotations)[used], found.scales, with_scales=False, rounds=CANDIDATE_ROUNDS,
-            model_order=model_order, should_stop=should_stop,
-        )  # fmt: skip
-        if not np.isfinite(other.energy):
-            break
-        other, _ = settled_depth(gram, other)
-        found = min(found, other, key=lambda each: each.energy)
-    return found
 
 
 def _coupled(gram: Floats, found: Learned, *, with_scales: bool, should_stop: Callable[[], bool] | None) -> Learned:

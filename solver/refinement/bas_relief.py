@@ -19,10 +19,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from pliant.solver.cameras.learned import Learned, motion_of, scene_at
 from pliant.solver.model.marginal_likelihood import CAMERA_PRIOR_WEIGHT, energy
 from pliant.solver.model.so3 import exponential
 from pliant.solver.records import Floats
+from pliant.solver.refinement.learned import Learned, motion_of, scene_at
 from scipy.optimize import minimize_scalar
 
 VISIBLE_DEPTH = (1 / 2 - 4 / 9) ** 0.5 / 0.5

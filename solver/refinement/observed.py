@@ -14,11 +14,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.cameras.estimation import CameraEstimate
-from pliant.solver.cameras.learned import START_EM_ROUNDS, Learned, turned_once
 from pliant.solver.cameras.perspective import Perspective, corrected, depth_map
 from pliant.solver.model.expectation_maximisation import learned
 from pliant.solver.model.observation_model import ImageDensity, inlier_probabilities
 from pliant.solver.records import Floats
+from pliant.solver.refinement.learned import START_EM_ROUNDS, Learned, turned_once
 from pliant.solver.tracks.completion import choose_points
 from pliant.solver.tracks.normalization import Normalized
 

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from pliant.solver import KnownCamera, Settings, Tracks, estimate_cameras, gallery
 from pliant.solver.cameras.estimation import given_cameras
-from pliant.solver.cameras.joint_refinement import refine_cameras
-from pliant.solver.cameras.learned import learned_at
-from pliant.solver.cameras.observed import Moments, Observed, cross_fitted, on_observations
 from pliant.solver.cameras.perspective import Perspective, corrected
 from pliant.solver.model.expectation_maximisation import MAX_MODES
 from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.reconstruction import cameras as reconstruction
 from pliant.solver.records import Floats
+from pliant.solver.refinement.joint_refinement import refine_cameras
+from pliant.solver.refinement.learned import learned_at
+from pliant.solver.refinement.observed import Moments, Observed, cross_fitted, on_observations
 from pliant.solver.tracks.normalization import normalize
 
 MADE = gallery.face(20, 60, degrees=60)

@@ -13,14 +13,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 from pliant.solver.cameras.factorization import upgrades
-from pliant.solver.cameras.focal_length import refined_with_focal
-from pliant.solver.cameras.learned import Learned
 from pliant.solver.cameras.multistart import CANDIDATES
 from pliant.solver.cameras.perspective import Perspective, centred, columns, corrected, depth_map, depths_of
 from pliant.solver.model.expectation_maximisation import annealed
 from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.so3 import MIRROR, nearest
 from pliant.solver.records import Floats
+from pliant.solver.refinement.focal_length import refined_with_focal
+from pliant.solver.refinement.learned import Learned
 from pliant.solver.tracks.frame_selection import evenly_spread
 
 ALTERNATION_ROUNDS = 3
@@ -30,7 +30,7 @@ ALTERNATION_EM_ROUNDS = 60
 """Rounds of expectation maximisation of an update."""
 
 COMPARED_FRAMES = 40
-"""Frames on which the cameras of factorizations are compared, as in `joint_refinement.START_FRAMES`."""
+"""Frames on which the cameras of factorizations are compared, as in `starts.START_FRAMES`."""
 
 
 def alternated(

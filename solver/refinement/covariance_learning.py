@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.solver.cameras.depth_rounds import with_depth_map
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.model.early_stopping import described, learn_with_early_stopping
 from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.monitor import enter
 from pliant.solver.records import Floats
+from pliant.solver.refinement.depth_rounds import with_depth_map
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -18,7 +18,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from pliant.solver.cameras.learned import Learned, motion_of, moved_to, scene_at
 from pliant.solver.cameras.perspective import (
     Candidate,
     Perspective,
@@ -36,6 +35,7 @@ from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.resection import MIN_RELATIVE_DISTANCE
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.records import Floats
+from pliant.solver.refinement.learned import Learned, motion_of, moved_to, scene_at
 from pliant.solver.tracks.frame_selection import evenly_spread
 from scipy.optimize import minimize
 

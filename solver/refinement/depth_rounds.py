@@ -7,16 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.solver.cameras.depth_alternation import alternated, factorized_again
 from pliant.solver.cameras.estimation import CameraEstimate
-from pliant.solver.cameras.focal_length import search
-from pliant.solver.cameras.learned import Learned
 from pliant.solver.cameras.perspective import Perspective, corrected_moments, depth_map, mirrored
 from pliant.solver.cameras.planar_ambiguity import is_planar
 from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import MIRROR, exponential, logarithm
 from pliant.solver.records import Floats, read_only
+from pliant.solver.refinement.depth_alternation import alternated, factorized_again
+from pliant.solver.refinement.focal_length import search
+from pliant.solver.refinement.learned import Learned
 from pliant.solver.tracks.frame_selection import between
 from pliant.solver.tracks.normalization import Normalized
 

@@ -1,0 +1,114 @@
+"""Scales of the frames, adopted where the likelihood of the tracks is clearly higher with them.
+
+The likelihood penalises each mode of deformation, so it distinguishes a camera that zooms from a shape that grows
+(`cameras.scale`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from pliant.solver.cameras.scale import WIDEST, rigid_scales
+from pliant.solver.model.marginal_likelihood import Scene, cameras_of, fit, start
+from pliant.solver.model.model_order import ModelOrder
+from pliant.solver.records import Floats
+from pliant.solver.refinement.learned import Learned, learned_at, turned
+from pliant.solver.tracks.frame_selection import between, evenly_spread, of_frames
+
+SCALE_FRAMES = 120
+"""Frames used to decide whether scales are free; with 60 instead of 120 chance gains of fixed scales reach .054."""
+
+SMOOTH_ITERATIONS = 120
+"""L-BFGS iterations for the scales of smooth modes, as many as those of `SCALE_ROUNDS`."""
+
+SCALE_ROUNDS = 2
+"""Refinements used to decide whether scales are free."""
+
+MIN_SCALE_GAIN = 0.12
+"""Decrease of the energy, per point and frame, required to free scales that vary from frame to frame. BIC for one
+parameter per frame gives .075; fixed scales gain up to .08 by chance, real scale changes .23 and more."""
+
+SMOOTH_SCALE_SHARE = 0.4
+"""Share of `MIN_SCALE_GAIN` required of slowly varying scales, which need fewer parameters: a swing of .05 over 60
+frames gains .058, none up to .04."""
+
+MIN_SCALE_STD = 0.01
+"""Standard deviation of log s below which scales stay 1."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScaleTrial:
+    """What freeing the scales of some frames gained."""
+
+    start: Floats | None
+    """Scales of all frames to start from, mean logarithm 0; None where free scales gain no more than chance."""
+
+    reason: str
+    """A sentence."""
+
+    fixed: Learned
+    """Cameras and covariance of the frames compared, with scales of 1."""
+
+
+def try_free_scales(
+    gram: Floats,
+    rotations: Floats,
+    model_order: ModelOrder,
+    should_stop: Callable[[], bool] | None,
+    *,
+    turning: bool = True,
+) -> ScaleTrial:
+    """Compare free scales with scales of 1 on a subset of the frames.
+
+    Scales are free from two starts, 1 and those of a rigid shape. Deformation that is mistaken for scale ends in a worse
+    minimum than fixed scales, or in one with nearly constant scales. With `turning` False the rotations are kept. The scales of
+    a rigid shape are then a poor start, because nothing but the scales can absorb the deformation; those found with smooth
+    modes are a third one.
+    """
+    used = evenly_spread(len(rotations), SCALE_FRAMES)
+    part, given, none = of_frames(gram, used), rotations[used], np.ones(len(used))
+
+    def turned_some(begun: Learned, *, with_scales: bool) -> Learned:
+        return turned(
+            part, begun, with_scales=with_scales, rounds=SCALE_ROUNDS, turning=turning, should_stop=should_stop
+        )
+
+    starts = [none, rigid_scales(part, given)]
+    if not turning:
+        starts.append(_smooth_scales(part, given, ordered=model_order.ordered, should_stop=should_stop))
+    even, *others = (learned_at(part, given, scales, model_order, should_stop) for scales in starts)
+    fixed, runs = (
+        turned_some(even, with_scales=False),
+        [turned_some(each, with_scales=True) for each in (even, *others)],
+    )
+    best = min(runs, key=lambda run: run.energy)
+    gain, logs = fixed.energy - best.energy, np.log(best.scales)
+    extent = f"from {best.scales.min():.3f} to {best.scales.max():.3f}"
+    if logs.std() > WIDEST:
+        return ScaleTrial(None, f"Every scale is 1: those found, {extent}, are wider apart than any camera's.", fixed)
+    share = _scale_gain_share(logs) if model_order.ordered else 1.0
+    if not (gain > MIN_SCALE_GAIN * share and logs.std() > MIN_SCALE_STD):
+        reason = (
+            f"Every scale is 1: free ones, {extent}, would gain {gain:.3f} in the logarithm of the "
+            "likelihood, no more than deformation alone does."
+        )
+        return ScaleTrial(None, reason, fixed)
+    logs = between(used, logs[:, None], len(rotations))[:, 0]
+    reason = f"Scales {extent} gain {gain:.3f} in the logarithm of the likelihood, per point and frame."
+    return ScaleTrial(np.exp(logs - logs.mean()), reason, fixed)
+
+
+def _smooth_scales(gram: Floats, rotations: Floats, *, ordered: bool, should_stop: Callable[[], bool] | None) -> Floats:
+    """Return the most probable scales of given rotations where the modes are smooth and the noise is large, shape `(F,)`."""
+    scene = Scene.of(gram, rotations, with_scales=True, ordered=ordered)
+    begun = start(scene, np.ones(len(rotations)))
+    moved, _ = fit(scene, begun, iterations=SMOOTH_ITERATIONS, turning=False, should_stop=should_stop)
+    return cameras_of(scene, moved)[1]
+
+
+def _scale_gain_share(logs: Floats) -> float:
+    """Return the share of `MIN_SCALE_GAIN` required: `SMOOTH_SCALE_SHARE` for slowly varying scales, up to 1 for independent ones."""
+    rough = float(np.diff(logs).var()) / max(2 * float(logs.var()), np.finfo(float).tiny)
+    return float(np.clip(3 * rough, SMOOTH_SCALE_SHARE, 1.0))
