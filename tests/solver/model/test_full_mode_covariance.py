@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pliant.solver.cameras import learned
 from pliant.solver.model.full_mode_covariance import (
     MAX_BASIS_FRAMES,
     MAX_NOISE_STD,
@@ -22,6 +21,7 @@ from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.random_walk import random_walk
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import angles_between, exponential, nearest
+from pliant.solver.refinement import learned
 
 FRAMES = 16
 

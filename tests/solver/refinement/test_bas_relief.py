@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from pliant.solver import Settings, Tracks, gallery, solve
-from pliant.solver.cameras import bas_relief, joint_refinement
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import MIRROR, angles_between, exponential
+from pliant.solver.refinement import bas_relief, joint_refinement
 from pliant.solver.refinement.bas_relief import VISIBLE_DEPTH, bulges, extent_penalty, settled_depth
 from pliant.solver.refinement.learned import Learned
 from scipy.optimize import minimize_scalar

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from pliant.solver import Settings, Tracks, gallery, solve
-from pliant.solver.cameras import depth_rounds
 from pliant.solver.cameras.perspective import MIRROR, Perspective, centred, columns
 from pliant.solver.evaluation.metrics import e3d_frame_scaled
 from pliant.solver.model.expectation_maximisation import annealed
 from pliant.solver.model.model_order import ModelOrder
 from pliant.solver.model.so3 import angles_between, exponential
+from pliant.solver.refinement import depth_rounds
 from pliant.solver.refinement.depth_alternation import aligned, alternated, factorized_again
 from pliant.solver.refinement.learned import Learned
 
