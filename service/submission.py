@@ -16,9 +16,11 @@ from pliant.service.problems import Refusal, from_validation, wrong_input
 from pliant.service.settings import ServiceSettings
 from pliant.worker.artifacts import kinds_for
 from pliant.worker.errors import Conflict, UnknownUpload
+from pliant.worker.execution.solver_settings import solver_settings
 from pliant.worker.films.sources import FilmBounds, FilmSource, is_source, open_source, save_source
 from pliant.worker.films.tracker import check_film, described, film_options
 from pliant.worker.formats import Limits, store_inputs
+from pliant.worker.formats.cost import estimated
 from pliant.worker.formats.point_names import one_line
 from pliant.worker.formats.tracks.film_tracks import tracks_options
 from pliant.worker.jobs.service import Jobs
@@ -97,9 +99,6 @@ def accept(
     fingerprint = form.fingerprint
     options = parse_options(form.texts.get("options", ""))
     name = _name(form.texts.get("name", ""))
-    kept = kept_inputs(form, options, folder, jobs)
-    if kept is not None:
-        form, options, name = kept.form, kept.options, name or kept.job.name
     webhook = parse_webhook(
         form.texts.get("webhook", "").strip(),
         form.texts.get("webhook_secret", "").strip(),
@@ -112,11 +111,15 @@ def accept(
     known = jobs.known(submission)
     if known is not None:
         return known, False
-    canonical = folder / "canonical.npz"
+    kept = kept_inputs(form, options, folder, jobs)
+    if kept is not None:
+        form, options, submission = kept.form, kept.options, replace(submission, name=name or kept.job.name)
     if kept is not None and kept.canonical is not None:
-        known_reading = kept.job.interpretation
-        kinds_for(options, size=(known_reading.num_frames, known_reading.num_points))
-        return jobs.submit(kept.canonical, submission, interpretation=known_reading), True
+        read = _read_again(kept.job.interpretation, options)
+        return jobs.submit(
+            kept.canonical, replace(submission, options=read.options), interpretation=read.interpretation
+        ), True
+    canonical = folder / "canonical.npz"
     films = FilmBounds.of(jobs.settings, max_bytes=limits.max_bytes)
     read = read_form(form, options, limits, films=films, target=canonical)
     job = jobs.submit(canonical, replace(submission, options=read.options), interpretation=read.interpretation)
@@ -254,7 +257,19 @@ def read_form(
     if form.texts.get("mesh", "").strip():
         files["mesh"] = form.texts["mesh"].strip()
     interpretation = store_inputs(**files, options=options, limits=limits, target=target)  # type: ignore[arg-type]
-    return ReadInputs(interpretation, tracks_options(options, interpretation))
+    options = tracks_options(options, interpretation)
+    solver_settings(options)  # refuses options that contradict each other
+    return ReadInputs(interpretation, options)
+
+
+def _read_again(interpretation: Interpretation, options: Options) -> ReadInputs:
+    """Return tracks that an earlier job has read, with what other options of the solve change."""
+    size = (interpretation.num_frames, interpretation.num_points)
+    kinds_for(options, size=size)
+    options = tracks_options(options, interpretation)
+    solver_settings(options)
+    estimate = estimated(*size, options, has_rotations=interpretation.has_rotations)
+    return ReadInputs(interpretation.model_copy(update={"estimate": estimate}), options)
 
 
 def _check_film_parts(form: Form) -> None:
@@ -280,6 +295,7 @@ def _read_film(form: Form, options: Options, bounds: FilmBounds, target: Path | 
     )  # fmt: skip
     facts = check_film(source, options, bounds, picture=picture)
     options = film_options(options, facts)
+    solver_settings(options)
     interpretation = described(facts, options)
     if target is not None:
         save_source(source, interpretation, target)

@@ -25,7 +25,9 @@ class OriginCheck:
 
     def __init__(self, app: ASGIApp, settings: ServiceSettings) -> None:
         self._app = app
-        self._hosts = frozenset(settings.allowed_hosts) or (_LOOPBACK_HOSTS if settings.loopback else frozenset())
+        self._hosts = frozenset(map(_without_port, settings.allowed_hosts)) or (
+            _LOOPBACK_HOSTS if settings.loopback else frozenset()
+        )
         self._origins = frozenset(settings.cors_origins)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:

@@ -14,6 +14,7 @@ from pliant.service.multipart import receive_form
 from pliant.service.openapi import JOB_EXAMPLE, SUBMIT_BODY, problems
 from pliant.service.problems import Refusal
 from pliant.service.submission import accept, form_rules
+from pliant.worker.errors import StoreUnavailable, UnknownJob
 from pliant.worker.jobs.retry import retry as run_again
 from pliant.worker.jobs.service import LARGEST_PAGE, Jobs
 
@@ -65,8 +66,7 @@ async def submit(
     After any other status nothing was queued and nothing is kept.
     """
     job, _ = await _receive(request, core, jobs, bounds, idempotency_key=key)
-    response.headers["Location"] = f"/v1/jobs/{job.id}"
-    return await _waited(job, core, jobs, prefer, response)
+    return await _accepted(job, core, jobs, prefer, response)
 
 
 @router.put(
@@ -90,8 +90,7 @@ async def put(
     """
     job, new = await _receive(request, core, jobs, bounds, id=id)
     response.status_code = 202 if new else 200
-    response.headers["Location"] = f"/v1/jobs/{job.id}"
-    return await _waited(job, core, jobs, prefer, response)
+    return await _accepted(job, core, jobs, prefer, response)
 
 
 @router.get("", operation_id="list_jobs", summary="List jobs", responses=problems(401, 422, 503))
@@ -177,6 +176,18 @@ async def _receive(
                 idempotency_key=idempotency_key,
             ),
         )
+
+
+async def _accepted(job: Job, core: Service, jobs: Jobs, prefer: str | None, response: Response) -> Job:
+    """Return a submitted job, after the wait that was asked for.
+
+    Where the wait fails, it is returned as it was accepted: the job is stored, and an error would say that it is not.
+    """
+    response.headers["Location"] = f"/v1/jobs/{job.id}"
+    try:
+        return await _waited(job, core, jobs, prefer, response)
+    except (StoreUnavailable, UnknownJob):
+        return job
 
 
 async def _waited(job: Job, core: Service, jobs: Jobs, prefer: str | None, response: Response) -> Job:

@@ -22,7 +22,7 @@ from anyio import to_thread
 from fastapi import APIRouter, Header, Path, Request, Response
 from pliant.schemas.job import Upload
 from pliant.schemas.problems import ProblemCode
-from pliant.service.dependencies import Bounds, Core, MyUploads, Service, bounds_of
+from pliant.service.dependencies import Bound, Bounds, Core, MyUploads, Service, bounds_of
 from pliant.service.multipart import batches
 from pliant.service.openapi import problems
 from pliant.service.problems import refused, wrong_input
@@ -88,6 +88,7 @@ async def put(
     request: Request,
     response: Response,
     core: Core,
+    bounds: Bound,
     uploads: MyUploads,
     offset: Offset = None,
     complete: Complete = "?1",
@@ -106,7 +107,7 @@ async def put(
         async with core.upload_locks.take((uploads.owner, id)):
             await _receive(request, core, uploads=uploads, id=id, sending=sending)
         there = await to_thread.run_sync(uploads.get, id)
-    _describe(response, there, core, uploads)
+    _describe(response, there, bounds, uploads)
     response.headers["Location"] = f"/v1/uploads/{id}"
     return there
 
@@ -123,6 +124,7 @@ async def patch(
     request: Request,
     response: Response,
     core: Core,
+    bounds: Bound,
     uploads: MyUploads,
     offset: Annotated[int, Header(alias="Upload-Offset", ge=0, le=ANY)],
     complete: Complete = "?1",
@@ -130,7 +132,7 @@ async def patch(
     digest: Digest = None,
 ) -> Upload:
     """Append at `Upload-Offset`, as the IETF draft specifies. `PUT` with that header does the same."""
-    there = await put(id, request, response, core, uploads, offset, complete, length, digest)
+    there = await put(id, request, response, core, bounds, uploads, offset, complete, length, digest)
     response.status_code = 200
     return there
 
@@ -142,9 +144,9 @@ async def patch(
     summary="Get the offset of an upload",
     responses={204: {"headers": _STATE}, **problems(401, 404)},
 )
-def head(id: Id, response: Response, core: Core, uploads: MyUploads) -> None:
+def head(id: Id, response: Response, bounds: Bound, uploads: MyUploads) -> None:
     """Return `Upload-Offset`, where to resume, and `Upload-Complete`."""
-    _describe(response, uploads.get(id), core, uploads)
+    _describe(response, uploads.get(id), bounds, uploads)
 
 
 @router.get(
@@ -153,10 +155,10 @@ def head(id: Id, response: Response, core: Core, uploads: MyUploads) -> None:
     summary="Get an upload",
     responses={200: {"headers": _STATE}, **problems(401, 404)},
 )
-def get(id: Id, response: Response, core: Core, uploads: MyUploads) -> Upload:
+def get(id: Id, response: Response, bounds: Bound, uploads: MyUploads) -> Upload:
     """Return the bytes received, the expiry date, and the SHA-256 of a complete upload."""
     there = uploads.get(id)
-    _describe(response, there, core, uploads)
+    _describe(response, there, bounds, uploads)
     return there
 
 
@@ -249,7 +251,7 @@ def _sha256(digest: str | None) -> str | None:
     return value.hex()
 
 
-def _describe(response: Response, upload: Upload, core: Service, uploads: Uploads) -> None:
+def _describe(response: Response, upload: Upload, bounds: Bounds, uploads: Uploads) -> None:
     """Set the headers that describe an upload."""
     headers = response.headers
     headers["Upload-Offset"] = str(upload.offset)
@@ -257,6 +259,6 @@ def _describe(response: Response, upload: Upload, core: Service, uploads: Upload
     if upload.length is not None:
         headers["Upload-Length"] = str(upload.length)
     age = f", max-age={int(uploads.expiry)}" if uploads.expiry > 0 else ""
-    headers["Upload-Limit"] = f"max-size={core.limits.max_bytes}{age}"
+    headers["Upload-Limit"] = f"max-size={bounds.max_upload_bytes}{age}"
     if upload.sha256 is not None:
         headers["Repr-Digest"] = f"sha-256=:{base64.b64encode(bytes.fromhex(upload.sha256)).decode()}:"

@@ -19,6 +19,7 @@ from typing import cast
 import httpx
 import pytest
 from pliant.service.event_stream import WOKEN_AT_ONCE, Followers, _Watcher, is_final
+from pliant.worker.errors import StoreUnavailable
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.records import Event, utc_now
 from pliant.worker.settings import Settings
@@ -140,6 +141,21 @@ def test_a_submission_can_wait_for_the_end(running: Running, http: httpx.Client,
     timer.join()
     assert late.json()["id"] == early.json()["id"]
     assert late.json()["status"] == "succeeded"
+
+
+@pytest.mark.parametrize("verb", ["POST", "PUT"])
+def test_a_submission_whose_wait_fails_is_accepted_all_the_same(
+    running: Running, http: httpx.Client, verb: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def away(*_: object, **__: object) -> list[object]:
+        raise StoreUnavailable("The job store", reason="ConnectionError")
+
+    path = "/v1/jobs" if verb == "POST" else "/v1/jobs/accepted-all-the-same"
+    monkeypatch.setattr(running.jobs.records, "events", away)
+    answer = http.request(verb, path, files=form(name="accepted"), headers={"Prefer": "wait=5"})
+    assert (answer.status_code, answer.json()["status"]) == (202, "queued")
+    assert answer.headers["location"] == f"/v1/jobs/{answer.json()['id']}"
+    assert http.get(answer.headers["location"], headers={"Prefer": "wait=5"}).json()["code"] == "store_unavailable"
 
 
 @pytest.mark.parametrize("wish", ["wait", "wait=", "wait=x", "wait=-9", "return=minimal", "wait=9.5", "wait=٩"])

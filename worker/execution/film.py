@@ -15,8 +15,9 @@ from pliant.solver.stages import planned
 from pliant.worker.artifacts import described, kinds_for
 from pliant.worker.errors import Interrupted
 from pliant.worker.execution.pace import MachinePace
-from pliant.worker.execution.pipeline import Halt, silent, solve_and_write, solver_settings
+from pliant.worker.execution.pipeline import Halt, silent, solve_and_write
 from pliant.worker.execution.progress import FILM_SHARES, Reporter
+from pliant.worker.execution.solver_settings import solver_settings
 from pliant.worker.films import frame_strip
 from pliant.worker.films.inputs import read_tracked
 from pliant.worker.films.sources import FilmBounds, FilmSource

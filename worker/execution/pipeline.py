@@ -9,33 +9,18 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from pliant.schemas.job import Artifact, Progress
-from pliant.schemas.options import SOLVER_FIELDS, Options
-from pliant.solver import Outcome, Settings, Solution, Step, solve
+from pliant.schemas.options import Options
+from pliant.solver import Outcome, Solution, Step, solve
 from pliant.solver.evaluation.metrics import evaluate
 from pliant.worker.artifacts import build_report, kinds_for, write_artifacts
 from pliant.worker.errors import Interrupted, TimedOut
 from pliant.worker.execution.progress import Reporter
+from pliant.worker.execution.solver_settings import solver_settings
 from pliant.worker.formats import Inputs
 from pliant.worker.jobs.finished import Finished
 
 EXPORT_SECONDS = 1.5e-7
 """Seconds per frame and point of writing a file whose `share` is 1, measured on a face of 99 frames and 3,000 points."""
-
-
-def solver_settings(options: Options, *, y_up: bool = False) -> Settings:
-    """Return the solver settings of a job's options; `y_up` as the tracks were read."""
-    values = {name: getattr(options, name) for name in SOLVER_FIELDS}
-    values["image_size"] = _pair(options.image_size, "x")
-    values["principal_point"] = _pair(options.principal_point, ",")
-    return Settings(**values, y_up=y_up)
-
-
-def _pair(text: str | None, between: str) -> tuple[float, float] | None:
-    """Return two numbers written with a separator between them."""
-    if text is None:
-        return None
-    first, second = text.split(between)
-    return float(first), float(second)
 
 
 def reconstruct(

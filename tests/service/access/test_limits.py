@@ -170,7 +170,8 @@ def test_a_token_can_have_a_smaller_body_limit(serve: Serve) -> None:
         assert small.get("/v1/limits").json()["max_body_bytes"] == 1000
         assert small.post("/v1/jobs", files=form()).status_code == 413
         assert small.put("/v1/uploads/one", content=b"x" * 1001).status_code == 413
-        assert small.put("/v1/uploads/two", content=b"x" * 1000).status_code == 201
+        stored = small.put("/v1/uploads/two", content=b"x" * 1000)
+        assert (stored.status_code, stored.headers["upload-limit"]) == (201, "max-size=1000, max-age=86400")
         assert large.get("/v1/limits").json()["max_body_bytes"] == running.settings.max_body_bytes
         submit(large)
 

@@ -15,7 +15,8 @@ from pliant.solver.evaluation.metrics import e3d_frame
 from pliant.solver.shapes.irls import MAX_INNER
 from pliant.worker.errors import Interrupted, TimedOut
 from pliant.worker.execution.failures import problem_of
-from pliant.worker.execution.pipeline import reconstruct, solver_settings
+from pliant.worker.execution.pipeline import reconstruct
+from pliant.worker.execution.solver_settings import solver_settings
 from pliant.worker.formats import Inputs
 from worker_house import make_inputs
 

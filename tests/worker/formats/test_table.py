@@ -11,7 +11,7 @@ import pytest
 from pliant.cli import app
 from pliant.schemas.options import Options
 from pliant.solver import Solution, solve
-from pliant.worker.execution.pipeline import solver_settings
+from pliant.worker.execution.solver_settings import solver_settings
 from pliant.worker.formats import Inputs, Limits, read_inputs
 from pliant.worker.formats.reading import containers
 from pliant.worker.formats.reading.parsers import PARSERS
