@@ -53,9 +53,6 @@ Name = Annotated[
     typer.Option("--name", "-n", help="Label of the job and name of the object in its files; by default the file's."),
 ]
 
-LONGEST_NAME = 200
-"""Characters of a name that is taken from a file."""
-
 LINE_EVERY = 30.0
 """Without a terminal, waiting commands print a line this often, seconds."""
 
@@ -90,8 +87,9 @@ class Session:
 
 def name_of(given: str, file: Path) -> str:
     """Return the name of a job: the one given, or that of its file without the ending, as far as a service takes it."""
-    own = file.resolve().name if file.is_dir() else file.stem
-    return given or own.encode("utf-8", "replace").decode()[:LONGEST_NAME]
+    from pliant.client.multipart import job_name
+
+    return given or job_name(file.resolve().name if file.is_dir() else file.stem)
 
 
 def parse_options(pairs: list[str] | None) -> dict[str, Any]:

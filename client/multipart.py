@@ -86,6 +86,9 @@ RESUMABLE_BYTES = 32 * 2**20
 SMALL = 2**20
 """Bytes of a file that is sent with the job in any case."""
 
+LONGEST_NAME = 200
+"""Characters of a job's name that a service takes."""
+
 
 class Count:
     """Bytes read of all files of a form."""
@@ -276,6 +279,11 @@ def expanded(path: Path | str, name: str) -> Path:
             f"{name}: expected a path, got {path}, and {Path(path).parts[0]} is nobody's home directory. "
             "Write out the whole path."
         ) from None
+
+
+def job_name(of_file: str) -> str:
+    """Return the name of a job that is called like its file, as far as a service takes it."""
+    return of_file.encode("utf-8", "replace").decode()[:LONGEST_NAME]
 
 
 def existing_file(path: Path | str, name: str) -> Path:

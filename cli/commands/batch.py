@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from pliant.cli.exits import Exit
 from pliant.cli.films import is_film
 from pliant.cli.paths import different_files, made_folder, output_folder
-from pliant.cli.session import LINE_EVERY, Session
+from pliant.cli.session import LINE_EVERY, Session, name_of
 from pliant.cli.show import COLOURS, VERDICTS, details_of, err, explained_at, out, print_json
 
 if TYPE_CHECKING:
@@ -160,7 +160,7 @@ class Batch:
             try:
                 film = is_film(file, None)
                 job = client.submit(
-                    None if film else file, film=file if film else None, name=file.stem, options=self.options,
+                    None if film else file, film=file if film else None, name=name_of("", file), options=self.options,
                     idempotency_key=self._key_of(file), priority=self.priority, timeout=self.timeout,  # type: ignore[arg-type]
                     webhook_secret=os.environ.get("PLIANT_WEBHOOK_SECRET") if self.shared.get("webhook") else None,
                     on_upload=bar.on_upload, **self.shared,
@@ -239,4 +239,5 @@ class Batch:
         rest = json.dumps(
             [self.key, self.options, {name: str(each) for name, each in self.shared.items()}], sort_keys=True
         )
-        return f"batch/{hashlib.sha256(f'{content} {file.stem} {rest}'.encode()).hexdigest()}"
+        name = name_of("", file)
+        return f"batch/{hashlib.sha256(f'{content} {name} {rest}'.encode()).hexdigest()}"

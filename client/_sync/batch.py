@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from pliant.client._sync.job import RemoteJob, Result
 from pliant.client.errors import PliantError
-from pliant.client.multipart import Source
+from pliant.client.multipart import Source, job_name
 
 if TYPE_CHECKING:
     from pliant.client._sync.client import Client
@@ -61,5 +61,5 @@ def mapped(
 
 
 def named(source: object) -> str:
-    """Return the label of a job: its file's name without the ending, empty for arrays."""
-    return Path(source).stem if isinstance(source, (str, Path)) else ""
+    """Return the label of a job: its file's name without the ending as far as a service takes it, empty for arrays."""
+    return job_name(Path(source).stem) if isinstance(source, (str, Path)) else ""

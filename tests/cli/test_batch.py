@@ -15,6 +15,7 @@ import pytest
 from pliant.cli import app
 from pliant.cli.exits import Exit
 from pliant.cli.session import Session
+from pliant.client.multipart import LONGEST_NAME
 from pliant.service.testing import InMemoryService
 from typer.testing import CliRunner, Result
 
@@ -56,6 +57,14 @@ def test_a_folder_a_pattern_and_a_list_are_a_job_for_each_file(run: Run, takes: 
         assert [Path(row["file"]).name for row in rows] == [f"take-{number}.npz" for number in range(3)]
         assert [row["job"]["name"] for row in rows] == [f"take-{number}" for number in range(3)]
     assert len(jobs_of(run)) == 3, "the second and third command found the jobs of the first"
+
+
+def test_a_name_that_no_service_takes_is_shortened(run: Run, takes: Path) -> None:
+    files = [(takes / "take-0.npz").rename(takes / f"{'x' * 230}.npz"), takes / "take-1.npz"]
+    for _ in range(2):
+        ran = run("submit", *files, "--mesh", "none")
+        assert ran.exit_code == 0, ran.output
+    assert sorted(job["name"] for job in jobs_of(run)) == ["take-1", "x" * LONGEST_NAME]
 
 
 def test_another_option_or_key_makes_other_jobs(run: Run, takes: Path) -> None:

@@ -14,9 +14,10 @@ from pathlib import Path
 import pytest
 import redis
 from pliant.cli.demo import GOOD, announced, judge
-from pliant.cli.session import LONGEST_NAME, Session, name_of, parse_options
+from pliant.cli.session import Session, name_of, parse_options
 from pliant.cli.solve import file_or_word
 from pliant.client import BadArgument, Unreachable
+from pliant.client.multipart import LONGEST_NAME
 from pliant.service.testing import InMemoryService
 from pliant.worker.processes.valkey import find_binary
 from pliant.worker.settings import NUMERICAL_THREADS

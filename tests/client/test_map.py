@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+from pathlib import Path
 
 import numpy as np
 import pytest
 from pliant.client import AsyncClient, Client, InvalidRequest, PliantError
+from pliant.client.multipart import LONGEST_NAME
 from pliant.service.testing import InMemoryService
 
 
@@ -54,3 +56,12 @@ def test_the_same_key_finds_the_jobs_of_the_first_time() -> None:
         again = [result.job.id for result in client.map(inputs(3), key="tonight", mesh="none", load=False)]
         assert again == first
         assert len(list(client.list())) == 3
+
+
+def test_jobs_are_named_after_their_files_as_far_as_a_service_takes_it(tmp_path: Path) -> None:
+    files = [tmp_path / f"{name}.npz" for name in ("face", "x" * 230)]
+    for file, tracks in zip(files, inputs(2), strict=True):
+        np.savez(file, tracks=tracks)
+    with Client("http://pliant.test", transport=InMemoryService(steps=1)) as client:
+        names = [result.job.name for result in client.map(files, mesh="none", load=False)]
+    assert names == ["face", "x" * LONGEST_NAME]
