@@ -27,6 +27,9 @@ PREFIX = "pliant_"
 
 LONGEST_TOKEN_NAME = 100
 
+LONGEST_LIFETIME = timedelta(days=999_999)
+"""Longest time until a token expires, so that its end is a date: years end at 9999."""
+
 _FORM = re.compile(PREFIX + r"([0-9a-f]{12})_([A-Za-z0-9_-]{43})", re.ASCII)
 _DURATION = re.compile(r"([1-9][0-9]{0,5})([smhdw])", re.ASCII)
 _UNITS = {"s": "seconds", "m": "minutes", "h": "hours", "d": "days", "w": "weeks"}
@@ -229,15 +232,17 @@ def parse_duration(text: str) -> timedelta:
     Raises
     ------
     InvalidRequest
-        The duration is malformed.
+        The duration is malformed or longer than `LONGEST_LIFETIME`.
     """
     form = _DURATION.fullmatch(text.strip())
-    if form is None:
+    lasting = None if form is None else timedelta(**{_UNITS[form[2]]: int(form[1])})
+    if lasting is None or lasting > LONGEST_LIFETIME:
+        expected = f"a duration such as 12h, 90d or 52w, at most {LONGEST_LIFETIME.days}d"
         raise InvalidRequest(
-            "invalid_duration", field="expires", expected="a duration such as 12h, 90d or 52w", got=repr(text)[:80],
+            "invalid_duration", field="expires", expected=expected, got=repr(text)[:80],
             hint="Omit it for a token that never expires.",
         )  # fmt: skip
-    return timedelta(**{_UNITS[form[2]]: int(form[1])})
+    return lasting
 
 
 def _digest(text: str) -> str:

@@ -122,6 +122,15 @@ def test_durations() -> None:
             parse_duration(wrong)
 
 
+def test_a_lifetime_has_an_end_that_is_a_date() -> None:
+    longest = parse_duration("999999d")
+    assert datetime.now(UTC) + longest < datetime.max.replace(tzinfo=UTC)
+    assert parse_duration("142857w") == longest
+    with pytest.raises(InvalidRequest, match=r"expected a duration .*, at most 999999d, got '142858w'") as caught:
+        parse_duration("142858w")
+    assert caught.value.code == "invalid_duration"
+
+
 def test_an_unavailable_store_is_an_error(tmp_path: object) -> None:
     tokens = Tokens(connect(f"unix://{tmp_path}/nobody.sock", decode=True, retries=0), prefix="x")
     with pytest.raises(StoreUnavailable):
