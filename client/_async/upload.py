@@ -14,7 +14,7 @@ import httpx
 from pliant.client import multipart
 from pliant.client._async.transport import Exchange, parse, refusal
 from pliant.client.call import Call
-from pliant.client.errors import APIStatusError, NotFound
+from pliant.client.errors import APIStatusError, NotFound, PliantError
 from pliant.client.multipart import Form, Remainder, sha256
 from pliant.client.pauses import async_sleep, in_thread
 from pliant.client.retry import OUT_OF_STEP
@@ -93,10 +93,10 @@ async def upload(exchange: Exchange, path: Path, upload_id: str, *, digest: str,
 
 
 async def delete_uploads(exchange: Exchange, form: Form) -> None:
-    """Delete the uploads of a form, once the job has a copy of its own; those that remain expire."""
+    """Delete the uploads of a form, once the service has answered; those that remain, as after the deadline, expire."""
     for name, upload_id in form.fields.items():
         if name.endswith("_upload"):
-            with suppress(httpx.TransportError):
+            with suppress(httpx.TransportError, PliantError):
                 response = await exchange.send(Call(method="DELETE", path=_path(upload_id)))
                 await response.aclose()
 

@@ -15,7 +15,7 @@ import httpx
 from pliant.client import multipart
 from pliant.client._sync.transport import Exchange, parse, refusal
 from pliant.client.call import Call
-from pliant.client.errors import APIStatusError, NotFound
+from pliant.client.errors import APIStatusError, NotFound, PliantError
 from pliant.client.multipart import Form, Remainder, sha256
 from pliant.client.pauses import in_place, sleep
 from pliant.client.retry import OUT_OF_STEP
@@ -94,10 +94,10 @@ def upload(exchange: Exchange, path: Path, upload_id: str, *, digest: str, repor
 
 
 def delete_uploads(exchange: Exchange, form: Form) -> None:
-    """Delete the uploads of a form, once the job has a copy of its own; those that remain expire."""
+    """Delete the uploads of a form, once the service has answered; those that remain, as after the deadline, expire."""
     for name, upload_id in form.fields.items():
         if name.endswith("_upload"):
-            with suppress(httpx.TransportError):
+            with suppress(httpx.TransportError, PliantError):
                 response = exchange.send(Call(method="DELETE", path=_path(upload_id)))
                 response.close()
 

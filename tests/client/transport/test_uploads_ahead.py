@@ -132,6 +132,26 @@ def test_an_expired_upload_is_sent_again() -> None:
     assert caught.value.code == "unknown_upload"
 
 
+def test_a_deadline_that_passes_after_the_answer_does_not_hide_the_job() -> None:
+    now = 0.0
+
+    class Late(InMemoryService):
+        """Its answer to the submission comes just before the deadline."""
+
+        def handle_request(self, request: httpx.Request) -> httpx.Response:
+            nonlocal now
+            answer = super().handle_request(request)
+            if request.url.path == "/v1/jobs":
+                answer.read()
+                now = 10.0
+            return answer
+
+    service = Late()
+    with Client("http://pliant.test", transport=service, retries=Retry(clock=lambda: now)) as client:
+        assert client.submit(POINTS, mesh="none", timeout=10).record.interpretation.num_points == 30_000
+    assert [request.method for request in service.requests] == ["GET", "PUT", "POST"], "the upload is left to expire"
+
+
 def test_after_an_offset_mismatch_the_offset_is_read_again(tmp_path: Path) -> None:
     class Jumping(InMemoryService):
         """Somebody else has written part of it in the meantime."""
