@@ -67,7 +67,7 @@ def submit(
 ) -> None:  # fmt: skip
     """Submit tracks or a film to a service and print the job; of several files a table.
 
-    Repeating the command for several files finds the jobs that exist already: each is known by the content of its file and the options.
+    Repeating the command for several files finds the jobs that exist already: each is known by the contents of its files and the options.
     """
     from pliant.cli.commands.batch import Batch, expanded
 

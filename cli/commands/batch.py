@@ -149,10 +149,18 @@ class Batch:
                 err().print(f"{row.file}: {row.job.status}", highlight=False, markup=False)
 
     def _submit(self, client: Client, bar: Bar) -> list[tuple[Row, RemoteJob]]:
-        """Submit each file and print the id of its job at once, so that an interruption loses none."""
-        from pliant.client.errors import InvalidRequest
+        """Submit each file and print the id of its job at once, so that an interruption loses none.
+
+        Raises
+        ------
+        NotAuthorized
+            The token is missing or lacks a scope: every other file would be refused, too.
+        """
+        from pliant.client.errors import APIStatusError, NotAuthorized
 
         submitted: list[tuple[Row, RemoteJob]] = []
+        secret = os.environ.get("PLIANT_WEBHOOK_SECRET") if self.shared.get("webhook") else None
+        common = self._common(secret)
         for file in self.files:
             row = Row(file)
             self.rows.append(row)
@@ -161,11 +169,12 @@ class Batch:
                 film = is_film(file, None)
                 job = client.submit(
                     None if film else file, film=file if film else None, name=name_of("", file), options=self.options,
-                    idempotency_key=self._key_of(file), priority=self.priority, timeout=self.timeout,  # type: ignore[arg-type]
-                    webhook_secret=os.environ.get("PLIANT_WEBHOOK_SECRET") if self.shared.get("webhook") else None,
-                    on_upload=bar.on_upload, **self.shared,
+                    idempotency_key=self._key_of(file, common), priority=self.priority, timeout=self.timeout,  # type: ignore[arg-type]
+                    webhook_secret=secret, on_upload=bar.on_upload, **self.shared,
                 )  # fmt: skip
-            except InvalidRequest as error:
+            except NotAuthorized:
+                raise
+            except APIStatusError as error:
                 row.error = error
                 continue
             row.job = job.record
@@ -231,13 +240,22 @@ class Batch:
             "explained_at": None if row.error is None else explained_at(details_of(row.error), self.url),
         }
 
-    def _key_of(self, file: Path) -> str:
-        """Return the idempotency key of a file: of its content, the options and everything that goes with it."""
+    def _common(self, secret: str | None) -> str:
+        """Return what the requests of all files have in common: mesh, truth and rotations by content, the secret by its digest."""
+        from pliant.client.multipart import sha256
+
+        parts = {name: None if part is None else str(part) for name, part in self.shared.items()}
+        for name in ("mesh", "ground_truth", "rotations"):
+            path = self.shared.get(name)
+            if path is not None and Path(path).is_file():
+                parts[name] = sha256(Path(path))
+        digest = None if secret is None else hashlib.sha256(secret.encode()).hexdigest()
+        return json.dumps([self.key, self.options, self.priority, parts, digest], sort_keys=True)
+
+    def _key_of(self, file: Path, common: str) -> str:
+        """Return the idempotency key of a file: of its content, its name, and all that goes with it."""
         from pliant.client.multipart import sha256
 
         content = sha256(file) if file.is_file() else str(file.absolute())
-        rest = json.dumps(
-            [self.key, self.options, {name: str(each) for name, each in self.shared.items()}], sort_keys=True
-        )
         name = name_of("", file)
-        return f"batch/{hashlib.sha256(f'{content} {name} {rest}'.encode()).hexdigest()}"
+        return f"batch/{hashlib.sha256(f'{content} {name} {common}'.encode()).hexdigest()}"

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from pliant.cli import app
+from pliant.cli.commands.batch import Batch
 from pliant.cli.exits import Exit
 from pliant.cli.session import Session
 from pliant.client.multipart import LONGEST_NAME
@@ -73,6 +74,35 @@ def test_another_option_or_key_makes_other_jobs(run: Run, takes: Path) -> None:
     assert len(jobs_of(run)) == 9
 
 
+def test_whatever_changes_the_jobs_makes_other_jobs(
+    run: Run, takes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mesh, truth, rotations = (tmp_path / name for name in ("mesh.npz", "truth.npz", "rotations.npz"))
+    np.savez(mesh, faces=[[0, 1, 2]])
+    np.savez(truth, shapes=np.random.default_rng(7).normal(size=(5, 12, 3)))
+    np.savez(rotations, rotations=np.tile(np.eye(3), (5, 1, 1)))
+    files = ("-m", mesh, "-g", truth, "-r", rotations, "--webhook", "https://example.org/")
+
+    def number_of_jobs(*more: str) -> int:
+        ran = run("submit", takes / "take-0.npz", takes / "take-1.npz", *files, *more)
+        assert ran.exit_code == 0, ran.output
+        return len(jobs_of(run))
+
+    monkeypatch.setenv("PLIANT_WEBHOOK_SECRET", f"whsec_{'A' * 43}=")
+    assert [number_of_jobs(), number_of_jobs()] == [2, 2]
+    assert [number_of_jobs("--priority", "high"), number_of_jobs("--priority", "high")] == [4, 4]
+    np.savez(mesh, faces=[[0, 1, 2], [1, 2, 3]])
+    assert [number_of_jobs(), number_of_jobs()] == [6, 6]
+    np.savez(truth, shapes=np.random.default_rng(8).normal(size=(5, 12, 3)))
+    assert [number_of_jobs(), number_of_jobs()] == [8, 8]
+    np.savez(rotations, rotations=np.tile(-np.eye(3)[[1, 0, 2]], (5, 1, 1)))
+    assert [number_of_jobs(), number_of_jobs()] == [10, 10]
+    monkeypatch.setenv("PLIANT_WEBHOOK_SECRET", f"whsec_{'B' * 42}A=")
+    assert [number_of_jobs(), number_of_jobs()] == [12, 12]
+    files = ("-m", mesh.rename(tmp_path / "same.npz"), *files[2:])
+    assert number_of_jobs() == 12, "the content counts, not the path"
+
+
 def test_results_lie_in_a_folder_for_each_and_a_second_run_goes_on(run: Run, takes: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     first = run("submit", takes, "--mesh", "none", "-o", out)
@@ -121,6 +151,29 @@ def test_a_file_that_is_refused_has_its_row_and_stops_nothing(run: Run, takes: P
         )
     ]
     assert len(jobs_of(run)) == 2
+
+
+def test_a_file_whose_key_is_taken_has_its_row_and_stops_nothing(
+    run: Run, takes: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Batch, "_key_of", lambda _, file, *__: str(file.stem == "take-2"))
+    ran = run("submit", takes, "--mesh", "none", "--json")
+    assert ran.exit_code == Exit.FAILED, ran.output
+    first, second, third = json.loads(ran.stdout)
+    assert (first["error"], third["error"]) == (None, None)
+    assert (second["job"], second["error"].partition(",")[0]) == (
+        None,
+        "This Idempotency-Key was used for a different request",
+    )
+    assert len(jobs_of(run)) == 2
+
+
+def test_a_missing_token_ends_it_at_the_first_file(takes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("PLIANT_TOKEN", raising=False)
+    service = InMemoryService(auth="required")
+    ran = CliRunner().invoke(app, ["submit", str(takes), "--mesh", "none"], obj=Session(transport=service))
+    assert ran.exit_code == Exit.NOT_NOW
+    assert [request.url.path for request in service.requests] == ["/v1/jobs"]
 
 
 def test_what_belongs_to_one_job_is_refused(run: Run, takes: Path, tmp_path: Path) -> None:
