@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import socket
 import subprocess
 import sys
@@ -167,11 +166,15 @@ def address(host: str, port: int) -> str:
 
 def service_child(settings: Settings, host: str, port: int, url: str, *, auth: str) -> Child:
     """Return the API process as a child that counts as started once every part is ready."""
+    from pliant.service.settings import ServiceSettings
+    from pliant.worker.environment import given
     from pliant.worker.processes.supervisor import Child
 
     env = {**settings.to_environment(), "PLIANT_HOST": host, "PLIANT_PORT": str(port), "PLIANT_AUTH": auth}
-    # No access log between the lines of this terminal, unless it is requested.
-    env["PLIANT_LOG_LEVEL"] = os.environ.get("PLIANT_LOG_LEVEL") or "warning"
+    if "log_level" not in given(
+        ServiceSettings
+    ):  # no access log between the lines of this terminal, unless it is requested
+        env["PLIANT_LOG_LEVEL"] = "warning"
     command = [sys.executable, "-m", "pliant.service"]
     return Child(name="service", argv=command, env=env, ready=until_ready(url), grace=15.0)
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args, get_origin
 
 from pliant.worker.errors import InvalidSetting
-from pydantic import ValidationError, create_model, model_validator
+from pydantic import BaseModel, ValidationError, create_model, model_validator
 from pydantic.dataclasses import is_pydantic_dataclass
 from pydantic.fields import FieldInfo
 
@@ -60,6 +60,16 @@ def read(record: type[T]) -> T:
     InvalidSetting
         A variable does not parse or is out of its range.
     """
+    found = _found(record)
+    return record(**{field.name: getattr(found, field.name) for field in fields(record)})  # type: ignore[arg-type]
+
+
+def given(record: type[Any]) -> frozenset[str]:
+    """Return the names of the fields that the environment, `.env` or the secret files give a value. Raises as `read`."""
+    return frozenset(_found(record).model_fields_set)
+
+
+def _found(record: type[Any]) -> BaseModel:
     # Here, because only a process of the service or of a worker reads its settings: the SDK works without the extra `server`.
     from pydantic_settings import BaseSettings, SettingsConfigDict
 
@@ -83,12 +93,11 @@ def read(record: type[T]) -> T:
 
     spelled: dict[str, Any] = {name: (field.annotation, field) for name, field in known.items()}
     try:
-        found = create_model("Environment", __base__=Environment, **spelled)()
+        return create_model("Environment", __base__=Environment, **spelled)()
     except ValidationError as error:
         first = error.errors()[0]
         name = str(first["loc"][0])
         raise InvalidSetting(variable_of(name), expected=expected_of(known[name]), got=repr(first["input"])) from None
-    return record(**{field.name: getattr(found, field.name) for field in fields(record)})  # type: ignore[arg-type]
 
 
 def _secrets() -> str | None:

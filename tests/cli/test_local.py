@@ -18,9 +18,10 @@ from pliant.cli.session import Session, name_of, parse_options
 from pliant.cli.solve import file_or_word
 from pliant.client import BadArgument, Unreachable
 from pliant.client.multipart import LONGEST_NAME
+from pliant.service.settings import ServiceSettings
 from pliant.service.testing import InMemoryService
 from pliant.worker.processes.valkey import find_binary
-from pliant.worker.settings import NUMERICAL_THREADS
+from pliant.worker.settings import NUMERICAL_THREADS, Settings
 from serving import free_port, until
 
 doctor = importlib.import_module("pliant.cli.doctor")  # the name in the package is the command's
@@ -80,6 +81,28 @@ def test_the_command_line_takes_precedence_over_the_environment(monkeypatch: pyt
     monkeypatch.setenv("PLIANT_DATA", "there")
     assert (up.chosen(None, None).workers, up.chosen(None, None).data) == (3, Path("there"))
     assert (up.chosen(Path("here"), 5).workers, up.chosen(Path("here"), 5).data) == (5, Path("here"))
+
+
+def test_the_service_logs_warnings_unless_a_level_is_given_anywhere(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def level() -> str | None:
+        """Return the level that `pliant up` sets; None: the service reads it where it was given."""
+        return up.service_child(Settings(), "127.0.0.1", 80, "http://127.0.0.1:80", auth="off").env.get(
+            "PLIANT_LOG_LEVEL"
+        )
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PLIANT_SECRETS_DIR", str(tmp_path))
+    monkeypatch.setenv("PLIANT_LOG_LEVEL", "")
+    assert level() == "warning"
+    for file in (tmp_path / ".env", tmp_path / "pliant_log_level"):
+        file.write_text("PLIANT_LOG_LEVEL=info\n" if file.name == ".env" else "info\n")
+        assert (level(), ServiceSettings.from_environment().log_level) == (None, "info")
+        file.unlink()
+    assert level() == "warning"
+    monkeypatch.setenv("PLIANT_LOG_LEVEL", "debug")
+    assert (level(), ServiceSettings.from_environment().log_level) == (None, "debug")
 
 
 def test_a_service_that_ends_instead_of_starting_is_reported() -> None:
