@@ -8,10 +8,10 @@ import socket
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 from pliant.cli.exits import Exit
@@ -19,6 +19,10 @@ from pliant.cli.extras import missing_modules, require_server
 from pliant.cli.paths import installation
 from pliant.cli.session import HOME, Json, Session, Url
 from pliant.cli.show import out, print_json
+from pliant.cli.up import Data, chosen
+
+if TYPE_CHECKING:
+    from pliant.worker.settings import Settings
 
 OLDEST_PYTHON = (3, 11)
 LITTLE_SPACE = 2 * 1024**3
@@ -42,12 +46,9 @@ class Finding:
     """What to do; empty if nothing is wrong."""
 
 
-Data = Annotated[Path, typer.Option("--data", envvar="PLIANT_DATA", help="Data directory.")]
-
-
 def doctor(
     ctx: typer.Context,
-    data: Data = Path("pliant-data"),
+    data: Data = None,
     port: Annotated[int, typer.Option("--port", help="Port that `pliant up` would use.", min=1, max=65535)] = 8000,
     url: Url = HOME,
     as_json: Json = False,
@@ -60,14 +61,14 @@ def doctor(
         *check_packages(),
         *check_blas(),
         *check_cores(),
-        *check_storage(data),
+        *check_storage(data or settings_here().data),
         *check_valkey(),
         *check_blobs(),
     ]
     report([*findings, *check_port(port), *check_service(session, url)], as_json=as_json)
 
 
-def fsck(ctx: typer.Context, data: Data = Path("pliant-data"), as_json: Json = False) -> None:
+def fsck(ctx: typer.Context, data: Data = None, as_json: Json = False) -> None:
     """Compare job records, queue, files, uploads and scratch directories; exit code 8 if they are inconsistent.
 
     Needs a running queue: run it beside `pliant up`, or with PLIANT_REDIS_URL.
@@ -75,10 +76,16 @@ def fsck(ctx: typer.Context, data: Data = Path("pliant-data"), as_json: Json = F
     session: Session = ctx.obj
     session.json = as_json
     require_server("pliant fsck")
+    settings = chosen(data, None)
+    installation(settings)
+    report(list(check_stored(settings)), as_json=as_json)
+
+
+def settings_here() -> Settings:
+    """Return the settings of this machine; the defaults where the extra `server`, which reads them, is missing."""
     from pliant.worker.settings import Settings
 
-    installation(replace(Settings.from_environment(), data=data))
-    report(list(check_stored(data)), as_json=as_json)
+    return Settings() if missing_modules() else Settings.from_environment()
 
 
 def report(findings: list[Finding], *, as_json: bool) -> None:
@@ -160,9 +167,9 @@ def check_blas() -> Iterator[Finding]:
 
 def check_cores() -> Iterator[Finding]:
     """Check how the cores are divided among workers."""
-    from pliant.worker.settings import Settings, usable_cores
+    from pliant.worker.settings import usable_cores
 
-    settings = Settings() if missing_modules() else Settings.from_environment()
+    settings = settings_here()
     threads, cores = settings.threads_per_job, usable_cores()
     found = f"{cores} usable cores; {settings.workers} worker(s) of {threads} thread(s)"
     if threads * settings.workers > cores:
@@ -195,9 +202,8 @@ def check_valkey() -> Iterator[Finding]:
         return
     from pliant.worker.errors import WorkerError
     from pliant.worker.processes.valkey import find_binary
-    from pliant.worker.settings import Settings
 
-    address = Settings.from_environment().redis_url
+    address = settings_here().redis_url
     if address is not None:
         yield _redis(address)
         return
@@ -239,15 +245,13 @@ def check_service(session: Session, url: str) -> Iterator[Finding]:
     yield Finding("service", "good", f"{url}: {', '.join(f'{name} {how}' for name, how in state.items())}")
 
 
-def check_stored(data: Path) -> Iterator[Finding]:
+def check_stored(settings: Settings) -> Iterator[Finding]:
     """Compare records, queue, blobs, scratch directories, uploads and incomplete request bodies with each other."""
     from pliant.service.spool import Incoming
     from pliant.worker.errors import StoreUnavailable
     from pliant.worker.jobs.service import Jobs
     from pliant.worker.maintenance.fsck import findings
-    from pliant.worker.settings import Settings
 
-    settings = replace(Settings.from_environment(), data=data)
     try:
         found = findings(Jobs.open(settings))
     except StoreUnavailable as fault:
@@ -257,7 +261,7 @@ def check_stored(data: Path) -> Iterator[Finding]:
         yield Finding(
             "stored", "bad", sentence, "Most mismatches are repaired within minutes; report those that remain."
         )
-    for name in Incoming(data / "incoming").abandoned():
+    for name in Incoming(settings.incoming).abandoned():
         advice = "The next start of the service removes it."
         yield Finding("stored", "bad", f"Folder incoming/{name} belongs to a process that has ended.", advice)
     if not found:
@@ -281,14 +285,12 @@ def show(findings: list[Finding]) -> None:
 
 def check_blobs() -> Iterator[Finding]:
     """Check the blob store of PLIANT_BLOB_URL by listing what it holds."""
-    import os
-
-    if os.environ.get("PLIANT_BLOB_URL", "") == "" or missing_modules():
+    url = settings_here().blob_url
+    if url is None:
         return
     from pliant.worker.errors import StoreUnavailable
     from pliant.worker.store.blobs import Blobs
 
-    url = os.environ["PLIANT_BLOB_URL"]
     try:
         Blobs.open(url).check()
     except StoreUnavailable as fault:

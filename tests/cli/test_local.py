@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib
 import io
+import json
+import os
 import re
 import socket
 import subprocess
@@ -13,6 +15,7 @@ from pathlib import Path
 
 import pytest
 import redis
+from pliant.cli import app
 from pliant.cli.demo import GOOD, announced, judge
 from pliant.cli.session import Session, name_of, parse_options
 from pliant.cli.solve import file_or_word
@@ -23,6 +26,7 @@ from pliant.service.testing import InMemoryService
 from pliant.worker.processes.valkey import find_binary
 from pliant.worker.settings import NUMERICAL_THREADS, Settings
 from serving import free_port, until
+from typer.testing import CliRunner
 
 doctor = importlib.import_module("pliant.cli.doctor")  # the name in the package is the command's
 up = importlib.import_module("pliant.cli.up")
@@ -230,6 +234,28 @@ def test_doctor_checks_the_blob_store(tmp_path: Path, monkeypatch: pytest.Monkey
     (found,) = doctor.check_blobs()
     assert found.verdict == "bad"
     assert "AWS_" in found.advice
+
+
+def test_doctor_and_fsck_read_env_and_secret_files_as_the_service_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in [name for name in os.environ if name.startswith("PLIANT_")]:
+        monkeypatch.delenv(name)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PLIANT_SECRETS_DIR", str(tmp_path))
+    (tmp_path / "there" / "valkey").mkdir(parents=True)
+    (tmp_path / ".env").write_text("PLIANT_DATA=there\n")
+    (tmp_path / "pliant_blob_url").write_text((tmp_path / "bucket").as_uri())
+
+    def found(*command: str) -> dict[str, str]:
+        ran = CliRunner().invoke(app, [*command, "--json"], obj=Session(transport=InMemoryService()))
+        return {finding["what"]: finding["found"] for finding in json.loads(ran.stdout)}
+
+    findings = found("doctor")
+    assert findings["storage"].startswith(f"{tmp_path / 'there'}, ")
+    assert findings["blobs"] == f"{(tmp_path / 'bucket').as_uri()} answers"
+    assert found("doctor", "--data", "here")["storage"].startswith(f"{tmp_path / 'here'}, ")
+    assert "job store" in found("fsck")["stored"], "the directory is an installation, whose queue is not running"
 
 
 def test_doctor_checks_the_service() -> None:
