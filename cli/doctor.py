@@ -49,7 +49,12 @@ class Finding:
 def doctor(
     ctx: typer.Context,
     data: Data = None,
-    port: Annotated[int, typer.Option("--port", help="Port that `pliant up` would use.", min=1, max=65535)] = 8000,
+    port: Annotated[
+        int | None,
+        typer.Option(
+            "--port", help="Port that `pliant up` would use.", min=1, max=65535, show_default="as `pliant up`"
+        ),
+    ] = None,
     url: Url = HOME,
     as_json: Json = False,
 ) -> None:
@@ -65,7 +70,9 @@ def doctor(
         *check_valkey(),
         *check_blobs(),
     ]
-    report([*findings, *check_port(port), *check_service(session, url)], as_json=as_json)
+    report(
+        [*findings, *check_port(port_here() if port is None else port), *check_service(session, url)], as_json=as_json
+    )
 
 
 def fsck(ctx: typer.Context, data: Data = None, as_json: Json = False) -> None:
@@ -86,6 +93,13 @@ def settings_here() -> Settings:
     from pliant.worker.settings import Settings
 
     return Settings() if missing_modules() else Settings.from_environment()
+
+
+def port_here() -> int:
+    """Return the port that `pliant up` would use on this machine."""
+    from pliant.service.settings import ServiceSettings
+
+    return ServiceSettings().port if missing_modules() else ServiceSettings.from_environment().port
 
 
 def report(findings: list[Finding], *, as_json: bool) -> None:

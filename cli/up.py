@@ -171,9 +171,8 @@ def service_child(settings: Settings, host: str, port: int, url: str, *, auth: s
     from pliant.worker.processes.supervisor import Child
 
     env = {**settings.to_environment(), "PLIANT_HOST": host, "PLIANT_PORT": str(port), "PLIANT_AUTH": auth}
-    if "log_level" not in given(
-        ServiceSettings
-    ):  # no access log between the lines of this terminal, unless it is requested
+    # No access log between the lines of this terminal, unless it is requested.
+    if "log_level" not in given(ServiceSettings):
         env["PLIANT_LOG_LEVEL"] = "warning"
     command = [sys.executable, "-m", "pliant.service"]
     return Child(name="service", argv=command, env=env, ready=until_ready(url), grace=15.0)

@@ -55,7 +55,8 @@ class Form:
             opened = {}
             for name, path in self.files.items():
                 file = CountedFile(stack.enter_context(path.open("rb")), count)
-                opened[name] = (path.name, cast(IO[bytes], file), "application/octet-stream")
+                file_name = path.name.encode("utf-8", "replace").decode()  # the system's names need not be UTF-8
+                opened[name] = (file_name, cast(IO[bytes], file), "application/octet-stream")
             yield opened
 
 

@@ -109,9 +109,9 @@ class Exchange:
         if may_repeat(call, fault):
             await async_sleep(self.attempts.pause_after(fault))
             return
-        self.attempts.remaining()
         if isinstance(fault, PliantError):
             raise fault
+        self.attempts.remaining()
         raise Unreachable(
             f"{call.method} {call.path} was interrupted ({str(fault) or type(fault).__name__}) and was not sent again, "
             "because it may have been carried out. Check the job before repeating it."

@@ -110,9 +110,9 @@ class Exchange:
         if may_repeat(call, fault):
             sleep(self.attempts.pause_after(fault))
             return
-        self.attempts.remaining()
         if isinstance(fault, PliantError):
             raise fault
+        self.attempts.remaining()
         raise Unreachable(
             f"{call.method} {call.path} was interrupted ({str(fault) or type(fault).__name__}) and was not sent again, "
             "because it may have been carried out. Check the job before repeating it."

@@ -244,7 +244,8 @@ def test_doctor_and_fsck_read_env_and_secret_files_as_the_service_does(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PLIANT_SECRETS_DIR", str(tmp_path))
     (tmp_path / "there" / "valkey").mkdir(parents=True)
-    (tmp_path / ".env").write_text("PLIANT_DATA=there\n")
+    port = free_port()
+    (tmp_path / ".env").write_text(f"PLIANT_DATA=there\nPLIANT_PORT={port}\n")
     (tmp_path / "pliant_blob_url").write_text((tmp_path / "bucket").as_uri())
 
     def found(*command: str) -> dict[str, str]:
@@ -253,6 +254,7 @@ def test_doctor_and_fsck_read_env_and_secret_files_as_the_service_does(
 
     findings = found("doctor")
     assert findings["storage"].startswith(f"{tmp_path / 'there'}, ")
+    assert findings["port"] == f"{port} is free"
     assert findings["blobs"] == f"{(tmp_path / 'bucket').as_uri()} answers"
     assert found("doctor", "--data", "here")["storage"].startswith(f"{tmp_path / 'here'}, ")
     assert "job store" in found("fsck")["stored"], "the directory is an installation, whose queue is not running"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 from pathlib import Path
 from typing import Any
 
@@ -169,3 +170,11 @@ def test_a_plot_shows_the_requested_frames(tmp_path: Path) -> None:
 def test_a_folder_is_not_an_input(tmp_path: Path) -> None:
     with pytest.raises(BadArgument, match="got the folder"):
         existing_file(tmp_path, "mesh")
+
+
+@pytest.mark.skipif(os.fsencode("\udcff") != b"\xff", reason="names of files are text here")
+def test_a_file_whose_name_is_not_utf8_is_sent(tmp_path: Path) -> None:
+    path = tmp_path / "take \udcff.npz"
+    np.savez(path, tracks=POINTS)
+    with Client("http://pliant.test", transport=InMemoryService()) as client:
+        assert client.submit(path).wait(timeout=60).shapes.shape == (4, 9, 3)

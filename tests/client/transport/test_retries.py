@@ -205,6 +205,15 @@ def test_the_overall_timeout_holds_over_all_repetitions(clock: Clock) -> None:
     assert isinstance(caught.value, TimeoutError)
 
 
+def test_a_refusal_that_arrives_with_the_deadline_is_the_error(clock: Clock) -> None:
+    def late(request: httpx.Request) -> httpx.Response:
+        clock.now += 5
+        return answer(422)(request)
+
+    with pytest.raises(InvalidRequest, match=r"Sentence\."):
+        client_of(Flaky(late), clock).options(timeout=3)
+
+
 @pytest.mark.parametrize("on_progress", [None, lambda _: None], ids=["polling", "events"])
 def test_waiting_ends_with_the_timeout_and_the_job_continues(on_progress: Callable[[Job], None] | None) -> None:
     service = InMemoryService(steps=math.inf)
