@@ -129,9 +129,10 @@ def restore_backup(settings: Settings, source: Path) -> Summary:
 def _copy_blobs(jobs: Jobs, stored: Stored, target: Path, kept: dict[str, int]) -> int | None:
     """Copy the blobs of a record; return how many were not there, None if the job was deleted meanwhile."""
     sizes = {f"{stored.prefix}{each.name}": each.bytes for each in stored.job.artifacts}
+    given = [key for key in (stored.inputs, stored.result) if key is not None]
     found: dict[str, int] = {}
     new = 0
-    for key in (stored.inputs, *sizes):
+    for key in (*given, *sizes):
         file = target / "blobs" / key
         try:
             size = sizes[key] if key in sizes else jobs.blobs.get(key).size

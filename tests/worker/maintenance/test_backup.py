@@ -14,9 +14,11 @@ from pathlib import Path
 import httpx
 import pytest
 from pliant.schemas.job import Artifact, Job, Status
+from pliant.schemas.outputs import OutputRequest
 from pliant.worker.errors import BadBackup, NewerData
 from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.finished import Finished
+from pliant.worker.jobs.further_outputs import make_outputs
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.maintenance.backup import restore_backup, write_backup
 from pliant.worker.maintenance.fsck import findings
@@ -101,6 +103,22 @@ def test_a_restored_installation_is_the_same(jobs: Jobs, sent: dict[str, str], e
     assert len(there.queue.waiting()) == 2
     assert Tokens.open(empty).all() == Tokens.open(jobs.settings).all()
     assert there.records.tallies()["ended:succeeded"] == 1
+
+
+def test_a_job_of_further_outputs_keeps_the_result_that_it_works_from(
+    jobs: Jobs, submit: Submit, empty: Settings, tmp_path: Path
+) -> None:
+    solved = submit(name="done").id
+    succeed(jobs, solved, b"the shapes", tmp_path)
+    jobs.queue.remove(jobs.records.get(solved).attempt_id)
+    more, _ = make_outputs(jobs, solved, OutputRequest(outputs=("obj",)))
+    assert write_backup(jobs.settings, tmp_path / "backup").blobs == 4
+    restore_backup(empty, tmp_path / "backup")
+    there = Jobs.open(empty)
+    assert findings(there, pause=0) == []
+    key = there.stored(more.id).result
+    assert key is not None
+    assert b"".join(there.blobs.get(key).read()) == b"the shapes"
 
 
 def test_what_a_webhook_owes_is_owed_after_the_restoration(
