@@ -11,6 +11,7 @@ from pliant.schemas.outputs import OutputRequest
 from pliant.worker.artifacts import kinds_for
 from pliant.worker.errors import NotAllowedNow, UnknownJob
 from pliant.worker.ids import new_job_id
+from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.jobs.submission import Submission, copy_beside
 from pliant.worker.records import Stored
@@ -72,13 +73,7 @@ def make_outputs(
             return known, False
         submission = replace(submission, idempotency_key=None)
     _check(stored, submission)
-    further = job.model_copy(
-        update={
-            "id": new_job_id(), "status": Status.QUEUED, "created_at": jobs.clock(), "started_at": None, "finished_at": None,
-            "expires_at": None, "attempt": 0, "retry_of": None, "outputs_of": id, "options": submission.options,
-            "progress": None, "artifacts": [],
-        }
-    )  # fmt: skip
+    further = lifecycle.again(job, id=new_job_id(), now=jobs.clock(), outputs_of=id, options=submission.options)
     copies = [(_inputs_of(stored), "inputs.npz"), (f"{stored.prefix}{RESULT}", "result.npz")]
     try:
         size = sum(jobs.blobs.get(key).size for key, _ in copies)

@@ -14,13 +14,31 @@ from __future__ import annotations
 
 from datetime import datetime, timedelta
 
-from pliant.schemas.job import Problem, Progress, Status
+from pliant.schemas.job import Job, Problem, Progress, Status
 from pliant.worker.errors import NotAllowedNow, StaleAttempt
 from pliant.worker.jobs.finished import Finished
 from pliant.worker.records import Stored
 
 ACTIVE = (Status.RUNNING, Status.CANCELLING)
 FINAL = (Status.SUCCEEDED, Status.FAILED, Status.CANCELLED)
+
+
+def again(job: Job, *, id: str, now: datetime, **changes: object) -> Job:
+    """Return a new queued job like a finished one.
+
+    Metrics, outcome, verdict and warnings stay. A failed or cancelled job has them only if it works from a stored result, and
+    then they are those of that result.
+
+    Parameters
+    ----------
+    **changes
+        Further fields of the new job.
+    """
+    fresh: dict[str, object] = {
+        "id": id, "status": Status.QUEUED, "created_at": now, "started_at": None, "finished_at": None, "expires_at": None,
+        "attempt": 0, "retry_of": None, "progress": None, "artifacts": [], "error": None,
+    }  # fmt: skip
+    return job.model_copy(update=fresh | changes)
 
 
 def claim(stored: Stored, *, attempt_id: str, worker: str, now: datetime) -> Stored:

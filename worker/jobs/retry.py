@@ -7,6 +7,7 @@ import hashlib
 from pliant.schemas.job import Job, Status
 from pliant.worker.errors import NotAllowedNow, UnknownJob
 from pliant.worker.ids import new_job_id
+from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.jobs.submission import Submission, copy_beside
 
@@ -42,17 +43,7 @@ def retry(jobs: Jobs, id: str, *, idempotency_key: str | None = None) -> Job:
     if job.status not in (Status.FAILED, Status.CANCELLED):
         hint = "It has its result." if job.status is Status.SUCCEEDED else "Wait until it ends, or cancel it first."
         raise NotAllowedNow(id, job.status, wanted="run again", hint=hint)
-    again = Job(
-        id=new_job_id(),
-        name=job.name,
-        status=Status.QUEUED,
-        created_at=jobs.clock(),
-        retry_of=id,
-        outputs_of=job.outputs_of,
-        priority=job.priority,
-        options=job.options,
-        interpretation=job.interpretation,
-    )
+    again = lifecycle.again(job, id=new_job_id(), now=jobs.clock(), retry_of=id)
     try:
         copies = [(stored.inputs, "inputs.npz"), *([(stored.result, "result.npz")] if stored.result else [])]
         size = sum(jobs.blobs.get(key).size for key, _ in copies)

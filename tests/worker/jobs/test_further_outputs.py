@@ -92,6 +92,20 @@ def test_a_cancelled_one_is_made_anew_and_can_be_retried(jobs: Jobs, solved: Job
         make_outputs(jobs, solved.id, OutputRequest(outputs=("csv",)), idempotency_key="mine")
 
 
+def test_a_retried_one_says_what_the_result_says(jobs: Jobs, solved: Job, tmp_path: Path) -> None:
+    said = ("metrics", "outcome", "sentence", "verdict", "verdict_reasons", "trust_sentence", "warnings")
+    more, _ = make_outputs(jobs, solved.id, WANTED)
+    jobs.cancel(more.id)
+    retried = retry(jobs, more.id)
+    done = run(jobs, retried, tmp_path / "w")
+    assert done.status is Status.SUCCEEDED, done.error
+    for job in (retried, done):
+        assert {name: getattr(job, name) for name in said} == {name: getattr(solved, name) for name in said}
+    assert (retried.retry_of, retried.attempt, retried.finished_at, retried.artifacts) == (more.id, 0, None, [])
+    assert solved.metrics
+    assert solved.verdict is not None
+
+
 def test_it_counts_against_queue_and_quota(jobs: Jobs, solved: Job) -> None:
     one = dataclasses.replace(jobs, max_queued=1)
     make_outputs(one, solved.id, WANTED)
