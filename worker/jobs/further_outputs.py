@@ -27,7 +27,7 @@ def make_outputs(
     """Queue a job that writes further files of a result.
 
     The new job has copies of what it needs, so the first one may be deleted meanwhile; it counts against the same limits as
-    every other job. The same request again returns the same job, unless that one failed or was cancelled.
+    every other job. The same request again returns the same job; after one that failed or was cancelled it makes one more.
 
     Parameters
     ----------
@@ -67,11 +67,10 @@ def make_outputs(
         options=request.applied_to(job.options), name=job.name, idempotency_key=idempotency_key or f"outputs {wish}",
         fingerprint=wish,
     )  # fmt: skip
-    known = jobs.known(submission)
-    if known is not None:
+    while (known := jobs.known(submission)) is not None:
         if idempotency_key is not None or known.status not in (Status.FAILED, Status.CANCELLED):
             return known, False
-        submission = replace(submission, idempotency_key=None)
+        submission = replace(submission, idempotency_key=f"outputs {wish} after {known.id}")
     _check(stored, submission)
     further = lifecycle.again(job, id=new_job_id(), now=jobs.clock(), outputs_of=id, options=submission.options)
     copies = [(_inputs_of(stored), "inputs.npz"), (f"{stored.prefix}{RESULT}", "result.npz")]

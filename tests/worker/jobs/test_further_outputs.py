@@ -82,6 +82,11 @@ def test_a_cancelled_one_is_made_anew_and_can_be_retried(jobs: Jobs, solved: Job
     again, new = make_outputs(jobs, solved.id, WANTED)
     assert new
     assert again.id != more.id
+    assert make_outputs(jobs, solved.id, WANTED) == (jobs.get(again.id), False), "and only once"
+    jobs.cancel(again.id)
+    third, new = make_outputs(jobs, solved.id, WANTED)
+    assert new
+    assert make_outputs(jobs, solved.id, WANTED) == (jobs.get(third.id), False)
     retried = retry(jobs, more.id)
     assert retried.outputs_of == solved.id
     assert run(jobs, retried, tmp_path / "w").artifacts[0].name == "shapes_obj.zip"
