@@ -76,11 +76,11 @@ class Writer:
         Raises
         ------
         InvalidRequest
-            They exceed the upload's length; the bytes that fit are kept.
+            They exceed the upload's length; none of them is written, and what was written before stays.
         UploadTooLarge
             The upload exceeds its maximum size; it is removed, since it can never be completed.
         QuotaExceeded
-            The disk quota is reached; the bytes that fit are kept.
+            The disk quota is reached; the same holds.
         OSError
             The disk is full; the bytes of this request are removed to free the space.
         """

@@ -103,6 +103,17 @@ def test_the_length_holds_over_requests(uploads: Uploads) -> None:
     assert uploads.get("one").complete
 
 
+def test_a_piece_that_exceeds_the_length_is_not_written_and_those_before_it_stay(uploads: Uploads) -> None:
+    with uploads.write("one", offset=0, length=6, capacity=CAPACITY) as writer:
+        writer.write(b"half")
+        with pytest.raises(errors.InvalidRequest) as caught:
+            writer.write(b"xyz")
+    assert caught.value.code == "inconsistent_upload_length"
+    assert uploads.get("one").offset == 4
+    send(uploads, "one", b"yz", offset=4)
+    assert uploads.get("one").sha256 == hashlib.sha256(b"halfyz").hexdigest()
+
+
 def test_too_large_uploads_are_removed_and_those_over_quota_kept(uploads: Uploads) -> None:
     for length in (None, 1001):
         with pytest.raises(errors.UploadTooLarge, match="at most 1,000 bytes"):
