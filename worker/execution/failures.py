@@ -72,9 +72,16 @@ def worker_lost(reason: str) -> Problem:
 def how_it_ended(status: int) -> str:
     """Return a sentence for a wait status."""
     if os.WIFSIGNALED(status):
-        number = os.WTERMSIG(status)
-        return f"The job process was ended by signal {number} ({signal.Signals(number).name})."
+        return f"The job process was ended by signal {_named(os.WTERMSIG(status))}."
     return f"The job process ended with code {os.WEXITSTATUS(status)} without recording an outcome."
+
+
+def _named(number: int) -> str:
+    """Return the number of a signal with its name, if it has one: most real-time signals have none."""
+    try:
+        return f"{number} ({signal.Signals(number).name})"
+    except ValueError:
+        return str(number)
 
 
 def _sentence(text: str) -> str:

@@ -223,6 +223,7 @@ def test_limits_are_stated_in_messages() -> None:
     assert "the machine has" in out_of_memory().detail
     assert "1.5 s" in timed_out(1.5).detail
     assert "signal 11 (SIGSEGV)" in how_it_ended(11)
+    assert "by signal 40." in how_it_ended(40), "one without a name"
     assert "code 3" in how_it_ended(3 << 8)
     assert isinstance(out_of_memory(), Problem)
 
