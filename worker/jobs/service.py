@@ -200,6 +200,9 @@ class Jobs:
     def delete(self, id: str) -> None:
         """Remove a finished job with its record and files. Files that cannot be removed now are removed by the reconciler.
 
+        A new job may have the id before the files are removed: only those are removed that the record names. What lost attempts left
+        is removed by the reconciler, too.
+
         Raises
         ------
         NotAllowedNow
@@ -210,8 +213,10 @@ class Jobs:
             raise NotAllowedNow(id, stored.job.status, wanted="deleted", hint="Cancel it first.")
         self.records.delete(id, at=self.clock())
         with suppress(StoreUnavailable):
-            self.blobs.delete(f"jobs/{id}/")
-            self.records.forget_deleted(id)
+            for attempt_id in {stored.inputs.split("/")[2], stored.attempt_id}:
+                self.blobs.delete(f"jobs/{id}/{attempt_id}/")
+            if not self.blobs.list(f"jobs/{id}/"):
+                self.records.forget_deleted(id)
 
     def artifact(self, id: str, name: str) -> tuple[Artifact, Blob]:
         """Return the record of a result file, and the file, readable in ranges.

@@ -25,6 +25,7 @@ from pliant.worker.jobs.retry import retry
 from pliant.worker.jobs.service import Jobs
 from pliant.worker.jobs.submission import Submission
 from pliant.worker.records import Stored
+from pliant.worker.store.blobs import Blobs
 from pliant.worker.uploads.service import Capacity, Uploads
 
 NOW = datetime(2030, 1, 2, tzinfo=UTC)
@@ -292,6 +293,37 @@ def test_deleting_leaves_nothing(jobs: Jobs, submit, inputs_file: Path) -> None:
     with pytest.raises(UnknownJob):
         jobs.delete(id)
     assert submit(idempotency_key="k", fingerprint="g").id != id, "the key is free again"
+
+
+def test_a_job_that_takes_the_id_during_a_deletion_keeps_its_files(
+    jobs: Jobs,
+    submit,  # type: ignore[no-untyped-def]
+    inputs_file: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    finish(jobs, submit(id="nightly").id, inputs_file)
+    plain, new = Blobs.delete, []
+
+    def after_another(blobs: Blobs, prefix: str) -> None:
+        if not new:
+            new.append(submit(id="nightly", name="the next night"))
+        plain(blobs, prefix)
+
+    with monkeypatch.context() as slow:
+        slow.setattr(Blobs, "delete", after_another)
+        jobs.delete("nightly")
+    assert jobs.get("nightly") == new[0]
+    assert blob_names(jobs) == [jobs.records.get("nightly").inputs]
+
+
+def test_what_a_lost_attempt_left_is_noted_for_the_reconciler(jobs: Jobs, submit, inputs_file: Path) -> None:  # type: ignore[no-untyped-def]
+    id = submit().id
+    finish(jobs, id, inputs_file)
+    left = f"jobs/{id}/{id}-lost/artifacts/shapes.npz"
+    jobs.blobs.put(left, inputs_file)
+    jobs.delete(id)
+    assert blob_names(jobs) == [left]
+    assert list(jobs.records.deleted()) == [id]
 
 
 def test_running_again_is_a_new_job_with_the_same_inputs(jobs: Jobs, submit, inputs_file: Path) -> None:  # type: ignore[no-untyped-def]
