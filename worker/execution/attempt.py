@@ -11,6 +11,7 @@ import faulthandler
 import logging
 import os
 import resource
+import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
@@ -105,6 +106,9 @@ class Attempt:
     """Spans of the trace, where there is one."""
     _next_look: float = 0.0
     _lines: list[str] = field(default_factory=list)
+    """Lines of the log that are not written yet."""
+    _log_lock: threading.Lock = field(default_factory=threading.Lock)
+    """Held while `_lines` changes and is written: progress is repeated from a thread of its own."""
 
     def report(self, progress: Progress) -> None:
         """Write the progress: each new stage, else at most every `PROGRESS_INTERVAL` seconds. An unavailable store is ignored."""
@@ -136,7 +140,8 @@ class Attempt:
     def log(self, text: str) -> None:
         """Append to the job's log; written with the next progress."""
         moment = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
-        self._lines += [f"{moment} {line}" for line in text.splitlines()]
+        with self._log_lock:
+            self._lines += [f"{moment} {line}" for line in text.splitlines()]
 
     def conclude(self, end: Finished | Problem | None) -> str:
         """Write the final record: the result, the failure, or None for a stop on request.
@@ -161,9 +166,10 @@ class Attempt:
                 held, end, attempt_id=self.attempt_id, prefix=self.prefix, now=now, retention=settings.retention
             )
 
+        patience = Patience(PATIENCE)
         with contextlib.suppress(StoreUnavailable):
-            self._flush()
-        kept = Patience(PATIENCE).retry(lambda: self.jobs.records.update(self.id, change))
+            patience.retry(self._flush)
+        kept = patience.retry(lambda: self.jobs.records.update(self.id, change))
         if kept.prefix is None:
             self.jobs.blobs.delete(self.prefix)
         return kept.job.status.value
@@ -213,8 +219,9 @@ class Attempt:
             return Status.RUNNING
 
     def _flush(self) -> None:
-        lines, self._lines = self._lines, []
-        self.jobs.records.append_log(self.id, lines)
+        with self._log_lock:
+            self.jobs.records.append_log(self.id, self._lines)
+            self._lines.clear()
 
 
 def work(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,6 +13,7 @@ from pliant.schemas.job import Artifact, Interpretation, Progress, Status
 from pliant.schemas.options import Options
 from pliant.worker.errors import Interrupted, StoreUnavailable
 from pliant.worker.execution.attempt import Attempt, run, work
+from pliant.worker.execution.failures import problem_of
 from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.finished import Finished
 from pliant.worker.jobs.service import Jobs
@@ -20,6 +21,8 @@ from pliant.worker.jobs.submission import Submission
 from pliant.worker.records import Stored
 from pliant.worker.store.blobs import Blobs
 from worker_house import SHORT, make_inputs
+
+PROBLEM = problem_of(ValueError("unexpected"))
 
 
 @pytest.fixture
@@ -106,6 +109,58 @@ def test_a_finished_job_waits_for_an_unavailable_blob_store(
     away[0] = 1
     with pytest.raises(StoreUnavailable):
         attempt.store(finished, tmp_path)
+
+
+def test_the_log_is_complete_though_the_store_was_away_at_the_end(
+    jobs: Jobs, attempt: Attempt, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    append, away = jobs.records.append_log, [2]
+
+    def sometimes(id: str, lines: Sequence[str]) -> None:
+        if away[0]:
+            away[0] -= 1
+            raise StoreUnavailable("The job store", reason="away")
+        append(id, lines)
+
+    monkeypatch.setattr(jobs.records, "append_log", sometimes)
+    monkeypatch.setattr("pliant.worker.execution.monitor.time.sleep", lambda seconds: None)
+    attempt.log("Begun.")
+    attempt.report(Progress(stage="reweight", fraction=0.5, updated_at=datetime.now(UTC)))
+    attempt.log("Failed: why.")
+    attempt.conclude(PROBLEM)
+    assert [line.split(" ", 1)[1] for line in jobs.log(attempt.id).splitlines()] == ["Begun.", "Failed: why."]
+
+
+def test_a_log_that_cannot_be_written_does_not_withhold_the_outcome(
+    jobs: Jobs, attempt: Attempt, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def never(id: str, lines: Sequence[str]) -> None:
+        raise StoreUnavailable("The job store", reason="away")
+
+    monkeypatch.setattr(jobs.records, "append_log", never)
+    monkeypatch.setattr("pliant.worker.execution.attempt.PATIENCE", -1.0)
+    attempt.log("Failed: why.")
+    attempt.conclude(PROBLEM)
+    assert jobs.get(attempt.id).status is Status.FAILED
+
+
+def test_a_line_that_is_logged_during_a_write_is_written_once(
+    jobs: Jobs, attempt: Attempt, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    append, logging = jobs.records.append_log, threading.Thread(target=attempt.log, args=("Second.",))
+
+    def during(id: str, lines: Sequence[str]) -> None:
+        append(id, lines)
+        if not logging.ident:
+            logging.start()
+            logging.join(0.1)
+
+    monkeypatch.setattr(jobs.records, "append_log", during)
+    attempt.log("First.")
+    attempt.report(Progress(stage="reweight", fraction=0.5, updated_at=datetime.now(UTC)))
+    logging.join(10)
+    attempt.conclude(PROBLEM)
+    assert [line.split(" ", 1)[1] for line in jobs.log(attempt.id).splitlines()] == ["First.", "Second."]
 
 
 def test_a_new_stage_is_reported_at_once(jobs: Jobs, attempt: Attempt, now: list[float]) -> None:
