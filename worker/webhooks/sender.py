@@ -14,6 +14,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
 from urllib.parse import urlsplit
@@ -43,6 +44,10 @@ POSTPONED = 2.0
 WITHIN = 20.0
 """Seconds that one attempt may take, from name resolution to the response headers."""
 
+LOOKUPS = 64
+"""Names looked up at once, in threads that do nothing else. A lookup cannot be stopped, and without an answer it takes longer than
+`WITHIN`: the resolver asks each of up to three servers twice for 5 s. An owner then holds twice `PER_OWNER` threads at most."""
+
 LEASE = 60.0
 """Seconds after which a message leased by a killed process is sent by another; more than `WITHIN`."""
 
@@ -65,6 +70,9 @@ class WebhookSender:
     pauses: tuple[float, ...] = PAUSES
     trusted: ssl.SSLContext | None = None
     """Trusted certificates; None: those of the system's default authorities."""
+    _lookups: ThreadPoolExecutor = field(
+        default_factory=lambda: ThreadPoolExecutor(LOOKUPS, thread_name_prefix="webhook names")
+    )
     _ended: threading.Event = field(default_factory=threading.Event)
     _thread: threading.Thread | None = None
 
@@ -91,6 +99,13 @@ class WebhookSender:
             self._thread.join(2 * LOOK_EVERY + 1)
 
     async def _run(self) -> None:
+        try:
+            await self._send_due()
+        finally:
+            self._lookups.shutdown(wait=False, cancel_futures=True)
+
+    async def _send_due(self) -> None:
+        """Send what is due until the sender is stopped."""
         under_way: set[asyncio.Task[None]] = set()
         busy: Counter[str] = Counter()
         while not self._ended.is_set():
@@ -170,7 +185,7 @@ class WebhookSender:
         parts = urlsplit(webhook.url)
         host = parts.hostname or ""
         port = parts.port or (443 if parts.scheme == "https" else 80)
-        addresses = await asyncio.to_thread(self.resolve, host, port)
+        addresses = await asyncio.get_running_loop().run_in_executor(self._lookups, self.resolve, host, port)
         address = checked_address(host, addresses, self.networks)
         request = httpx.Request(
             "POST",
@@ -222,7 +237,7 @@ class WebhookSender:
 
 
 def _release(busy: Counter[str], limits: list[str], _: asyncio.Task[None]) -> None:
-    busy.subtract(limits)
+    busy -= Counter(limits)  # in place, and without what is at zero
 
 
 def _log_error(task: asyncio.Task[None]) -> None:

@@ -29,7 +29,7 @@ from pliant.worker.records import Webhook
 from pliant.worker.settings import Settings
 from pliant.worker.store.connection import connect
 from pliant.worker.store.outbox import Outbox
-from pliant.worker.webhooks.sender import CONCURRENT, PAUSES, PER_OWNER, PER_RECEIVER, WebhookSender, resolve
+from pliant.worker.webhooks.sender import CONCURRENT, PAUSES, PER_OWNER, PER_RECEIVER, WebhookSender, _release, resolve
 
 SECRET = "whsec_" + base64.b64encode(b"k" * 32).decode()
 LOOPBACK = "127.0.0.0/8"
@@ -94,9 +94,9 @@ Made = Callable[..., Job]
 def made(door: Jobs, inputs_file: Path, interpretation: Interpretation) -> Made:
     """Submit a job and cancel it at once: it has ended, and its end is owed."""
 
-    def call(url: str, *, end: bool = True) -> Job:
+    def call(url: str, *, end: bool = True, owner: str | None = None) -> Job:
         hook = Webhook(url=url, secret=SECRET)
-        job = door.submit(
+        job = (door if owner is None else door.of(owner)).submit(
             inputs_file, Submission(options=Options(), name="hooked", webhook=hook), interpretation=interpretation
         )
         return door.cancel(job.id) if end else job
@@ -298,6 +298,37 @@ def test_a_slow_receiver_delays_no_other_messages(
         slow.open.set()
         slow.server.shutdown()
         slow.server.server_close()
+
+
+def test_a_name_that_is_looked_up_for_long_delays_no_other_messages(
+    door: Jobs, made: Made, receiver: Receiver, webhook_sender: WebhookSender
+) -> None:
+    asked: list[str] = []
+    answered = threading.Event()
+
+    def slowly(host: str, port: int) -> list[ipaddress.IPv4Address | ipaddress.IPv6Address]:
+        asked.append(host)
+        if host.startswith("slow"):
+            answered.wait(30)
+        return resolve("127.0.0.1", port)
+
+    webhook_sender.resolve = slowly
+    try:
+        for number in range(PER_OWNER):
+            made(f"http://slow{number}.example:{receiver.port}/", owner="somebody")
+        webhook_sender.start()
+        until(lambda: len(asked) == PER_OWNER, seconds=30)
+        quick = made(receiver.url)
+        until(lambda: "Webhook delivered" in door.log(quick.id), seconds=5)
+        assert len(receiver.got) == 1
+    finally:
+        answered.set()
+
+
+def test_what_is_not_busy_any_more_is_not_counted() -> None:
+    busy = collections.Counter({"receiver a": 1, "owner b": 2})
+    _release(busy, ["receiver a", "owner b"], None)  # type: ignore[arg-type]
+    assert dict(busy) == {"owner b": 1}
 
 
 def test_one_owner_does_not_occupy_all_connections(door: Jobs, made: Made, webhook_sender: WebhookSender) -> None:
