@@ -68,8 +68,8 @@ class WebhookSender:
     clock: Callable[[], float] = time.time
     """Seconds since 1970."""
     pauses: tuple[float, ...] = PAUSES
-    trusted: ssl.SSLContext | None = None
-    """Trusted certificates; None: those of the system's default authorities."""
+    trusted: ssl.SSLContext = field(default_factory=lambda: trusted_by_default())
+    """Authorities whose certificates are trusted."""
     _lookups: ThreadPoolExecutor = field(
         default_factory=lambda: ThreadPoolExecutor(LOOKUPS, thread_name_prefix="webhook names")
     )
@@ -202,7 +202,7 @@ class WebhookSender:
         )
         # No proxies, which would resolve the name again, and no redirects to other addresses.
         async with httpx.AsyncClient(
-            trust_env=False, follow_redirects=False, timeout=WITHIN, verify=self.trusted or True
+            trust_env=False, follow_redirects=False, timeout=WITHIN, verify=self.trusted
         ) as client:
             answer = await client.send(request, stream=True)
             await answer.aclose()
@@ -234,6 +234,15 @@ class WebhookSender:
     def _log(self, id: str, sentence: str) -> None:
         logger.info("job %s: %s", id, sentence)
         self.records.append_log(id, [sentence])
+
+
+def trusted_by_default() -> ssl.SSLContext:
+    """Trust the system's authorities, among them a company's own, and those of certifi where the system has none."""
+    import httpx
+
+    context = httpx.create_ssl_context(trust_env=False)  # certifi's
+    context.load_default_certs()
+    return context
 
 
 def _release(busy: Counter[str], limits: list[str], _: asyncio.Task[None]) -> None:

@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
+import httpx
 import pytest
 from pliant.schemas.job import Interpretation, Job, Status
 from pliant.schemas.options import Options
@@ -29,7 +30,16 @@ from pliant.worker.records import Webhook
 from pliant.worker.settings import Settings
 from pliant.worker.store.connection import connect
 from pliant.worker.store.outbox import Outbox
-from pliant.worker.webhooks.sender import CONCURRENT, PAUSES, PER_OWNER, PER_RECEIVER, WebhookSender, _release, resolve
+from pliant.worker.webhooks.sender import (
+    CONCURRENT,
+    PAUSES,
+    PER_OWNER,
+    PER_RECEIVER,
+    WebhookSender,
+    _release,
+    resolve,
+    trusted_by_default,
+)
 
 SECRET = "whsec_" + base64.b64encode(b"k" * 32).decode()
 LOOPBACK = "127.0.0.0/8"
@@ -240,10 +250,11 @@ def test_the_name_is_looked_up_once_and_the_connection_goes_to_what_was_found(
     assert headers["host"] == f"rebinding.example:{receiver.port}"
 
 
-@pytest.mark.skipif(shutil.which("openssl") is None, reason="needs the command openssl to make a certificate")
-def test_the_certificate_must_match_the_host_name(
-    door: Jobs, made: Made, receiver: Receiver, webhook_sender: WebhookSender, tmp_path: Path
-) -> None:
+@pytest.fixture
+def certificate(receiver: Receiver, tmp_path: Path) -> Path:
+    """A certificate for right.example that nobody knows; the receiver has it."""
+    if shutil.which("openssl") is None:
+        pytest.skip("needs the command openssl to make a certificate")
     pem = tmp_path / "both.pem"
     names = ["-subj", "/CN=x", "-addext", "subjectAltName=DNS:right.example"]
     files = ["-keyout", str(pem), "-out", str(tmp_path / "cert.pem")]
@@ -253,16 +264,39 @@ def test_the_certificate_must_match_the_host_name(
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(tmp_path / "cert.pem", pem)
     receiver.server.socket = context.wrap_socket(receiver.server.socket, server_side=True)
+    return tmp_path / "cert.pem"
+
+
+def test_the_certificate_must_match_the_host_name(
+    door: Jobs, made: Made, receiver: Receiver, webhook_sender: WebhookSender, certificate: Path
+) -> None:
     webhook_sender.resolve = lambda host, port: [ipaddress.ip_address("127.0.0.1")]
-    webhook_sender.trusted = ssl.create_default_context(cafile=str(tmp_path / "cert.pem"))
+    webhook_sender.trusted = ssl.create_default_context(cafile=str(certificate))
     right, wrong = (made(f"https://{name}.example:{receiver.port}/") for name in ("right", "wrong"))
     webhook_sender.start()
     until(lambda: "Webhook delivered" in door.log(right.id))
     until(lambda: "given up: ConnectError" in door.log(wrong.id))
-    webhook_sender.trusted = None
+    webhook_sender.trusted = trusted_by_default()
     stranger = made(f"https://right.example:{receiver.port}/")
     until(lambda: "given up: ConnectError" in door.log(stranger.id))
     assert len(receiver.got) == 1
+
+
+def test_an_authority_that_the_system_trusts_is_trusted(
+    door: Jobs, made: Made, receiver: Receiver, certificate: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A company's own, say. Public ones are trusted as well, also where the system has no list of them."""
+    monkeypatch.setenv("SSL_CERT_FILE", str(certificate))
+    carrier = WebhookSender.open(door.settings, door.records)
+    carrier.resolve = lambda host, port: [ipaddress.ip_address("127.0.0.1")]
+    job = made(f"https://right.example:{receiver.port}/")
+    carrier.start()
+    try:
+        until(lambda: "Webhook delivered" in door.log(job.id))
+    finally:
+        carrier.stop()
+    others = len(carrier.trusted.get_ca_certs()) - len(ssl.create_default_context().get_ca_certs())
+    assert others == len(httpx.create_ssl_context(trust_env=False).get_ca_certs())
 
 
 def test_a_proxy_of_the_environment_is_not_used(
