@@ -47,12 +47,16 @@ def work(settings: Settings) -> int:
     gc.collect()
     gc.freeze()  # otherwise the first garbage collection of every job process would copy all shared pages
     make_data_directory(settings.data)
-    quick = connect(settings.redis, decode=True, retries=0, answer_within=WATCH_ANSWERS_WITHIN)
+    quick, text = (
+        connect(settings.redis, decode=decode, retries=0, answer_within=WATCH_ANSWERS_WITHIN)
+        for decode in (False, True)
+    )
     connection = connect(settings.redis, decode=False, answer_within=BLOCK_WITHIN)
     PliantWorker(
         settings=settings,
         connection=connection,
-        records=RedisRecords(quick, prefix=settings.queue),
+        quick=quick,
+        records=RedisRecords(text, prefix=settings.queue),
         queue=RedisQueue(connection, name=settings.queue),
         name=secrets.token_hex(6),
     ).work(logging_level=None)

@@ -84,11 +84,20 @@ class Delivery(RqJob):
 
 
 class PliantWorker(Worker):
-    """One job at a time, each in a forked job process."""
+    """One job at a time, each in a forked job process.
+
+    Parameters
+    ----------
+    connection : Redis
+        For RQ, which waits for deliveries on it.
+    quick : Redis
+        For the heartbeats during a job; its time limit and that of `records` delay supervision of the job.
+    """
 
     def __init__(
-        self, *, settings: Settings, connection: redis.Redis, records: Records, queue: Queue, name: str
-    ) -> None:
+        self, *, settings: Settings, connection: redis.Redis, quick: redis.Redis, records: Records, queue: Queue,
+        name: str,
+    ) -> None:  # fmt: skip
         rq_queue = RqQueue(settings.queue, connection=connection, serializer=JSONSerializer, job_class=Delivery)
         super().__init__(
             [rq_queue],
@@ -100,6 +109,7 @@ class PliantWorker(Worker):
             log_job_description=False,
         )
         self._settings = settings
+        self._quick = quick
         self._records = records
         self._deliveries = queue
         self._stop_by: float | None = None
@@ -222,10 +232,13 @@ class PliantWorker(Worker):
 
     def _keep_execution(self, job: RqJob) -> None:
         """Write the job's heartbeat, and RQ's for the delivery: without it RQ abandons every job of more than 90 s."""
+        patient, self.connection = self.connection, self._quick
         try:
             self.maintain_heartbeats(job)
         except AWAY as error:
             logger.warning("heartbeat not written: %s", error)
+        finally:
+            self.connection = patient
 
     def _reap(self, watch: Watch, job: RqJob, *, status: int, peak: int) -> None:
         patience = Patience(60.0 if self._stop_by is None else 2.0)

@@ -48,7 +48,12 @@ def test_scratch_files_are_removed_once_the_store_confirms_their_owner(
 ) -> None:
     connection = connect(settings.redis, decode=False)
     worker = PliantWorker(
-        settings=jobs.settings, connection=connection, records=jobs.records, queue=jobs.queue, name="me"
+        settings=jobs.settings,
+        connection=connection,
+        quick=connection,
+        records=jobs.records,
+        queue=jobs.queue,
+        name="me",
     )
     id = jobs.submit(inputs_file, Submission(options=Options()), interpretation=interpretation).id
     attempt_id = jobs.records.get(id).attempt_id

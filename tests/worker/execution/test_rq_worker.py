@@ -1,0 +1,44 @@
+"""The RQ worker beside its job process: what it writes during a job does not delay supervision."""
+
+from __future__ import annotations
+
+import time
+
+from pliant.worker.execution.rq_worker import Delivery, PliantWorker
+from pliant.worker.settings import Settings
+from pliant.worker.store.connection import connect
+from pliant.worker.store.queue import FUNCTION, RedisQueue
+from pliant.worker.store.redis import RedisRecords
+from rq.serializers import JSONSerializer
+
+PAUSE = 3.0
+"""Seconds that the server gives no answer."""
+
+
+def test_heartbeats_do_not_delay_supervision_while_the_server_hangs(settings: Settings) -> None:
+    connection, quick = (connect(settings.redis, decode=False, retries=0, answer_within=each) for each in (30.0, 0.3))
+    text = connect(settings.redis, decode=True)
+    worker = PliantWorker(
+        settings=settings, connection=connection, quick=quick, records=RedisRecords(text, prefix=settings.queue),
+        queue=RedisQueue(connection, name=settings.queue), name="me",
+    )  # fmt: skip
+    job = Delivery.create(
+        FUNCTION, args=("a-job", "a-job-1"), id="a-job-1", connection=connection, serializer=JSONSerializer,
+        origin=settings.queue,
+    )  # fmt: skip
+    job.save()
+    worker.register_birth()
+    worker.execution = worker.prepare_execution(job)
+    worker._keep_execution(job)
+    before = connection.hget(job.key, "last_heartbeat")
+    assert before
+    connection.execute_command("CLIENT", "PAUSE", int(1000 * PAUSE))
+    begun = time.monotonic()
+    worker._keep_execution(job)
+    assert time.monotonic() - begun < PAUSE / 2
+    connection.ping()  # waits until the pause is over
+    worker._keep_execution(job)
+    assert connection.hget(job.key, "last_heartbeat") > before
+    assert worker.connection is connection
+    for each in (connection, quick, text):
+        each.close()
