@@ -52,7 +52,7 @@ def solve(
     settings : Settings, optional
         Method, weights, precision; the defaults are meant to need no change.
     on_step : callable, optional
-        Called after every unit of work.
+        Called as the solve proceeds, as a rule at least every half second.
     should_stop : callable, optional
         Called between units of work; once it returns True, the solve ends with `Outcome.STOPPED` and the last shapes.
     scratch : path, optional

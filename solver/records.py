@@ -20,7 +20,7 @@ Ints = NDArray[np.int32]
 
 
 def read_only(array: NDArray[np.generic]) -> None:
-    """Make the array read-only and return it."""
+    """Make the array read-only."""
     array.flags.writeable = False
 
 
@@ -231,7 +231,7 @@ class KnownCamera:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """Argument of `on_step`, called after each unit of work."""
+    """Argument of `on_step`, called as the solve proceeds (`monitor.MIN_FRACTION_STEP`)."""
 
     stage: str
     """`cameras`, `initialise`, `reweight` or `finish`."""

@@ -60,7 +60,7 @@ class Settings:
     surface: Surface = "auto"
     """`isometric`: a sheet that bends without stretching, seen in perspective; `free`: any surface; `auto`: isometric if the tracks
     are those of a sheet and its edge lengths determine a focal length. `auto` tests this only if `image_size` or the focal length is
-    given, with the default camera model, method and prior."""
+    given, with camera `auto` or `perspective` and the default method and prior."""
 
     order: Order = "auto"
     """`film`: neighbouring frames are alike; `any`: photographs in no order, of which no prior compares neighbours (Gaussian prior only);

@@ -54,8 +54,12 @@ class Chain:
 
     @property
     def confidence(self) -> Floats:
-        """Median variance of the visible places over a place's own, at most 1; 0 where hidden, shape `(F, P)`."""
-        usual = max(float(np.median(self.variance[self.visible])), float(np.finfo(np.float32).tiny))
+        """Median variance of the visible places over a place's own, at most 1; 0 where hidden, shape `(F, P)`.
+
+        The template's places are exact and do not count in the median.
+        """
+        found = self.variance[self.visible & (self.variance > 0)]
+        usual = max(float(np.median(found)) if found.size else 0.0, float(np.finfo(np.float32).tiny))
         return np.where(self.visible, usual / np.maximum(self.variance, usual), 0).astype(np.float32)
 
 

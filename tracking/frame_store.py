@@ -12,7 +12,7 @@ import numpy as np
 from pliant.tracking.flow import Grey
 
 CACHED = 24
-"""Decompressed frames kept in memory: the template, the 16 before t, t, and some for threads that run ahead."""
+"""Decompressed frames kept in memory: the template, the 8 before t, t, and some for threads that run ahead."""
 
 
 class FrameStore:

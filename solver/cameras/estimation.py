@@ -226,7 +226,15 @@ def _everywhere(before: Floats, best: Candidate, used: slice, settings: Settings
     return after, f"Refined by variable projection{how}; rotations moved by {turn:.2f}° on average."
 
 
-def given_cameras(normalized: Normalized, known: KnownCamera, settings: Settings, *, rank: int = 0) -> CameraEstimate:
+def given_cameras(
+    normalized: Normalized,
+    known: KnownCamera,
+    settings: Settings,
+    *,
+    rank: int = 0,
+    perspective: bool = False,
+    should_stop: Callable[[], bool] | None = None,
+) -> CameraEstimate:
     """Return given cameras as an estimate; missing scales are estimated if the camera model has them.
 
     Estimated scales are those with which one rigid shape explains the tracks best: Σ_f ‖W_f − s_f R_f S‖² is least. A
@@ -234,14 +242,15 @@ def given_cameras(normalized: Normalized, known: KnownCamera, settings: Settings
     `refinement.joint_refinement` frees them where the likelihood gains, because a rigid shape takes deformation for scale.
 
     Where scales are known, the prior does not need the tracks' Gram matrix and translations are estimated with the
-    shapes, completion is skipped, because it could take longer than the shapes. `rank` is as for `estimate_cameras`.
+    shapes, completion is skipped, because it could take longer than the shapes; not with `perspective`, whose depths are those of
+    the completed tracks. `rank` is as for `estimate_cameras`.
     """
     frames = len(known.rotations)
     exact = known.scales is not None or settings.camera == "orthographic"
-    if exact and not settings.gaussian and settings.method != "pseudo_inverse":
+    if exact and not perspective and not settings.gaussian and settings.method != "pseudo_inverse":
         completed = Completed(np.zeros((0, 0)), np.zeros((frames, 0, 2)), np.zeros((frames, 2)), 0, 0.0)
     else:
-        completed = complete(normalized, seed=settings.seed, rank=rank)
+        completed = complete(normalized, seed=settings.seed, rank=rank, should_stop=should_stop)
     if known.scales is not None:
         scales, reason = np.array(known.scales), "Rotations and scales were given."
     elif settings.gaussian and settings.estimates_scales:

@@ -71,7 +71,7 @@ class Trust:
     """Holds the true error in nearly eight of ten solves; None where the model behind it is not believed."""
 
     turn_degrees: float
-    """Angle between the two most different viewing directions, degrees; above 90 they may be opposite."""
+    """Angle between the two most different viewing directions, degrees, at most 90: opposite directions count as the same."""
 
     residual: float
     """Median distance of visible observations from the projected shapes, share of the size."""

@@ -79,7 +79,7 @@ def choose_anchors(points: Floats, seen: NDArray[np.bool_], count: int) -> Ancho
     seen : shape (F, P)
         Which observations there are.
     count : int
-        Anchors wanted; fewer where there are fewer points.
+        Anchors wanted; fewer where there are fewer points, none where none is seen often enough.
     """
     pool = _pool(seen)
     views = unlike_frames(points[:, pool], seen[:, pool], VIEWS)
@@ -97,6 +97,8 @@ def choose_anchors(points: Floats, seen: NDArray[np.bool_], count: int) -> Ancho
     placed, known = (fitted, fits) if share >= DENSE else (points[:, own], seen[:, own] & (agrees | ~fits))
     enough = known.sum(axis=0)
     good = np.flatnonzero(faithful & (2 * enough >= enough.max()) & (enough >= 2))
+    if len(good) == 0:
+        return Anchors(np.zeros((len(points), 0, 2)), np.zeros((len(points), 0), dtype=bool), noise)
     kept = good[farthest_points(placed[:, good], known[:, good], min(count, len(good)))]
     return Anchors(np.where(known[:, kept, None], placed[:, kept], 0.0), known[:, kept], noise)
 
@@ -211,7 +213,7 @@ def _fit_patches(points: Floats, seen: NDArray[np.bool_], patches: Indices) -> t
     middle = _middle(image, known)
     image = np.where(known[..., None], image - middle, 0.0)
     radius = np.linalg.norm(image, axis=3)
-    size = np.median(radius[known])
+    size = float(np.median(radius[known])) or float(radius.max()) or 1.0  # most patches may be copies of one point
     clipped = image * np.minimum(1.0, 3 * size / np.maximum(radius, 1e-12 * max(size, 1e-300)))[..., None]
     stacked = clipped.transpose(0, 1, 3, 2).reshape(len(patches), -1, patches.shape[1])
     right = np.linalg.svd(stacked, full_matrices=False)[2][:, :RANK]
@@ -240,7 +242,7 @@ def _fit_patches(points: Floats, seen: NDArray[np.bool_], patches: Indices) -> t
 def _middle(image: Floats, known: NDArray[np.bool_]) -> Floats:
     """Return the median position of every patch in every frame, `(N, F, 1, 2)`; 0 where nothing is seen."""
     masked = np.where(known[..., None], image, np.nan)
-    found = np.moveaxis(_over_frames(np.moveaxis(masked, 2, 0), 0.5), 0, 0)[:, :, None]
+    found = _over_frames(np.moveaxis(masked, 2, 0), 0.5)[:, :, None]
     return np.where(np.isfinite(found), found, 0.0)
 
 

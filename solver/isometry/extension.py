@@ -58,13 +58,14 @@ def flatten(edges: Indices, lengths: Floats, count: int) -> Floats | None:
     return template / spread if spread > 0 else None
 
 
-def complete_anchors(points: Floats, seen: NDArray[np.bool_], template: Floats) -> Floats:
-    """Return anchors `(F, A, 3)` without gaps.
+def complete_anchors(points: Floats, seen: NDArray[np.bool_], template: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return anchors `(F, A, 3)` without gaps, and the frames `(F,)` that show enough of them.
 
     A hidden anchor is taken from the frame whose seen anchors are most alike after a rigid motion, moved by that motion and by a
-    spline, over the template, of what the motion leaves.
+    spline, over the template, of what the motion leaves. A frame that shows too few anchors has all those of the nearest frame that
+    shows enough.
     """
-    filled = points.copy()
+    filled, enough = points.copy(), np.ones(len(points), dtype=bool)
     for frame in np.flatnonzero(~seen.all(axis=1)):
         missing = ~seen[frame]
         for other in _alike(points, seen, int(frame)):
@@ -76,9 +77,13 @@ def complete_anchors(points: Floats, seen: NDArray[np.bool_], template: Floats) 
                 missing &= ~gained
             if not missing.any():
                 break
-        if missing.any() and (~missing).sum() >= MIN_ANCHORS:
+        enough[frame] = (~missing).sum() >= MIN_ANCHORS
+        if missing.any() and enough[frame]:
             filled[frame, missing] = spline(template[~missing], filled[frame, ~missing], template[missing])
-    return filled
+    usable = np.flatnonzero(enough)
+    for frame in np.flatnonzero(~enough) if len(usable) else ():
+        filled[frame] = filled[usable[np.abs(usable - frame).argmin()]]
+    return filled, enough
 
 
 def extend(

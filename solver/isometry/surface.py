@@ -100,6 +100,9 @@ class IsometricSurface:
     placed: NDArray[np.bool_]
     """Points with a place on the surface, shape `(P,)`."""
 
+    shown: NDArray[np.bool_]
+    """Frames that show enough of the surface, shape `(F,)`; each other one has the shape of the nearest of these."""
+
     focal: float
     """Pixels, given or found."""
 
@@ -150,7 +153,9 @@ def isometric_surface(
     if against is not None or search is None:
         return IsometricVerdict(against or TOO_LITTLE)
     tried = sweep(search, first, diagonal, given=focal is not None)
-    if not tried or search.stopped:
+    if search.stopped:
+        return IsometricVerdict("Stopped before it was known whether the surface is isometric.", _trace(tried))
+    if not tried:
         return IsometricVerdict("No isometric surface was found: the conic program has no solution.", _trace(tried))
     least = min(tried, key=lambda each: each.found.inconsistency)
     clear, why = judged(tried, least)
@@ -214,11 +219,15 @@ def _prepared(
     if (seen.sum(axis=0) >= 2).sum() < FEWEST_ANCHORS:
         return None
     anchors = choose_anchors(points, seen, ANCHORS)
+    if anchors.points.shape[1] < FEWEST_ANCHORS:
+        return None
     edges = nearest_neighbours(anchors)
-    if anchors.points.shape[1] < FEWEST_ANCHORS or len(edges) == 0:
+    if len(edges) == 0:
         return None
     known = connected(anchors.seen, edges)
-    if (known.sum(axis=1) >= FEWEST_ANCHORS).sum() < 2:
+    # The depths of fewer are open, and the lengths of all frames would follow them.
+    known &= known.sum(axis=1, keepdims=True) >= FEWEST_ANCHORS
+    if known.any(axis=1).sum() < 2:
         return None
     frames = unlike_frames(anchors.points, known, SOLVED_FRAMES)
     return FocalSearch(anchors, edges, known, frames, centre, should_stop)
@@ -245,8 +254,6 @@ def _everywhere(search: FocalSearch, tracks: Tracks, seen: NDArray[np.bool_], ch
     found = min(found, chosen.found, key=lambda each: each.inconsistency)
     if len(search.frames) < tracks.num_frames:
         found = refine(whole, _from_similar(whole, search, found.depths), should_stop=search.should_stop)
-    else:
-        found = replace(found, depths=found.depths[np.argsort(search.frames)])
     if not search.stopped:  # the chord of a long edge is shorter than the surface between its ends
         near = replace(
             whole, edges=nearest_neighbours(replace(search.anchors, seen=search.seen), neighbours=LAST_NEIGHBOURS)
@@ -257,15 +264,15 @@ def _everywhere(search: FocalSearch, tracks: Tracks, seen: NDArray[np.bool_], ch
     template = flatten(search.edges, found.lengths, search.seen.shape[1])
     if template is None:
         return None
-    points = complete_anchors(found.depths[..., None] * whole.rays, search.seen, template)
+    points, enough = complete_anchors(found.depths[..., None] * whole.rays, search.seen, template)
     all_of_it: Extended = extend(
         tracks.points, seen, images=search.anchors.points, known=search.seen, anchors=points, template=template,
         focal=chosen.focal, centre=search.centre,
     )  # fmt: skip
-    if not np.isfinite(all_of_it.points).all():
+    if not np.isfinite(all_of_it.points).all() or not enough.any():
         return None
     return IsometricSurface(
-        all_of_it.points, all_of_it.outliers, all_of_it.placed, chosen.focal,
+        all_of_it.points, all_of_it.outliers, all_of_it.placed, enough, chosen.focal,
         (float(search.centre[0]), float(search.centre[1])), found.inconsistency, search.anchors.noise_std,
     )  # fmt: skip
 

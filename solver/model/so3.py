@@ -1,4 +1,4 @@
-"""Mathematics of SO(3), for stacks of rotations: exponential map, its Jacobian, nearest rotation, mean."""
+"""Mathematics of SO(3), for stacks of rotations: exponential map, its Jacobian, logarithm, nearest rotation."""
 
 from __future__ import annotations
 

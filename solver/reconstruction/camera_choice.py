@@ -61,7 +61,8 @@ def described(view: Perspective, unit: float) -> str:
             f"Orthography: the best perspective compared, focal length {unit / abs(best):.4g}, changes the log likelihood per point "
             f"and frame by {nll[0.0] - nll[best]:+.3f}; more than {MIN_PERSPECTIVE_GAIN} is required, and a clear sign of depth."
         )
-    gain = nll[0.0] - min((value for each, value in nll.items() if each != 0), default=nll[0.0])
+    compared = [each for each in nll if each != 0 and (view.given is None or abs(each) == view.given)]
+    gain = nll[0.0] - min((nll[each] for each in compared), default=nll[0.0])
     how = "as given" if view.given is not None else f"± {unit * view.curvature_std / view.curvature**2:.2g}"
     return (
         f"Perspective with focal length {unit / abs(view.curvature):.4g} {how}: gains {gain:.3f} in the log likelihood per point and frame "
@@ -76,7 +77,7 @@ def improbable(view: Perspective, unit: float) -> str | None:
     nll = {each.curvature: each.nll for each in view.candidates}
     own = min((nll[each] for each in (view.given, -view.given) if each in nll), default=np.inf)
     best = min(nll, key=lambda each: nll[each], default=0.0)
-    if not own - nll.get(best, np.inf) > MIN_PERSPECTIVE_GAIN:
+    if not np.isfinite(own) or own - nll.get(best, np.inf) <= MIN_PERSPECTIVE_GAIN:
         return None
     other = "orthography" if best == 0 else f"a focal length of {unit / abs(best):.4g}"
     return (

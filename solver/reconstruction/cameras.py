@@ -196,7 +196,14 @@ def _without_shapes(observations: Observations, monitor: Monitor, rank: int = 0)
     enter(monitor, "completion")
     settings, normalized = observations.settings, observations.normalized
     if observations.known is not None:
-        return given_cameras(normalized, observations.known, settings, rank=rank)
+        return given_cameras(
+            normalized,
+            observations.known,
+            settings,
+            rank=rank,
+            perspective=observations.lens is not None,
+            should_stop=monitor,
+        )
     on_step = None if rank else monitor.report
     return estimation.estimate_cameras(normalized, settings, on_step=on_step, should_stop=monitor, rank=rank)
 

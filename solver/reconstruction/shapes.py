@@ -6,12 +6,11 @@ import time
 from dataclasses import replace
 
 import numpy as np
-from pliant.solver.energy.problem import Problem
 from pliant.solver.monitor import Monitor
 from pliant.solver.reconstruction.camera_choice import with_camera_choice
 from pliant.solver.reconstruction.solution import finish
 from pliant.solver.reconstruction.start import Start
-from pliant.solver.records import Floats, Step
+from pliant.solver.records import Step
 from pliant.solver.shapes.assessment import assessed
 from pliant.solver.shapes.inliers import with_inlier_probability
 from pliant.solver.shapes.irls import init, no_higher, step, terminate
@@ -124,15 +123,13 @@ def _finished(
     monitor()
     solution = with_inlier_probability(solution, tracks, confidence, loss=problem.loss, should_stop=monitor)
     monitor.enter("trust")
+    # Without its weight the prior is not that of the shapes, and says nothing about their errors.
+    covariance = start.covariance if problem.weights.temporal > 0 else None
     solution = assessed(
-        solution, tracks, confidence, estimate, start.covariance, normalized.unit,
+        solution, tracks, confidence, estimate, covariance, normalized.unit,
         turning=observations.turning, seed=start.settings.seed, changes=changes, centred=problem.moving, should_stop=monitor,
     )  # fmt: skip
     return replace(solution, outcome=Outcome.STOPPED) if monitor.stopped else solution
-
-
-def _rows(points: Floats, problem: Problem) -> Floats:
-    return np.ascontiguousarray(points.transpose(0, 2, 1), dtype=problem.points.dtype)
 
 
 def _step_of(stage: str, state: State, start: Start, *, fraction: float = 0.0) -> Step:

@@ -59,7 +59,7 @@ def solve_shapes(
     scratch : path, optional
         Folder for a temporary file that holds the result of blocks, as for `solve`.
     on_step : callable, optional
-        Called after every unit of work.
+        Called as the solve proceeds, as a rule at least every half second.
     should_stop : callable, optional
         Called between units of work; once it returns True, the solve ends with `Outcome.STOPPED` and the last shapes.
 

@@ -54,7 +54,7 @@ def solution_of(
 ) -> Solution:
     """Return the solution of an accepted verdict; `began` is the clock at the start of the solve."""
     unit, seconds = normalize(tracks).unit, {"cameras": time.perf_counter() - began}
-    solution = isometric_solution(tracks, verdict, settings, unit=unit, seconds=seconds)
+    solution = isometric_solution(tracks, verdict, settings, unit=unit, seconds=seconds, stopped=monitor.stopped)
     used = np.where(solution.weights > 0, tracks.visible, 0.0)
     monitor.report(Step("finish", 1.0, max_reweightings=settings.max_reweightings))
     return with_inlier_probability(solution, tracks, used, loss="l2")

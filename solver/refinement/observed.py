@@ -153,6 +153,8 @@ def on_observations(
     should_stop : callable, optional
         Called between units of work; once it returns True, the best so far is returned.
     """
+    if should_stop is not None and should_stop():
+        return found, completed
     moments = _expected(observed, found, completed, start_scales)
     for _ in range(ROUNDS):
         if should_stop is not None and should_stop():

@@ -22,7 +22,13 @@ ALTERNATIONS = 5
 
 
 def isometric_solution(
-    tracks: Tracks, verdict: IsometricVerdict, settings: Settings, *, unit: float, seconds: dict[str, float]
+    tracks: Tracks,
+    verdict: IsometricVerdict,
+    settings: Settings,
+    *,
+    unit: float,
+    seconds: dict[str, float],
+    stopped: bool = False,
 ) -> Solution:
     """Return the solution that an accepted verdict stands for.
 
@@ -38,6 +44,8 @@ def isometric_solution(
         RMS radius of the centred tracks, reported with the choices.
     seconds : dict
         Wall time per stage.
+    stopped : bool
+        Whether the refinement of the surface was cut short.
     """
     surface = verdict.surface
     assert surface is not None
@@ -54,7 +62,7 @@ def isometric_solution(
     trace = Trace(np.array([surface.inconsistency]), np.array([median]), np.zeros(1, dtype=np.int32))
     choices = _choices(verdict, surface, unit, float(surface.outliers.sum() / seen.sum()))
     return Solution(
-        shapes, camera, residual, weights, trace, Outcome.CONVERGED, choices, seconds,
+        shapes, camera, residual, weights, trace, Outcome.STOPPED if stopped else Outcome.CONVERGED, choices, seconds,
         trust=_trust(
             verdict, camera, shapes, residual=median / unit, hidden=float((weights == 0).mean()), ordered=settings.order == "film"
         ),
@@ -130,6 +138,10 @@ def _choices(verdict: IsometricVerdict, surface: IsometricSurface, unit: float, 
         "outliers": f"{outliers:.1%} of what was seen contradicts the surface and was not used.",
     }
     warnings = list(verdict.warnings)
+    if not surface.shown.all():
+        count = int((~surface.shown).sum())
+        few = f"{count} of {len(surface.shown)} frames show too little of the surface"
+        warnings.append(f"{few}; they have the shapes and cameras of the nearest others.")
     if not surface.placed.all():
         share = 1 - float(surface.placed.mean())
         warnings.append(f"{share:.1%} of the points were never seen on the surface; they lie in its middle.")

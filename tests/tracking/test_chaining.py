@@ -72,3 +72,14 @@ def test_points_that_were_hidden_are_seen_again() -> None:
     assert result.visible[3:5, left].mean() < 0.1
     assert result.visible[5:, left].mean() > 0.9
     assert np.percentile(np.linalg.norm(result.points - true, axis=2)[5:, left], 90) < 0.3
+
+
+def test_exact_places_of_the_template_do_not_count_in_the_usual_variance() -> None:
+    visible, variance = np.zeros((4, 10), bool), np.full((4, 10), 0.04, np.float32)
+    visible[0], visible[1:, :3], variance[0] = True, True, 0.0
+    variance[1, 0] = 0.4
+    found = Chain(np.zeros((4, 10, 2), np.float32), visible, variance).confidence
+    assert (found[0] == 1).all()
+    assert found[2, :3] == pytest.approx(1)
+    assert found[1, 0] == pytest.approx(0.1)
+    assert (found[~visible] == 0).all()

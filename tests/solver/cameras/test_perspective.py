@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from pliant.solver import Camera, InvalidInput, InvalidSettings, KnownCamera, Settings, Solution, Tracks, gallery, solve
 from pliant.solver.cameras.lens import given_lens
-from pliant.solver.cameras.perspective import corrected, density, depth_map, depths_of, mirrored
+from pliant.solver.cameras.perspective import Candidate, Perspective, corrected, density, depth_map, depths_of, mirrored
 from pliant.solver.evaluation.metrics import e3d_frame_scaled, focal_error, reprojection
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.model.so3 import exponential
+from pliant.solver.reconstruction.camera_choice import described, improbable
 from pliant.solver.refinement.focal_length import corrected_energy
 from pliant.solver.refinement.learned import Learned, motion_of
 from pliant.solver.shapes import perspective_shapes
@@ -294,3 +295,21 @@ def test_shapes_centred_on_more_points_keep_their_image() -> None:
         given, image, replace(view, curvature=normalized.unit / FOCAL), normalized.unit, kept
     )
     assert found.residuals.max() < 1e-6
+
+
+@pytest.mark.parametrize("given", [{"prior": "smooth"}, {"method": "temporal"}])
+def test_other_priors_take_cameras_that_are_given_whole(given: dict[str, object]) -> None:
+    cameras = KnownCamera.from_arrays(FACE.rotations, np.ones(8), focal=FOCAL, principal_point=(639.5, 359.5))
+    found = solve(pinhole(SEEN, FOCAL), cameras=cameras, settings=Settings(order="film", **given))  # type: ignore[arg-type]
+    assert found.camera.focal == pytest.approx(FOCAL)
+    assert reprojection(pinhole(SEEN, FOCAL), found).rms < 3.0
+
+
+def test_the_gain_of_a_given_focal_length_is_its_own() -> None:
+    candidates = tuple(Candidate(each, nll) for each, nll in ((0.0, 1.0), (0.1, 0.9), (0.2, 0.5), (-0.1, 0.95)))
+    view = Perspective(
+        np.zeros((8, 2)), CENTRE, given=0.1, signs=(1, -1), required=False, curvature=0.1, candidates=candidates
+    )
+    assert "gains 0.100 in" in described(view, 100.0)
+    assert "gains 0.400 in" in str(improbable(view, 100.0))
+    assert improbable(replace(view, candidates=candidates[:1]), 100.0) is None  # stopped before its own was compared

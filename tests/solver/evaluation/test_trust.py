@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pliant.solver import Settings, Tracks, gallery, solve
+from pliant.solver import KnownCamera, Settings, Tracks, gallery, solve
 from pliant.solver.evaluation.metrics import e3d_frame
 from pliant.solver.evaluation.trust import Verdict, assess, per_frame, turned
 from scipy.spatial.transform import Rotation
@@ -155,3 +155,12 @@ def test_noise_and_a_still_camera_give_do_not_use() -> None:
     for found in (noise, solve(Tracks.from_arrays(body), settings=Settings(prior="gaussian"))):
         assert found.trust is not None
         assert found.trust.verdict is Verdict.DO_NOT_USE
+
+
+def test_without_the_weight_of_the_prior_there_is_no_expected_error() -> None:
+    made = gallery.face(8, 60)
+    cameras = KnownCamera.from_arrays(made.rotations, made.scales)
+    found = solve(made.tracks, made.mesh, cameras=cameras, settings=Settings(temporal_weight=0.0))
+    assert found.shapes_std is None
+    assert found.trust is not None
+    assert found.trust.expected_error is None

@@ -1,0 +1,65 @@
+"""Isometric surfaces of which some frames, or all, show little; and solves that are stopped."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pliant.solver import Outcome, Settings, Tracks, gallery, solve
+from pliant.solver.isometry import surface
+from pliant.solver.isometry.extension import complete_anchors
+from rolled_sheets import FOCAL, SIZE, one_scale_error, rolled
+
+GIVEN = Settings(surface="isometric", focal=FOCAL, image_size=SIZE, order="film")
+
+
+@pytest.mark.parametrize("shown", [0, 5])
+def test_a_frame_that_shows_too_little_is_like_its_neighbour_and_leaves_the_others_as_they_are(shown: int) -> None:
+    sheet = rolled(frames=6, side=7)
+    visible = np.ones(sheet.tracks.visible.shape)
+    visible[2, shown:] = 0
+    found = solve(Tracks.from_arrays(sheet.tracks.points, visible), settings=GIVEN)
+    others = [0, 1, 3, 4, 5]
+    assert one_scale_error(found.shapes[others], sheet.points[others]) < 0.03
+    assert 0.5 < np.ptp(found.shapes[2]) / np.ptp(found.shapes[others]) < 1.5
+    assert np.abs(np.log(found.camera.scales)).max() < 0.5
+    assert any(warning.startswith("1 of 6 frames show too little") for warning in found.choices.warnings)
+
+
+def test_without_any_frame_that_shows_enough_nothing_is_filled_in() -> None:
+    points, seen = np.zeros((3, 7, 3)), np.zeros((3, 7), dtype=bool)
+    filled, enough = complete_anchors(points, seen, np.random.default_rng(0).normal(size=(7, 2)))
+    assert not enough.any()
+    assert (filled == points).all()
+
+
+@pytest.mark.parametrize("required", [False, True])
+def test_points_that_are_hardly_seen_together_are_no_sheet(required: bool) -> None:
+    flag, random = gallery.flag(30, 600), np.random.default_rng(0)
+    visible = np.zeros((30, 600))
+    for point in range(600):
+        visible[random.choice(30, 4, replace=False), point] = 1
+    sparse = Tracks.from_arrays(flag.tracks.points, visible)
+    assert surface.isometric_surface(sparse, image_size=SIZE, required=required).reason == surface.TOO_LITTLE
+
+
+def test_copies_of_points_give_finite_noise_and_probabilities() -> None:
+    sheet = rolled(frames=6, side=5)
+    found = solve(Tracks.from_arrays(np.repeat(sheet.tracks.points, 14, axis=1)), settings=GIVEN)
+    assert np.isfinite(found.choices.noise)
+    assert np.isfinite(found.inlier_probability).all()
+
+
+def test_a_stop_while_the_surface_is_refined_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    refining, everywhere = [], surface._everywhere
+    monkeypatch.setattr(surface, "_everywhere", lambda *given: refining.append(True) or everywhere(*given))
+    found = solve(rolled(frames=6, side=7).tracks, settings=GIVEN, should_stop=lambda: bool(refining))
+    assert found.choices.camera == "perspective"
+    assert found.outcome is Outcome.STOPPED
+
+
+def test_a_stop_before_that_says_so() -> None:
+    sheet = rolled(frames=6, side=7)
+    verdict = surface.isometric_surface(
+        sheet.tracks, focal=FOCAL, image_size=SIZE, required=True, should_stop=lambda: True
+    )
+    assert verdict.reason.startswith("Stopped before")
