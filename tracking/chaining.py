@@ -56,10 +56,10 @@ class Chain:
     def confidence(self) -> Floats:
         """Median variance of the visible places over a place's own, at most 1; 0 where hidden, shape `(F, P)`.
 
-        The template's places are exact and do not count in the median.
+        Places in the template are exact. Where most visible places are in it, the median is that of the others.
         """
-        found = self.variance[self.visible & (self.variance > 0)]
-        usual = max(float(np.median(found)) if found.size else 0.0, float(np.finfo(np.float32).tiny))
+        found = self.variance[self.visible]
+        usual = float(np.median(found)) or float(np.median(found[found > 0])) if (found > 0).any() else 1.0
         return np.where(self.visible, usual / np.maximum(self.variance, usual), 0).astype(np.float32)
 
 

@@ -74,7 +74,7 @@ def test_points_that_were_hidden_are_seen_again() -> None:
     assert np.percentile(np.linalg.norm(result.points - true, axis=2)[5:, left], 90) < 0.3
 
 
-def test_exact_places_of_the_template_do_not_count_in_the_usual_variance() -> None:
+def test_places_outside_the_template_keep_their_confidence_where_most_are_in_it() -> None:
     visible, variance = np.zeros((4, 10), bool), np.full((4, 10), 0.04, np.float32)
     visible[0], visible[1:, :3], variance[0] = True, True, 0.0
     variance[1, 0] = 0.4
