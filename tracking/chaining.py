@@ -59,7 +59,10 @@ class Chain:
         Places in the template are exact. Where most visible places are in it, the median is that of the others.
         """
         found = self.variance[self.visible]
-        usual = float(np.median(found)) or float(np.median(found[found > 0])) if (found > 0).any() else 1.0
+        elsewhere = found[found > 0]
+        if elsewhere.size == 0:
+            return self.visible.astype(np.float32)
+        usual = float(np.median(found)) or float(np.median(elsewhere))
         return np.where(self.visible, usual / np.maximum(self.variance, usual), 0).astype(np.float32)
 
 

@@ -83,3 +83,5 @@ def test_places_outside_the_template_keep_their_confidence_where_most_are_in_it(
     assert found[2, :3] == pytest.approx(1)
     assert found[1, 0] == pytest.approx(0.1)
     assert (found[~visible] == 0).all()
+    exact = Chain(np.zeros((4, 10, 2), np.float32), visible, np.zeros((4, 10), np.float32)).confidence
+    assert (exact == visible).all()
