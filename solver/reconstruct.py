@@ -71,7 +71,7 @@ def solve(
         The folder `scratch` is missing, cannot be written to, or has too little space.
     """
     settings = settings if settings is not None else Settings()
-    check_fit(tracks, mesh, cameras)
+    check_fit(tracks, mesh, cameras, settings)
     settings, why = resolved_order(tracks, settings)
     sheet = tries_isometry(cameras, settings)
     monitor = monitored(tracks, cameras, settings, on_step, should_stop, sheet=sheet)

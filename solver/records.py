@@ -126,7 +126,7 @@ class Camera:
     """φ, focal length, the tracks' unit; None: orthographic."""
 
     focal_std: float | None = None
-    """Standard deviation of an estimated φ; 0 for a given one, None for orthographic cameras."""
+    """Standard deviation of an estimated φ; 0 for a given one, None for orthographic cameras and where an isometric surface gave φ."""
 
     principal_point: Floats = field(default_factory=lambda: np.zeros(2))
     """c, shape `(2,)`, the tracks' unit; without effect for orthographic cameras."""

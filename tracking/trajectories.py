@@ -30,22 +30,28 @@ FRAMES_AHEAD = 8
 """Frames whose registration waits or runs: two for each of the default's four threads at most."""
 
 
-def move_to_expected(chained: Chain) -> None:
+def move_to_expected(chained: Chain, should_stop: Callable[[], bool]) -> None:
     """Put all points where their paths in a space of few dimensions lead, fitted to their places weighted by confidence.
 
     The space is fitted to a sample of the points. The number of its dimensions is the one that predicts held-out places best.
+
+    Raises
+    ------
+    TrackingStopped
+        `should_stop` returned True; some points may have been moved.
     """
     weight, random = chained.confidence, np.random.default_rng(0)
     chosen = choose_points(weight, random)
     sample = normalize(Tracks.from_arrays(chained.points[:, chosen], weight[:, chosen]))
-    basis, spread, scale = fit_basis(sample.points, np.asarray(sample.visible), random)
+    basis, spread, scale = fit_basis(sample.points, np.asarray(sample.visible), random, should_stop=should_stop)
     centre = sample.centroid[:, None]
     for start in range(0, weight.shape[1], POINTS_AT_ONCE):
+        if should_stop():
+            raise TrackingStopped
         part = slice(start, start + POINTS_AT_ONCE)
         points = (chained.points[:, part] - centre) / sample.unit
-        coefficients, _ = coefficients_of(
-            points, weight[:, part].astype(np.float64), basis, spread, scale, sweeps=4, with_moment=False
-        )
+        relative = weight[:, part].astype(np.float64) / sample.full_confidence
+        coefficients, _ = coefficients_of(points, relative, basis, spread, scale, sweeps=4, with_moment=False)
         chained.points[:, part] = predict(basis, coefficients) * sample.unit + centre
 
 
@@ -72,9 +78,7 @@ def track_again(
     TrackingStopped
         `should_stop` returned True.
     """
-    if should_stop():
-        raise TrackingStopped
-    move_to_expected(chained)
+    move_to_expected(chained, should_stop)
     chained.points[template] = appearance.points
 
     def again(t: int) -> tuple[Floats, Bools, Floats]:

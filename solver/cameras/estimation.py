@@ -46,6 +46,20 @@ rotate: 1.8 for a horse seen from its short side, 144 for false cameras of faces
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class OtherCameras:
+    """Rotations that may be more probable than those of the estimate once the shapes are known."""
+
+    basis_size: int
+    """K of the factorization."""
+
+    rotations: Floats
+    """Shape `(F, 3, 3)`."""
+
+    description: str
+    """What distinguishes them, in a few words."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class CameraEstimate:
     """The cameras and how they were found."""
 
@@ -68,8 +82,8 @@ class CameraEstimate:
     """Some points of the completed tracks, centred, shape `(F, S, 2)`, normalized units; empty where it is not
     needed."""
 
-    hypotheses: tuple[tuple[int, Floats], ...] = ()
-    """K and rotations `(F, 3, 3)` that are about as probable: of factorizations, not refined, or of a sheet with other pose signs."""
+    hypotheses: tuple[OtherCameras, ...] = ()
+    """About as probable: of factorizations, not refined, or of a sheet with other pose signs."""
 
     outliers: float = 0.0
     """Share of the visible entries that completion replaced as gross outliers."""
@@ -93,8 +107,8 @@ class CameraEstimate:
     warnings: tuple[str, ...] = ()
     """Reasons to distrust the result."""
 
-    candidates: tuple[tuple[int, Floats], ...] = ()
-    """K and rotations `(F, 3, 3)` of all candidates of the multistart, which refinement with the shapes may rank otherwise."""
+    candidates: tuple[OtherCameras, ...] = ()
+    """All candidates of the multistart, which refinement with the shapes may rank otherwise."""
 
     depth_is_typical: bool = False
     """Whether the extent of depth rests on its prior and not on the tracks (`refinement.bas_relief`)."""
@@ -137,9 +151,9 @@ def estimate_cameras(
     best, ran = min(entries, key=lambda candidate: candidate.energy), entries
     if settings.refine_rotations:
         best, ran = run_multistart(part, entries, ordered=ordered, should_stop=should_stop)
-    own = next(each for each in factorized if each.basis_size == best.basis_size)
+    own = {each.basis_size: each.rotations for each in factorized}
     report(Step("cameras", 0.8 * PROGRESS_SHARE))
-    rotations, refined = _everywhere(own.rotations, best, used, settings)
+    rotations, refined = _everywhere(own[best.basis_size], best, used, settings)
     alternative = None
     if planar := settings.refine_rotations and is_planar(gram):
         rotations, alternative, sides = resolve_pose_signs(gram, rotations, ordered=ordered, should_stop=should_stop)
@@ -147,8 +161,11 @@ def estimate_cameras(
     compared = ran if settings.refine_rotations and not planar else []
     hypotheses = _hypotheses(factorized, compared, part, used)
     if alternative is not None:
-        hypotheses = ((best.basis_size, alternative),)
-    candidates = tuple((each.basis_size, _everywhere(own.rotations, each, used, settings)[0]) for each in compared)
+        hypotheses = (OtherCameras(best.basis_size, alternative, "reversed poses of some frames"),)
+    candidates = tuple(
+        _from_factorization(each.basis_size, _everywhere(own[each.basis_size], each, used, settings)[0])
+        for each in compared
+    )
     read_only(rotations)
     read_only(scales)
     report(Step("cameras", PROGRESS_SHARE))
@@ -187,27 +204,29 @@ def _factorized(
     return factorized, entries
 
 
-def restarted(estimate: CameraEstimate, size: int, rotations: Floats) -> CameraEstimate:
-    """Return the estimate with other rotations, which come from the factorization with K = `size`."""
+def restarted(estimate: CameraEstimate, other: OtherCameras) -> CameraEstimate:
+    """Return the estimate with other rotations."""
     known = estimate.reasons.get("basis_size", "")
-    why = f"{known} With the shapes, other rotations, from K = {size}, lead to more probable motion."
+    why = f"{known} With the shapes, {other.description} lead to more probable motion."
     return replace(
         estimate,
-        rotations=rotations,
-        basis_size=size,
+        rotations=other.rotations,
+        basis_size=other.basis_size,
         reasons={**estimate.reasons, "basis_size": why.strip()},
-        warnings=_warnings(rotations),
+        warnings=_warnings(other.rotations),
     )
 
 
-def _hypotheses(
-    factorized: list[Upgrade], ran: list[Candidate], gram: Floats, used: slice
-) -> tuple[tuple[int, Floats], ...]:
-    """Return K and rotations of factorizations that reached nearly the lowest energy in the first round and are not too deep."""
+def _from_factorization(size: int, rotations: Floats) -> OtherCameras:
+    return OtherCameras(size, rotations, f"other rotations, from K = {size},")
+
+
+def _hypotheses(factorized: list[Upgrade], ran: list[Candidate], gram: Floats, used: slice) -> tuple[OtherCameras, ...]:
+    """Return the cameras of factorizations that reached nearly the lowest energy in the first round and are not too deep."""
     lowest = min((candidate.energy for candidate in ran), default=np.inf)
     near = {each.basis_size for each in ran if not each.smooth_start and each.energy <= lowest + MAX_HYPOTHESIS_GAP}
     return tuple(
-        (each.basis_size, each.rotations)
+        _from_factorization(each.basis_size, each.rotations)
         for each in factorized
         if each.basis_size in near and depth(gram, each.rotations[used]) < MAX_START_DEPTH_VARIANCE
     )

@@ -20,6 +20,9 @@ faces (true scales are constant). The last two cannot be separated; above both, 
 RIGID_ENOUGH = 0.01
 """Maximum residual of the scaled rigid shape, relative to the variance of the tracks, for scales to be adopted."""
 
+ALTERNATIONS = 30
+"""Alternations of rigid shape and scales."""
+
 WIDEST = 0.3
 """Maximum standard deviation of the logarithm of the scales for them to be adopted."""
 
@@ -52,11 +55,11 @@ def _unexplained(gram: Floats, rotations: Floats, scales: Floats) -> float:
     return float(np.trace(gram) - np.trace(basis.T @ gram @ basis))
 
 
-def rigid_scales(gram: Floats, rotations: Floats, *, rounds: int = 30) -> Floats:
+def rigid_scales(gram: Floats, rotations: Floats) -> Floats:
     """Return the scales with which one rigid shape explains the tracks best, given the rotations; mean logarithm 0."""
     frames = len(rotations)
     scales = np.ones(frames)
-    for _ in range(rounds):
+    for _ in range(ALTERNATIONS):
         rows = (rotations[:, :2] * scales[:, None, None]).reshape(2 * frames, 3)
         pseudo = np.linalg.pinv(rows)
         shape_gram, cross = pseudo @ gram @ pseudo.T, (gram @ pseudo.T).reshape(frames, 2, 3)

@@ -27,7 +27,7 @@ def disagreement(search: FocalSearch, chosen: Tried) -> float:
     found: list[float] = []
     for half in (frames[::2], frames[1::2]):
         graph = search.graph(chosen.focal, half)
-        depths = maximum_depth(graph) if len(half) >= 2 else None
+        depths = maximum_depth(graph, should_stop=search.should_stop) if len(half) >= 2 else None
         if depths is None:
             return np.inf
         found.append(unlike(refine(graph, depths, should_stop=search.should_stop).lengths, chosen.found.lengths))

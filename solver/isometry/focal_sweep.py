@@ -144,7 +144,7 @@ def tried_at(search: FocalSearch, focal: float, near: Tried | None) -> Tried | N
     """Return the isometry at a focal length, from a neighbouring one's depths or from the conic program."""
     graph = search.graph(focal, search.frames)
     if near is None:
-        depths = maximum_depth(graph)
+        depths = maximum_depth(graph, should_stop=search.should_stop)
     else:
         depths = _carried(near.found.depths, graph.seen, focal / near.focal)
     return Tried(focal, refine(graph, depths, should_stop=search.should_stop)) if depths is not None else None

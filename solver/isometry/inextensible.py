@@ -1,7 +1,7 @@
 """Depths of an inextensible surface seen by pinhole cameras: the maximum-depth heuristic as one convex problem.
 
 Chhatkuli, Pizarro, Collins and Bartoli, "Inextensible non-rigid structure-from-motion by second-order cone programming"
-(TPAMI 2018): with viewing rays r_fi and depths z_fi, maximise Σ z_fi subject to
+(TPAMI 2018): with viewing rays r_fi and depths z_fi, maximise Σ g_f z_fi subject to
 
     ‖z_fi r_fi − z_fj r_fj‖ ≤ d_ij   for neighbours i, j seen together in frame f,    Σ d_ij = 1,    z ≥ 0.
 
@@ -11,6 +11,7 @@ nor a template is needed. A hidden observation has no variable and no cone. The 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -54,19 +55,29 @@ class SurfaceGraph:
         return number[frame, self.edges[edge, 0]], number[frame, self.edges[edge, 1]]
 
 
-def maximum_depth(graph: SurfaceGraph, *, seconds: float = 60.0) -> Floats | None:
+def maximum_depth(graph: SurfaceGraph, *, should_stop: Callable[[], bool] | None = None) -> Floats | None:
     """Return depths `(F, A)` of the deepest inextensible surface, 0 where hidden; the unit makes Σ d_ij = 1.
 
-    None if no two neighbours are seen together, or if Clarabel finds no solution within `seconds`.
+    None if no two neighbours are seen together, if Clarabel finds no solution, or once `should_stop` returns True between its steps.
     """
     if len(graph.pairs[0]) == 0:
         return None
-    found = _solved(*_program(graph), observations=int(graph.seen.sum()), cones=len(graph.pairs[0]), seconds=seconds)
+    found = _solved(*_program(graph), gain=_gain(graph), cones=len(graph.pairs[0]), should_stop=should_stop)
     if found is None:
         return None
     depths = np.zeros(graph.seen.shape)
     depths[graph.seen] = np.maximum(found, 0.0)
     return depths if bool((found > 0).any()) else None
+
+
+def _gain(graph: SurfaceGraph) -> Floats:
+    """Return the weight of every seen depth in the sum, shape `(O,)`: the frame's pairs per observation, relative to the most.
+
+    A frame of few pairs reaches large depths when their few lengths take all of Σ d; with equal weights it would, and the others collapse.
+    """
+    counts = graph.seen.sum(axis=1)
+    ratio = np.bincount(graph.pairs[0], minlength=len(counts)) / np.maximum(counts, 1)
+    return np.repeat(ratio / ratio.max(), counts)
 
 
 def _program(graph: SurfaceGraph) -> tuple[sparse.csc_matrix, Floats]:
@@ -90,20 +101,22 @@ def _program(graph: SurfaceGraph) -> tuple[sparse.csc_matrix, Floats]:
 
 
 def _solved(
-    matrix: sparse.csc_matrix, bound: Floats, *, observations: int, cones: int, seconds: float
+    matrix: sparse.csc_matrix, bound: Floats, *, gain: Floats, cones: int, should_stop: Callable[[], bool] | None
 ) -> Floats | None:
     """Return the depths of the seen observations."""
     import clarabel  # only sequences that look like a sheet need it
 
-    variables = matrix.shape[1]
+    variables, observations = matrix.shape[1], len(gain)
     cost = np.zeros(variables)
-    cost[:observations] = -1.0
+    cost[:observations] = -gain
     kinds = [clarabel.ZeroConeT(1), clarabel.NonnegativeConeT(observations), *[clarabel.SecondOrderConeT(4)] * cones]
     options = clarabel.DefaultSettings()
     options.verbose = False
     options.max_threads = 1
-    options.time_limit = seconds
     options.tol_gap_rel = options.tol_gap_abs = options.tol_feas = ACCURACY
     nothing = sparse.csc_matrix((variables, variables))
-    solved = clarabel.DefaultSolver(nothing, cost, matrix, bound, kinds, options).solve()
+    solver = clarabel.DefaultSolver(nothing, cost, matrix, bound, kinds, options)
+    if should_stop is not None:
+        solver.set_termination_callback(lambda _: should_stop())
+    solved = solver.solve()
     return np.asarray(solved.x)[:observations] if str(solved.status) in SOLVED else None

@@ -241,7 +241,7 @@ def _glance(search: FocalSearch, focal: float) -> float:
     used = search.frames[:frames]
     rays = search.graph(focal, used).rays[:, :some]
     graph = SurfaceGraph(rays, connected(part.seen, edges)[used], edges)
-    depths = maximum_depth(graph)
+    depths = maximum_depth(graph, should_stop=search.should_stop)
     return refine(graph, depths, iterations=10).inconsistency if depths is not None else float("inf")
 
 
@@ -249,7 +249,7 @@ def _everywhere(search: FocalSearch, tracks: Tracks, seen: NDArray[np.bool_], ch
     """Return the surface of all frames and points, from the anchors of some frames at the chosen focal length."""
     part = search.graph(chosen.focal, search.frames)
     whole = search.graph(chosen.focal)
-    afresh = maximum_depth(part)
+    afresh = maximum_depth(part, should_stop=search.should_stop)
     found = chosen.found if afresh is None else refine(part, afresh, should_stop=search.should_stop)
     found = min(found, chosen.found, key=lambda each: each.inconsistency)
     if len(search.frames) < tracks.num_frames:

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.solver.errors import InvalidSettings
 from pliant.solver.mesh import Mesh
 from pliant.solver.operators.aggregation import Level, build_levels
 from pliant.solver.records import Floats, Ints
@@ -72,19 +71,9 @@ def build_laplacian(
         A typical shape, any unit; required for `cotangent` only.
     seed : int
         Of the coarser levels, which speed up the minimisation.
-
-    Raises
-    ------
-    InvalidSettings
-        `grid8` without a grid.
     """
     if mesh is None or (len(mesh.faces) == 0 and mesh.grid is None):
         return None
-    if kind == "grid8" and mesh.grid is None:
-        raise InvalidSettings(
-            "invalid_option", field="options.laplacian", expected="a mesh that is a pixel grid", got="faces only",
-            hint="Use laplacian auto, uniform or cotangent, or give the points as a grid.",
-        )  # fmt: skip
     if mesh.grid is not None and kind in ("auto", "grid8"):
         matrix, name = _grid_matrix(mesh.grid, mesh.num_points), "grid8"
     elif kind == "cotangent" and reference is not None:
@@ -165,7 +154,7 @@ def _boundary(mesh: Mesh) -> NDArray[np.intp]:
 
 
 def _cotangent_weights(mesh: Mesh, reference: Floats) -> Floats:
-    """Return (cot α + cot β)/2 of each edge of `mesh.edges` on the reference shape, at least 1 % of the typical weight.
+    """Return (cot α + cot β)/2 of each edge of `mesh.edges` on the reference shape, from 1 % to 100 times the typical weight.
 
     Quads are split along both diagonals with half weight each; the diagonals themselves get no weight.
     """

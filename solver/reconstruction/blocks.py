@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.solver.evaluation.trust import Trust, Verdict, assess
+from pliant.solver.evaluation.trust import Trust
 from pliant.solver.limits import BLOCK_OBSERVATIONS
 from pliant.solver.mesh import Mesh
 from pliant.solver.monitor import Monitor
@@ -24,9 +24,17 @@ from pliant.solver.reconstruction.cameras import Cameras
 from pliant.solver.reconstruction.observations import monitored
 from pliant.solver.reconstruction.prior import Prior, estimate_with
 from pliant.solver.reconstruction.shapes import shapes_from
-from pliant.solver.reconstruction.start import Start, prepared, warm, with_outlier_reason, with_outliers_rejected
-from pliant.solver.records import Floats, Ints, Step, Tracks, read_only
+from pliant.solver.reconstruction.start import (
+    Start,
+    outlier_reason,
+    prepared,
+    warm,
+    with_outlier_reason,
+    with_outliers_rejected,
+)
+from pliant.solver.records import Choices, Floats, Ints, Step, Tracks, read_only
 from pliant.solver.settings import Settings
+from pliant.solver.shapes.assessment import judged
 from pliant.solver.shapes.jackknife import Changes, learning_changes
 from pliant.solver.shapes.sparsely_observed import mesh_of
 from pliant.solver.solution import Outcome, Solution, Trace
@@ -39,6 +47,9 @@ and .0010 of its size (RMS) with 2, 4, 8 and 16 rings, with the smooth prior by 
 
 JUDGED_POINTS = 20_000
 """Points, evenly spread, by which the whole result is judged."""
+
+CHOSEN_BY_BLOCK = ("temporal_weight", "spatial_weight", "robust_scale", "noise")
+"""Choices that follow from the points of a block, unless cameras and learned prior determine them."""
 
 START_SHARE = 0.07
 """Share of the time that the starts take from which the weight of bending is computed; measured on 50 × 200,000."""
@@ -63,7 +74,7 @@ def shapes_in_blocks(
     scratch: str | Path | None = None,
 ) -> Solution:
     """Return the solution of all points; `seconds` are those of the stages so far, `start` and `scratch` as for `solve_shapes`."""
-    began, whole = time.perf_counter(), _Whole(tracks, scratch)
+    began, whole = time.perf_counter(), _Whole(tracks, cameras, prior, scratch)
     groups = blocks(tracks, -(-tracks.num_frames * tracks.num_points // BLOCK_OBSERVATIONS))
     edges = np.zeros((0, 2), dtype=np.int32) if mesh is None else mesh.edges
     pulse()
@@ -199,11 +210,12 @@ def _monitor_of(part: Tracks, settings: Settings, monitor: Monitor, number: int,
 class _Whole:
     """The result, filled block by block."""
 
-    def __init__(self, tracks: Tracks, scratch: str | Path | None) -> None:
+    def __init__(self, tracks: Tracks, cameras: Cameras, prior: Prior | None, scratch: str | Path | None) -> None:
         frames, points = tracks.num_frames, tracks.num_points
-        self._tracks, self._scratch = tracks, scratch
+        self._tracks, self._cameras, self._prior, self._scratch = tracks, cameras, prior, scratch
         self._shapes = allocated((frames, points, 3), scratch)
         self._others: dict[str, Floats] = {}
+        self._seen = self._rejected = 0
         self._parts: list[Solution] = []
 
     def add(self, solution: Solution, own: NDArray[np.intp], places: NDArray[np.intp]) -> None:
@@ -215,6 +227,10 @@ class _Whole:
                 if name not in self._others:
                     self._others[name] = allocated(self._shapes.shape[:2], self._scratch)
                 _copy(array, places, onto=self._others[name], own=own)
+        if solution.inlier_probability is not None:
+            own_probability = solution.inlier_probability[:, places]
+            self._rejected += int(np.count_nonzero(own_probability == 0))
+            self._seen += int(np.count_nonzero(np.isfinite(own_probability)))
         let_go(self._shapes, *self._others.values(), self._tracks.points, self._tracks.visible)
         none = np.zeros((0, 0))
         self._parts.append(
@@ -248,24 +264,38 @@ class _Whole:
             first, shapes=self._shapes, camera=camera, seconds=seconds, trace=_summed([part.trace for part in self._parts]),
             outcome=next(each for each in order if each in found), **self._others,  # type: ignore[arg-type]
         )  # fmt: skip
-        return replace(solution, trust=self._judged(solution, first.trust))
+        return replace(solution, choices=self._choices(), trust=self._judged(solution))
 
-    def _judged(self, solution: Solution, example: Trust | None) -> Trust | None:
-        if example is None:
-            return None
+    def _choices(self) -> Choices:
+        """Return the choices, with medians of those that every block makes for itself, and all warnings."""
+        every = [part.choices for part in self._parts]
+        values = {name: float(np.median([getattr(each, name) for each in every])) for name in CHOSEN_BY_BLOCK}
+        reasons = dict(every[0].reasons)
+        if "outliers" in reasons:
+            reasons["outliers"] = outlier_reason(self._rejected, self._seen, self._cameras.outliers)
+        if len({each.temporal_weight for each in every}) > 1:
+            reasons["weights"] = f"Medians of {len(every)} blocks of points. The first: {reasons['weights']}"
+        warnings = tuple(dict.fromkeys(warning for each in every for warning in each.warnings))
+        return replace(every[0], reasons=reasons, warnings=warnings, **values)  # type: ignore[arg-type]
+
+    def _judged(self, solution: Solution) -> Trust:
+        """Return the verdict on all points, by `JUDGED_POINTS` of them."""
         some = slice(None, None, -(-self._tracks.num_points // JUDGED_POINTS))
-        std, weights = solution.shapes_std, self._tracks.visible[:, some]
-        parts = [part.trust for part in self._parts if part.trust is not None]
-        held_out = [trust.held_out_error for trust in parts if trust.held_out_error is not None]
-        judged = assess(
-            solution.shapes[:, some], solution.camera.rotations, solution.residuals[:, some], weights,
-            scales=solution.camera.scales, shapes_std=None if std is None else std[:, some],
-            held_out_error=float(np.median(held_out)) if held_out else None, ordered=example.degrees_per_frame is not None,
+        prior, std = self._prior, solution.shapes_std
+        held_out = [part.trust.held_out_error for part in self._parts if part.trust is not None]
+        left_out = [error for error in held_out if error is not None]
+        tracks = Tracks.from_arrays(self._tracks.points[:, some], self._tracks.visible[:, some])
+        confidence = tracks.visible
+        if solution.inlier_probability is not None:
+            confidence = np.where(solution.inlier_probability[:, some] > 0, confidence, 0.0)  # 0 where rejected
+        few = replace(
+            solution, shapes=solution.shapes[:, some], residuals=solution.residuals[:, some],
+            shapes_std=None if std is None else std[:, some],
         )  # fmt: skip
-        reasons = dict.fromkeys(each for trust in (judged, *parts) for each in trust.reasons)
-        worst = max((trust.verdict for trust in (judged, *parts)), key=list(Verdict).index)
-        interval = None if any(trust.interval is None for trust in parts) else judged.interval
-        return replace(judged, verdict=worst, reasons=tuple(reasons), interval=interval)
+        return judged(
+            few, tracks, confidence, self._cameras.estimate if prior is None else estimate_with(self._cameras, prior),
+            None if prior is None else prior.normalized, held_out_error=float(np.median(left_out)) if left_out else None,
+        )  # fmt: skip
 
 
 def _summed(traces: list[Trace]) -> Trace:

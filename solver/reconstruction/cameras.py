@@ -103,7 +103,7 @@ def estimate_cameras(
         Settings and tracks contradict each other.
     """
     settings = settings if settings is not None else Settings()
-    check_fit(tracks, None, known)
+    check_fit(tracks, None, known, settings)
     settings, _ = resolved_order(tracks, settings)
     observations = observe(tracks, known, settings)
     monitor = monitored(tracks, known, settings, on_step, should_stop, only=STAGES)

@@ -87,7 +87,6 @@ def _views(observations: Observations, estimate: CameraEstimate, chosen: NDArray
     normalized, view = observations.normalized, estimate.perspective
     points = normalized.points[:, chosen].transpose(0, 2, 1)
     weight = normalized.visible[:, chosen]
-    weight = weight / max(float(weight.max()), np.finfo(float).tiny)
     if view is None or not view.bends or observations.lens is None:
         return Views(np.ascontiguousarray(points), weight)
     return Views(points + observations.lens.offsets[:, :, None], weight, view.curvature)

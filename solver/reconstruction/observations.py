@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 from pliant.solver.cameras.lens import given_lens
 from pliant.solver.cameras.perspective import Perspective
 from pliant.solver.descent import Descent
-from pliant.solver.errors import InvalidInput
+from pliant.solver.errors import InvalidInput, InvalidSettings
 from pliant.solver.limits import frame_chunks
 from pliant.solver.mesh import Mesh
 from pliant.solver.monitor import Monitor
 from pliant.solver.records import KnownCamera, Step, Tracks
 from pliant.solver.settings import Settings
 from pliant.solver.stages import iteration_seconds, planned, unseen_frames
-from pliant.solver.tracks.normalization import Normalized, normalize
+from pliant.solver.tracks.normalization import Normalized, normalize, relative
 
 OnStep = Callable[[Step], None]
 ShouldStop = Callable[[], bool]
@@ -101,7 +101,7 @@ def in_units_of(normalized: Normalized, tracks: Tracks) -> Normalized:
     for some in frame_chunks(tracks.num_frames, tracks.num_points):
         placed = (tracks.points[some] - normalized.centroid[some, None]) / normalized.unit
         points[some] = np.where(tracks.visible[some, :, None] > 0, placed, 0.0)
-    return replace(normalized, points=points, visible=tracks.visible)
+    return replace(normalized, points=points, visible=relative(tracks.visible, normalized.full_confidence))
 
 
 def observe(tracks: Tracks, known: KnownCamera | None, settings: Settings) -> Observations:
@@ -116,18 +116,25 @@ def observe(tracks: Tracks, known: KnownCamera | None, settings: Settings) -> Ob
     return Observations(tracks, normalized, settings, given_lens(tracks, normalized, settings, known), known)
 
 
-def check_fit(tracks: Tracks, mesh: Mesh | None, cameras: KnownCamera | None) -> None:
-    """Check that mesh and given cameras fit the tracks.
+def check_fit(tracks: Tracks, mesh: Mesh | None, cameras: KnownCamera | None, settings: Settings) -> None:
+    """Check that mesh and given cameras fit the tracks, and the settings the mesh.
 
     Raises
     ------
     InvalidInput
         Codes mesh_mismatch and camera_mismatch.
+    InvalidSettings
+        `laplacian="grid8"` with faces only.
     """
     if mesh is not None and mesh.num_points != tracks.num_points:
         raise InvalidInput(
             "mesh_mismatch", field="mesh", expected=f"{tracks.num_points} vertices, one for each point of the tracks",
             got=f"{mesh.num_points}", hint="Vertex i of the mesh must be point i of the tracks.",
+        )  # fmt: skip
+    if mesh is not None and settings.laplacian == "grid8" and mesh.grid is None and len(mesh.faces) > 0:
+        raise InvalidSettings(
+            "invalid_option", field="options.laplacian", expected="a mesh that is a pixel grid", got="faces only",
+            hint="Use laplacian auto, uniform or cotangent, or give the points as a grid.",
         )  # fmt: skip
     if cameras is not None and len(cameras.rotations) != tracks.num_frames:
         raise InvalidInput(

@@ -121,7 +121,9 @@ def _finished(
         solution = seen_in_perspective(solution, tracks, estimate.perspective, normalized.unit, start.kept)
     confidence = np.asarray(problem.confidence, dtype=np.float64)
     monitor()
-    solution = with_inlier_probability(solution, tracks, confidence, loss=problem.loss, should_stop=monitor)
+    solution = with_inlier_probability(
+        solution, tracks, confidence, full_confidence=normalized.full_confidence, loss=problem.loss, should_stop=monitor
+    )
     monitor.enter("trust")
     # Without its weight the prior is not that of the shapes, and says nothing about their errors.
     covariance = start.covariance if problem.weights.temporal > 0 else None

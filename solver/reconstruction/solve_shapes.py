@@ -75,12 +75,12 @@ def solve_shapes(
         The folder `scratch` is missing, cannot be written to, or has too little space.
     """
     began = time.perf_counter()
-    check_fit(tracks, mesh, None)
     observations = cameras.observations.of(tracks)
     first = None if start is None else np.asarray(start.shapes if isinstance(start, Solution) else start, dtype=float)
     if first is not None:
         check_shapes(first, tracks)
     settings = settings if settings is not None else observations.settings
+    check_fit(tracks, mesh, None, settings)
     settings = without_learned_prior(settings) if prior is None else settings
     monitor = monitored(tracks, None, settings, on_step, should_stop, only=("shapes", "finish", "trust"))
     with pulses_to(monitor.pulse):
@@ -88,7 +88,8 @@ def solve_shapes(
             return shapes_in_blocks(
                 tracks, cameras, prior, mesh, settings, monitor, seconds={}, start=first, scratch=scratch
             )
-        begun = with_outlier_reason(with_outliers_rejected(prepared(tracks, cameras, prior, mesh, settings), monitor))
+        begun = prepared(tracks, cameras, prior, mesh, settings, should_stop=monitor)
+        begun = with_outlier_reason(with_outliers_rejected(begun, monitor))
         if first is not None:
             begun = warm(begun, first)
         seconds, starts = {"initialise": time.perf_counter() - began}, [begun]

@@ -98,9 +98,10 @@ def find_outliers(
     ndarray of bool, shape (F, P)
         All False where the share of outliers that the cameras were estimated with, `cameras.outliers`, is 0.5 % or less.
     """
-    start = prepared(tracks, cameras, prior, mesh, settings)
-    monitor = monitored(tracks, None, start.settings, on_step, should_stop, only=("shapes",))
+    used = cameras.observations.settings if settings is None else settings
+    monitor = monitored(tracks, None, used, on_step, should_stop, only=("shapes",))
     with pulses_to(monitor.pulse):
+        start = prepared(tracks, cameras, prior, mesh, settings, should_stop=monitor)
         found = with_outliers_rejected(start, monitor).rejected()
     monitor.report(Step("finish", 1.0))
     return found
@@ -128,9 +129,9 @@ def prepared(
     InvalidSettings
         A learned prior beside settings of another one.
     """
-    check_fit(tracks, mesh, None)
     observations = cameras.observations.of(tracks)
     settings = observations.settings if settings is None else settings
+    check_fit(tracks, mesh, None, settings)
     if prior is None:
         estimate, covariance = cameras.estimate, None
         settings = without_learned_prior(settings)
@@ -250,6 +251,11 @@ def with_outlier_reason(start: Start) -> Start:
     outliers = start.outliers
     if start.covariance is None or start.problem.weights.temporal == 0 or outliers <= OUTLIER_SHARE:
         return start
-    share = 1 - np.count_nonzero(start.confidence()) / np.count_nonzero(start.observations.tracks.visible)
-    reason = f"{share:.1%} of the visible observations are rejected as gross outliers; {outliers:.1%} were expected."
+    seen = int(np.count_nonzero(start.observations.tracks.visible))
+    reason = outlier_reason(seen - int(np.count_nonzero(start.confidence())), seen, outliers)
     return replace(start, choices=replace(start.choices, reasons={**start.choices.reasons, "outliers": reason}))
+
+
+def outlier_reason(rejected: int, seen: int, expected: float) -> str:
+    """Return a sentence about the number of rejected observations, of those seen, and the expected share."""
+    return f"{rejected / seen:.1%} of the visible observations are rejected as gross outliers; {expected:.1%} were expected."

@@ -53,11 +53,13 @@ def solution_of(
     tracks: Tracks, verdict: IsometricVerdict, settings: Settings, monitor: Monitor, *, began: float
 ) -> Solution:
     """Return the solution of an accepted verdict; `began` is the clock at the start of the solve."""
-    unit, seconds = normalize(tracks).unit, {"cameras": time.perf_counter() - began}
-    solution = isometric_solution(tracks, verdict, settings, unit=unit, seconds=seconds, stopped=monitor.stopped)
+    normalized, seconds = normalize(tracks), {"cameras": time.perf_counter() - began}
+    solution = isometric_solution(
+        tracks, verdict, settings, unit=normalized.unit, seconds=seconds, stopped=monitor.stopped
+    )
     used = np.where(solution.weights > 0, tracks.visible, 0.0)
     monitor.report(Step("finish", 1.0, max_reweightings=settings.max_reweightings))
-    return with_inlier_probability(solution, tracks, used, loss="l2")
+    return with_inlier_probability(solution, tracks, used, full_confidence=normalized.full_confidence, loss="l2")
 
 
 def with_verdict(choices: Choices, verdict: IsometricVerdict, settings: Settings) -> Choices:

@@ -255,7 +255,6 @@ def refined_with_focal(
     free: bool,
     turning: bool,
     with_scales: bool,
-    iterations: int = UPDATE_ITERATIONS,
 ) -> tuple[Learned, float]:
     """Return cameras, covariance and κ of higher likelihood, after one update of the depths.
 
@@ -273,8 +272,6 @@ def refined_with_focal(
         False keeps the rotations.
     with_scales : bool
         False keeps the scales at 1.
-    iterations : int
-        Of L-BFGS.
     """
     depths = depths_of(depth_map(found.rotations, found.scales, found.covariance), views, curvature)
     energy = corrected_energy(views, depths, found, with_scales=with_scales)
@@ -288,7 +285,7 @@ def refined_with_focal(
         return value, gradient[held:]
 
     result = minimize(
-        objective, given[held:], jac=True, method="L-BFGS-B", options={"maxiter": iterations, "maxcor": 20}
+        objective, given[held:], jac=True, method="L-BFGS-B", options={"maxiter": UPDATE_ITERATIONS, "maxcor": 20}
     )
     flat = np.concatenate([given[:held], np.asarray(result.x)])
     moved = Motion.unflat(flat[:-1], len(views))

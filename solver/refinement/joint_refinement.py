@@ -255,8 +255,8 @@ def _of_all_frames(
     rotations = rotations_between(used, found.rotations, frames)
     if trial is not None:
         estimate = _with_scale_reason(estimate, trial)
-    if trial is not None and trial.start is not None:
-        estimate = replace(estimate, scales=_at_all_frames(used, found.scales, frames))
+    if (found.scales != 1).any():
+        estimate = replace(estimate, scales=_at_all_frames(used, found.scales * evidence.start_scales[used], frames))
     return _with_rotation_reason(estimate, rotations, np.asarray(start.estimate.rotations)), rotations
 
 

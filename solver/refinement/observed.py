@@ -53,7 +53,7 @@ class Observed:
         """Return the observations of the points that completion sampled with this seed."""
         assert estimate.filling is not None
         chosen = choose_points(normalized.visible, np.random.default_rng(seed))
-        points, confidence = normalized.points[:, chosen], normalized.visible[:, chosen] / normalized.visible.max()
+        points, confidence = normalized.points[:, chosen], normalized.visible[:, chosen]
         weight = np.where(estimate.filling.outliers(points, confidence), 0.0, confidence)
         view = estimate.perspective
         view = replace(view, offsets=view.offsets[used]) if view is not None and view.bends else None

@@ -71,10 +71,10 @@ def best_start(
 
     own, others = begun(estimate, 0.0), []
     for starts, margin in ((estimate.hypotheses, 0.0), (estimate.candidates, MAX_HYPOTHESIS_GAP)):
-        for size, rotations in starts:
+        for other in starts:
             if should_stop is not None and should_stop():
                 return estimate
-            others.append(begun(restarted(estimate, size, rotations), margin))
+            others.append(begun(restarted(estimate, other), margin))
     others.sort(key=lambda trial: trial.energy)
     finals = [trial.refined(part, should_stop) for trial in (own, *others[:FINALISTS])]
     return min(finals, key=lambda trial: trial.energy).estimate
@@ -93,11 +93,11 @@ def best_candidate(
     The prior on camera motion prefers rotations that are too small, whatever their direction. Only at comparable depths does it distinguish
     a turn of the object from its deformation.
     """
-    for _, rotations in estimate.candidates:
+    for candidate in estimate.candidates:
         if should_stop is not None and should_stop():
             break
         other = refined(
-            gram, np.asarray(rotations)[used], found.scales, with_scales=False, rounds=CANDIDATE_ROUNDS,
+            gram, candidate.rotations[used], found.scales, with_scales=False, rounds=CANDIDATE_ROUNDS,
             model_order=model_order, should_stop=should_stop,
         )  # fmt: skip
         if not np.isfinite(other.energy):

@@ -9,7 +9,7 @@ import numpy as np
 from pliant.solver.cameras.estimation import CameraEstimate
 from pliant.solver.cameras.planar_ambiguity import is_planar, on_one_line
 from pliant.solver.energy.hyperparameters import noise_std
-from pliant.solver.evaluation.trust import assess
+from pliant.solver.evaluation.trust import Trust, assess
 from pliant.solver.model.shape_covariance import ShapeCovariance
 from pliant.solver.records import Floats, Tracks, read_only
 from pliant.solver.shapes.held_out import held_out_error
@@ -62,7 +62,7 @@ def assessed(
     should_stop : callable, optional
         Called between units of work; once it returns True, what is left is not computed.
     """
-    std, modes, held_out = None, 0, None
+    std, held_out = None, None
     tick = should_stop if should_stop is not None else bool
     tick()
     confidence = np.asarray(confidence, dtype=np.float64)
@@ -82,20 +82,32 @@ def assessed(
         np.hypot(std, changes.std_of(solution.shapes, unit, centred=centred), out=std)
         std *= INFLATION
         held_out = held_out_error(tracks, solution.shapes, solution.camera, confidence, covariance, unit=unit)
-        modes = covariance.modes.shape[1]
         read_only(std)
     tick()
-    trust = assess(
+    solution = replace(solution, shapes_std=std)
+    return replace(solution, trust=judged(solution, tracks, confidence, estimate, covariance, held_out_error=held_out))
+
+
+def judged(
+    solution: Solution,
+    tracks: Tracks,
+    confidence: Floats,
+    estimate: CameraEstimate,
+    covariance: ShapeCovariance | None,
+    *,
+    held_out_error: float | None,
+) -> Trust:
+    """Return the verdict on a solution that has its standard deviations; arguments as for `assessed`."""
+    return assess(
         solution.shapes,
         solution.camera.rotations,
         solution.residuals,
         confidence,
         scales=solution.camera.scales,
-        shapes_std=std,
-        held_out_error=held_out,
+        shapes_std=solution.shapes_std,
+        held_out_error=held_out_error,
         ordered=estimate.ordered,
         planar=is_planar(estimate.gram) or on_one_line(tracks),
-        modes=modes,
+        modes=0 if covariance is None else covariance.modes.shape[1],
         depth_is_typical=estimate.depth_is_typical,
     )
-    return replace(solution, shapes_std=std, trust=trust)

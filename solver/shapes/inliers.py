@@ -23,6 +23,7 @@ from pliant.solver.pulse import pulse
 from pliant.solver.records import Floats, Tracks, read_only
 from pliant.solver.solution import Solution
 from pliant.solver.tracks.noise import weighted_median
+from pliant.solver.tracks.normalization import relative
 from scipy.special import expit
 
 MEDIAN_LENGTH = float(np.sqrt(2 * np.log(2)))
@@ -34,6 +35,7 @@ def with_inlier_probability(
     tracks: Tracks,
     confidence: Floats,
     *,
+    full_confidence: float,
     loss: str,
     should_stop: Callable[[], bool] | None = None,
 ) -> Solution:
@@ -47,6 +49,8 @@ def with_inlier_probability(
         All observations.
     confidence : ndarray, shape (F, P)
         Of the observations that were used; 0 where rejected.
+    full_confidence : float
+        Confidence of the tracks that counts as 1.
     loss : {"l1", "l2", "huber"}
         Of the data term.
     should_stop : callable, optional
@@ -64,7 +68,12 @@ def with_inlier_probability(
         high = np.maximum(high, placed.max(axis=0, initial=-np.inf))
         tick()
     probability = inlier_probability(
-        left, tracks.visible, rejected, noise_std=solution.choices.noise, extent=high - low, loss=loss
+        left,
+        relative(tracks.visible, full_confidence),
+        rejected,
+        noise_std=solution.choices.noise,
+        extent=high - low,
+        loss=loss,
     )
     read_only(probability)
     return replace(solution, inlier_probability=probability)

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 from pliant.solver.evaluation.alignment import procrustes
-from pliant.solver.evaluation.trust import Trust, Verdict, per_frame, turned
+from pliant.solver.evaluation.trust import Trust, Verdict, per_frame, size_of, turned
 from pliant.solver.isometry.surface import IsometricSurface, IsometricVerdict
 from pliant.solver.records import Camera, Choices, Floats, Tracks, read_only
 from pliant.solver.settings import Settings
@@ -55,8 +55,9 @@ def isometric_solution(
         camera = upwards(camera)
     seen = tracks.visible > 0
     residual = np.where(seen, np.linalg.norm(camera.project(shapes) - tracks.points, axis=2), 0.0)
-    weights = np.where(seen & ~surface.outliers & surface.placed, tracks.visible, 0.0)
+    weights = (seen & ~surface.outliers & surface.placed).astype(np.float64)
     median = float(np.median(residual[seen]))
+    relative = float(np.median((residual / camera.scales[:, None])[seen])) / size_of(shapes)
     for array in (shapes, residual, weights):
         read_only(array)
     trace = Trace(np.array([surface.inconsistency]), np.array([median]), np.zeros(1, dtype=np.int32))
@@ -64,7 +65,7 @@ def isometric_solution(
     return Solution(
         shapes, camera, residual, weights, trace, Outcome.STOPPED if stopped else Outcome.CONVERGED, choices, seconds,
         trust=_trust(
-            verdict, camera, shapes, residual=median / unit, hidden=float((weights == 0).mean()), ordered=settings.order == "film"
+            verdict, camera, shapes, residual=relative, hidden=float((weights == 0).mean()), ordered=settings.order == "film"
         ),
     )  # fmt: skip
 

@@ -52,10 +52,9 @@ def gross_outliers(
     frames = len(projections)
     windows = np.array_split(np.arange(frames), -(-frames // LEARNED_FRAMES))
     images = [covariance.of_image(projections[window], window) for window in windows]
-    most = float(flat.visible.max())
     for first in range(0, flat.visible.shape[1], POINTS_PER_CHUNK):
         span = slice(first, first + POINTS_PER_CHUNK)
-        confidence = flat.visible[:, span] / most
+        confidence = flat.visible[:, span]
         weight = np.where(filling.outliers(flat.points[:, span], confidence), 0.0, confidence)
         points = np.where(confidence[..., None] > 0, flat.points[:, span] - translations[:, None], 0.0)
         for window, image in zip(windows, images, strict=True):

@@ -96,7 +96,7 @@ def well_observed(normalized: Normalized, mesh: Mesh | None) -> WellObserved | N
     kept = np.flatnonzero((normalized.visible > 0).mean(axis=0) >= WELL_OBSERVED_SHARE)
     if len(kept) == count or len(kept) < max(MIN_POINTS, (1 - MAX_SPARSE_SHARE) * count):
         return None
-    part = Normalized(normalized.points[:, kept], normalized.visible[:, kept], normalized.centroid, normalized.unit)
+    part = replace(normalized, points=normalized.points[:, kept], visible=normalized.visible[:, kept])
     return WellObserved(part, mesh_of(mesh, kept), kept, TENSION**0.5 * _differences(mesh))
 
 

@@ -10,7 +10,7 @@ P; all points are then projected onto the basis in one pass.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -120,9 +120,6 @@ def complete(
     InvalidInput
         Fewer than `MIN_POINTS` points are visible in two or more frames.
     """
-    most = float(normalized.visible.max())
-    if 0 < most < 1:  # only the ratios of confidences count
-        normalized = replace(normalized, visible=normalized.visible / most)
     random = np.random.default_rng(seed)
     chosen = choose_points(normalized.visible, random)
     again = seen_again(normalized.visible)

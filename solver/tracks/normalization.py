@@ -23,13 +23,16 @@ class Normalized:
     """Shape `(F, P, 2)`, RMS radius 1; 0 where hidden."""
 
     visible: Floats
-    """Confidence in [0, 1], shape `(F, P)`, as in the tracks."""
+    """Confidence relative to the largest of the tracks, shape `(F, P)`: only their ratios count. 0 where hidden."""
 
     centroid: Floats
     """Mean of each frame's visible points, shape `(F, 2)`, the tracks' unit; interpolated in frames without any."""
 
     unit: float
     """One normalized unit: RMS radius of the centred tracks, the tracks' unit."""
+
+    full_confidence: float
+    """Confidence of the tracks that counts as 1: their largest."""
 
 
 def normalize(tracks: Tracks) -> Normalized:
@@ -66,7 +69,17 @@ def normalize(tracks: Tracks) -> Normalized:
     points /= unit
     read_only(points)
     read_only(centroid)
-    return Normalized(points, tracks.visible, centroid, unit)
+    full = float(tracks.visible.max())
+    return Normalized(points, relative(tracks.visible, full), centroid, unit, full)
+
+
+def relative(confidence: Floats, full: float) -> Floats:
+    """Return confidences, shape `(F, P)`, as shares of `full`, read-only; themselves where that is 1, or nothing is seen."""
+    if full in (0, 1):
+        return confidence
+    shares = confidence / full
+    read_only(shares)
+    return shares
 
 
 def _near(tracks: Tracks, seen: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -95,6 +96,36 @@ def test_a_stop_between_blocks_leaves_a_result(film: gallery.Sequence) -> None:
     solution = solve(film.tracks, film.mesh, cameras=given(film), settings=settings, should_stop=later)
     assert solution.outcome is Outcome.STOPPED
     assert np.isfinite(solution.shapes).all()
+
+
+@pytest.mark.usefixtures("limited")
+def test_the_verdict_is_that_of_all_points_and_choices_those_of_all_blocks(film: gallery.Sequence) -> None:
+    tracks, _ = gallery.corrupt_tracks(film.tracks, noise=0.003, outliers=0.08, hidden=0.3, seed=0)
+    cameras, settings = given(film), Settings(max_reweightings=3)
+    parts = solve(tracks, film.mesh, cameras=cameras, settings=settings)
+    blocks.BLOCK_OBSERVATIONS = FRAMES * POINTS
+    whole = solve(tracks, film.mesh, cameras=cameras, settings=settings)
+    assert parts.trust is not None
+    assert whole.trust is not None
+    assert parts.trust.hidden == pytest.approx(whole.trust.hidden, abs=2e-3)
+    assert parts.trust.hidden > 0.33  # rejected observations among them
+    assert [reason[:20] for reason in parts.trust.reasons] == [reason[:20] for reason in whole.trust.reasons]
+    rejected = [float(each.choices.reasons["outliers"].split("%")[0]) for each in (parts, whole)]
+    assert rejected[0] == pytest.approx(rejected[1], abs=0.3)
+
+
+@pytest.mark.usefixtures("limited")
+def test_what_every_block_chooses_is_reported_as_medians_and_every_warning(film: gallery.Sequence) -> None:
+    solution = solve(film.tracks, film.mesh, cameras=given(film), settings=Settings(prior="smooth", max_reweightings=2))
+    whole = blocks._Whole(film.tracks, estimate_cameras(film.tracks, given(film)), None, None)
+    kept = np.arange(POINTS)
+    for weight, warning in ((1.0, "one"), (3.0, "two"), (9.0, "one")):
+        choices = replace(solution.choices, temporal_weight=weight, warnings=(warning,))
+        whole.add(replace(solution, choices=choices), kept, kept)
+    found = whole.solution(seconds={}).choices
+    assert found.temporal_weight == 3
+    assert found.warnings == ("one", "two")
+    assert found.reasons["weights"].startswith("Medians of 3 blocks of points. The first: ")
 
 
 def test_blocks_are_equal_parts_of_all_points(film: gallery.Sequence) -> None:

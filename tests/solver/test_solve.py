@@ -101,7 +101,10 @@ def test_cameras_of_another_length_are_refused() -> None:
 def test_the_grid_stencil_needs_a_grid() -> None:
     _, rotations, tracks, _ = scene()
     with pytest.raises(InvalidSettings, match="pixel grid"):
-        solve(tracks, triangulated(sheet()[1]), cameras=cameras_of(rotations), settings=Settings(laplacian="grid8"))
+        solve(
+            tracks, triangulated(sheet()[1]), cameras=cameras_of(rotations), settings=Settings(laplacian="grid8"),
+            should_stop=lambda: pytest.fail("before any work"),
+        )  # fmt: skip
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")

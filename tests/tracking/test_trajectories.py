@@ -32,11 +32,18 @@ def test_expected_places_overrule_uncertain_ones_and_fill_hidden_ones() -> None:
     tracked[8:11, :20] += 2
     variance[8:11, :20] = 1
     tracked[2:6, 20:40], visible[2:6, 20:40] = 0, False
-    move_to_expected(Chain(tracked, visible, variance))
+    move_to_expected(Chain(tracked, visible, variance), bool)
     error = np.linalg.norm(tracked - true, axis=2)
     assert error[8:11, :20].mean() < 0.5
     assert error[2:6, 20:40].mean() < 0.2
     assert np.median(error) < 0.02
+
+
+def test_a_stop_is_heeded_between_parts_of_the_points() -> None:
+    points = turning(np.random.default_rng(0).uniform(20, 140, (60, 2)).astype(np.float32))
+    chained = Chain(points, np.ones((FRAMES, 60), bool), np.full((FRAMES, 60), 0.01, np.float32))
+    with pytest.raises(TrackingStopped):
+        move_to_expected(chained, lambda: True)
 
 
 def test_expected_places_take_the_memory_of_the_tracks() -> None:
@@ -46,7 +53,7 @@ def test_expected_places_take_the_memory_of_the_tracks() -> None:
     chained = Chain(points.copy(), np.ones((frames, count), bool), np.ones((frames, count), np.float32))
     tracemalloc.start()
     try:
-        move_to_expected(chained)
+        move_to_expected(chained, bool)
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from camera_errors import degrees_apart
 from pliant.solver import KnownCamera, Settings, Tracks, gallery
+from pliant.solver.cameras import estimation, multistart
 from pliant.solver.cameras.estimation import estimate_cameras, given_cameras
-from pliant.solver.cameras.factorization import upgrade
+from pliant.solver.cameras.factorization import upgrade, upgrades
 from pliant.solver.cameras.multistart import carried
 from pliant.solver.model.camera_motion_prior import (
     SCALE_FLOOR,
@@ -170,6 +171,18 @@ def test_corrections_are_carried_to_the_frames_between() -> None:
     assert degrees_apart(found[used], truth[used]) < 1e-6
     assert degrees_apart(found, truth) < 0.01
     assert degrees_apart(truth @ exponential(-drift), truth) > 3
+
+
+def test_candidates_of_a_long_film_are_carried_on_their_own_factorizations(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(multistart, "MULTISTART_FRAMES", 10)
+    monkeypatch.setattr(estimation, "run_multistart", lambda _, entries, **__: (entries[0], entries))  # unrefined
+    found = estimate_cameras(normalize(gallery.face(20, 60, degrees=60).tracks), Settings())
+    sizes = [each.basis_size for each in found.candidates]
+    assert len(set(sizes)) == len(sizes) > 2
+    gram = found.gram / np.outer(np.repeat(found.scales, 2), np.repeat(found.scales, 2))
+    for factorized, other in zip(upgrades(gram, sizes), found.candidates, strict=True):
+        assert factorized.basis_size == other.basis_size
+        assert degrees_apart(other.rotations, start_at_identity(factorized.rotations)) < 1e-6
 
 
 @pytest.mark.slow

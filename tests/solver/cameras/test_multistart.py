@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 from learning import learn
 from pliant.solver import Settings, gallery
-from pliant.solver.cameras.estimation import MAX_START_DEPTH_VARIANCE, CameraEstimate, estimate_cameras, restarted
+from pliant.solver.cameras.estimation import (
+    MAX_START_DEPTH_VARIANCE,
+    CameraEstimate,
+    OtherCameras,
+    estimate_cameras,
+    restarted,
+)
 from pliant.solver.cameras.multistart import CANDIDATES, SMOOTH_STARTS, depth
 from pliant.solver.model.so3 import angles_between, exponential, nearest
 from pliant.solver.tracks.normalization import normalize
@@ -18,10 +24,10 @@ FRAMES = 16
 def test_candidates_are_cameras_of_every_factorization_and_of_smooth_starts() -> None:
     face = gallery.face(16, 120)
     found = estimate_cameras(normalize(face.tracks), Settings())
-    sizes = [size for size, _ in found.candidates]
+    sizes = [each.basis_size for each in found.candidates]
     assert set(sizes) == {size for size in CANDIDATES if size <= 2 * 16 / 3}
     assert len(sizes) == len(set(sizes)) + SMOOTH_STARTS
-    for _, rotations in found.candidates:
+    for rotations in (each.rotations for each in found.candidates):
         assert np.allclose(rotations @ rotations.transpose(0, 2, 1), np.eye(3))
         assert np.allclose(rotations[0], np.eye(3))
     assert not estimate_cameras(normalize(face.tracks), Settings(refine_rotations=False)).candidates
@@ -32,8 +38,8 @@ def test_hypotheses_are_distinct_cameras_of_plausible_depth() -> None:
     face = gallery.face(16, 120)
     found = estimate_cameras(normalize(face.tracks), Settings())
     assert found.hypotheses
-    assert len({size for size, _ in found.hypotheses}) == len(found.hypotheses)
-    for _, rotations in found.hypotheses:
+    assert len({each.basis_size for each in found.hypotheses}) == len(found.hypotheses)
+    for rotations in (each.rotations for each in found.hypotheses):
         assert rotations.shape == (16, 3, 3)
         assert depth(found.gram, rotations) < MAX_START_DEPTH_VARIANCE
     assert not estimate_cameras(normalize(face.tracks), Settings(refine_rotations=False)).hypotheses
@@ -71,7 +77,13 @@ def test_the_start_that_leads_to_the_higher_likelihood_is_chosen(
     wrong = exponential(0.2 * np.stack([np.sin(5 * time + 1), np.cos(3 * time), np.sin(2 * time)], axis=1)) @ true
     own, other = (true, wrong) if better == "own" else (wrong, true)
     estimate = CameraEstimate(
-        own, np.ones(FRAMES), np.zeros((FRAMES, 2)), 1, rows @ rows.T / 300, tracks, **{kind: ((7, other),)}
+        own,
+        np.ones(FRAMES),
+        np.zeros((FRAMES, 2)),
+        1,
+        rows @ rows.T / 300,
+        tracks,
+        **{kind: (OtherCameras(7, other, "other rotations, from K = 7,"),)},
     )
     found, _ = learn(estimate, np.ones(FRAMES, dtype=bool), turning=True)
     common = nearest(np.einsum("fij,fik->jk", found.rotations, true))
@@ -84,5 +96,6 @@ def test_a_chosen_candidate_with_little_rotation_gives_a_warning() -> None:
     still = np.broadcast_to(np.eye(3), (FRAMES, 3, 3))
     turning = exponential(np.linspace(0, 1, FRAMES)[:, None] * np.array([0.0, 1.0, 0.0]))
     own = CameraEstimate(turning, np.ones(FRAMES), np.zeros((FRAMES, 2)), 1, np.zeros((0, 0)), np.zeros((FRAMES, 0, 2)))
-    assert restarted(own, 3, still).warnings
-    assert not restarted(restarted(own, 3, still), 1, turning).warnings
+    found = restarted(own, OtherCameras(3, still, "others"))
+    assert found.warnings
+    assert not restarted(found, OtherCameras(1, turning, "others")).warnings

@@ -167,6 +167,17 @@ def test_tracks_with_y_up_are_the_same_scene_in_other_axes(close: Solution) -> N
 
 
 @pytest.mark.slow
+def test_distances_of_a_rigid_thing_are_as_exact_as_its_shape() -> None:
+    seen = in_camera(np.repeat(FACE.shapes[:1], 8, axis=0), FACE.rotations)
+    away = np.exp(0.25 * np.sin(np.arange(8)))  # in units of the focal length
+    tracks = Tracks.from_arrays(CENTRE + seen[..., :2] / (away[:, None, None] + seen[..., 2:] / FOCAL))
+    found = solve(tracks, settings=Settings(image_size=PICTURE))
+    assert "Scales from" in found.choices.reasons["scales"]  # a rigid shape had determined them
+    product = found.camera.scales * away
+    assert product / np.exp(np.log(product).mean()) == pytest.approx(np.ones(8), abs=1e-3)
+    assert e3d_frame_scaled(found.shapes, seen) < 1e-3
+
+
 def test_a_principal_point_off_centre_is_used() -> None:
     corner = np.array([200.0, 650.0])
     views = pinhole(SEEN + np.array([150.0, -200.0, 0.0]), FOCAL, corner)

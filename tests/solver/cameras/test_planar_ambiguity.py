@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from camera_errors import degrees_apart
 from pliant.solver import Settings, Tracks, gallery, solve
-from pliant.solver.cameras.estimation import estimate_cameras
+from pliant.solver.cameras.estimation import estimate_cameras, restarted
 from pliant.solver.cameras.planar_ambiguity import (
     fitted,
     is_planar,
@@ -132,8 +132,9 @@ def test_given_cameras_that_reversals_make_more_probable_get_an_alternative() ->
     small = gallery.flag(16, 100)
     found = estimate_cameras(normalize(small.tracks), Settings())
     assert "as they were. With some of them reversed" in found.reasons["rotations"]
-    ((_, alternative),) = found.hypotheses
-    given, other = (fitted(found.gram, each, np.ones(16)).energy for each in (found.rotations, alternative))
+    (alternative,) = found.hypotheses
+    assert "With the shapes, reversed poses of some frames lead" in restarted(found, alternative).reasons["basis_size"]
+    given, other = (fitted(found.gram, each.rotations, np.ones(16)).energy for each in (found, alternative))
     assert other < given - 0.1
     solution = solve(small.tracks)  # with the given cameras the error is .52
     assert metrics.e3d_frame(solution.shapes, small.shapes) < 0.2

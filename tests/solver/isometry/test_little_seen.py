@@ -12,6 +12,16 @@ from rolled_sheets import FOCAL, SIZE, one_scale_error, rolled
 GIVEN = Settings(surface="isometric", focal=FOCAL, image_size=SIZE, order="film")
 
 
+@pytest.mark.parametrize("shown", [range(7), range(8), range(0, 49, 8)], ids=["row", "row and one", "diagonal"])
+def test_a_frame_that_shows_a_line_of_a_sheet_leaves_the_others_as_they_are(shown: range) -> None:
+    sheet = rolled(frames=6, side=7)
+    visible = np.ones(sheet.tracks.visible.shape)
+    visible[2] = np.isin(np.arange(49), shown)
+    found = solve(Tracks.from_arrays(sheet.tracks.points, visible), settings=GIVEN)
+    others = [0, 1, 3, 4, 5]
+    assert one_scale_error(found.shapes[others], sheet.points[others]) < 0.03
+
+
 @pytest.mark.parametrize("shown", [0, 5])
 def test_a_frame_that_shows_too_little_is_like_its_neighbour_and_leaves_the_others_as_they_are(shown: int) -> None:
     sheet = rolled(frames=6, side=7)

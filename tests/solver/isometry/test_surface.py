@@ -69,7 +69,7 @@ def test_maximum_depth_respects_every_cone_and_is_about_the_sheet() -> None:
     assert longest.sum() == pytest.approx(1.0, rel=1e-2)  # d_ij are the longest of the frames where they bind
     hidden = replace(graph, seen=np.zeros_like(graph.seen))
     assert maximum_depth(hidden) is None
-    assert maximum_depth(graph, seconds=1e-9) is None
+    assert maximum_depth(graph, should_stop=lambda: True) is None
 
 
 @pytest.mark.parametrize(("kind", "error"), [("cylinder", 0.015), pytest.param("cone", 0.08, marks=pytest.mark.slow)])
