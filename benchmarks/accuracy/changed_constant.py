@@ -111,13 +111,13 @@ def made(name: str) -> tuple[Case, dict[str, Any]]:
     from pliant.solver import gallery
 
     from benchmarks.accuracy.distances import PICTURE, seen_from
-    from benchmarks.sequences import from_gallery
+    from benchmarks.sequences import from_gallery, rolled_sheet
 
     kind, _, how = name.partition(", ")
+    if kind == "sheet":
+        return rolled_sheet(), {"image_size": (640.0, 480.0)}
     if kind == "flag":
         sequence = gallery.flag(16, 100)
-    elif kind == "sheet":
-        sequence = gallery.flag(16, 100, degrees=20)
     else:
         sequence = gallery.face(16, 100, degrees=40, scale_change=0.05 if how in ("", "errors") else 0.0)
     case = from_gallery(sequence, name)

@@ -38,7 +38,7 @@ ROOMS = {
     "solver/reconstruction": ("face, given cameras",),
     "solver/shapes": ("face, given cameras",),
     "solver/tracks": ("face", "face, given cameras"),
-    "solver/isometry": ("sheet, lens",),
+    "solver/isometry": ("sheet",),
 }
 """Folders, and the cases that their constants are changed in."""
 

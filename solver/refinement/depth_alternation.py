@@ -43,7 +43,7 @@ def alternated(
     rounds: int = ALTERNATION_ROUNDS,
     should_stop: Callable[[], bool] | None = None,
 ) -> tuple[Learned, Perspective]:
-    """Return cameras, covariance and κ after rounds of alternation.
+    """Return cameras, covariance and κ after rounds of alternation, those before a round that leads to depths beyond any measure.
 
     Parameters
     ----------
@@ -65,7 +65,10 @@ def alternated(
     for _ in range(rounds):
         if should_stop is not None and should_stop():
             break
-        found = _relearned(view, found, used, model_order)
+        try:
+            found = _relearned(view, found, used, model_order)
+        except np.linalg.LinAlgError:
+            break
         found, view = _with_focal(view, found, used, turning=turning)
     return found, view
 
@@ -91,7 +94,7 @@ def factorized_again(
     places = evenly_spread(len(used), COMPARED_FRAMES)
     some = used[places]
     part = replace(
-        found, rotations=found.rotations[places], scales=found.scales[places],
+        found, rotations=found.rotations[places], scales=found.scales[places], energy=np.inf,
         covariance=replace(found.covariance, modes=found.covariance.modes[places]),
     )  # fmt: skip
 

@@ -82,26 +82,18 @@ def test_the_committed_solves_keep_the_rule_of_the_verdict() -> None:
         assert solve["true"] >= 0.03 or solve["verdict"] != "do_not_use", (solve["sequence"], solve["kind"])
 
 
-def rolled_sheet(folder: Path) -> None:
-    """A sheet rolled onto cylinders, 12 views of a pinhole camera, as a recorded sequence."""
-    across, down = np.meshgrid(np.linspace(-1, 1, 7), np.linspace(-0.7, 0.7, 6))
-    shapes = []
-    for turn, bend in zip(np.linspace(-0.6, 0.6, 12), np.linspace(0.3, 1.3, 12), strict=True):
-        rolled = np.stack([np.sin(bend * across) / bend, down, (1 - np.cos(bend * across)) / bend], axis=-1).reshape(
-            -1, 3
-        )
-        rotation = np.array([[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]])
-        shapes.append(rolled @ rotation.T + [0, 0, 4])
-    truth = np.array(shapes)
+def recorded_sheet(folder: Path) -> None:
+    """The rolled sheet, as a recorded sequence."""
+    sheet = rolled_sheet()
     (folder / "rolled").mkdir(parents=True)
-    np.savez(folder / "rolled" / "tracks.npz", tracks=[319.5, 239.5] + 600 * truth[..., :2] / truth[..., 2:])
-    np.savez(folder / "rolled" / "truth.npz", shapes=truth, focal=600.0)
+    np.savez(folder / "rolled" / "tracks.npz", tracks=sheet.tracks.points)
+    np.savez(folder / "rolled" / "truth.npz", shapes=sheet.shapes, focal=600.0)
     (folder / "rolled" / "about.json").write_text(json.dumps({"units": "pixels", "image_size": [640, 480]}))
 
 
 def test_other_methods_on_a_sheet_are_measured_once_and_tabulated(bench, tmp_path, capsys) -> None:
     sheets = bench("accuracy.sheets")
-    rolled_sheet(tmp_path / "data")
+    recorded_sheet(tmp_path / "data")
     out = tmp_path / "sheets.jsonl"
     given = [
         "--data",
