@@ -44,7 +44,7 @@ class Scene:
 
 
 FULL = Scene(frames=30, size=(240, 180), points=800)
-SMALL = Scene(frames=12, size=(160, 120), points=300)
+SMALL = Scene(frames=8, size=(160, 120), points=300)
 
 MODEL_POINTS = 3000
 """Vertices of the rendered face: its facets are then about a pixel wide in the full film."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import http.client
+import json
 import socket
 import subprocess
 import sys
@@ -9,6 +11,7 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
+from http import HTTPStatus
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -181,6 +184,8 @@ def service_child(settings: Settings, host: str, port: int, url: str, *, auth: s
 def until_ready(url: str) -> Callable[[subprocess.Popen[bytes]], None]:
     """Return a function that waits until every part of the service is ready.
 
+    It asks without the SDK, whose libraries would stay in the memory of a process that only starts others.
+
     Raises
     ------
     Unreachable
@@ -188,22 +193,32 @@ def until_ready(url: str) -> Callable[[subprocess.Popen[bytes]], None]:
     """
 
     def wait(process: subprocess.Popen[bytes]) -> None:
-        from pliant.client import Client
-        from pliant.client.errors import PliantError, Unreachable
+        from pliant.client.errors import Unreachable
 
         reason = "it did not answer"
-        with Client(url) as client:
-            deadline = time.monotonic() + READY_WITHIN
-            while time.monotonic() < deadline:
-                if process.poll() is not None:
-                    raise Unreachable(f"The service ended with code {process.returncode}; see its last lines above.")
-                try:
-                    client.ready(timeout=1)
-                except PliantError as fault:
-                    reason = str(fault)
-                    time.sleep(0.1)
-                else:
-                    return
+        deadline = time.monotonic() + READY_WITHIN
+        while time.monotonic() < deadline:
+            if process.poll() is not None:
+                raise Unreachable(f"The service ended with code {process.returncode}; see its last lines above.")
+            try:
+                reason = _why_not_ready(url)
+            except (OSError, http.client.HTTPException, ValueError) as fault:
+                reason = str(fault)
+            if not reason:
+                return
+            time.sleep(0.1)
         raise Unreachable(f"The service is not ready after {READY_WITHIN:g} s: {reason}")
 
     return wait
+
+
+def _why_not_ready(url: str) -> str:
+    """Return the service's reason for not being ready, empty if it is."""
+    asked = http.client.HTTPConnection(url.removeprefix("http://"), timeout=1)
+    try:
+        asked.request("GET", "/readyz")
+        answer = asked.getresponse()
+        body = answer.read()
+    finally:
+        asked.close()
+    return "" if answer.status == HTTPStatus.OK else str(json.loads(body)["detail"])

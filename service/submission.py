@@ -17,7 +17,8 @@ from pliant.service.settings import ServiceSettings
 from pliant.worker.artifacts import kinds_for
 from pliant.worker.errors import Conflict, UnknownUpload
 from pliant.worker.execution.solver_settings import solver_settings
-from pliant.worker.films.sources import FilmBounds, FilmSource, is_source, open_source, save_source
+from pliant.worker.films.bounds import FilmBounds
+from pliant.worker.films.sources import FilmSource, is_source, open_source, save_source
 from pliant.worker.films.tracker import check_film, described, film_options
 from pliant.worker.formats import Limits, store_inputs
 from pliant.worker.formats.cost import estimated

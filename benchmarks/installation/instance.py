@@ -9,8 +9,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 
 from pliant.client import Client, Job, Retry
@@ -61,7 +62,7 @@ class Instance:
         """How it is set up."""
         return replace(self.chosen, data=self.folder / "data")
 
-    @property
+    @cached_property
     def jobs(self) -> Jobs:
         """The jobs, asked of the stores themselves."""
         return Jobs.open(self.settings)
@@ -202,14 +203,12 @@ class Instance:
 
 
 def children(parent: int) -> list[int]:
-    """Return the ids of the child processes that are not zombies, from the process table."""
-    found = []
-    for entry in Path("/proc").iterdir():
-        if entry.name.isdigit():
-            state = _state(int(entry.name))
-            if state is not None and state[0] != "Z" and int(state[1]) == parent:
-                found.append(int(entry.name))
-    return found
+    """Return the ids of the child processes that are not zombies."""
+    found: list[int] = []
+    with suppress(OSError):  # it has ended
+        for task in Path(f"/proc/{parent}/task").iterdir():
+            found += map(int, (task / "children").read_text().split())
+    return [child for child in found if running(child)]
 
 
 def running(pid: int) -> bool:

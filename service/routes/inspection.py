@@ -12,7 +12,7 @@ from pliant.service.dependencies import Bound, Core, MyUploads, Service
 from pliant.service.multipart import Form, receive_form
 from pliant.service.openapi import SUBMIT_BODY, problems
 from pliant.service.submission import form_rules, parse_options, read_form, with_uploads
-from pliant.worker.films.sources import FilmBounds
+from pliant.worker.films.bounds import FilmBounds
 from pliant.worker.formats import Inputs, load_inputs
 from pliant.worker.formats.isolated_reader import LARGE
 from pliant.worker.uploads.service import Uploads

@@ -27,6 +27,10 @@ from pliant.client.webhooks import new_secret, verified
 pytestmark = pytest.mark.slow
 
 PLIANT = [sys.executable, "-m", "pliant.cli"]
+QUICK = {"camera": "orthographic", "surface": "free", "prior": "smooth", "refine_rotations": False}
+"""Options of a job of a moment: a default job takes ten times as long, and what it computes does not matter here."""
+
+QUICKLY = [text for name, value in QUICK.items() for text in ("-O", f"{name}={str(value).lower()}")]
 CLEAN = {name: value for name, value in os.environ.items() if not name.startswith("PLIANT_")}
 
 
@@ -93,7 +97,7 @@ def test_a_service_that_requires_tokens_does_not_start_without_one(tmp_path: Pat
 
 
 def test_the_command_line_works_with_a_token_and_not_without(url: str, first: dict[str, Any], tracks: Path) -> None:
-    sent = pliant("submit", tracks, "--id", "mine", "--url", url, token=first["token"])
+    sent = pliant("submit", tracks, *QUICKLY, "--id", "mine", "--url", url, token=first["token"])
     assert sent.returncode == 0, sent.stderr
     seen = pliant("watch", "mine", "--url", url, "--json", token=first["token"])
     assert json.loads(seen.stdout)["status"] == "succeeded", seen.stderr
@@ -123,7 +127,7 @@ def test_the_webhook_of_a_job_is_signed_and_the_sdk_verifies_it(url: str, first:
         unsigned = pliant("submit", tracks, *hook, *where, token=first["token"])
         assert unsigned.returncode == Exit.REFUSED
         assert "webhook_secret" in unsigned.stderr
-        sent = pliant("submit", tracks, *hook, *where, token=first["token"], PLIANT_WEBHOOK_SECRET=secret)
+        sent = pliant("submit", tracks, *hook, *where, *QUICKLY, token=first["token"], PLIANT_WEBHOOK_SECRET=secret)
         assert sent.returncode == 0, sent.stderr
         deadline = time.monotonic() + 60
         while not got and time.monotonic() < deadline:
@@ -168,11 +172,11 @@ def test_invalid_token_arguments_are_rejected_with_a_message(
 def test_both_clients_work_with_a_token_and_not_without(url: str, first: dict[str, Any], tracks: Path) -> None:
     async def asked(token: str | None) -> tuple[int, ...]:
         async with AsyncClient(url, token=token) as client:
-            return (await (await client.submit(tracks)).wait(timeout=60)).shapes.shape
+            return (await (await client.submit(tracks, options=QUICK)).wait(timeout=60)).shapes.shape
 
     with Client(url, token=first["token"]) as client:
         assert client.inspect(tracks).num_points == 12
-        job = client.submit(tracks)
+        job = client.submit(tracks, options=QUICK)
         assert [now.status for now in job.events(timeout=60)][-1] == "succeeded"
         assert job.wait(timeout=60).shapes.shape == (5, 12, 3)
     assert asyncio.run(asked(first["token"])) == (5, 12, 3)
@@ -189,7 +193,8 @@ def test_both_clients_work_with_a_token_and_not_without(url: str, first: dict[st
 def test_the_page_asks_for_the_token_and_shows_its_jobs(url: str, first: dict[str, Any], tracks: Path) -> None:
     from playwright.sync_api import expect
 
-    sent = pliant("submit", tracks, "--id", "paged", "--name", "seen in the page", "--url", url, token=first["token"])
+    named = ["--id", "paged", "--name", "seen in the page"]
+    sent = pliant("submit", tracks, *QUICKLY, *named, "--url", url, token=first["token"])
     assert sent.returncode == 0, sent.stderr
     assert pliant("watch", "paged", "--url", url, token=first["token"]).returncode == 0
     with Browsing() as browser:

@@ -256,7 +256,7 @@ def test_pictures_are_drawn_of_anything(tmp_path: Path, given: str) -> None:
         "--out",
         tmp_path / "out",
     ]
-    command += ["--settings", "max_reweightings=2"]
+    command += ["--settings", "max_reweightings=2,prior=smooth,camera=orthographic,surface=free"]
     ran = subprocess.run(map(str, command), cwd=ROOT, capture_output=True, text=True, timeout=240, check=False)
     assert ran.returncode == 0, ran.stderr
     assert ("e3d_frame" in ran.stdout) == (given == "mesh and truth")

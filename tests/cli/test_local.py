@@ -10,6 +10,8 @@ import re
 import socket
 import subprocess
 import sys
+import threading
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -125,6 +127,37 @@ def test_a_service_that_never_becomes_ready_is_an_error(monkeypatch: pytest.Monk
     finally:
         process.kill()
         process.wait()
+
+
+def test_a_service_that_is_not_ready_in_time_gives_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Starting(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            body = b'{"detail": "No worker has started yet."}' if self.path == "/readyz" else b"{}"
+            self.send_response(503)
+            self.send_header("Content-Length", str(len(body)))
+            self.end_headers()
+            self.wfile.write(body)
+
+        def log_message(self, *_: object) -> None:
+            pass
+
+    monkeypatch.setattr(up, "READY_WITHIN", 0.3)
+    process = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+    with ThreadingHTTPServer(("127.0.0.1", 0), Starting) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        try:
+            with pytest.raises(Unreachable, match=r"not ready after 0\.3 s: No worker has started yet\."):
+                up.until_ready(up.address("127.0.0.1", server.server_address[1]))(process)
+        finally:
+            server.shutdown()
+            process.kill()
+            process.wait()
+
+
+def test_starting_others_needs_none_of_their_libraries() -> None:
+    code = "import sys, pliant.cli.up, pliant.service.settings, pliant.worker.processes.supervisor; print(*sys.modules)"
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert not {"fastapi", "httpx", "numpy", "redis", "rq"} & set(ran.stdout.split())
 
 
 def test_the_demonstration_succeeds_only_if_all_errors_are_small() -> None:

@@ -162,13 +162,13 @@ def test_inspecting_returns_the_interpretation_without_creating_a_job(client: Cl
     points = moving_points()
     points[2, 3] = np.nan
     before = [job.id for job in client.list()]
-    interpretation = client.inspect(points, mesh="none", rotations=np.tile(np.eye(3), (6, 1, 1)))
+    interpretation = client.inspect(points, mesh="none", rotations=np.tile(np.eye(3), (6, 1, 1)), options=FAST)
     assert [job.id for job in client.list()] == before
     assert (interpretation.num_frames, interpretation.num_points, interpretation.has_rotations) == (6, 16, True)
     assert interpretation.estimate is not None
     assert interpretation.estimate.memory_bytes > 0
     assert interpretation.hidden_fraction == pytest.approx(1 / (6 * 16))
-    job = client.submit(points, mesh="none", rotations=np.tile(np.eye(3), (6, 1, 1)))
+    job = client.submit(points, mesh="none", rotations=np.tile(np.eye(3), (6, 1, 1)), options=FAST)
     assert job.record.interpretation == interpretation
     with pytest.raises(InvalidRequest) as caught:
         client.inspect(np.ones((2, 9, 2)))

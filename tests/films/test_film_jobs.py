@@ -32,8 +32,9 @@ from pliant.worker.errors import Interrupted, TimedOut
 from pliant.worker.execution.film import reconstruct_film, solving_seconds
 from pliant.worker.execution.pace import MachinePace
 from pliant.worker.films import frame_strip, tracker
+from pliant.worker.films.bounds import FilmBounds
 from pliant.worker.films.inputs import read_tracked
-from pliant.worker.films.sources import FilmBounds, FilmSource, is_source, looks_like_film, open_source, save_source
+from pliant.worker.films.sources import FilmSource, is_source, looks_like_film, open_source, save_source
 from pliant.worker.films.tracker import (
     FilmFacts,
     Tracked,

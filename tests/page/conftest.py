@@ -57,7 +57,7 @@ def browser() -> Iterator[Browser]:
 
 @pytest.fixture
 def page(browser: Browser, url: str) -> Iterator[Page]:
-    """A page of its own on the front page; a script error or a blocked request fails the test."""
+    """An empty page of its own; a script error or a blocked request fails the test."""
     context = browser.new_context(viewport={"width": 1280, "height": 900}, reduced_motion="reduce")
     context.add_init_script(
         "addEventListener('securitypolicyviolation', (event) => console.error('CSP blocked ' + event.blockedURI));"
@@ -66,13 +66,18 @@ def page(browser: Browser, url: str) -> Iterator[Page]:
     troubles: list[str] = []
     page.on("pageerror", lambda error: troubles.append(str(error)))
     page.on("console", lambda message: troubles.append(message.text) if "CSP" in message.text else None)
-    page.goto(url)
     yield page
     page.unroute_all(behavior="ignoreErrors")  # a request may be under way when the test ends
     context.close()
     for job in httpx.get(f"{url}/v1/jobs?status=queued&status=running&limit=100").json()["jobs"]:
         httpx.post(f"{url}/v1/jobs/{job['id']}/cancel")  # the next test wants the one worker
     assert troubles == []
+
+
+@pytest.fixture
+def front(page: Page, url: str) -> None:
+    """Open the front page; a test that shows something else goes there at once, and the browser draws one page less."""
+    page.goto(url)
 
 
 @pytest.fixture(scope="session")

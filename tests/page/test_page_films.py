@@ -283,7 +283,6 @@ def test_a_service_without_films_offers_no_film_input(page: Page, url: str) -> N
 
     page.route("**/v1/options", without)
     page.goto(url)
-    page.reload()
     page.get_by_text("Files to write", exact=True).wait_for()
     expect(page.get_by_text("Drop tracks and a mesh here")).to_be_visible()
     expect(page.locator("[data-part=film]")).to_be_hidden()
@@ -346,8 +345,8 @@ def test_a_notification_at_the_end_for_those_who_asked(filming: Page, url: str, 
     filming.add_init_script(f"({NOTE})()")
     record = film_record(url, finished)
     answer_with(filming, record)
+    filming.goto("about:blank")  # the script runs in documents that come after it
     filming.goto(f"{url}/#job={finished}")
-    filming.reload()
     filming.get_by_role("button", name="Notify me at the end").click()
     expect(filming.get_by_role("button", name="You will be notified")).to_be_disabled()
     assert filming.evaluate("window.notes") == []
@@ -373,8 +372,8 @@ def test_the_result_of_a_film_shows_its_contact_sheet(filming: Page, url: str, f
     filming.evaluate("sessionStorage.setItem('pliant-token', '')")
     for token in ("", "a-token"):  # with a token, the picture cannot be loaded by its address
         filming.evaluate("(token) => sessionStorage.setItem('pliant-token', token)", token)
+        filming.goto("about:blank")
         filming.goto(f"{url}/#job={finished}")
-        filming.reload()
         shown = filming.get_by_role("region", name="Tracked film").get_by_role("img")
         until(lambda shown=shown: shown.evaluate("(it) => it.naturalWidth") == WIDTH)  # type: ignore[misc]
         address = str(shown.get_attribute("src"))

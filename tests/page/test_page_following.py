@@ -74,7 +74,6 @@ def test_the_list_follows_a_running_job_that_is_not_shown(page: Page, url: str, 
 def test_an_outage_and_its_end_are_reported(page: Page, url: str, finished: str) -> None:
     page.route("**/v1/**", lambda route: route.abort())
     page.goto(f"{url}/#job={finished}")
-    page.reload()
     expect(page.get_by_role("alert").first).to_contain_text("The service does not answer.")
     page.unroute_all()
     page.locator(".view canvas").wait_for(timeout=30_000)
@@ -91,7 +90,6 @@ def test_a_token_is_requested_once_and_sent_with_every_request(page: Page, url: 
 
     page.route("**/v1/**", guarded)
     page.goto(f"{url}/#job={finished}")
-    page.reload()
     expect(page.get_by_role("alert").first).to_contain_text("This service needs a token")
     expect(page.get_by_role("alert").first).to_contain_text("Paste the one that you were given for this service.")
     page.get_by_label("Token").fill("a-token")

@@ -59,6 +59,7 @@ def small_targets(page: Page) -> list[str]:
     return list(page.evaluate(script))
 
 
+@pytest.mark.usefixtures("front")
 def test_button_folds_and_refusals_in_place(page: Page) -> None:
     page.set_viewport_size({"width": 1280, "height": 720})
     send = page.get_by_role("button", name="Reconstruct")
@@ -88,6 +89,7 @@ def test_button_folds_and_refusals_in_place(page: Page) -> None:
     assert small_targets(page) == []
 
 
+@pytest.mark.usefixtures("front")
 def test_a_film_chosen_for_tracks_goes_to_its_own_place(page: Page) -> None:
     page.locator("[data-part=film]").wait_for()
     film = {"name": "clip.mp4", "mimeType": "video/mp4", "buffer": b"\0\0\0\x18ftypmp42" + bytes(64)}
@@ -99,7 +101,6 @@ def test_a_film_chosen_for_tracks_goes_to_its_own_place(page: Page) -> None:
 
 def test_after_a_job_more_files_a_link_and_other_options(page: Page, url: str, finished: str) -> None:
     page.goto(f"{url}/#job={finished}")
-    page.reload()
     page.get_by_role("button", name="More files").click()
     page.get_by_role("button", name="Make the files").click()
     expect(page.get_by_text("Choose at least one file.")).to_be_visible()
@@ -146,6 +147,7 @@ def test_after_a_job_more_files_a_link_and_other_options(page: Page, url: str, f
     assert (job["options"]["method"], job["interpretation"]["num_points"]) == ("temporal", 300)
 
 
+@pytest.mark.usefixtures("front")
 def test_a_deleted_job_and_a_wrong_option(page: Page, url: str, small: dict[str, bytes]) -> None:
     choose(page, {TRACKS: small[TRACKS]})
     page.get_by_text("Camera", exact=True).click()

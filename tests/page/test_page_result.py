@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import httpx
 import numpy as np
@@ -100,20 +101,24 @@ def test_the_animation_stops_loops_or_reverses_at_the_chosen_speed(page: Page, u
     assert steps_until(there_and_back).min() > -5
 
 
+@pytest.fixture(scope="module")
+def model(url: str, small: dict[str, bytes]) -> dict[str, Any]:
+    """The record of a job with options and a name that has to be quoted."""
+    options = {"method": "spatio_temporal", "fps": 12.5, "refine_rotations": False}
+    files = {"tracks": small[TRACKS], "mesh": small["mesh.npz"], "ground_truth": small["truth.npz"]}
+    sent = {"name": "it's a face", "options": json.dumps(options)}
+    record: dict[str, Any] = httpx.post(f"{url}/v1/jobs", files=files, data=sent, timeout=60).json()
+    return record
+
+
 @pytest.mark.parametrize("language", ["Python", "Shell", "curl"])
 def test_the_code_shown_submits_the_same_job(
-    page: Page, url: str, small: dict[str, bytes], tmp_path: Path, language: str
+    page: Page, url: str, small: dict[str, bytes], model: dict[str, Any], tmp_path: Path, language: str
 ) -> None:
     if language == "curl" and shutil.which("curl") is None:
         pytest.skip("no curl here")
     for name, content in small.items():
         (tmp_path / name).write_bytes(content)
-    options = {"method": "spatio_temporal", "fps": 12.5, "refine_rotations": False}
-    files = {"tracks": small[TRACKS], "mesh": small["mesh.npz"], "ground_truth": small["truth.npz"]}
-    asked = httpx.post(
-        f"{url}/v1/jobs", files=files, data={"name": "it's a face", "options": json.dumps(options)}, timeout=60
-    )
-    model = asked.json()
     page.goto(f"{url}/#job={model['id']}")
     page.get_by_role("button", name=language, exact=True).click()
     shown = page.get_by_role("region", name="Use from code").locator("code")
@@ -135,6 +140,7 @@ def test_the_code_shown_submits_the_same_job(
 
 
 @pytest.mark.long
+@pytest.mark.usefixtures("front")
 def test_a_dense_result_plays_within_time_and_memory(page: Page, tmp_path: Path) -> None:
     """99 frames of 29,000 points on the whole road, with known cameras and the method that takes seconds."""
     sequence = face(99, 29_000)

@@ -16,6 +16,7 @@ from playwright.sync_api import Page, Route, expect
 
 pytestmark = [
     pytest.mark.chromium,
+    pytest.mark.usefixtures("front"),
     pytest.mark.skipif(why_not() is not None and not os.environ.get("CI"), reason=str(why_not())),
 ]
 
@@ -31,7 +32,7 @@ def test_files_are_submitted_and_the_result_plays(page: Page, url: str, small: d
     painted = "(it) => it.getContext('2d').getImageData(0, 0, it.width, it.height).data.filter((v, i) => i % 4 === 3 && v > 0).length"
     assert seen.get_by_role("img", name="Sample of the tracks").evaluate(painted) > 200 * 9  # a dot each of 200 points
     page.get_by_text("For experts").click()
-    page.get_by_label("Preset").select_option(label="automatic")
+    page.get_by_label("Preset").select_option(label="as published")
     page.get_by_label("name (optional)").fill("my flag")
     page.get_by_role("button", name="Reconstruct").click()
     expect(page.get_by_role("heading", name="my flag")).to_be_focused()

@@ -15,7 +15,7 @@ from browsing import differing_pixels, why_not
 from paging import DONE, QUICK, TRACKS, packed, seek, until
 from PIL import Image
 from playwright.sync_api import Browser, Locator, Page, expect
-from pliant.solver import solve
+from pliant.solver import KnownCamera, solve
 from pliant.solver.gallery import corrupt, flag
 from pliant.worker.artifacts.preview import write_preview
 from pliant.worker.formats.texture import Texture
@@ -229,7 +229,8 @@ def test_another_job_is_compared_point_by_point(viewer: Page) -> None:
 def painted() -> bytes:
     """A preview of a flag whose left half is red and whose right half is blue in the film's picture; its depth has the wrong sign."""
     sequence = flag(FRAMES, POINTS)
-    solution = solve(sequence.tracks, sequence.mesh)
+    cameras = KnownCamera.from_arrays(sequence.rotations, sequence.scales)
+    solution = solve(sequence.tracks, sequence.mesh, cameras=cameras)
     first = sequence.tracks.points[0]
     places = (first - first.min(axis=0)) / np.ptp(first, axis=0)
     halves = np.zeros((64, 64, 3), dtype=np.uint8)

@@ -277,7 +277,8 @@ def _reconstruct(
     """Solve stored tracks, or track and solve a stored film."""
     from pliant.worker.execution import pipeline
     from pliant.worker.execution.film import reconstruct_film
-    from pliant.worker.films.sources import FilmBounds, is_source, open_source
+    from pliant.worker.films.bounds import FilmBounds
+    from pliant.worker.films.sources import is_source, open_source
     from pliant.worker.formats import load_inputs
 
     options = stored.job.options

@@ -19,8 +19,9 @@ from pliant.worker.execution.pipeline import Halt, silent, solve_and_write
 from pliant.worker.execution.progress import FILM_SHARES, Reporter
 from pliant.worker.execution.solver_settings import solver_settings
 from pliant.worker.films import frame_strip
+from pliant.worker.films.bounds import FilmBounds
 from pliant.worker.films.inputs import read_tracked
-from pliant.worker.films.sources import FilmBounds, FilmSource
+from pliant.worker.films.sources import FilmSource
 from pliant.worker.films.tracker import track_film
 from pliant.worker.jobs.finished import Finished
 

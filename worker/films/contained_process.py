@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any
 
 from pliant.solver.errors import InvalidInput
 from pliant.worker.films import frame_strip
+from pliant.worker.films.bounds import FilmBounds
 from pliant.worker.films.frame_strip import write_frames
-from pliant.worker.films.sources import FilmBounds
 from pliant.worker.formats.errors import too_large
 from pliant.worker.processes.contained import limit_process, serve
 from pliant.worker.processes.no_network import forbid_network

@@ -13,7 +13,8 @@ from pliant.schemas.job import FollowedPoints, Interpretation
 from pliant.schemas.options import Options
 from pliant.solver.errors import InvalidInput
 from pliant.worker.errors import Interrupted
-from pliant.worker.films.sources import FilmBounds, FilmSource
+from pliant.worker.films.bounds import FilmBounds
+from pliant.worker.films.sources import FilmSource
 from pliant.worker.formats.errors import damaged, too_large
 from pliant.worker.processes.contained import DONE, REFUSED, Ended, refusal_in, run_contained
 from pydantic import BaseModel, ConfigDict, Field, ValidationError

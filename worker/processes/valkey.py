@@ -13,6 +13,7 @@ import importlib.util
 import os
 import platform
 import shutil
+import socket
 import stat
 import subprocess
 import time
@@ -21,16 +22,17 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-import redis
 from pliant.worker.errors import DataDirectoryInUse, ServerFailed
 from pliant.worker.paths import make_data_directory, socket_path, valkey_directory
 from pliant.worker.settings import Settings
-from pliant.worker.store.connection import connect
 
 STARTS_WITHIN = 60.0
 """Seconds for the server to start: it first reads its append-only file."""
 
 STOPS_WITHIN = 15.0
+
+PONG_WITHIN = 5.0
+"""Seconds for a running server to answer."""
 
 
 def find_binary() -> Path:
@@ -81,10 +83,10 @@ class Valkey:
             There is no server binary, or the socket's directory belongs to another user.
         """
         binary = find_binary()
-        home, socket = valkey_directory(data), socket_path(data)
+        home, path = valkey_directory(data), socket_path(data)
         make_data_directory(data)
         home.mkdir(parents=True, exist_ok=True, mode=0o700)
-        _make_private(socket.parent)
+        _make_private(path.parent)
         supervisor_lock = os.open(home / "supervisor.lock", os.O_RDWR | os.O_CREAT, 0o600)
         if not _lock(supervisor_lock):
             holder = os.read(supervisor_lock, 20).decode(errors="replace").strip()
@@ -94,12 +96,12 @@ class Valkey:
         os.pwrite(supervisor_lock, f"{os.getpid()}\n".encode(), 0)
         lock = os.open(home / "server.lock", os.O_RDWR | os.O_CREAT, 0o600)
         if not _lock(lock):
-            _shut_down(socket)
+            _shut_down(path)
             if not _until(lambda: _lock(lock), STOPS_WITHIN):
                 os.close(lock)
                 os.close(supervisor_lock)
                 raise DataDirectoryInUse(str(data), holder="a Valkey server that does not stop")
-        return cls(data, _command(binary, home, socket), lock, supervisor_lock)
+        return cls(data, _command(binary, home, path), lock, supervisor_lock)
 
     def wait(self, process: subprocess.Popen[bytes]) -> None:
         """Return once the server answers.
@@ -109,18 +111,13 @@ class Valkey:
         ServerFailed
             It exited, or does not answer in time.
         """
-        client = connect(f"unix://{socket_path(self.data)}", decode=True, retries=0)
         deadline = time.monotonic() + STARTS_WITHIN
         while time.monotonic() < deadline:
             if process.poll() is not None:
                 raise ServerFailed(f"The embedded Valkey ended with code {process.returncode}.", log=self.log_tail())
-            try:
-                client.ping()
-            except (redis.ConnectionError, redis.TimeoutError):
-                time.sleep(0.02)
-            else:
-                client.close()
+            if _answers(socket_path(self.data)):
                 return
+            time.sleep(0.02)
         raise ServerFailed(f"The embedded Valkey does not answer after {STARTS_WITHIN:g} s.", log=self.log_tail())
 
     def start(self) -> subprocess.Popen[bytes]:
@@ -151,7 +148,7 @@ def attended(settings: Settings) -> Iterator[None]:
     DataDirectoryInUse, ServerFailed
         See `Valkey`.
     """
-    if settings.redis_url is not None or _answers(settings.redis):
+    if settings.redis_url is not None or _answers(socket_path(settings.data)):
         yield
         return
     valkey = Valkey.claim(settings.data)
@@ -166,21 +163,22 @@ def attended(settings: Settings) -> Iterator[None]:
         valkey.release()
 
 
-def _answers(url: str) -> bool:
-    client = connect(url, decode=True, retries=0)
-    try:
-        client.ping()
-    except (redis.ConnectionError, redis.TimeoutError):
-        return False
-    finally:
-        client.close()
-    return True
+def _answers(path: Path) -> bool:
+    """Whether a server answers on a socket, and has read its file; asked without the client library, which `pliant up` does not need."""
+    with socket.socket(socket.AF_UNIX) as probe:
+        probe.settimeout(PONG_WITHIN)
+        try:
+            probe.connect(str(path))
+            probe.sendall(b"PING\r\n")
+            return probe.recv(64) == b"+PONG\r\n"
+        except OSError:
+            return False
 
 
-def _command(binary: Path, home: Path, socket: Path) -> list[str]:
+def _command(binary: Path, home: Path, path: Path) -> list[str]:
     options = {
         "port": "0",
-        "unixsocket": str(socket),
+        "unixsocket": str(path),
         "unixsocketperm": "700",
         "dir": str(home),
         "save": "",
@@ -212,8 +210,11 @@ def _lock(descriptor: int) -> bool:
     return True
 
 
-def _shut_down(socket: Path) -> None:
-    client = connect(f"unix://{socket}", decode=True, retries=0)
+def _shut_down(path: Path) -> None:
+    import redis
+    from pliant.worker.store.connection import connect
+
+    client = connect(f"unix://{path}", decode=True, retries=0)
     try:
         client.shutdown(nosave=True)  # flushes the append-only file all the same
     except (redis.ConnectionError, redis.TimeoutError):

@@ -12,11 +12,17 @@ import pytest
 from pliant.worker.formats.reading.parsers import PARSERS
 
 LISTED = """
-import sys
+import os, sys
 import pliant.worker.formats.reading.sandbox
 from pliant.worker.formats.reading.parsers import PARSERS
-PARSERS[sys.argv[1]].load()
-print(*sys.modules)
+for name, parser in PARSERS.items():
+    if os.fork() == 0:
+        try:
+            parser.load()
+            print(name, *sys.modules, flush=True)
+        finally:
+            os._exit(0)
+    os.wait()
 """
 NEEDED = {"matlab5": {"scipy.io"}, "matlab73": {"h5py"}, "ply": {"plyfile"}, "obj": {"plyfile"}, "png": {"PIL"}}
 HEAVY = {"scipy.io", "scipy.linalg", "scipy.sparse", "h5py", "PIL", "pydantic", "pliant.solver.reconstruct"}
@@ -24,10 +30,16 @@ ALSO = {"matlab5": {"scipy.sparse", "scipy.linalg"}}
 """What comes with what is needed."""
 
 
+@pytest.fixture(scope="module")
+def modules() -> dict[str, set[str]]:
+    """What a sandbox has loaded, for each parser."""
+    ran = subprocess.run([sys.executable, "-I", "-c", LISTED], capture_output=True, text=True, check=True)
+    return {name: set(loaded) for name, *loaded in map(str.split, ran.stdout.splitlines())}
+
+
 @pytest.mark.parametrize("parser", PARSERS)
-def test_a_sandbox_loads_only_its_parser(parser: str) -> None:
-    ran = subprocess.run([sys.executable, "-I", "-c", LISTED, parser], capture_output=True, text=True, check=True)
-    loaded = set(ran.stdout.split())
+def test_a_sandbox_loads_only_its_parser(modules: dict[str, set[str]], parser: str) -> None:
+    loaded = modules[parser]
     needed = NEEDED.get(parser, set())
     assert needed <= loaded
     assert loaded & HEAVY <= needed | ALSO.get(parser, set())
@@ -46,6 +58,14 @@ def test_what_solves_nothing_loads_neither_scipy_nor_the_tracker(code: str) -> N
     listed = f"import sys; {code}; print(*sys.modules)"
     ran = subprocess.run([sys.executable, "-I", "-c", listed], capture_output=True, text=True, check=True)
     assert not {"scipy", "pliant.tracking.track", "pliant.solver.reconstruct"} & set(ran.stdout.split())
+
+
+def test_the_film_process_checks_nothing_that_needs_pydantic() -> None:
+    listed = "import sys, pliant.worker.films.contained_process, pliant.tracking as t; t.open_film; print(*sys.modules)"
+    ran = subprocess.run([sys.executable, "-I", "-c", listed], capture_output=True, text=True, check=True)
+    loaded = set(ran.stdout.split())
+    assert "cv2" in loaded
+    assert "pydantic" not in loaded
 
 
 @pytest.mark.parametrize("package", [pliant.solver, pliant.tracking, pliant.worker.formats])
