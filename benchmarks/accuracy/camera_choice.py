@@ -26,9 +26,6 @@ from benchmarks.sequences import Case, cases
 
 RESULTS = Path(__file__).parent.parent / "results" / "camera_choice.jsonl"
 
-WORST_ERROR, WORST_TIME = 1.02, 1.6
-"""Largest ratios of error and time, `auto` over orthography, that the choice may cost."""
-
 
 def measure(case: Case, *, image_size: tuple[float, float] | None = None) -> dict[str, Any]:
     """Return one row: the sequence solved with both camera models."""
