@@ -156,16 +156,7 @@ def made_folder(folder: Path, option: str) -> None:
 
 
 def output_folder(folder: Path, *, force: bool, files: Iterable[str] = RESULT_FILES) -> None:
-    """Create the folder of the results and check that it can take them.
-
-    Parameters
-    ----------
-    folder : Path
-        Created if it does not exist.
-    force : bool
-        Whether existing files may be replaced.
-    files : iterable of str
-        Names that are refused if they exist already.
+    """Create the folder of the results and check that it can take them; without `force` it may hold none of `files`.
 
     Raises
     ------

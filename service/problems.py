@@ -108,20 +108,9 @@ def answer(
     status: int | None = None,
     **members: Any,
 ) -> ProblemResponse:
-    """Return the response for a code.
+    """Return the response for a code, which gives type, title and, unless `status` is given, the status.
 
-    Parameters
-    ----------
-    code : ProblemCode
-        Stable machine-readable name; gives type, title and, unless `status` is given, the status.
-    detail : str
-        A whole sentence that ends with what to do.
-    headers : mapping of str to str, optional
-        Further response headers.
-    status : int, optional
-        HTTP status code.
-    **members
-        Further members of `Problem`.
+    `detail` is a whole sentence that ends with what to do; `members` are further ones of `Problem`.
     """
     return ProblemResponse(Problem.of(code, status, detail=detail, **members), headers=headers)
 
@@ -181,14 +170,8 @@ def _short(value: object) -> str:
 def install(app: FastAPI, table: Mapping[type[Exception], int], *, security_headers: Mapping[str, str]) -> None:
     """Answer every error of the app with a problem document.
 
-    Parameters
-    ----------
-    app : FastAPI
-        The application.
-    table : mapping of exception class to int
-        Status code by class; a subclass that is not listed uses its nearest base's.
-    security_headers : mapping of str to str
-        Headers of the answer to an unexpected exception, which is made outside all middleware.
+    The table has status codes by class; a subclass that is not listed uses its nearest base's. The security headers are for the
+    answer to an unexpected exception, which is made outside all middleware.
     """
     app.add_exception_handler(Refusal, _of_refusal)
     app.add_exception_handler(HTTPException, _of_http)

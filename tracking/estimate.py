@@ -43,11 +43,6 @@ def estimate(
 ) -> Estimate:
     """Place the points in the region's frame; time one flow of the region's size, and what else a frame takes.
 
-    Parameters
-    ----------
-    film, region, region_frame, grid_step, longest_side, threads
-        As in `track_film`.
-
     Raises
     ------
     FilmError

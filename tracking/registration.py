@@ -85,18 +85,10 @@ class Registration:
 
     @classmethod
     def of(cls, template: Grey, points: Floats, grid: NDArray[np.int32], *, noise: float) -> Registration:
-        """Prepare the registration of a template.
+        """Prepare the registration of a template, a grey frame `(H, W)`.
 
-        Parameters
-        ----------
-        template : array, shape (H, W)
-            Grey frame.
-        points : array, shape (P, 2)
-            Pixels of the template on a regular grid.
-        grid : array, shape (rows, columns)
-            Point of every cell of the grid, −1 where there is none.
-        noise : float
-            Variance of the frames' noise, square grey levels.
+        Points `(P, 2)` are pixels on a regular grid `(rows, columns)` of their indices, −1 where there is none. `noise` is the
+        variance of the frames' noise, square grey levels.
         """
         corners = np.stack([grid[:-1, :-1], grid[:-1, 1:], grid[1:, :-1], grid[1:, 1:]], axis=-1)
         full = np.asarray((corners >= 0).all(axis=-1))

@@ -57,13 +57,6 @@ EXAMPLES = {
 def example_file(name: str, file: str) -> bytes:
     """Return one input file of an example, with identical bytes on every call.
 
-    Parameters
-    ----------
-    name : str
-        A key of `EXAMPLES`, or the name of the example film where OpenCV is installed.
-    file : str
-        A file that the example lists.
-
     Raises
     ------
     UnknownExample

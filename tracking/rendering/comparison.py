@@ -77,16 +77,9 @@ class Truth:
         )
 
     def shape_error(self, shapes: ArrayLike, points: ArrayLike | None = None) -> float:
-        """Return `e3d_frame` of reconstructed shapes after one scale for the film, which does not show how large things are.
+        """Return `e3d_frame_scaled`: a film does not show how large things are.
 
-        The scale is that of `e3d_frame_scaled`, whose value this is.
-
-        Parameters
-        ----------
-        shapes : array, shape (F, K, 3)
-            Reconstructed points.
-        points : array, shape (K,), optional
-            Which of the N tracked points they are; all by default.
+        `points (K,)` are which of the N tracked points the shapes `(F, K, 3)` are of; all by default.
         """
         found = np.asarray(shapes, dtype=np.float64)
         chosen = np.arange(len(self.on)) if points is None else np.asarray(points, dtype=np.int64)

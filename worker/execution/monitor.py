@@ -136,17 +136,9 @@ class Watch:
 def finalize(watch: Watch, *, status: int, peak: int, patience: Patience) -> Stored | None:
     """Record the outcome of a job process that ended without recording one; otherwise change nothing.
 
-    Returns the record if it was written. The reason and the last output of the job process are logged before the record
-    becomes final, so the log of a finished job is complete.
-
-    Parameters
-    ----------
-    status : int
-        As `os.wait4` returns it.
-    peak : int
-        Peak resident size of the job process, bytes.
-    patience : Patience
-        Time limit for an unavailable store.
+    Returns the record if it was written. The reason and the last output of the job process are logged before the record becomes
+    final, so the log of a finished job is complete. `status` is as `os.wait4` returns it, `peak` the largest resident size in
+    bytes.
 
     Raises
     ------

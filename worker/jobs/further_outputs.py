@@ -24,26 +24,11 @@ TRACKS = "tracks.npz"
 def make_outputs(
     jobs: Jobs, id: str, request: OutputRequest, *, idempotency_key: str | None = None
 ) -> tuple[Job, bool]:
-    """Queue a job that writes further files of a result.
+    """Queue a job that writes further files of a result; return it, and whether it is new.
 
-    The new job has copies of what it needs, so the first one may be deleted meanwhile; it counts against the same limits as
-    every other job. The same request again returns the same job; after one that failed or was cancelled it makes one more.
-
-    Parameters
-    ----------
-    id : str
-        A job that has succeeded.
-    request : OutputRequest
-        Which files, and how.
-    idempotency_key : str, optional
-        A repeated request with the same key returns the first new job, whatever its status.
-
-    Returns
-    -------
-    job : Job
-        The new job, or the one that the same request made before; its `outputs_of` is the id given.
-    new : bool
-        False if an earlier request made it.
+    The new job has copies of what it needs, so the first one may be deleted meanwhile; it counts against the same limits as every
+    other job. The same request again returns the same job; after one that failed or was cancelled it makes one more, unless it
+    has the same key.
 
     Raises
     ------

@@ -15,10 +15,7 @@ from pliant.worker.jobs.submission import Submission, copy_beside
 def retry(jobs: Jobs, id: str, *, idempotency_key: str | None = None) -> Job:
     """Run a failed or cancelled job again, as a new job with the same inputs, options, name and webhook.
 
-    Parameters
-    ----------
-    idempotency_key : str, optional
-        A repeated request with the same key returns the first new job.
+    A repeated request with the same key returns the first new job.
 
     Raises
     ------

@@ -72,15 +72,8 @@ class Jobs:
     def submit(self, inputs_file: Path, submission: Submission, *, interpretation: Interpretation) -> Job:
         """Accept a job. After this returns the job ends with a result or an error, whichever process is killed.
 
-        Parameters
-        ----------
-        inputs_file : Path
-            Canonical inputs, as written by `worker.formats.save_inputs`. Linked or copied: the caller may unlink the
-            file, but must not write to it.
-        submission : Submission
-            The client's request.
-        interpretation : Interpretation
-            How the inputs were read.
+        The canonical inputs, as `worker.formats.save_inputs` writes them, are linked or copied: the caller may unlink the file,
+        but must not write to it.
 
         Raises
         ------
@@ -147,21 +140,12 @@ class Jobs:
         return self._placed(self.stored(id))
 
     def page(self, *, cursor: str | None = None, limit: int = 50, statuses: Sequence[Status] | None = None) -> JobPage:
-        """Return jobs, newest first.
-
-        Parameters
-        ----------
-        cursor : str, optional
-            `JobPage.next` of the previous page.
-        limit : int
-            1–200.
-        statuses : sequence of Status, optional
-            Statuses to include; all by default.
+        """Return jobs, newest first, after the previous page's `JobPage.next`; of all statuses by default.
 
         Raises
         ------
         InvalidRequest
-            The cursor is malformed, or the limit is out of range.
+            The cursor is malformed, or the limit is not 1–200.
         """
         check_page(cursor, limit)
         wanted = tuple(Status) if statuses is None else tuple(statuses)
@@ -256,14 +240,9 @@ class Jobs:
         return "".join(f"{line}\n" for line in self.records.log(id))
 
     def events(self, id: str, *, after: str | None = None) -> list[Event]:
-        """Return the job's events after a given one; `records.changes` signals new ones.
+        """Return the job's events after a given one; None: the latest 256, or 16 of a finished job. `records.changes` signals new ones.
 
         The last event of a finished job is a `job` event with a final status; nothing follows it.
-
-        Parameters
-        ----------
-        after : str, optional
-            `Event.id`; None returns all that are kept: the latest 256, or the latest 16 of a finished job.
 
         Raises
         ------
@@ -310,23 +289,10 @@ class Jobs:
         self, job: Job, submission: Submission, put: Callable[[str], object], *, size: int, owner: str | None = None,
         from_result: bool = False,
     ) -> Job:  # fmt: skip
-        """Store a new job and queue it.
+        """Store a new job and queue it; raises `Conflict`, `QuotaExceeded` and `TooManyQueued` as `submit`.
 
-        Parameters
-        ----------
-        put : callable
-            Stores the inputs under a blob key, and the result to work from beside them, see `result_beside`.
-        size : int
-            Bytes that `put` stores.
-        owner : str, optional
-            Whose job it is; None: the owner of these jobs.
-        from_result : bool
-            The job works from a stored result instead of solving.
-
-        Raises
-        ------
-        Conflict, QuotaExceeded, TooManyQueued
-            As `submit`.
+        `put` stores `size` bytes: the inputs under a blob key, and with `from_result` the result to work from beside them
+        (`result_beside`). The job belongs to the owner of these jobs unless another is given.
         """
         acceptance = Acceptance(records=self.records, blobs=self.blobs, queue=self.queue, settings=self.settings)
         acceptance.check_quota(size)

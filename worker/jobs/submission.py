@@ -77,19 +77,7 @@ class Acceptance:
     def create(self, stored: Stored, put: Callable[[str], object], *, max_queued: int) -> Stored:
         """Store inputs, record and queue entry, in this order; a failure in between leaves no accepted job.
 
-        Parameters
-        ----------
-        stored : Stored
-            The new record.
-        put : callable
-            Stores the inputs under a blob key.
-        max_queued : int
-            Jobs of this owner that may be queued at once; 0: any number.
-
-        Returns
-        -------
-        Stored
-            The new record, or the one that already has its idempotency key or id.
+        `put` stores the inputs under a blob key. Returns the new record, or the one that already has its idempotency key or id.
 
         Raises
         ------

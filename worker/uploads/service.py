@@ -89,14 +89,7 @@ class Uploads:
     def write(self, id: str, *, offset: int, length: int | None, capacity: Capacity) -> Iterator[Writer]:
         """Resume an upload, or start it at offset 0, which discards an incomplete one of the same id.
 
-        Parameters
-        ----------
-        offset : int
-            Position of the next bytes; must equal the current size of the upload.
-        length : int, optional
-            Bytes of the complete upload, if known.
-        capacity : Capacity
-            Limits of its size.
+        `offset` must equal the current size of the upload; `length` is that of the complete one, if known.
 
         Raises
         ------

@@ -23,16 +23,10 @@ SECRET_BYTES = range(24, 65)
 
 
 def parse_webhook(url: str, secret: str, *, networks: str = "") -> Webhook | None:
-    """Return the webhook of a submission, None if it has none.
+    """Return the webhook of a submission, None for an empty URL.
 
-    Parameters
-    ----------
-    url : str
-        ``http`` or ``https``, a host, no user name; empty: no webhook.
-    secret : str
-        ``whsec_`` and 24 to 64 random bytes in base64.
-    networks : str
-        `Settings.webhook_networks`.
+    The URL has ``http`` or ``https``, a host and no user name; the secret is ``whsec_`` and 24 to 64 random bytes in base64;
+    `networks` is `Settings.webhook_networks`.
 
     Raises
     ------

@@ -36,18 +36,9 @@ class Surface:
 def read_surface(
     mesh: Path | str | None, *, num_points: int, picture: tuple[int, int] | None, limits: Limits
 ) -> Surface:
-    """Read the form part `mesh`.
+    """Read the form part `mesh`: a file, ROWSxCOLUMNS or `none`.
 
-    Parameters
-    ----------
-    mesh : Path, str or None
-        A file, ROWSxCOLUMNS or `none`. None: the picture's grid if the points are its pixels, else a generated mesh.
-    num_points : int
-        P.
-    picture : tuple of int, optional
-        Rows and columns of the picture whose pixels the points are.
-    limits : Limits
-        Largest number of faces.
+    None: the grid of the picture whose pixels the points are, else a generated mesh.
 
     Raises
     ------

@@ -23,12 +23,7 @@ NOT_A_MESH = "Give an OBJ, PLY, glTF or npz mesh, a grid size such as 48x64, or 
 
 
 def read_obj(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
-    """Read `v` and `f` of a Wavefront OBJ; everything else is ignored.
-
-    Returns
-    -------
-    dict
-        `vertices (V, 3)` and `faces (T, 3)` or `(T, 4)`, indices from 0.
+    """Read `vertices (V, 3)` and `faces (T, 3)` or `(T, 4)`, from 0, of a Wavefront OBJ; all but `v` and `f` is ignored.
 
     Raises
     ------

@@ -113,22 +113,9 @@ def roughness(points: NDArray[np.generic]) -> float:
 def choose(
     name: str, array: NDArray[np.generic], *, dialect: Dialect, options: Options, field: str
 ) -> tuple[Reading, list[str]]:
-    """Select the interpretation that the options request, that is documented, or that the data indicate.
+    """Select the interpretation that the options request, that is documented, or that the data indicate; return it and notes.
 
-    Parameters
-    ----------
-    name, array
-        As found in the file, batch axis removed.
-    dialect : Dialect
-        Its documented layout is used unless another is five times smoother in time.
-    options : Options
-        `layout` and `rows` take precedence over detection.
-
-    Returns
-    -------
-    reading : Reading
-    notes : list of str
-        The evidence.
+    The array has no batch axis. The documented layout of the dialect is used unless another is five times smoother in time.
 
     Raises
     ------
