@@ -55,7 +55,7 @@ def mesh_file(mesh: str | None) -> None:
     input_file(Path(mesh), "mesh")
 
 
-def tracks_or_film(path: Path, name: str = "tracks") -> None:
+def tracks_or_film(path: Path) -> None:
     """Check that a path is a file that can be read, or a folder with the pictures of a film.
 
     Raises
@@ -67,10 +67,10 @@ def tracks_or_film(path: Path, name: str = "tracks") -> None:
     from pliant.worker.films.sources import PICTURES
 
     if not path.is_dir():
-        input_file(path, name)
+        input_file(path, "tracks")
     elif not any(each.suffix.lower() in PICTURES for each in path.iterdir()):
         raise BadArgument(
-            f"{name}: expected a file or a folder of pictures, got the folder {path}, which has no pictures. "
+            f"tracks: expected a file or a folder of pictures, got the folder {path}, which has no pictures. "
             "Give the path of a file in it."
         )
 

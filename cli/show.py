@@ -168,10 +168,9 @@ def understood(interpretation: Interpretation) -> list[tuple[str, str]]:
     return rows + [("note", note) for note in interpretation.notes]
 
 
-def metrics_table(metrics: Mapping[str, float], title: str = "") -> Table:
+def metrics_table(metrics: Mapping[str, float]) -> Table:
     """Return the metrics and what they mean as a table, `e3d_frame` first."""
-    table = Table(title=title or None, title_justify="left")
-    table.add_column("metric")
+    table = Table("metric")
     table.add_column("value", justify="right")
     table.add_column("meaning")
     for name in sorted(metrics, key=_place):

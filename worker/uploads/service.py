@@ -27,7 +27,7 @@ MAX_UPLOADS = 100
 """Maximum number of uploads per owner."""
 
 LATE = timedelta(minutes=10)
-"""Seconds after its expiry from which fsck reports an upload."""
+"""Time after its expiry from which fsck reports an upload."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
