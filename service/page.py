@@ -82,15 +82,7 @@ class PageFiles(StaticFiles):
 
 
 def mount_page(app: FastAPI, directory: Path = BUILT) -> None:
-    """Serve the built page. Without one, `/`, `/guide` and `/docs` answer 503 with how to build it.
-
-    Parameters
-    ----------
-    app : FastAPI
-        Gets routes that are not in its OpenAPI document.
-    directory : Path
-        Output folder of the build.
-    """
+    """Serve the built page. Without one, `/`, `/guide` and `/docs` answer 503 with how to build it."""
     files = PageFiles(directory=directory, check_dir=False)
     files.config_checked = True  # the page can be built while the service runs
 

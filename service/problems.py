@@ -116,15 +116,7 @@ def answer(
 
 
 def from_error(error: Exception, status: int) -> Problem:
-    """Return the problem of a worker's or reader's error, with its code, field, expected, got, hint and choices.
-
-    Parameters
-    ----------
-    error : Exception
-        An error with at least a ``code`` attribute.
-    status : int
-        Status code of its class.
-    """
+    """Return the problem of a worker's or reader's error, with its code, field, expected, got, hint and choices."""
     code = str(getattr(error, "code", ProblemCode.INTERNAL_ERROR))
     return Problem.of(code, status, detail=str(error), **members_of(error))
 
@@ -132,12 +124,7 @@ def from_error(error: Exception, status: int) -> Problem:
 def from_validation(errors: Sequence[Any], *, options: bool = False) -> Refusal:
     """Return the refusal of values that pydantic rejected: the first fault in full, the others counted.
 
-    Parameters
-    ----------
-    errors : sequence of dict
-        `ValidationError.errors()`.
-    options : bool
-        True if the values are the options of a job, not parameters of the request.
+    They are the options of a job or parameters of the request.
     """
     first = errors[0]
     where = [str(part) for part in first["loc"] if part not in ("body", "query", "path", "header")]

@@ -87,13 +87,7 @@ class ServiceSettings:
         return self.auth == "required" or (self.auth == "auto" and not self.loopback)
 
     def rate_of(self, own: int | None) -> int:
-        """Return the allowed requests per minute, 0 for no limit.
-
-        Parameters
-        ----------
-        own : int or None
-            The token's own limit.
-        """
+        """Return the requests per minute that a token with this limit of its own may send, 0 for no limit."""
         if own is not None:
             return own
         if self.requests_per_minute is not None:

@@ -103,25 +103,12 @@ class Registration:
     def refine(
         self, frame: Grey, points: Floats, variance: Floats, visible: Bools, *, steps: int = STEPS
     ) -> tuple[Floats, Floats]:
-        """Move visible points from the end of the flow to where a frame matches the template.
+        """Move visible points from where flow leads to where a frame matches the template; return points and variances of the matches.
 
-        Parameters
-        ----------
-        frame : array, shape (H, W)
-            Grey levels.
-        points, variance : array, shapes (P, 2) and (P,)
-            Where flow leads, and its variance in square pixels.
-        visible : array of bool, shape (P,)
-            Which points the frame shows. The others keep place and variance, as do those around which it shows something else.
-        steps : int
-            Gauss–Newton steps.
-
-        Returns
-        -------
-        points, variance
-            Of the matches: the variance is that of the shift which would explain the remaining difference of brightness, the mean squared
-            residual around a point over the mean squared slope in the direction of least slope. Errors of the motion model make it that
-            large; noise of the film, which averages out over the window, makes it too large.
+        Variances are in square pixels. Points that are not visible keep place and variance, as do those around which the frame
+        shows something else. The variance is that of the shift which would explain the remaining difference of brightness, the
+        mean squared residual around a point over the mean squared slope in the direction of least slope. Errors of the motion
+        model make it that large; noise of the film, which averages out over the window, makes it too large.
         """
         shown = np.asarray(visible[self.cells.corners].all(axis=1))
         used = np.zeros(len(points), dtype=bool)

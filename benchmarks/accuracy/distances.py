@@ -45,14 +45,9 @@ DOWN = np.diag([1.0, -1.0, -1.0])
 
 
 def seen_from(case: Case, distance: float) -> tuple[Tracks, np.ndarray, np.ndarray]:
-    """Return tracks in pixels, true shapes (F, P, 3) in pixels, and true rotations (F, 3, 3), y down.
+    """Return tracks in pixels, true shapes (F, P, 3) in pixels, and true rotations (F, 3, 3), y down, of a case that has both.
 
-    Parameters
-    ----------
-    case : Case
-        With shapes and cameras.
-    distance : float
-        In half-sizes; infinite for orthography.
+    The distance is in half-sizes; infinite for orthography.
     """
     if case.shapes is None or case.cameras is None:
         raise ValueError(f"{case.name} has no true shapes and cameras")

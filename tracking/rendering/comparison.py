@@ -47,16 +47,9 @@ class Truth:
 
     @classmethod
     def of(cls, film: RenderedFilm, tracks: ArrayLike, template: int, frames: ArrayLike | None = None) -> Truth:
-        """Follow the points of tracks `(F, N, 2)` from where they are in the template.
+        """Follow the points of tracks `(F, N, 2)`, in the film's pixels, from where they are in their row `template`.
 
-        Parameters
-        ----------
-        film
-            The film that was tracked.
-        tracks, template
-            Tracks in the film's pixels, and the row of the template frame among them.
-        frames
-            Number in the film of every row, shape `(F,)`; all frames by default.
+        `frames (F,)` are the numbers of the rows in the film; all frames by default.
         """
         found = np.asarray(tracks, dtype=np.float64)
         rows = np.arange(film.num_frames) if frames is None else np.asarray(frames, dtype=np.int64)

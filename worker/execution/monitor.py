@@ -92,10 +92,7 @@ class Watch:
     def must_end(self, *, stop_by: float | None) -> Reason | None:
         """Write a heartbeat if one is due; return the reason to kill the job process now, or None.
 
-        Parameters
-        ----------
-        stop_by : float or None
-            Monotonic time until which the job may continue while the worker shuts down.
+        `stop_by` is the monotonic time until which the job may continue while the worker shuts down.
         """
         now = self.clock()
         self.stopping = stop_by is not None

@@ -73,12 +73,8 @@ def message(job: Job) -> bytes:
 def signed(secret: str, *, id: str, timestamp: int, body: bytes) -> dict[str, str]:
     """Return the headers by which the receiver verifies the sender and the age of a message.
 
-    Parameters
-    ----------
-    id : str
-        The same for all attempts at one message, so that the receiver recognises duplicates.
-    timestamp : int
-        Time of this attempt, seconds since 1970.
+    The id is the same for all attempts at one message, so that the receiver recognises duplicates; the timestamp is of this
+    attempt.
     """
     key = _key(secret)
     assert key is not None, "checked when the job was submitted"
