@@ -56,7 +56,6 @@ class SharedUploads(Uploads):
     states: UploadStates
 
     def get(self, id: str) -> Upload:
-        """See `Uploads.get`."""
         state = self._state(id)
         if state is None:
             raise UnknownUpload(id)
@@ -119,7 +118,6 @@ class SharedUploads(Uploads):
         raise UnknownUpload(id)
 
     def used(self) -> int:
-        """See `Uploads.used`."""
         now = time.time()
         return sum(state.taken(now) for state in self.states.all().values())
 
@@ -137,7 +135,6 @@ class SharedUploads(Uploads):
         return gone
 
     def findings(self, now: datetime) -> Iterator[str]:
-        """See `Uploads.findings`."""
         sizes, held = self.blobs.sizes(FOLDER), self.states.all()
         for name, state in held.items():
             lost = [key for key, size in state.pieces if sizes.get(f"{FOLDER}{name}/{state.generation}/{key}") != size]
