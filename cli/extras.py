@@ -15,7 +15,6 @@ class MissingExtra(Exception):
 
     def __init__(self, command: str, missing: str) -> None:
         super().__init__(f"{command} needs the service, which is not installed: pip install 'pliant[server]'")
-        self.missing = missing
         """The first module that was not found."""
 
 
