@@ -105,7 +105,7 @@ class Guarded(TyperGroup):
         except (Exception, KeyboardInterrupt) as caught:
             fault: BaseException = caught
             if isinstance(fault, ModuleNotFoundError) and (fault.name or "").partition(".")[0] in SERVER_MODULES:
-                fault = MissingExtra(f"pliant {ctx.invoked_subcommand or ''}".strip(), str(fault.name))
+                fault = MissingExtra(f"pliant {ctx.invoked_subcommand or ''}".strip())
             code = code_of(fault)
             if code is None:
                 raise
