@@ -63,11 +63,7 @@ STATUS_OF: dict[type[Exception], int] = {
 
 
 def create_app(
-    jobs_of_all: Jobs,
-    settings: ServiceSettings,
-    *,
-    tokens: Tokens,
-    limits: Limits | None = None,
+    jobs_of_all: Jobs, settings: ServiceSettings, *, tokens: Tokens, limits: Limits | None = None
 ) -> FastAPI:
     """Return the application on the jobs of all owners, whose store is not used before the first request.
 

@@ -67,11 +67,7 @@ class PageFiles(StaticFiles):
         if "gzip" in accepted and packed.is_file():
             path, stat_result, headers["Content-Encoding"] = packed, packed.stat(), "gzip"
         response = FileResponse(
-            path,
-            status_code=status_code,
-            headers=headers,
-            media_type=media_type,
-            stat_result=stat_result,
+            path, status_code=status_code, headers=headers, media_type=media_type, stat_result=stat_result
         )
         if self.is_not_modified(response.headers, requested):
             unchanged = NotModifiedResponse(response.headers)

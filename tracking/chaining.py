@@ -148,13 +148,7 @@ class _Link:
 
 
 def _links(
-    read: Read,
-    t: int,
-    direction: int,
-    template: int,
-    recent: dict[int, _State],
-    near: Floats,
-    pool: ThreadPoolExecutor,
+    read: Read, t: int, direction: int, template: int, recent: dict[int, _State], near: Floats, pool: ThreadPoolExecutor
 ) -> dict[int, _Link]:
     """Begin to compute the flows to frame t, by the frame that they come from.
 

@@ -33,13 +33,7 @@ class Estimate:
 
 
 def estimate(
-    film: Film,
-    *,
-    region: Region | None,
-    region_frame: int,
-    grid_step: float | None,
-    longest_side: int,
-    threads: int,
+    film: Film, *, region: Region | None, region_frame: int, grid_step: float | None, longest_side: int, threads: int
 ) -> Estimate:
     """Place the points in the region's frame; time one flow of the region's size, and what else a frame takes.
 

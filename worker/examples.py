@@ -22,11 +22,7 @@ class Example:
     name: str
     title: str
     make: Callable[[], Sequence]
-    files: tuple[tuple[str, str], ...] = (
-        ("tracks", "tracks.npz"),
-        ("mesh", "mesh.npz"),
-        ("ground_truth", "truth.npz"),
-    )
+    files: tuple[tuple[str, str], ...] = (("tracks", "tracks.npz"), ("mesh", "mesh.npz"), ("ground_truth", "truth.npz"))
 
 
 def _npz(**arrays: ArrayLike) -> bytes:

@@ -21,15 +21,7 @@ import shlex
 import sys
 from pathlib import Path
 
-from benchmarks.speed.growth import (
-    FIXED_FRAMES,
-    FIXED_POINTS,
-    FRAMES,
-    POINTS,
-    Sizes,
-    growth,
-    mesh_against_grid,
-)
+from benchmarks.speed.growth import FIXED_FRAMES, FIXED_POINTS, FRAMES, POINTS, Sizes, growth, mesh_against_grid
 from benchmarks.speed.side_by_side import BASELINES, Workload, compare
 
 

@@ -180,12 +180,7 @@ def _input_sections(point_names: Sequence[str] | None, texture: Texture | None) 
 
 
 def _sections(
-    tracks: Tracks,
-    solution: Solution,
-    truth: Floats | None,
-    facing: Floats | None,
-    kept: range,
-    rounding: Rounding,
+    tracks: Tracks, solution: Solution, truth: Floats | None, facing: Floats | None, kept: range, rounding: Rounding
 ) -> list[Section]:
     """Return the sections from `cameras` to `rejected`, of the frames kept; `facing` is the truth aligned with the result."""
     shapes, std, camera = solution.shapes, solution.shapes_std, solution.camera

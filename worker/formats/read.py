@@ -196,10 +196,7 @@ def _read_truth(
         ]
     if given is not None:
         return truth, raw.notes
-    return truth, [
-        "The tracks file also contains true shapes; they are used for metrics only.",
-        *raw.notes,
-    ]
+    return truth, ["The tracks file also contains true shapes; they are used for metrics only.", *raw.notes]
 
 
 def _hidden_notes(tracks: Tracks) -> list[str]:

@@ -10,19 +10,11 @@ from pathlib import Path
 
 from pliant.schemas.job import Artifact, Interpretation, Job, JobPage, Status
 from pliant.worker import tracing
-from pliant.worker.errors import (
-    Conflict,
-    NotAllowedNow,
-    StoreUnavailable,
-    TooManyQueued,
-    UnknownArtifact,
-    UnknownJob,
-)
+from pliant.worker.errors import Conflict, NotAllowedNow, StoreUnavailable, TooManyQueued, UnknownArtifact, UnknownJob
 from pliant.worker.ids import check_id, is_id, new_attempt_id, new_job_id
 from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.admission import check_fits
 from pliant.worker.jobs.submission import Acceptance, Submission, key_digest, result_beside
-from pliant.worker.jobs.validation import LARGEST_PAGE as LARGEST_PAGE
 from pliant.worker.jobs.validation import check_event_id, check_key, check_page
 from pliant.worker.paths import make_data_directory
 from pliant.worker.records import Event, Records, Stored, utc_now

@@ -19,9 +19,7 @@ from pliant.worker.errors import Conflict, OffsetMismatch, TooManyUploads, Unkno
 from pliant.worker.ids import check_id, is_id
 from pliant.worker.settings import Settings
 from pliant.worker.uploads.folder import LENGTH, PART, RESERVED, WHOLE, content, declared_length, locked, taken
-from pliant.worker.uploads.writer import Capacity as Capacity
-from pliant.worker.uploads.writer import Writer as Writer
-from pliant.worker.uploads.writer import inconsistent
+from pliant.worker.uploads.writer import Capacity, Writer, inconsistent
 
 MAX_UPLOADS = 100
 """Maximum number of uploads per owner."""

@@ -16,13 +16,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 from pliant.schemas.job import Upload
-from pliant.worker.errors import (
-    Conflict,
-    OffsetMismatch,
-    QuotaExceeded,
-    TooManyUploads,
-    UnknownUpload,
-)
+from pliant.worker.errors import Conflict, OffsetMismatch, QuotaExceeded, TooManyUploads, UnknownUpload
 from pliant.worker.ids import check_id, is_id
 from pliant.worker.settings import Settings
 from pliant.worker.store.blobs import Blobs
