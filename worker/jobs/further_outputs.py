@@ -9,11 +9,11 @@ from dataclasses import replace
 from pliant.schemas.job import Job, Status
 from pliant.schemas.outputs import OutputRequest
 from pliant.worker.artifacts import kinds_for
-from pliant.worker.errors import NotAllowedNow, UnknownJob
+from pliant.worker.errors import NotAllowedNow
 from pliant.worker.ids import new_job_id
 from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.service import Jobs
-from pliant.worker.jobs.submission import Submission, copy_beside
+from pliant.worker.jobs.submission import Submission
 from pliant.worker.records import Stored
 
 RESULT = "shapes.npz"
@@ -58,15 +58,7 @@ def make_outputs(
         submission = replace(submission, idempotency_key=f"outputs {wish} after {known.id}")
     _check(stored, submission)
     further = lifecycle.again(job, id=new_job_id(), now=jobs.clock(), outputs_of=id, options=submission.options)
-    copies = [(_inputs_of(stored), "inputs.npz"), (f"{stored.prefix}{RESULT}", "result.npz")]
-    try:
-        size = sum(jobs.blobs.get(key).size for key, _ in copies)
-        made = jobs.create(
-            further, submission, lambda key: copy_beside(jobs.blobs, copies, key), size=size, owner=stored.owner,
-            from_result=True,
-        )  # fmt: skip
-    except FileNotFoundError:  # deleted between our look and the copy
-        raise UnknownJob(id) from None
+    made = jobs.create_copy(further, submission, stored, inputs=_inputs_of(stored), result=f"{stored.prefix}{RESULT}")
     return made, made.id == further.id
 
 

@@ -14,7 +14,7 @@ from pliant.worker.errors import Conflict, NotAllowedNow, StoreUnavailable, TooM
 from pliant.worker.ids import check_id, is_id, new_attempt_id, new_job_id
 from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.admission import check_fits
-from pliant.worker.jobs.submission import Acceptance, Submission, key_digest, result_beside
+from pliant.worker.jobs.submission import Acceptance, Submission, folder_of, key_digest
 from pliant.worker.jobs.validation import check_event_id, check_key, check_page
 from pliant.worker.paths import make_data_directory
 from pliant.worker.records import Event, Records, Stored, utc_now
@@ -92,7 +92,7 @@ class Jobs:
         )
         check_fits(interpretation, submission.options, self.queue.memories().values())
         size = inputs_file.stat().st_size
-        return self.create(job, submission, lambda key: self.blobs.put(key, inputs_file), size=size)
+        return self._create(job, submission, lambda key: self.blobs.put(key, inputs_file), size=size)
 
     def known(self, submission: Submission) -> Job | None:
         """Return the job of an earlier identical request, None if the request is new. Raises as `submit`."""
@@ -277,14 +277,40 @@ class Jobs:
             raise UnknownJob(id)
         return stored
 
-    def create(
+    def create_copy(self, job: Job, submission: Submission, source: Stored, *, inputs: str, result: str | None) -> Job:
+        """Store and queue a new job of the source's owner, with copies of stored inputs and of a result to work from.
+
+        Raises
+        ------
+        Conflict, QuotaExceeded, TooManyQueued
+            As `submit`.
+        UnknownJob
+            The source was deleted meanwhile.
+        """
+        copies = {"inputs.npz": inputs} | ({} if result is None else {"result.npz": result})
+
+        def copy(to: str) -> None:
+            try:
+                for name, key in copies.items():
+                    self.blobs.copy(key, f"{folder_of(to)}{name}")
+            except FileNotFoundError:
+                self.blobs.delete(folder_of(to))
+                raise
+
+        try:
+            size = sum(self.blobs.get(key).size for key in copies.values())
+            return self._create(job, submission, copy, size=size, owner=source.owner, from_result=result is not None)
+        except FileNotFoundError:
+            raise UnknownJob(source.job.id) from None
+
+    def _create(
         self, job: Job, submission: Submission, put: Callable[[str], object], *, size: int, owner: str | None = None,
         from_result: bool = False,
     ) -> Job:  # fmt: skip
-        """Store a new job and queue it; raises `Conflict`, `QuotaExceeded` and `TooManyQueued` as `submit`.
+        """Store a new job and queue it.
 
-        `put` stores `size` bytes: the inputs under a blob key, and with `from_result` the result to work from beside them
-        (`result_beside`). The job belongs to the owner of these jobs unless another is given.
+        `put` stores `size` bytes: the inputs under a blob key, and with `from_result` the result to work from beside them. The
+        job belongs to the owner of these jobs unless another is given.
         """
         acceptance = Acceptance(records=self.records, blobs=self.blobs, queue=self.queue, settings=self.settings)
         acceptance.check_quota(size)
@@ -294,7 +320,7 @@ class Jobs:
             owner=owner if owner is not None else self.owner or "",
             attempt_id=attempt_id,
             inputs=(inputs := f"jobs/{job.id}/{attempt_id}/inputs.npz"),
-            result=result_beside(inputs) if from_result else None,
+            result=f"{folder_of(inputs)}result.npz" if from_result else None,
             bytes=size,
             key=key_digest(submission.idempotency_key, self.owner),
             fingerprint=submission.fingerprint,
