@@ -78,11 +78,6 @@ class Uploads:
             return self.get(id)
         return None
 
-    def size(self, id: str) -> int:
-        """Return the received bytes of an upload, 0 if there is no upload of that id."""
-        there = self.find(id)
-        return 0 if there is None else there.offset
-
     @contextmanager
     def write(self, id: str, *, offset: int, length: int | None, capacity: Capacity) -> Iterator[Writer]:
         """Resume an upload, or start it at offset 0, which discards an incomplete one of the same id.
