@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import platform
@@ -9,6 +10,16 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.commit import commit
+
+
+def parser_of(doc: str | None, *, out: Path, points: int | None = None) -> argparse.ArgumentParser:
+    """Return a parser with the options of all measurements that are kept one on a line."""
+    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, help="directory of recorded sequences")
+    parser.add_argument("--only", action="append", default=[], help="names that hold this word")
+    parser.add_argument("--points", type=int, default=points, help="keep at most so many points")
+    parser.add_argument("--out", type=Path, default=out, help="file to which results are appended")
+    return parser
 
 
 def machine() -> str:

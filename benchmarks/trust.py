@@ -15,7 +15,6 @@ standard deviation at 1, 2, … 99 %, so that the coverage of any interval follo
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
 from collections.abc import Iterator
@@ -29,7 +28,7 @@ from pliant.solver.evaluation.alignment import align
 from pliant.solver.evaluation.metrics import coverage, e3d_frame
 from pliant.solver.gallery import corrupt_tracks
 
-from benchmarks.rows import append_row, rows
+from benchmarks.rows import append_row, parser_of, rows
 from benchmarks.sequences import Case, cases
 from benchmarks.trust_tables import written
 
@@ -133,12 +132,8 @@ def measured(case: Case, solution: Solution, *, scale_free: bool) -> dict[str, A
 
 def main(arguments: list[str] | None = None) -> None:
     """Measure what is missing, or print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, help="directory of recorded sequences, beside the gallery")
-    parser.add_argument("--only", action="append", default=[], help="names that hold this word")
+    parser = parser_of(__doc__, out=Path("benchmarks/results/trust.jsonl"), points=300)
     parser.add_argument("--kinds", default=",".join(KINDS), help="comma-separated: " + ", ".join(KINDS))
-    parser.add_argument("--points", type=int, default=300, help="keep at most so many points")
-    parser.add_argument("--out", type=Path, default=Path("benchmarks/results/trust.jsonl"))
     parser.add_argument("--tables", action="store_true", help="print the tables instead of measuring")
     parser.add_argument("--into", type=Path, help="replace the tables of this page")
     given = parser.parse_args(arguments)

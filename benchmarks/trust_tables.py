@@ -1,4 +1,4 @@
-"""The tables of `benchmarks.trust`: verdicts against true errors, coverage by sequence."""
+"""The tables of `benchmarks.trust`: verdicts against true errors, and coverage."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def tables(rows: list[Row], calibration: Sequence[str]) -> str:
         confusion("Other sequences", held),
         missed(rows),
     ]
-    parts += [separated(chosen, held), covered(chosen, held), by_sequence(rows, calibration)]
+    parts += [separated(chosen, held), covered(chosen, held)]
     return "\n\n".join(part for part in parts if part)
 
 
@@ -168,15 +168,6 @@ def pooled(rows: list[Row], width: float = NINETY) -> float:
     return float(np.mean([np.mean(shares) for shares in by_name.values()]))
 
 
-def calibrated(rows: list[Row], share: float = 0.9) -> float:
-    """Return the half-width, in standard deviations, within which `share` of the positions lie, pooled over sequences."""
-    low, high = 0.0, 1e3
-    for _ in range(60):
-        middle = (low + high) / 2
-        low, high = (middle, high) if pooled(rows, middle) < share else (low, middle)
-    return high
-
-
 def covered(chosen: list[Row], held: list[Row]) -> str:
     """Return how many positions and sequences the intervals hold."""
     lines = [
@@ -198,48 +189,5 @@ def covered(chosen: list[Row], held: list[Row]) -> str:
             f"| {name} | {len(values)} | {pooled(rows):.0%} | {right} | {int((values > AIM[1]).sum())} | "
             f"{int((values < AIM[0]).sum())} | {sum(inside)} of {len(inside)} |"
         )
-    lines += ["", f"The interval is ± {NINETY:g} standard deviations; {exceptions([*chosen, *held])}"]
+    lines += ["", f"The interval is ± {NINETY:g} standard deviations."]
     return "\n".join(lines)
-
-
-def exceptions(rows: list[Row]) -> str:
-    """Return a sentence that names the solves whose intervals hold less than `AIM` promises, the worst first."""
-    shares = [(share, row) for row in rows if (share := within(row)) is not None]
-    low = sorted(((share, row) for share, row in shares if share < AIM[0]), key=lambda each: each[0])
-    if not low:
-        return "no solve has fewer than 85 % of its positions within it."
-    names = ", ".join(f"{row['sequence']} {row['kind']} {share:.0%}" for share, row in low)
-    return f"solves with fewer than 85 % of their positions within it: {names}."
-
-
-def by_sequence(rows: list[Row], calibration: Sequence[str]) -> str:
-    """Return one line a solve; * marks sequences that constants were chosen on."""
-    lines = [
-        "| sequence | tracks | verdict | first reason | expected | true | coverage | mean σ / RMS error | held-out error | turn over "
-        "deformation |",
-        "|---|---|---|---|---|---|---|---|---|---|",
-    ]
-    for row in sorted(rows, key=lambda row: row["sequence"]):
-        star = "*" if is_of(row, calibration) else ""
-        reason = row["reasons"][0] if row["reasons"] else ""
-        cells = (
-            f"{row['sequence']}{star}", row["kind"], VERDICTS[row["verdict"]], reason, figure(row["expected"]), figure(row["true"]),
-            percent(within(row)), ratio(row.get("std_over_error")), figure(row.get("held_out")), ratio(turn_over_deformation(row)),
-        )  # fmt: skip
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
-
-
-def figure(value: float | None) -> str:
-    """Return an error as the tables have it: `.042`."""
-    return "–" if value is None else f"{value:.3g}".replace("0.", ".", 1) if value < 1 else f"{value:.2f}"
-
-
-def percent(value: float | None) -> str:
-    """Return a share in percent."""
-    return "–" if value is None else f"{value:.0%}"
-
-
-def ratio(value: float | None) -> str:
-    """Return a ratio with two digits."""
-    return "–" if value is None else f"{value:.2g}"

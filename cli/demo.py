@@ -196,12 +196,7 @@ def report(
 
 @contextmanager
 def running(folder: Path) -> Iterator[str]:
-    """Run `pliant up` on a free port with its data in a folder, yield its address, and stop it afterwards.
-
-    Parameters
-    ----------
-    folder : Path
-        Created if missing; holds the data and the log.
+    """Run `pliant up` on a free port with data and log in a folder, which is created; yield its address, and stop it afterwards.
 
     Raises
     ------

@@ -321,8 +321,6 @@ def _redis(address: str) -> Finding:
     parts = urlsplit(address)
     where = f"{parts.scheme}://{parts.hostname or parts.path}:{parts.port or 6379}"
     advice = "Start that server, or unset PLIANT_REDIS_URL to use the embedded one."
-    if missing_modules():
-        return Finding("queue", "note", f"{where} was not checked", "Checking it needs pip install 'pliant[server]'.")
     from pliant.worker.errors import WorkerError
     from pliant.worker.store.connection import check_server
 

@@ -75,16 +75,9 @@ def code_of(fault: BaseException) -> Exit | None:
 
 
 def sentence_of(fault: BaseException, job: str | None = None, *, others: int = 0) -> str:
-    """Return the message for an error.
+    """Return the message for an error that ended a command.
 
-    Parameters
-    ----------
-    fault : BaseException
-        What ended the command.
-    job : str, optional
-        Id of the job that the command was waiting for.
-    others : int
-        How many further jobs it had submitted and not yet seen to the end.
+    `job` is the id of the job that it waited for; `others` further jobs had been submitted and not yet seen to the end.
     """
     if isinstance(fault, KeyboardInterrupt):
         if job is None:
@@ -112,7 +105,7 @@ class Guarded(TyperGroup):
         except (Exception, KeyboardInterrupt) as caught:
             fault: BaseException = caught
             if isinstance(fault, ModuleNotFoundError) and (fault.name or "").partition(".")[0] in SERVER_MODULES:
-                fault = MissingExtra(f"pliant {ctx.invoked_subcommand or ''}".strip(), str(fault.name))
+                fault = MissingExtra(f"pliant {ctx.invoked_subcommand or ''}".strip())
             code = code_of(fault)
             if code is None:
                 raise

@@ -13,10 +13,8 @@ class MissingExtra(Exception):
 
     code = "missing_extra"
 
-    def __init__(self, command: str, missing: str) -> None:
+    def __init__(self, command: str) -> None:
         super().__init__(f"{command} needs the service, which is not installed: pip install 'pliant[server]'")
-        self.missing = missing
-        """The first module that was not found."""
 
 
 def missing_modules() -> list[str]:
@@ -32,9 +30,8 @@ def require_server(command: str) -> None:
     MissingExtra
         It is not.
     """
-    missing = missing_modules()
-    if missing:
-        raise MissingExtra(command, missing[0])
+    if missing_modules():
+        raise MissingExtra(command)
 
 
 def _installed(name: str) -> bool:

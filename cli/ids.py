@@ -14,14 +14,7 @@ SEARCHED = 1000
 
 
 def find_job(client: Client, text: str) -> RemoteJob:
-    """Return the job that a command line names.
-
-    Parameters
-    ----------
-    client : Client
-        Of the service.
-    text : str
-        An id, the beginning of exactly one id, or ``@last``, the newest job.
+    """Return the job that a command line names: an id, the beginning of exactly one id, or ``@last``, the newest job.
 
     Raises
     ------

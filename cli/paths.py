@@ -55,7 +55,7 @@ def mesh_file(mesh: str | None) -> None:
     input_file(Path(mesh), "mesh")
 
 
-def tracks_or_film(path: Path, name: str = "tracks") -> None:
+def tracks_or_film(path: Path) -> None:
     """Check that a path is a file that can be read, or a folder with the pictures of a film.
 
     Raises
@@ -67,10 +67,10 @@ def tracks_or_film(path: Path, name: str = "tracks") -> None:
     from pliant.worker.films.sources import PICTURES
 
     if not path.is_dir():
-        input_file(path, name)
+        input_file(path, "tracks")
     elif not any(each.suffix.lower() in PICTURES for each in path.iterdir()):
         raise BadArgument(
-            f"{name}: expected a file or a folder of pictures, got the folder {path}, which has no pictures. "
+            f"tracks: expected a file or a folder of pictures, got the folder {path}, which has no pictures. "
             "Give the path of a file in it."
         )
 
@@ -156,16 +156,7 @@ def made_folder(folder: Path, option: str) -> None:
 
 
 def output_folder(folder: Path, *, force: bool, files: Iterable[str] = RESULT_FILES) -> None:
-    """Create the folder of the results and check that it can take them.
-
-    Parameters
-    ----------
-    folder : Path
-        Created if it does not exist.
-    force : bool
-        Whether existing files may be replaced.
-    files : iterable of str
-        Names that are refused if they exist already.
+    """Create the folder of the results and check that it can take them; without `force` it may hold none of `files`.
 
     Raises
     ------

@@ -35,8 +35,7 @@ Tracks = Annotated[
     ),
 ]
 Region = Annotated[
-    Path | None,
-    typer.Option("--region", help="Of a film: mask picture of its size; white is tracked.", readable=False),
+    Path | None, typer.Option("--region", help="Of a film: mask picture of its size; white is tracked.", readable=False)
 ]
 """Paths are checked by the commands: one exit code and one form of message for every wrong path."""
 Mesh = Annotated[

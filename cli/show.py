@@ -71,19 +71,9 @@ def show_fault(fault: BaseException, sentence: str, code: Exit, *, as_json: bool
 
 
 def explained_at(details: Mapping[str, Any], url: str | None) -> str | None:
-    """Return where the code of an error is explained.
+    """Return where the code of an error (`details_of`) is explained; None without a known code.
 
-    Parameters
-    ----------
-    details : mapping
-        Of the error, as `details_of` returns them.
-    url : str or None
-        Address of the service that the command used.
-
-    Returns
-    -------
-    str or None
-        The service's page if the error is one of its answers, else the command that prints the same text; None without a known code.
+    It is the service's page if the error is an answer of the service at `url`, else the command that prints the same text.
     """
     from pliant.schemas.problems import find_code, type_of
 
@@ -178,10 +168,9 @@ def understood(interpretation: Interpretation) -> list[tuple[str, str]]:
     return rows + [("note", note) for note in interpretation.notes]
 
 
-def metrics_table(metrics: Mapping[str, float], title: str = "") -> Table:
+def metrics_table(metrics: Mapping[str, float]) -> Table:
     """Return the metrics and what they mean as a table, `e3d_frame` first."""
-    table = Table(title=title or None, title_justify="left")
-    table.add_column("metric")
+    table = Table("metric")
     table.add_column("value", justify="right")
     table.add_column("meaning")
     for name in sorted(metrics, key=_place):

@@ -29,10 +29,7 @@ if TYPE_CHECKING:
     from pliant.schemas.job import Interpretation
     from pliant.worker.jobs.finished import Finished
 
-Threads = Annotated[
-    int | None,
-    typer.Option("--threads", help="Threads to use; all cores if not given.", min=1),
-]
+Threads = Annotated[int | None, typer.Option("--threads", help="Threads to use; all cores if not given.", min=1)]
 
 
 def solve(

@@ -167,12 +167,7 @@ def scopes_of(words: list[str]) -> list[Any]:
 def store(data: Path | None, *, new: bool = False) -> Iterator[Tokens]:
     """Open the tokens of an installation, whether its service is running or not.
 
-    Parameters
-    ----------
-    data : Path, optional
-        Data directory; by default that of the settings.
-    new : bool
-        Whether an installation may be created: its first token is made before its service runs.
+    With `new` it may be created: the first token is made before the service runs.
 
     Raises
     ------

@@ -35,15 +35,7 @@ if TYPE_CHECKING:
         WaitTimeout,
     )
     from pliant.client.retry import Retry
-    from pliant.schemas.job import (
-        Artifact,
-        Interpretation,
-        Job,
-        Problem,
-        Progress,
-        ServiceLimits,
-        Status,
-    )
+    from pliant.schemas.job import Artifact, Interpretation, Job, Problem, Progress, ServiceLimits, Status
     from pliant.schemas.options import Options
     from pliant.schemas.shares import Share
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import AsyncIterator, Iterator, Mapping
+from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from importlib.metadata import version
@@ -30,7 +30,7 @@ class Call:
     method: str
     path: str
     """Relative to the service's address, e.g. ``/v1/jobs``."""
-    params: Mapping[str, str | list[str]] = field(default_factory=dict)
+    params: Mapping[str, str | Sequence[str]] = field(default_factory=dict)
     headers: Mapping[str, str] = field(default_factory=dict)
     form: Form | None = None
     """Multipart body; its files are reopened for each attempt."""

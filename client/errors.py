@@ -192,7 +192,7 @@ def error_from(status: int, headers: Mapping[str, str], body: bytes) -> APIStatu
     return kind(problem, retry_after=seconds_of(headers.get("retry-after")))
 
 
-def seconds_of(retry_after: str | None, *, now: datetime | None = None) -> float | None:
+def seconds_of(retry_after: str | None) -> float | None:
     """Read a Retry-After header, seconds or an HTTP date; an invalid one counts as absent."""
     if retry_after is None:
         return None
@@ -204,7 +204,7 @@ def seconds_of(retry_after: str | None, *, now: datetime | None = None) -> float
         return None
     if moment.tzinfo is None:  # "-0000": the time is UTC, its origin unknown
         moment = moment.replace(tzinfo=UTC)
-    return max(0.0, (moment - (now if now is not None else datetime.now(UTC))).total_seconds())
+    return max(0.0, (moment - datetime.now(UTC)).total_seconds())
 
 
 def _ending(job: Job) -> str:

@@ -258,6 +258,11 @@ def checked_options(options: Options | Mapping[str, Any] | None) -> Options:
         ) from fault
 
 
+def option_fields(options: Options | Mapping[str, Any] | None) -> dict[str, str]:
+    """Return the form fields of a job's options. Raises as `checked_options`."""
+    return {"options": checked_options(options).model_dump_json(exclude_unset=True)}
+
+
 def _alone(visible: ArrayLike | None) -> None:
     if visible is not None:
         raise BadArgument(

@@ -24,14 +24,7 @@ LIGHT = np.array([-0.5, -0.6, 0.62])
 def draw(shapes: NDArray[np.float64], faces: NDArray[np.int32], frames: int, *, title: str) -> Figure:
     """Draw evenly spaced frames side by side at one scale: the lit surface, or points coloured by depth.
 
-    Parameters
-    ----------
-    shapes : ndarray, shape (F, P, 3)
-        World axes, y down as in images; drawn with y up.
-    faces : ndarray, shape (T, 3) or (T, 4)
-        Without faces, or with too many, only points are drawn.
-    frames : int
-        Number of frames to draw, at most F.
+    Shapes `(F, P, 3)` have y down as in images and are drawn with y up. Without faces, or with too many, only points are drawn.
 
     Raises
     ------

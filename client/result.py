@@ -214,8 +214,5 @@ def unknown_file(job: Job, name: str) -> NotFound:
     """Return the error for a file that a job does not have."""
     held = ", ".join(artifact.name for artifact in job.artifacts) or "none"
     return NotFound(
-        Problem.of(
-            "unknown_artifact",
-            detail=f"Job {job.id} ({job.status}) has no file {name!r}. Its files: {held}.",
-        )
+        Problem.of("unknown_artifact", detail=f"Job {job.id} ({job.status}) has no file {name!r}. Its files: {held}.")
     )

@@ -124,8 +124,7 @@ class Options(BaseModel):
         description="Residual at which the loss changes from quadratic to linear, in RMS radii of the tracks; null: the preset's.",
     )
     temporal_order: Literal[1, 2] | None = Field(
-        None,
-        description="1 penalises velocity, 2 acceleration; null: the preset's. No effect with prior gaussian.",
+        None, description="1 penalises velocity, 2 acceleration; null: the preset's. No effect with prior gaussian."
     )
     loss: Literal["l1", "l2", "huber"] = Field("l1", description="Loss of the data term when method is robust.")
     laplacian: Literal["auto", "grid8", "uniform", "cotangent"] = Field(

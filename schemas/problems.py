@@ -56,11 +56,6 @@ class ProblemCode(StrEnum):
         return explanations()[self].remedy
 
     @property
-    def path(self) -> str:
-        """Path of the service that explains the code."""
-        return type_of(self)
-
-    @property
     def retryable(self) -> bool:
         """True if the same request can succeed later."""
         return self.status in RETRYABLE_STATUSES

@@ -63,24 +63,11 @@ STATUS_OF: dict[type[Exception], int] = {
 
 
 def create_app(
-    jobs_of_all: Jobs,
-    settings: ServiceSettings,
-    *,
-    tokens: Tokens,
-    limits: Limits | None = None,
+    jobs_of_all: Jobs, settings: ServiceSettings, *, tokens: Tokens, limits: Limits | None = None
 ) -> FastAPI:
-    """Return the application.
+    """Return the application on the jobs of all owners, whose store is not used before the first request.
 
-    Parameters
-    ----------
-    jobs_of_all : Jobs
-        The jobs of all owners; their store is not used before the first request.
-    settings : ServiceSettings
-        Settings of the service.
-    tokens : Tokens
-        The bearer tokens, where the settings require them.
-    limits : Limits, optional
-        Largest inputs that the readers accept; None: the usual limits, with `read_memory` of the jobs' settings.
+    `limits` are the largest inputs that the readers accept; None: the usual limits, with `read_memory` of the jobs' settings.
     """
     metrics = Metrics()
     limits = limits or Limits(read_memory=jobs_of_all.settings.read_memory)

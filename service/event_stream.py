@@ -58,18 +58,7 @@ class Followers:
     async def follow(
         self, jobs: Jobs, id: str, *, after: str | None = None, heartbeat: float = 15.0
     ) -> AsyncGenerator[Event | None]:
-        """Yield a job's events as they come, None when `heartbeat` seconds passed without one; ends at a final status.
-
-        Parameters
-        ----------
-        jobs : Jobs
-            The jobs that the client may see.
-        id : str
-            The job.
-        after : str, optional
-            The last event already known; None begins with all that are kept.
-        heartbeat : float
-            Seconds.
+        """Yield a job's events after the last one known, None when `heartbeat` seconds passed without one; ends at a final status.
 
         Raises
         ------

@@ -58,13 +58,7 @@ class Metrics:
         self.seconds.labels(route).observe(seconds)
 
     def exposition(self, jobs: Jobs) -> bytes:
-        """Return all metrics in Prometheus' text format. Blocks; call it on a thread.
-
-        Parameters
-        ----------
-        jobs : Jobs
-            The jobs of all owners.
-        """
+        """Return all metrics, of the jobs of all owners, in Prometheus' text format. Blocks; call it on a thread."""
         of_store = CollectorRegistry()
         of_store.register(StoreCollector(jobs))
         return prometheus_client.generate_latest(of_store) + prometheus_client.generate_latest(self.registry)

@@ -80,16 +80,7 @@ class Form:
 
 
 async def receive_form(request: Request, folder: Path, *, rules: FormRules) -> Form:
-    """Receive a multipart form.
-
-    Parameters
-    ----------
-    request : Request
-        Its body has not been read yet.
-    folder : Path
-        An empty folder for the files; the caller removes it.
-    rules : FormRules
-        Which parts there may be, and how large.
+    """Receive a multipart form into an empty folder, which the caller removes.
 
     Raises
     ------
@@ -119,21 +110,12 @@ async def receive_form(request: Request, folder: Path, *, rules: FormRules) -> F
 
 
 async def batches(request: Request, *, max_bytes: int, stall_seconds: float) -> AsyncIterator[bytes]:
-    """Yield the body in pieces of about `BATCH` bytes.
-
-    Parameters
-    ----------
-    request : Request
-        Its body has not been read yet.
-    max_bytes : int
-        Largest body.
-    stall_seconds : float
-        Seconds without a byte after which the request is refused.
+    """Yield the body, which has not been read yet, in pieces of about `BATCH` bytes.
 
     Raises
     ------
     Refusal
-        413 if the body is declared or turns out larger than that, 408 if the client stalls.
+        413 if the body is declared or turns out larger than `max_bytes`, 408 if no byte comes for `stall_seconds`.
     ClientDisconnect
         The body breaks off, after what has arrived of it.
     """

@@ -67,11 +67,7 @@ class PageFiles(StaticFiles):
         if "gzip" in accepted and packed.is_file():
             path, stat_result, headers["Content-Encoding"] = packed, packed.stat(), "gzip"
         response = FileResponse(
-            path,
-            status_code=status_code,
-            headers=headers,
-            media_type=media_type,
-            stat_result=stat_result,
+            path, status_code=status_code, headers=headers, media_type=media_type, stat_result=stat_result
         )
         if self.is_not_modified(response.headers, requested):
             unchanged = NotModifiedResponse(response.headers)
@@ -82,15 +78,7 @@ class PageFiles(StaticFiles):
 
 
 def mount_page(app: FastAPI, directory: Path = BUILT) -> None:
-    """Serve the built page. Without one, `/`, `/guide` and `/docs` answer 503 with how to build it.
-
-    Parameters
-    ----------
-    app : FastAPI
-        Gets routes that are not in its OpenAPI document.
-    directory : Path
-        Output folder of the build.
-    """
+    """Serve the built page. Without one, `/`, `/guide` and `/docs` answer 503 with how to build it."""
     files = PageFiles(directory=directory, check_dir=False)
     files.config_checked = True  # the page can be built while the service runs
 

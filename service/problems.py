@@ -108,34 +108,15 @@ def answer(
     status: int | None = None,
     **members: Any,
 ) -> ProblemResponse:
-    """Return the response for a code.
+    """Return the response for a code, which gives type, title and, unless `status` is given, the status.
 
-    Parameters
-    ----------
-    code : ProblemCode
-        Stable machine-readable name; gives type, title and, unless `status` is given, the status.
-    detail : str
-        A whole sentence that ends with what to do.
-    headers : mapping of str to str, optional
-        Further response headers.
-    status : int, optional
-        HTTP status code.
-    **members
-        Further members of `Problem`.
+    `detail` is a whole sentence that ends with what to do; `members` are further ones of `Problem`.
     """
     return ProblemResponse(Problem.of(code, status, detail=detail, **members), headers=headers)
 
 
 def from_error(error: Exception, status: int) -> Problem:
-    """Return the problem of a worker's or reader's error, with its code, field, expected, got, hint and choices.
-
-    Parameters
-    ----------
-    error : Exception
-        An error with at least a ``code`` attribute.
-    status : int
-        Status code of its class.
-    """
+    """Return the problem of a worker's or reader's error, with its code, field, expected, got, hint and choices."""
     code = str(getattr(error, "code", ProblemCode.INTERNAL_ERROR))
     return Problem.of(code, status, detail=str(error), **members_of(error))
 
@@ -143,12 +124,7 @@ def from_error(error: Exception, status: int) -> Problem:
 def from_validation(errors: Sequence[Any], *, options: bool = False) -> Refusal:
     """Return the refusal of values that pydantic rejected: the first fault in full, the others counted.
 
-    Parameters
-    ----------
-    errors : sequence of dict
-        `ValidationError.errors()`.
-    options : bool
-        True if the values are the options of a job, not parameters of the request.
+    They are the options of a job or parameters of the request.
     """
     first = errors[0]
     where = [str(part) for part in first["loc"] if part not in ("body", "query", "path", "header")]
@@ -181,14 +157,8 @@ def _short(value: object) -> str:
 def install(app: FastAPI, table: Mapping[type[Exception], int], *, security_headers: Mapping[str, str]) -> None:
     """Answer every error of the app with a problem document.
 
-    Parameters
-    ----------
-    app : FastAPI
-        The application.
-    table : mapping of exception class to int
-        Status code by class; a subclass that is not listed uses its nearest base's.
-    security_headers : mapping of str to str
-        Headers of the answer to an unexpected exception, which is made outside all middleware.
+    The table has status codes by class; a subclass that is not listed uses its nearest base's. The security headers are for the
+    answer to an unexpected exception, which is made outside all middleware.
     """
     app.add_exception_handler(Refusal, _of_refusal)
     app.add_exception_handler(HTTPException, _of_http)

@@ -21,19 +21,10 @@ class Slice:
 
 
 def decide(headers: Mapping[str, str], *, size: int, etag: str) -> Slice:
-    """Return what a GET with these headers is to be answered with.
+    """Return what a GET with these headers is to be answered with; `etag` is the file's strong entity tag, with its quotes.
 
-    Preconditions come first (If-Match, If-None-Match), then Range if If-Range agrees. Several ranges at once are answered
-    with the whole file, as RFC 9110 §14.2 allows: nobody resumes a download that way.
-
-    Parameters
-    ----------
-    headers : mapping of str to str
-        The request's headers, names in lower case or case-insensitive.
-    size : int
-        The file's bytes.
-    etag : str
-        The file's strong entity tag, with its quotes.
+    Preconditions come first (If-Match, If-None-Match), then Range if If-Range agrees. Several ranges at once are answered with
+    the whole file, as RFC 9110 §14.2 allows: nobody resumes a download that way.
     """
     if "if-match" in headers and not _matches(headers["if-match"], etag, strong=True):
         return Slice(412)

@@ -61,8 +61,8 @@ class ServiceSettings:
     cors_origins: Listed = ()
     """Origins whose pages may call the service, separated by commas; empty: none."""
     trusted_proxies: Listed = ()
-    """Addresses or networks of proxies whose `X-Forwarded-For` names the client, separated by commas; `*` for any
-   . Empty: none, because any user of the machine could choose the address that is counted."""
+    """Addresses or networks of proxies whose `X-Forwarded-For` names the client, separated by commas; `*` for
+    any. Empty: none, because any user of the machine could choose the address that is counted."""
     presigned_redirects: bool = True
     """Whether downloads that accept it (`?redirect=true`) are redirected to S3 by a URL that is valid for five minutes. False where
     clients cannot reach the object store. Without S3 it has no effect."""
@@ -87,13 +87,7 @@ class ServiceSettings:
         return self.auth == "required" or (self.auth == "auto" and not self.loopback)
 
     def rate_of(self, own: int | None) -> int:
-        """Return the allowed requests per minute, 0 for no limit.
-
-        Parameters
-        ----------
-        own : int or None
-            The token's own limit.
-        """
+        """Return the requests per minute that a token with this limit of its own may send, 0 for no limit."""
         if own is not None:
             return own
         if self.requests_per_minute is not None:

@@ -67,29 +67,10 @@ def accept(
     id: str | None = None,
     idempotency_key: str | None = None,
 ) -> tuple[Job, bool]:
-    """Read a form's inputs and submit the job. Blocks; call it on a thread.
+    """Read a form's inputs and submit the job; return it, and whether it is new. Blocks; call it on a thread.
 
-    Parameters
-    ----------
-    form : Form
-        The received form.
-    folder : Path
-        Where to write the canonical inputs; removed by the caller.
-    jobs : Jobs
-        The jobs of the request's token.
-    uploads : Uploads
-        The uploads of the request's token; the form may name them.
-    limits : Limits
-        Largest inputs that the readers accept.
-    id, idempotency_key : str, optional
-        The client's own id, and the idempotency key.
-
-    Returns
-    -------
-    job : Job
-        The new job, or the one that the same request created before.
-    new : bool
-        False if an earlier request created it.
+    The canonical inputs are written to `folder`, which the caller removes. `limits` are the largest inputs that the readers
+    accept.
 
     Raises
     ------

@@ -52,19 +52,11 @@ class Appearance:
         return cls(points, neighbours, _centred(patches), noise_variance(template))
 
     def agrees(self, frame: Grey, points: Floats, visible: Bools, *, pool: ThreadPoolExecutor | None = None) -> Bools:
-        """Compare a frame with the template at tracked points; return which of the visible ones stay so, shape `(P,)`.
+        """Compare a frame with the template at tracked points `(P, 2)`; return which of the visible ones stay so, shape `(P,)`.
 
-        The patches follow the tracks' local affine map, estimated from visible neighbours on the grid. The variance of the
-        noise is added to the patches' own, so that two flat patches count as equal.
-
-        Parameters
-        ----------
-        frame
-            Same size as the template.
-        points, visible
-            Tracked points, `(P, 2)`, and which of them are seen, `(P,)`.
-        pool
-            Threads to use; the result does not depend on them.
+        The patches follow the tracks' local affine map, estimated from visible neighbours on the grid. The variance of the noise
+        is added to the patches' own, so that two flat patches count as equal. The result does not depend on the threads of
+        `pool`.
         """
         image, affine = smooth(frame), self._affine(points, visible)
         seen = visible & _by_blocks(

@@ -87,24 +87,10 @@ def chain(
     on_frame: OnFrame,
     should_stop: Callable[[], bool],
 ) -> Chain:
-    """Track the points of a template to both ends of the film.
+    """Track the points `(P, 2)` of a template, a frame's index, to both ends of the film.
 
-    Parameters
-    ----------
-    read
-        Grey frame by index, all of one size.
-    num_frames, template
-        F, and the index of the template.
-    appearance
-        The points `(P, 2)` and what the template shows around them.
-    registration
-        The same points, and what the template shows between them.
-    pool
-        Threads for the flows of one frame.
-    on_frame
-        Called after every tracked frame with its index, the points `(P, 2)` in pixels of the tracker's frames, and which are visible.
-    should_stop
-        Asked before every frame.
+    `read` returns grey frames by index. `on_frame` is called after every tracked frame with its index, the points in pixels of
+    the tracker's frames, and which are visible; `should_stop` is asked before every frame.
 
     Raises
     ------
@@ -162,13 +148,7 @@ class _Link:
 
 
 def _links(
-    read: Read,
-    t: int,
-    direction: int,
-    template: int,
-    recent: dict[int, _State],
-    near: Floats,
-    pool: ThreadPoolExecutor,
+    read: Read, t: int, direction: int, template: int, recent: dict[int, _State], near: Floats, pool: ThreadPoolExecutor
 ) -> dict[int, _Link]:
     """Begin to compute the flows to frame t, by the frame that they come from.
 

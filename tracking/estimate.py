@@ -33,20 +33,9 @@ class Estimate:
 
 
 def estimate(
-    film: Film,
-    *,
-    region: Region | None,
-    region_frame: int,
-    grid_step: float | None,
-    longest_side: int,
-    threads: int,
+    film: Film, *, region: Region | None, region_frame: int, grid_step: float | None, longest_side: int, threads: int
 ) -> Estimate:
     """Place the points in the region's frame; time one flow of the region's size, and what else a frame takes.
-
-    Parameters
-    ----------
-    film, region, region_frame, grid_step, longest_side, threads
-        As in `track_film`.
 
     Raises
     ------

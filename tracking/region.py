@@ -26,13 +26,8 @@ LONG_STEP = 2
 def read_region(region: Region, size: tuple[int, int]) -> Bools:
     """Turn a region into a mask, shape `(H, W)`.
 
-    Parameters
-    ----------
-    region
-        A path to a mask picture of the film's size, its array `(H, W)` (bool, or uint8 with 128 and more inside), or a
-        polygon, `(N, 2)` pixels with N ≥ 3. Where a picture has transparency, opaque is inside.
-    size
-        Width and height of the film.
+    It is a path to a mask picture of the film's size, its array `(H, W)` (bool, or uint8 with 128 and more inside), or a polygon,
+    `(N, 2)` pixels with N ≥ 3. Where a picture has transparency, opaque is inside.
 
     Raises
     ------

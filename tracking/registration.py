@@ -85,18 +85,10 @@ class Registration:
 
     @classmethod
     def of(cls, template: Grey, points: Floats, grid: NDArray[np.int32], *, noise: float) -> Registration:
-        """Prepare the registration of a template.
+        """Prepare the registration of a template, a grey frame `(H, W)`.
 
-        Parameters
-        ----------
-        template : array, shape (H, W)
-            Grey frame.
-        points : array, shape (P, 2)
-            Pixels of the template on a regular grid.
-        grid : array, shape (rows, columns)
-            Point of every cell of the grid, −1 where there is none.
-        noise : float
-            Variance of the frames' noise, square grey levels.
+        Points `(P, 2)` are pixels on a regular grid `(rows, columns)` of their indices, −1 where there is none. `noise` is the
+        variance of the frames' noise, square grey levels.
         """
         corners = np.stack([grid[:-1, :-1], grid[:-1, 1:], grid[1:, :-1], grid[1:, 1:]], axis=-1)
         full = np.asarray((corners >= 0).all(axis=-1))
@@ -111,25 +103,12 @@ class Registration:
     def refine(
         self, frame: Grey, points: Floats, variance: Floats, visible: Bools, *, steps: int = STEPS
     ) -> tuple[Floats, Floats]:
-        """Move visible points from the end of the flow to where a frame matches the template.
+        """Move visible points from where flow leads to where a frame matches the template; return points and variances of the matches.
 
-        Parameters
-        ----------
-        frame : array, shape (H, W)
-            Grey levels.
-        points, variance : array, shapes (P, 2) and (P,)
-            Where flow leads, and its variance in square pixels.
-        visible : array of bool, shape (P,)
-            Which points the frame shows. The others keep place and variance, as do those around which it shows something else.
-        steps : int
-            Gauss–Newton steps.
-
-        Returns
-        -------
-        points, variance
-            Of the matches: the variance is that of the shift which would explain the remaining difference of brightness, the mean squared
-            residual around a point over the mean squared slope in the direction of least slope. Errors of the motion model make it that
-            large; noise of the film, which averages out over the window, makes it too large.
+        Variances are in square pixels. Points that are not visible keep place and variance, as do those around which the frame
+        shows something else. The variance is that of the shift which would explain the remaining difference of brightness, the
+        mean squared residual around a point over the mean squared slope in the direction of least slope. Errors of the motion
+        model make it that large; noise of the film, which averages out over the window, makes it too large.
         """
         shown = np.asarray(visible[self.cells.corners].all(axis=1))
         used = np.zeros(len(points), dtype=bool)

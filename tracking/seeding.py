@@ -44,23 +44,10 @@ def default_step(region: Bools) -> float:
 
 
 def place(template: Grey, region: Bools, *, step: float, everywhere: bool = False) -> tuple[Seeds, float]:
-    """Put points on a grid inside a region, where there is texture.
+    """Put points on a grid of `step` pixels inside a region, where there is texture or, if told so, everywhere.
 
-    Single cells without texture between textured ones are kept, so that the mesh has no pinholes.
-
-    Parameters
-    ----------
-    template, region
-        Grey frame and mask, `(H, W)`.
-    step
-        Distance of neighbouring points in pixels.
-    everywhere
-        Put points also where there is no texture.
-
-    Returns
-    -------
-    seeds, share
-        The points that belong to at least one face, and the share of the region's cells that have texture.
+    Single cells without texture between textured ones are kept, so that the mesh has no pinholes. Returns the points that belong
+    to at least one face, and the share of the region's cells that have texture.
     """
     height, width = template.shape
     x, y = (np.arange(step / 2, side - 1, step) for side in (width, height))

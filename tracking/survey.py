@@ -108,13 +108,7 @@ def tracking_scale(size: tuple[int, int], longest_side: int) -> float:
 
 
 def find_cuts(likeness: NDArray[np.float64]) -> tuple[int, ...]:
-    """Find single unlike steps among alike ones.
-
-    Parameters
-    ----------
-    likeness
-        Correlation of every frame with the one before, shape `(N,)`; the first is 1.
-    """
+    """Find single unlike steps among alike ones; `likeness (N,)` is the correlation of every frame with the one before, at first 1."""
     cuts = []
     for t in np.flatnonzero(likeness < CUT):
         around = np.concatenate([likeness[max(0, t - AROUND) : t], likeness[t + 1 : t + 1 + AROUND]])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from pliant.solver.threads import available_cores
 from pliant.tracking.advice import warnings_before, warnings_of
 from pliant.tracking.appearance import Appearance
 from pliant.tracking.chaining import Chain, chain
@@ -115,9 +115,7 @@ def track_film(
     _check_options(grid_step, longest_side, threads)
     opened = film if isinstance(film, Film) else open_film(film, frames=frames, limits=limits)
     stop = should_stop or (lambda: False)
-    workers = threads or min(
-        4, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    )
+    workers = threads or min(4, available_cores())
     with opencv_serial(), FrameStore() as store, ThreadPoolExecutor(workers) as pool:
         run = _Run(opened, store, pool, on_step or (lambda _: None), stop)
         mask = None if region is None else read_region(region, opened.size)

@@ -68,10 +68,7 @@ def track_again(
 ) -> None:
     """Register every frame again from the expected places; points that look like the template there are visible again.
 
-    Parameters
-    ----------
-    chained
-        From `chain`, whose other arguments these are. Its arrays are overwritten.
+    The arguments are those of `chain`, and what it returned, whose arrays are overwritten.
 
     Raises
     ------

@@ -1,28 +1,4 @@
-"""Errors of the worker package.
-
-    WorkerError                 base: catch this one
-    ├── UnknownJob              no job of that id (or not yours)
-    ├── UnknownArtifact         the job has no such file
-    ├── UnknownExample          no such example, or it has no such file
-    ├── UnknownShare            the job has no such share link
-    ├── UnknownToken            there is no token of that id
-    ├── UnknownUpload           no upload of that id (or not yours)
-    ├── NotAllowedNow           the job's status does not allow it
-    ├── Conflict                an id or idempotency key is used by a different request
-    │   └── OffsetMismatch      the offset of the bytes is not the size of the upload
-    ├── InvalidRequest          a malformed id or cursor
-    │   └── UploadTooLarge      an upload exceeds its maximum size
-    ├── TooManyShares           the limit of share links of a job is reached
-    ├── TooManyUploads          the owner's limit of uploads is reached
-    ├── InvalidSetting          a setting does not parse or is out of range
-    ├── TooManyQueued           the owner's limit of queued jobs is reached
-    ├── QuotaExceeded           the disk quota is reached
-    ├── StoreUnavailable        Redis or the blob store does not answer, or is full
-    ├── DataDirectoryInUse      another Pliant runs on the data directory
-    ├── ServerFailed            the embedded Valkey does not start
-    ├── Interrupted             a reconstruction was stopped on request
-    ├── TimedOut                a reconstruction took longer than its options allow
-    └── StaleAttempt            an attempt that no longer owns its job tried to write
+"""Errors of the worker package; `WorkerError` is the base of all.
 
 Every one carries a stable `code`, a whole sentence (`str(error)`) and whether the same request may succeed later.
 """
@@ -58,7 +34,6 @@ class UnknownJob(WorkerError):
 
     def __init__(self, id: str) -> None:
         super().__init__(f"There is no job {id!r}. List your jobs to see which exist; expired ones are removed.")
-        self.id = id
 
 
 class UnknownArtifact(WorkerError):
@@ -69,7 +44,6 @@ class UnknownArtifact(WorkerError):
     def __init__(self, id: str, name: str, *, names: list[str]) -> None:
         have = ", ".join(names) if names else "none (only a succeeded job has files)"
         super().__init__(f"Job {id!r} has no file {name!r}. It has: {have}.")
-        self.id, self.name, self.names = id, name, names
 
 
 class UnknownExample(WorkerError):
@@ -79,7 +53,6 @@ class UnknownExample(WorkerError):
 
     def __init__(self, name: str, file: str, *, known: list[str]) -> None:
         super().__init__(f"There is no example file {name}/{file}. There are: {', '.join(known)}.")
-        self.name, self.file = name, file
 
 
 class UnknownShare(WorkerError):
@@ -91,7 +64,6 @@ class UnknownShare(WorkerError):
         super().__init__(
             f"Job {id!r} has no share link {share!r}; it may have expired. List the links to see which there are."
         )
-        self.id, self.share = id, share
 
 
 class UnknownToken(WorkerError):
@@ -101,7 +73,6 @@ class UnknownToken(WorkerError):
 
     def __init__(self, id: str) -> None:
         super().__init__(f"There is no token {id!r}. `pliant token list` lists all tokens.")
-        self.id = id
 
 
 class UnknownUpload(WorkerError):
@@ -111,7 +82,6 @@ class UnknownUpload(WorkerError):
 
     def __init__(self, id: str) -> None:
         super().__init__(f"There is no upload {id!r}; uploads are removed when they expire. Send it again.")
-        self.id = id
 
 
 class NotAllowedNow(WorkerError):
@@ -121,7 +91,7 @@ class NotAllowedNow(WorkerError):
 
     def __init__(self, id: str, status: Status, *, wanted: str, hint: str) -> None:
         super().__init__(f"Job {id!r} has the status {status.value}: it cannot be {wanted} now. {hint}")
-        self.id, self.status, self.hint = id, status, hint
+        self.hint = hint
 
 
 class Conflict(WorkerError):
@@ -177,7 +147,6 @@ class TooManyShares(WorkerError):
 
     def __init__(self, id: str, most: int) -> None:
         super().__init__(f"Job {id!r} has {most} share links already. Revoke one, or wait until one expires.")
-        self.id, self.most = id, most
 
 
 class InvalidSetting(Invalid, WorkerError):
@@ -200,7 +169,6 @@ class TooManyQueued(WorkerError):
         super().__init__(
             f"Queue limit reached: {limit} jobs are already queued. Submit again when one of them has started, or cancel one."
         )
-        self.limit = limit
 
 
 class QuotaExceeded(WorkerError):
@@ -213,7 +181,6 @@ class QuotaExceeded(WorkerError):
         super().__init__(
             f"Disk quota reached: {used:,} of {quota:,} bytes are used. Delete jobs, wait until they expire, or raise PLIANT_DISK_QUOTA."
         )
-        self.used, self.quota = used, quota
 
 
 class StoreUnavailable(WorkerError):
@@ -225,7 +192,7 @@ class StoreUnavailable(WorkerError):
 
     def __init__(self, what: str, *, reason: str) -> None:
         super().__init__(f"{what} is unavailable ({reason}). No data was lost; try again in a few seconds.")
-        self.what, self.reason = what, reason
+        self.reason = reason
 
 
 class DataDirectoryInUse(WorkerError):
@@ -235,7 +202,6 @@ class DataDirectoryInUse(WorkerError):
 
     def __init__(self, data: str, *, holder: str) -> None:
         super().__init__(f"{data} is already used by {holder}. Stop it first, or choose another directory (--data).")
-        self.data, self.holder = data, holder
 
 
 class NewerData(WorkerError):
@@ -248,7 +214,6 @@ class NewerData(WorkerError):
             f"The records were written by a newer Pliant (version {found} of their form; this one reads up to {known}). "
             "Install that Pliant, or restore a backup that was made before the upgrade."
         )
-        self.found, self.known = found, known
 
 
 class BadBackup(WorkerError):
@@ -264,7 +229,6 @@ class ServerFailed(WorkerError):
 
     def __init__(self, sentence: str, *, log: str) -> None:
         super().__init__(f"{sentence} Its log ends with: {log}" if log else sentence)
-        self.log = log
 
 
 class Interrupted(WorkerError):
@@ -287,7 +251,6 @@ class TimedOut(WorkerError):
             f"The job exceeded its option time_limit of {limit:g} s. Raise it, send fewer points or frames, "
             "or lower max_reweightings."
         )
-        self.limit = limit
 
 
 class StaleAttempt(WorkerError):
@@ -297,4 +260,3 @@ class StaleAttempt(WorkerError):
 
     def __init__(self, id: str) -> None:
         super().__init__(f"This attempt at job {id!r} no longer owns it; nothing was written.")
-        self.id = id

@@ -22,11 +22,7 @@ class Example:
     name: str
     title: str
     make: Callable[[], Sequence]
-    files: tuple[tuple[str, str], ...] = (
-        ("tracks", "tracks.npz"),
-        ("mesh", "mesh.npz"),
-        ("ground_truth", "truth.npz"),
-    )
+    files: tuple[tuple[str, str], ...] = (("tracks", "tracks.npz"), ("mesh", "mesh.npz"), ("ground_truth", "truth.npz"))
 
 
 def _npz(**arrays: ArrayLike) -> bytes:
@@ -56,13 +52,6 @@ EXAMPLES = {
 
 def example_file(name: str, file: str) -> bytes:
     """Return one input file of an example, with identical bytes on every call.
-
-    Parameters
-    ----------
-    name : str
-        A key of `EXAMPLES`, or the name of the example film where OpenCV is installed.
-    file : str
-        A file that the example lists.
 
     Raises
     ------

@@ -42,15 +42,7 @@ class AddRequestId(logging.Filter):
 
 
 def configure_logging(level: LogLevel, format: LogFormat) -> None:
-    """Send all records of this process to standard error.
-
-    Parameters
-    ----------
-    level : str
-        Least level.
-    format : str
-        ``"console"`` or ``"json"``.
-    """
+    """Send all records of this process from a level on to standard error."""
     handler = logging.StreamHandler()
     handler.addFilter(AddRequestId())
     handler.setFormatter(formatter(format))

@@ -210,12 +210,7 @@ class Records(ABC):
     def create(self, stored: Stored, *, max_queued: int = 0, max_bytes: int = 0) -> Stored:
         """Write a new record; if its idempotency key or id is taken, return the existing record instead.
 
-        Parameters
-        ----------
-        max_queued : int
-            Maximum number of queued jobs of this owner, including the new one; 0: no limit.
-        max_bytes : int
-            Maximum total bytes of all jobs, including the new one; 0: no limit.
+        `max_queued` limits the queued jobs of this owner, `max_bytes` the bytes of all jobs, the new one included; 0: no limit.
 
         Raises
         ------
@@ -315,13 +310,9 @@ class Records(ABC):
         """Return normally if the store answers."""
 
     def update(self, id: str, change: Change) -> Stored:
-        """Apply a change to a record; repeat on the newer record after a concurrent write.
+        """Apply a change, a pure function, to a record; repeat on the newer record after a concurrent write.
 
-        Parameters
-        ----------
-        change : callable
-            Pure function of the stored record. Its exceptions pass through without a write; returning its argument
-            means no change.
+        Its exceptions pass through without a write; returning its argument means no change.
 
         Raises
         ------

@@ -109,30 +109,10 @@ class Tokens:
         requests_per_minute: int | None = None,
         text: str | None = None,
     ) -> tuple[Token, str]:
-        """Create a token.
+        """Create a token; return its record, and the token itself, which is not stored and cannot be shown again.
 
-        Parameters
-        ----------
-        name : str
-            User or purpose of the token.
-        scopes : sequence of Scope
-            Its permissions.
-        expires : timedelta, optional
-            Lifetime from now; None: unlimited.
-        sharing : str, optional
-            Id of a token whose jobs the new one shares, e.g. to replace it.
-        max_body_bytes, max_queued, max_running, requests_per_minute : int, optional
-            Limits of this token.
-        text : str, optional
-            The token itself, where it was made elsewhere, e.g. by a deployment; None: a new one. One that is known already stays as
-            it is.
-
-        Returns
-        -------
-        token : Token
-            The stored record.
-        text : str
-            The token itself. It is not stored and cannot be shown again.
+        Its lifetime is unlimited without `expires`. `sharing` is the id of a token whose jobs the new one shares, e.g. to replace
+        it. `text` is a token that was made elsewhere, e.g. by a deployment; one that is known already stays as it is.
 
         Raises
         ------

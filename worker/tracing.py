@@ -22,14 +22,9 @@ _provider: Any = None
 
 
 def configure(kind: str, *, service: str) -> None:
-    """Turn tracing on for this process. Call it after a fork: exporters have threads.
+    """Turn tracing on for this process, `service` in traces. Call it after a fork: exporters have threads.
 
-    Parameters
-    ----------
-    kind : str
-        `off`; `otlp`, which sends to `OTEL_EXPORTER_OTLP_ENDPOINT` and reads the other `OTEL_…` variables; or `console`.
-    service : str
-        Name of the process in traces.
+    `kind` is `off`; `otlp`, which sends to `OTEL_EXPORTER_OTLP_ENDPOINT` and reads the other `OTEL_…` variables; or `console`.
 
     Raises
     ------
@@ -67,19 +62,10 @@ def finish() -> None:
 
 @contextmanager
 def span(name: str, *, parent: str | None = None, **attributes: str | int | float) -> Iterator[Any]:
-    """Time a block as a span of the current trace.
+    """Time a block as a span; yield None where tracing is off.
 
-    Parameters
-    ----------
-    parent : str, optional
-        A `traceparent` to continue; None: the current span of this thread or task, if there is one.
-    attributes
-        Written with `pliant.` in front.
-
-    Yields
-    ------
-    Span or None
-        None where tracing is off.
+    `parent` is a `traceparent` to continue; None: the current span of this thread or task. Attributes are written with `pliant.`
+    in front.
     """
     if _provider is None:
         yield None

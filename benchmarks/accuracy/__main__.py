@@ -4,7 +4,7 @@
     python -m benchmarks.accuracy --data DIR --points 2500  recorded sequences, thinned
     python -m benchmarks.accuracy --data DIR --only face --corruptions all
     python -m benchmarks.accuracy --data DIR --plan        the whole table, part by part (see plan.py)
-    python -m benchmarks.accuracy --tables                  print what has been measured so far, and the aims beside it
+    python -m benchmarks.accuracy --tables                  print what has been measured so far
     python -m benchmarks.accuracy --tables --summary FILE   write mean and spread of every cell, in every metric, as JSON lines
     python -m benchmarks.accuracy --gate                    small gallery sequences against the committed baseline
 
@@ -23,11 +23,10 @@ from pathlib import Path
 from pliant.solver import InvalidInput
 
 from benchmarks.accuracy import gate
-from benchmarks.accuracy.aims import aims_table
 from benchmarks.accuracy.cells import CORRUPTIONS, METHODS, Key, measure, read_rows
 from benchmarks.accuracy.plan import PARTS
 from benchmarks.accuracy.summary import write_summary
-from benchmarks.accuracy.tables import METRICS, clean_table, corruption_table, cost_table, number
+from benchmarks.accuracy.tables import METRICS, clean_table, corruption_table, number
 from benchmarks.commit import commit
 from benchmarks.rows import append_row
 from benchmarks.sequences import Case, cases, wanted
@@ -126,9 +125,7 @@ def tables(options: argparse.Namespace, visibility: str, metrics: Iterable[str])
             if any(row["corruption"] != "clean" and row["cameras"] == cameras for row in rows)
         ]
     commits = sorted({str(row.get("commit", "unknown")) for row in rows})
-    parts.append(f"### Aims\n\n{aims_table(rows)}\n\n{len(rows)} cells, measured at {', '.join(commits) or '–'}")
-    if {"true", "estimated"} <= set(options.cameras):
-        parts.append(f"### e3d_frame, estimated over true cameras, clean\n\n{cost_table(rows, 'e3d_frame')}")
+    parts.append(f"{len(rows)} cells, measured at {', '.join(commits) or '–'}")
     return "\n\n".join(parts)
 
 

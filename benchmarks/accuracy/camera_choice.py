@@ -10,7 +10,6 @@ the true shapes by a pinhole so many half-sizes away (`benchmarks.accuracy.dista
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
 from dataclasses import replace
@@ -21,13 +20,10 @@ from pliant.solver import Settings, solve
 from pliant.solver.evaluation.metrics import e3d_frame
 
 from benchmarks.accuracy.distances import PICTURE, seen_from
-from benchmarks.rows import append_row, rows
+from benchmarks.rows import append_row, parser_of, rows
 from benchmarks.sequences import Case, cases
 
 RESULTS = Path(__file__).parent.parent / "results" / "camera_choice.jsonl"
-
-WORST_ERROR, WORST_TIME = 1.02, 1.6
-"""Largest ratios of error and time, `auto` over orthography, that the choice may cost."""
 
 
 def measure(case: Case, *, image_size: tuple[float, float] | None = None) -> dict[str, Any]:
@@ -60,12 +56,8 @@ def table(path: Path) -> str:
 
 def main(arguments: list[str] | None = None) -> None:
     """Measure what is missing, and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, help="directory of recorded sequences; the gallery without it")
-    parser.add_argument("--only", action="append", default=[], help="names that hold this word")
-    parser.add_argument("--points", type=int, default=300, help="keep at most so many points")
+    parser = parser_of(__doc__, out=RESULTS, points=300)
     parser.add_argument("--distance", help="of a pinhole camera, in half-sizes; the tracks as recorded without it")
-    parser.add_argument("--out", type=Path, default=RESULTS)
     parser.add_argument("--table", action="store_true", help="only print what was measured")
     given = parser.parse_args(arguments)
     done = {row["sequence"] for row in rows(given.out)}

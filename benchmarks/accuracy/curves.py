@@ -8,14 +8,13 @@ of level 0. `python -m benchmarks.figures.plots` draws the curves.
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
 from pliant.solver import solve
 from pliant.solver.evaluation.metrics import e3d_frame
 from pliant.solver.gallery import corrupt_tracks
 
-from benchmarks.rows import append_row, rows
+from benchmarks.rows import append_row, parser_of, rows
 from benchmarks.sequences import Case, cases
 
 LEVELS = {
@@ -28,12 +27,8 @@ LEVELS = {
 
 def main() -> None:
     """Measure the draws that are missing."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, help="directory of recorded sequences; the gallery when not given")
-    parser.add_argument("--only", action="append", default=[], help="names that hold this word")
-    parser.add_argument("--points", type=int, default=300, help="keep at most so many points")
+    parser = parser_of(__doc__, out=Path("benchmarks/results/curves.jsonl"), points=300)
     parser.add_argument("--draws", type=int, default=5)
-    parser.add_argument("--out", type=Path, default=Path("benchmarks/results/curves.jsonl"))
     given = parser.parse_args()
     done = {(row["sequence"], row["spoiling"], row["level"], row["draw"]) for row in rows(given.out)}
     for case in cases(given.data, points=given.points, visibility="file", only=given.only):

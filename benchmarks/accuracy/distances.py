@@ -11,7 +11,6 @@ solver gets `image_size`, not φ. Distance `inf` is orthography. `--spoil noise,
 
 from __future__ import annotations
 
-import argparse
 import time
 from pathlib import Path
 
@@ -20,7 +19,7 @@ from pliant.solver import Settings, Tracks, solve
 from pliant.solver.evaluation.metrics import evaluate
 
 from benchmarks.accuracy.spoiling import SPOILINGS, spoiled
-from benchmarks.rows import append_row, rows
+from benchmarks.rows import append_row, parser_of, rows
 from benchmarks.sequences import Case, cases
 
 HALF_SIZE = 300.0
@@ -45,14 +44,9 @@ DOWN = np.diag([1.0, -1.0, -1.0])
 
 
 def seen_from(case: Case, distance: float) -> tuple[Tracks, np.ndarray, np.ndarray]:
-    """Return tracks in pixels, true shapes (F, P, 3) in pixels, and true rotations (F, 3, 3), y down.
+    """Return tracks in pixels, true shapes (F, P, 3) in pixels, and true rotations (F, 3, 3), y down, of a case that has both.
 
-    Parameters
-    ----------
-    case : Case
-        With shapes and cameras.
-    distance : float
-        In half-sizes; infinite for orthography.
+    The distance is in half-sizes; infinite for orthography.
     """
     if case.shapes is None or case.cameras is None:
         raise ValueError(f"{case.name} has no true shapes and cameras")
@@ -90,14 +84,10 @@ def measure(case: Case, distance: str, method: str, *, spoil: str = "clean") -> 
 
 def main(arguments: list[str] | None = None) -> None:
     """Measure what is missing, and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, help="directory of recorded sequences; the gallery without it")
-    parser.add_argument("--only", action="append", default=[], help="names that hold this word")
-    parser.add_argument("--points", type=int, help="keep at most so many points")
+    parser = parser_of(__doc__, out=Path("benchmarks/results/distances.jsonl"))
     parser.add_argument("--distances", default=",".join(DISTANCES), help="half-sizes, comma-separated")
     parser.add_argument("--methods", default=",".join(CAMERAS), help="comma-separated: " + ", ".join(CAMERAS))
     parser.add_argument("--spoil", default="clean", help="comma-separated: " + ", ".join(SPOILINGS))
-    parser.add_argument("--out", type=Path, default=Path("benchmarks/results/distances.jsonl"))
     given = parser.parse_args(arguments)
     done = {(row["sequence"], row["distance"], row["method"]) for row in rows(given.out)}
     given.out.parent.mkdir(parents=True, exist_ok=True)

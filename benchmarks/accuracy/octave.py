@@ -63,24 +63,10 @@ class Failed(Exception):
 
 
 def run(call: str, tracks: np.ndarray, *, paths: list[Path], seconds: int) -> tuple[np.ndarray, float]:
-    """Evaluate `call`, which makes `S (3F, P)` of `W (2F, P)`.
+    """Evaluate Octave statements that make `S (3F, P)` of `W (2F, P)`; return shapes `(F, P, 3)` and the processor seconds of the call.
 
-    Parameters
-    ----------
-    call : str
-        Octave statements.
-    tracks : array, shape (F, P, 2)
-        Complete tracks, any unit.
-    paths : list of Path
-        Folders that Octave searches, the last one first.
-    seconds : int
-        Processor time after which Octave is ended.
-
-    Returns
-    -------
-    shapes : array, shape (F, P, 3)
-    seconds : float
-        Processor time of the call alone.
+    The tracks `(F, P, 2)` are complete. Octave searches the last of the folders first, and is ended after so many processor
+    seconds.
 
     Raises
     ------

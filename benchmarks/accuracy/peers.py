@@ -22,7 +22,6 @@ the sequence is free, in `e3d_frame_similarity` one for every frame. Seconds are
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
 from collections import defaultdict
@@ -36,7 +35,7 @@ from pliant.solver.evaluation.metrics import e3d_frame, e3d_frame_similarity
 
 from benchmarks.accuracy.octave import Failed, run
 from benchmarks.accuracy.tables import number
-from benchmarks.rows import append_row, rows
+from benchmarks.rows import append_row, parser_of, rows
 from benchmarks.sequences import Case, cases
 
 RESULTS = Path(__file__).parent.parent / "results" / "peers.jsonl"
@@ -160,15 +159,11 @@ def _cell(measurements: list[dict[str, Any]]) -> str:
 
 def main(arguments: list[str] | None = None) -> None:
     """Measure what is missing, and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, help="directory of recorded sequences")
+    parser = parser_of(__doc__, out=RESULTS, points=300)
     parser.add_argument("--code", type=Path, help="folder with the checkouts")
-    parser.add_argument("--only", action="append", default=[], help="names that hold this word")
     parser.add_argument("--methods", default=",".join(PEERS), help="comma-separated: " + ", ".join(PEERS))
     parser.add_argument("--ours", action="store_true", help="measure Pliant on the same tracks as well")
-    parser.add_argument("--points", type=int, default=300, help="keep at most so many points")
     parser.add_argument("--timeout", type=int, default=SECONDS, help="processor seconds of one run of a peer")
-    parser.add_argument("--out", type=Path, default=RESULTS)
     parser.add_argument("--table", action="store_true", help="only print what was measured")
     given = parser.parse_args(arguments)
     methods = [each for each in given.methods.split(",") if each] + [OURS] * given.ours

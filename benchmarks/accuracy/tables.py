@@ -55,24 +55,6 @@ def corruption_table(rows: Rows, metric: str, cameras: str) -> str:
     return _markdown(["sequence", "corruption", "trials", *methods], body)
 
 
-def cost_table(rows: Rows, metric: str) -> str:
-    """What estimating the cameras costs: estimated over true, for every method, clean."""
-    found = {
-        (_name(row), *_column(row)): row for row in rows if row["corruption"] == "clean" and metric in row["metrics"]
-    }
-    names = list(dict.fromkeys(case for case, cameras, _ in found if cameras == "true"))
-    methods = [method for method in METHODS if any(key[2] == method for key in found)]
-    body = []
-    for name in names:
-        line = [name]
-        for method in methods:
-            pair = [found.get((name, cameras, method)) for cameras in ("estimated", "true")]
-            both = [row["metrics"][metric] for row in pair if row is not None]
-            line.append(f"{both[0] / both[1]:.2f}" if len(both) == 2 and both[1] > 0 else "–")
-        body.append(line)
-    return _markdown(["sequence", *methods], body)
-
-
 def number(value: float) -> str:
     """Three significant digits in the field's manner: .0341, 1.25, 12.5; a dash where there is no truth to compare with."""
     if value == 0 or not np.isfinite(value):

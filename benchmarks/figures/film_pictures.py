@@ -57,20 +57,9 @@ def read_result(folder: Path) -> Result:
 
 
 def draw(result: Result, film: Path | None, frames: list[int], *, side: float, height: int) -> Image.Image:
-    """Draw rows of pictures, one row a frame.
+    """Draw a row of pictures for each frame, `height` pixels high, seen from `side` degrees beside the camera.
 
-    Parameters
-    ----------
-    result
-        What to draw.
-    film
-        Its film; None: the mesh alone, from three directions.
-    frames
-        Indices among the result's frames.
-    side
-        Degrees from the camera's direction.
-    height
-        Of one picture, pixels.
+    Without its film: the mesh alone, from three directions.
     """
     rows = []
     pictures = {} if film is None else _film_frames(film, {int(result.frames[frame]) for frame in frames})

@@ -26,20 +26,10 @@ def draw_mesh(
     colours: np.ndarray | None = None,
     background: float = 1.0,
 ) -> np.ndarray:
-    """Draw a mesh orthographically with smooth shading.
+    """Draw a mesh orthographically with smooth shading; return `(height, width, 3)` in [0, 1].
 
-    Parameters
-    ----------
-    points : (P, 3) camera axes: x right, y down, z away from the viewer.
-    faces : (T, 3) or (T, 4).
-    size : (height, width) in pixels.
-    scale : pixels per unit.
-    centre : x, y of the point that is drawn in the middle.
-    colours : (P, 3) in [0, 1]; grey when not given.
-
-    Returns
-    -------
-    (height, width, 3) float in [0, 1].
+    Points `(P, 3)` are in camera axes: x right, y down, z away from the viewer; `scale` is in pixels per unit, and `centre` is
+    drawn in the middle. Colours `(P, 3)` are in [0, 1].
     """
     fine = SUPERSAMPLING
     height, width = size[0] * fine, size[1] * fine

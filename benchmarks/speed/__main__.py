@@ -1,12 +1,10 @@
-r"""Time and memory: side by side with what else there is, against the size, against the machine.
+r"""Time and memory: side by side with what else there is, and against the size.
 
     python -m benchmarks.speed compare --data DIR --only facescan99   the solver and the baselines on one energy
     python -m benchmarks.speed growth                                 against P and against F, with fitted exponents
     python -m benchmarks.speed growth --cameras estimated --settings "" --outliers 0 --kind talk --fixed-points 300 \
         --against-points "" --against-frames 300,1000,3000,10000 --results benchmarks/results/growth.jsonl
     python -m benchmarks.speed mesh --frames 30 --points 10000        a mesh and a grid of equal F and P
-    python -m benchmarks.speed bandwidth --frames 30 --points 30000   an iteration against the machine's copying
-    python -m benchmarks.speed profile --data DIR --only facescan99   where the time goes
 
 Without `--data` the sequence is a gallery face. Every number comes from a process of its own. Wall time is what counts on a quiet
 machine; CPU time of all threads stands beside it because it stays comparable where other work shares the cores.
@@ -19,23 +17,12 @@ energy or `--cap` seconds have gone; then its time is extrapolated at its last r
 from __future__ import annotations
 
 import argparse
-import cProfile
-import pstats
 import shlex
 import sys
 from pathlib import Path
 
-from benchmarks.speed.growth import (
-    FIXED_FRAMES,
-    FIXED_POINTS,
-    FRAMES,
-    POINTS,
-    Sizes,
-    bandwidth,
-    growth,
-    mesh_against_grid,
-)
-from benchmarks.speed.side_by_side import BASELINES, Workload, compare, solved
+from benchmarks.speed.growth import FIXED_FRAMES, FIXED_POINTS, FRAMES, POINTS, Sizes, growth, mesh_against_grid
+from benchmarks.speed.side_by_side import BASELINES, Workload, compare
 
 
 def main() -> None:
@@ -54,12 +41,8 @@ def main() -> None:
             fixed_points=options.fixed_points, fixed_frames=options.fixed_frames,
         )  # fmt: skip
         growth(work, sizes, results=options.results, command=command_of(sys.argv[1:]))
-    elif options.what == "mesh":
-        mesh_against_grid(work)
-    elif options.what == "bandwidth":
-        bandwidth(work)
     else:
-        profile(work)
+        mesh_against_grid(work)
 
 
 def command_of(arguments: list[str]) -> str:
@@ -71,15 +54,6 @@ def command_of(arguments: list[str]) -> str:
     return f"python -m benchmarks.speed {shlex.join(kept)}"
 
 
-def profile(work: Workload, *, lines: int = 20) -> None:
-    """Print the functions that take the most time themselves."""
-    profiler = cProfile.Profile()
-    solution = profiler.runcall(solved, work)
-    print({stage: round(seconds, 2) for stage, seconds in solution.seconds.items()})
-    print("iterations", solution.trace.iterations.tolist())
-    pstats.Stats(profiler).strip_dirs().sort_stats("tottime").print_stats(lines)
-
-
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 
@@ -89,7 +63,7 @@ def _parser() -> argparse.ArgumentParser:
     def sizes(text: str) -> tuple[int, ...]:
         return tuple(int(word) for word in words(text))
 
-    parser.add_argument("what", choices=("compare", "growth", "mesh", "bandwidth", "profile"))
+    parser.add_argument("what", choices=("compare", "growth", "mesh"))
     parser.add_argument("--data", type=Path, help="directory of sequences; a gallery face when not given")
     parser.add_argument("--only", default="facescan99", help="the first sequence whose name holds this word")
     parser.add_argument("--kind", default="face", choices=("face", "flag", "sphere", "talk"), help="gallery sequence")

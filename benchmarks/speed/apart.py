@@ -58,15 +58,7 @@ def memory(name: str) -> int:
 
 
 def apart(work: Callable[..., Any], *arguments: Any, limit: int | None = None) -> Measured | None:
-    """Call `work(stopwatch, *arguments)` in a fresh process; None if its memory did not suffice.
-
-    Parameters
-    ----------
-    work : callable
-        Importable by name, as are its arguments.
-    limit : int, optional
-        Bytes of address space.
-    """
+    """Call `work(stopwatch, *arguments)`, importable by name, in a fresh process of `limit` bytes; None if they did not suffice."""
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, mp_context=context) as pool:
         try:

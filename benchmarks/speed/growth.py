@@ -1,10 +1,8 @@
-"""Time and memory against the size of a sequence, and against what the machine can move."""
+"""Time and memory against the size of a sequence."""
 
 from __future__ import annotations
 
 import json
-import time
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -39,13 +37,6 @@ class Sizes:
         if name == "P":
             return {"frames": self.fixed_frames, "points": size}
         return {"frames": size, "points": self.fixed_points}
-
-
-NUMBERS_MOVED, BYTES = 65, 4
-"""Numbers for each of the F·P observations that one iteration of conjugate gradients moves at least, operation by operation, and the
-size of one, corrections being solved in single precision: the operator reads x and the weights and writes 𝒜x (3 + 2 + 3), the
-preconditioner reads and writes (3 + 3) and reads its factors on the way there and back (6 + 6), three vector updates read two and write
-one (27), two inner products read two (12), and x and its neighbours in time are taken from the cache."""
 
 
 def growth(work: Workload, sizes: Sizes | None = None, *, results: Path | None = None, command: str = "") -> list[str]:
@@ -150,41 +141,6 @@ def mesh_against_grid(work: Workload) -> list[str]:
     wall, cpu = (mesh / grid for mesh, grid in zip(taken["triangles"], taken["grid"], strict=True))
     _say(lines, f"\nthe mesh takes {wall:.2f} × the grid's time ({cpu:.2f} × its CPU time)")
     return lines
-
-
-def bandwidth(work: Workload) -> list[str]:
-    """Compare what an iteration must move with what the machine can move in the time that it takes."""
-    copied = copying()
-    ours: Ours = best_of(work).value
-    frames, points = ours.size
-    must = NUMBERS_MOVED * BYTES * frames * points
-    seconds = per_iteration(ours)
-    lines: list[str] = []
-    _say(
-        lines,
-        f"{frames} × {points}: an iteration takes {1e3 * seconds:.1f} ms, reweighting included ({ours.iterations} iterations)",
-    )
-    _say(lines, f"it moves at least {must / 1e6:.0f} MB ({NUMBERS_MOVED} numbers of {BYTES} bytes for each of F·P)")
-    _say(
-        lines,
-        f"copying on {available_cores()} threads: {copied / 1e9:.1f} GB/s; the iteration: {must / seconds / 1e9:.1f} GB/s",
-    )
-    _say(lines, f"ratio: {must / seconds / copied:.2f} of the copy bandwidth")
-    return lines
-
-
-def copying(size: int = 1 << 28, repeats: int = 5) -> float:
-    """Bytes read and written a second by copying `size` bytes on every core, best of some."""
-    count = available_cores()
-    source, target = np.ones(size // 8), np.zeros(size // 8)
-    parts = [slice(size // 8 * i // count, size // 8 * (i + 1) // count) for i in range(count)]
-    best = 0.0
-    with ThreadPoolExecutor(count) as pool:
-        for _ in range(repeats):
-            began = time.perf_counter()
-            list(pool.map(lambda part: np.copyto(target[part], source[part]), parts))
-            best = max(best, 2 * size / (time.perf_counter() - began))
-    return best
 
 
 def exponent(sizes: np.ndarray, seconds: np.ndarray) -> float:

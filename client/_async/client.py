@@ -2,24 +2,35 @@
 
 from __future__ import annotations
 
+import json
+import secrets
 import tempfile
 from collections.abc import AsyncGenerator, Iterable, Mapping, Sequence
 from contextlib import aclosing
+from functools import partial
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from numpy.typing import ArrayLike
 from pliant.client._async import operations
 from pliant.client._async.batch import OnFailure, mapped
 from pliant.client._async.connection import AsyncConnection
+from pliant.client._async.events import follow
 from pliant.client._async.job import AsyncRemoteJob, AsyncResult
 from pliant.client._async.operations import OnJob
-from pliant.client.multipart import Inputs, OnBytes, Source
+from pliant.client.call import Call
+from pliant.client.errors import NotFound
+from pliant.client.multipart import Inputs, OnBytes, Source, option_fields
+from pliant.client.pauses import in_thread
 from pliant.client.requests import further, sharing
-from pliant.client.result import finished, loaded, succeeded
-from pliant.schemas.job import Interpretation, Job, Priority, ServiceLimits, Status
+from pliant.client.result import finished, job_path, loaded, succeeded
+from pliant.schemas.job import Interpretation, Job, JobPage, Priority, ServiceLimits, Status
 from pliant.schemas.options import Options, Output
 from pliant.schemas.shares import Share
+
+JSON = "application/json"
+JSON_BODY = {"Content-Type": JSON}
 
 
 class AsyncClient(AsyncConnection):
@@ -212,24 +223,27 @@ class AsyncClient(AsyncConnection):
         """
         inputs = Inputs(tracks=tracks, visible=visible, mesh=mesh, ground_truth=ground_truth, rotations=rotations)
         with tempfile.TemporaryDirectory(prefix="pliant-inspect-") as folder:
-            return await operations.inspect(
-                self._exchange(timeout, "the inspection"),
-                inputs,
-                folder=Path(folder),
-                options=options,
-                on_upload=on_upload,
-            )
+            form = await in_thread(partial(inputs.form, Path(folder), option_fields(options), on_upload))
+            call = Call(method="POST", path="/v1/inspect", form=form, changes_nothing=True)
+            return await self._exchange(timeout, "the inspection").record(call, Interpretation)
 
     async def get(self, job: str, *, timeout: float | None = None) -> AsyncRemoteJob:
         """Return a job with its current record."""
-        return AsyncRemoteJob(self, await operations.get(self._exchange(timeout), job))
+        return AsyncRemoteJob(self, await self._exchange(timeout).record(Call(method="GET", path=job_path(job)), Job))
 
     async def list(
         self, *, statuses: Iterable[Status | str] = (), page_size: int = 50, timeout: float | None = None
     ) -> AsyncGenerator[AsyncRemoteJob, None]:
         """Iterate over the jobs, newest first; pages are requested as needed."""
-        async for job in operations.jobs(self._exchange(timeout), statuses=statuses, page_size=page_size):
-            yield AsyncRemoteJob(self, job)
+        exchange, wanted = self._exchange(timeout), [Status(status).value for status in statuses]
+        params: dict[str, str | Sequence[str]] = {"limit": str(page_size), "status": wanted}
+        cursor: str | None = ""
+        while cursor is not None:
+            page = await exchange.record(Call(method="GET", path="/v1/jobs", params=params), JobPage)
+            for job in page.jobs:
+                yield AsyncRemoteJob(self, job)
+            cursor = page.next
+            params = {**params, "cursor": cursor or ""}
 
     async def wait(
         self,
@@ -273,7 +287,7 @@ class AsyncClient(AsyncConnection):
         If the connection breaks or the service restarts, the stream resumes after the last event.
         """
         exchange = self._exchange(timeout, f"the events of job {job}")
-        async with aclosing(operations.events(exchange, job)) as changes:
+        async with aclosing(follow(exchange, job_path(job))) as changes:
             async for now in changes:
                 yield now
 
@@ -282,7 +296,7 @@ class AsyncClient(AsyncConnection):
     ) -> AsyncResult:
         """Return the result of a job that has succeeded; unlike `wait`, raises `NotAllowedNow` if it is not finished."""
         exchange = self._exchange(timeout, f"the download of job {job}")
-        record = finished(await operations.get(exchange, job))
+        record = finished(await exchange.record(Call(method="GET", path=job_path(job)), Job))
         result = AsyncResult(self, record, folder)
         if load:
             await operations.fetch(exchange, record, result.folder, names=loaded(record), on_download=None)
@@ -290,15 +304,19 @@ class AsyncClient(AsyncConnection):
 
     async def log(self, job: str, *, timeout: float | None = None) -> str:
         """Return a job's log so far, one entry per line."""
-        return await operations.log(self._exchange(timeout), job)
+        _, body = await self._exchange(timeout).answer(Call(method="GET", path=f"{job_path(job)}/log"))
+        return body.decode("utf-8", "replace")
 
     async def cancel(self, job: str, *, timeout: float | None = None) -> AsyncRemoteJob:
         """Request that a job stops; a running one is `cancelling` until it has."""
-        return AsyncRemoteJob(self, await operations.cancel(self._exchange(timeout), job))
+        call = Call(method="POST", path=f"{job_path(job)}/cancel", changes_nothing=True)
+        return AsyncRemoteJob(self, await self._exchange(timeout).record(call, Job))
 
     async def retry(self, job: str, *, timeout: float | None = None) -> AsyncRemoteJob:
         """Queue and return a new job with the inputs and options of a failed or cancelled one."""
-        return AsyncRemoteJob(self, await operations.retry(self._exchange(timeout), job))
+        headers = {"Idempotency-Key": secrets.token_urlsafe(16)}
+        call = Call(method="POST", path=f"{job_path(job)}/retry", headers=headers)
+        return AsyncRemoteJob(self, await self._exchange(timeout).record(call, Job))
 
     async def make_outputs(
         self,
@@ -333,8 +351,10 @@ class AsyncClient(AsyncConnection):
             The service refuses; see `pliant.client.errors`.
         """
         request = further(outputs, {**options, **({} if fps is None else {"fps": fps})})
-        exchange = self._exchange(timeout, "the request for further files")
-        return AsyncRemoteJob(self, await operations.make_outputs(exchange, job, request, key=idempotency_key))
+        headers = JSON_BODY | ({} if idempotency_key is None else {"Idempotency-Key": idempotency_key})
+        body = request.model_dump_json(exclude_unset=True).encode()
+        call = Call(method="POST", path=f"{job_path(job)}/outputs", headers=headers, content=body, changes_nothing=True)
+        return AsyncRemoteJob(self, await self._exchange(timeout, "the request for further files").record(call, Job))
 
     async def share(self, job: str, *, days: float = 7, timeout: float | None = None) -> Share:
         """Create a link that shows a finished job's result, read-only, until it expires or is revoked.
@@ -346,19 +366,28 @@ class AsyncClient(AsyncConnection):
         days : float
             How long the link is valid, a minute to 366 days.
         """
-        return await operations.share(self._exchange(timeout), job, sharing(days))
+        body = sharing(days).model_dump_json(exclude_unset=True).encode()
+        call = Call(method="POST", path=f"{job_path(job)}/shares", headers=JSON_BODY, content=body)
+        return await self._exchange(timeout).record(call, Share)
 
     async def shares(self, job: str, *, timeout: float | None = None) -> Sequence[Share]:
         """Return the valid share links of a job, without their secrets."""
-        return await operations.shares(self._exchange(timeout), job)
+        shares: Sequence[Any] = await self._document(f"{job_path(job)}/shares", timeout)
+        return [Share.model_validate(each) for each in shares]
 
     async def revoke_share(self, job: str, share: str, *, timeout: float | None = None) -> None:
         """End a share link, named by its id."""
-        await operations.revoke_share(self._exchange(timeout), job, share)
+        call = Call(method="DELETE", path=f"{job_path(job)}/shares/{quote(share, safe='')}")
+        await self._exchange(timeout).answer(call)
 
     async def delete(self, job: str, *, timeout: float | None = None) -> None:
         """Delete a finished job and its files."""
-        await operations.delete(self._exchange(timeout), job)
+        exchange = self._exchange(timeout)
+        try:
+            await exchange.answer(Call(method="DELETE", path=job_path(job)))
+        except NotFound:
+            if exchange.attempts.failures == 0:  # otherwise an earlier attempt deleted it and its answer was lost
+                raise
 
     async def download(
         self,
@@ -379,17 +408,23 @@ class AsyncClient(AsyncConnection):
             Called with (bytes of this file so far, bytes of this file).
         """
         exchange = self._exchange(timeout, f"the download of job {job}")
-        record = await operations.get(exchange, job)
+        record = await exchange.record(Call(method="GET", path=job_path(job)), Job)
         return await operations.fetch(exchange, record, Path(folder), names=names, on_download=on_download)
 
     async def options(self, *, timeout: float | None = None) -> dict[str, Any]:
         """Return the JSON Schema of the options: names, meanings, bounds, defaults."""
-        return await operations.document(self._exchange(timeout), "/v1/options")
+        schema: dict[str, Any] = await self._document("/v1/options", timeout)
+        return schema
 
     async def limits(self, *, timeout: float | None = None) -> ServiceLimits:
         """Return the service's limits."""
-        return await operations.limits(self._exchange(timeout))
+        return await self._exchange(timeout).record(Call(method="GET", path="/v1/limits"), ServiceLimits)
 
     async def ready(self, *, timeout: float | None = None) -> dict[str, Any]:
         """Return the state of each part of the service: queue, storage, workers."""
-        return await operations.document(self._exchange(timeout), "/readyz")
+        parts: dict[str, Any] = await self._document("/readyz", timeout)
+        return parts
+
+    async def _document(self, path: str, timeout: float | None) -> Any:
+        _, body = await self._exchange(timeout).answer(Call(method="GET", path=path, headers={"Accept": JSON}))
+        return json.loads(body)

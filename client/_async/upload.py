@@ -24,14 +24,8 @@ from pliant.schemas.job import Upload
 async def upload_large(exchange: Exchange, form: Form, key: str) -> Form:
     """Upload the large files of a form and return the form that refers to them.
 
-    Parameters
-    ----------
-    exchange : Exchange
-        Of the whole submission.
-    form : Form
-        Returned unchanged if its files are small, or if the service has no uploads.
-    key : str
-        Of the submission: the same key and the same content find the bytes of an earlier run.
+    It is returned unchanged if its files are small, or if the service has no uploads. The same `key` of a submission and the same
+    content find the bytes of an earlier run.
     """
     if form.size <= multipart.RESUMABLE_BYTES:
         return form

@@ -3,24 +3,35 @@
 
 from __future__ import annotations
 
+import json
+import secrets
 import tempfile
 from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from numpy.typing import ArrayLike
 from pliant.client._sync import operations
 from pliant.client._sync.batch import OnFailure, mapped
 from pliant.client._sync.connection import Connection
+from pliant.client._sync.events import follow
 from pliant.client._sync.job import RemoteJob, Result
 from pliant.client._sync.operations import OnJob
-from pliant.client.multipart import Inputs, OnBytes, Source
+from pliant.client.call import Call
+from pliant.client.errors import NotFound
+from pliant.client.multipart import Inputs, OnBytes, Source, option_fields
+from pliant.client.pauses import in_place
 from pliant.client.requests import further, sharing
-from pliant.client.result import finished, loaded, succeeded
-from pliant.schemas.job import Interpretation, Job, Priority, ServiceLimits, Status
+from pliant.client.result import finished, job_path, loaded, succeeded
+from pliant.schemas.job import Interpretation, Job, JobPage, Priority, ServiceLimits, Status
 from pliant.schemas.options import Options, Output
 from pliant.schemas.shares import Share
+
+JSON = "application/json"
+JSON_BODY = {"Content-Type": JSON}
 
 
 class Client(Connection):
@@ -213,24 +224,27 @@ class Client(Connection):
         """
         inputs = Inputs(tracks=tracks, visible=visible, mesh=mesh, ground_truth=ground_truth, rotations=rotations)
         with tempfile.TemporaryDirectory(prefix="pliant-inspect-") as folder:
-            return operations.inspect(
-                self._exchange(timeout, "the inspection"),
-                inputs,
-                folder=Path(folder),
-                options=options,
-                on_upload=on_upload,
-            )
+            form = in_place(partial(inputs.form, Path(folder), option_fields(options), on_upload))
+            call = Call(method="POST", path="/v1/inspect", form=form, changes_nothing=True)
+            return self._exchange(timeout, "the inspection").record(call, Interpretation)
 
     def get(self, job: str, *, timeout: float | None = None) -> RemoteJob:
         """Return a job with its current record."""
-        return RemoteJob(self, operations.get(self._exchange(timeout), job))
+        return RemoteJob(self, self._exchange(timeout).record(Call(method="GET", path=job_path(job)), Job))
 
     def list(
         self, *, statuses: Iterable[Status | str] = (), page_size: int = 50, timeout: float | None = None
     ) -> Generator[RemoteJob, None, None]:
         """Iterate over the jobs, newest first; pages are requested as needed."""
-        for job in operations.jobs(self._exchange(timeout), statuses=statuses, page_size=page_size):
-            yield RemoteJob(self, job)
+        exchange, wanted = self._exchange(timeout), [Status(status).value for status in statuses]
+        params: dict[str, str | Sequence[str]] = {"limit": str(page_size), "status": wanted}
+        cursor: str | None = ""
+        while cursor is not None:
+            page = exchange.record(Call(method="GET", path="/v1/jobs", params=params), JobPage)
+            for job in page.jobs:
+                yield RemoteJob(self, job)
+            cursor = page.next
+            params = {**params, "cursor": cursor or ""}
 
     def wait(
         self,
@@ -274,7 +288,7 @@ class Client(Connection):
         If the connection breaks or the service restarts, the stream resumes after the last event.
         """
         exchange = self._exchange(timeout, f"the events of job {job}")
-        with closing(operations.events(exchange, job)) as changes:
+        with closing(follow(exchange, job_path(job))) as changes:
             for now in changes:
                 yield now
 
@@ -283,7 +297,7 @@ class Client(Connection):
     ) -> Result:
         """Return the result of a job that has succeeded; unlike `wait`, raises `NotAllowedNow` if it is not finished."""
         exchange = self._exchange(timeout, f"the download of job {job}")
-        record = finished(operations.get(exchange, job))
+        record = finished(exchange.record(Call(method="GET", path=job_path(job)), Job))
         result = Result(self, record, folder)
         if load:
             operations.fetch(exchange, record, result.folder, names=loaded(record), on_download=None)
@@ -291,15 +305,19 @@ class Client(Connection):
 
     def log(self, job: str, *, timeout: float | None = None) -> str:
         """Return a job's log so far, one entry per line."""
-        return operations.log(self._exchange(timeout), job)
+        _, body = self._exchange(timeout).answer(Call(method="GET", path=f"{job_path(job)}/log"))
+        return body.decode("utf-8", "replace")
 
     def cancel(self, job: str, *, timeout: float | None = None) -> RemoteJob:
         """Request that a job stops; a running one is `cancelling` until it has."""
-        return RemoteJob(self, operations.cancel(self._exchange(timeout), job))
+        call = Call(method="POST", path=f"{job_path(job)}/cancel", changes_nothing=True)
+        return RemoteJob(self, self._exchange(timeout).record(call, Job))
 
     def retry(self, job: str, *, timeout: float | None = None) -> RemoteJob:
         """Queue and return a new job with the inputs and options of a failed or cancelled one."""
-        return RemoteJob(self, operations.retry(self._exchange(timeout), job))
+        headers = {"Idempotency-Key": secrets.token_urlsafe(16)}
+        call = Call(method="POST", path=f"{job_path(job)}/retry", headers=headers)
+        return RemoteJob(self, self._exchange(timeout).record(call, Job))
 
     def make_outputs(
         self,
@@ -334,8 +352,10 @@ class Client(Connection):
             The service refuses; see `pliant.client.errors`.
         """
         request = further(outputs, {**options, **({} if fps is None else {"fps": fps})})
-        exchange = self._exchange(timeout, "the request for further files")
-        return RemoteJob(self, operations.make_outputs(exchange, job, request, key=idempotency_key))
+        headers = JSON_BODY | ({} if idempotency_key is None else {"Idempotency-Key": idempotency_key})
+        body = request.model_dump_json(exclude_unset=True).encode()
+        call = Call(method="POST", path=f"{job_path(job)}/outputs", headers=headers, content=body, changes_nothing=True)
+        return RemoteJob(self, self._exchange(timeout, "the request for further files").record(call, Job))
 
     def share(self, job: str, *, days: float = 7, timeout: float | None = None) -> Share:
         """Create a link that shows a finished job's result, read-only, until it expires or is revoked.
@@ -347,19 +367,28 @@ class Client(Connection):
         days : float
             How long the link is valid, a minute to 366 days.
         """
-        return operations.share(self._exchange(timeout), job, sharing(days))
+        body = sharing(days).model_dump_json(exclude_unset=True).encode()
+        call = Call(method="POST", path=f"{job_path(job)}/shares", headers=JSON_BODY, content=body)
+        return self._exchange(timeout).record(call, Share)
 
     def shares(self, job: str, *, timeout: float | None = None) -> Sequence[Share]:
         """Return the valid share links of a job, without their secrets."""
-        return operations.shares(self._exchange(timeout), job)
+        shares: Sequence[Any] = self._document(f"{job_path(job)}/shares", timeout)
+        return [Share.model_validate(each) for each in shares]
 
     def revoke_share(self, job: str, share: str, *, timeout: float | None = None) -> None:
         """End a share link, named by its id."""
-        operations.revoke_share(self._exchange(timeout), job, share)
+        call = Call(method="DELETE", path=f"{job_path(job)}/shares/{quote(share, safe='')}")
+        self._exchange(timeout).answer(call)
 
     def delete(self, job: str, *, timeout: float | None = None) -> None:
         """Delete a finished job and its files."""
-        operations.delete(self._exchange(timeout), job)
+        exchange = self._exchange(timeout)
+        try:
+            exchange.answer(Call(method="DELETE", path=job_path(job)))
+        except NotFound:
+            if exchange.attempts.failures == 0:  # otherwise an earlier attempt deleted it and its answer was lost
+                raise
 
     def download(
         self,
@@ -380,17 +409,23 @@ class Client(Connection):
             Called with (bytes of this file so far, bytes of this file).
         """
         exchange = self._exchange(timeout, f"the download of job {job}")
-        record = operations.get(exchange, job)
+        record = exchange.record(Call(method="GET", path=job_path(job)), Job)
         return operations.fetch(exchange, record, Path(folder), names=names, on_download=on_download)
 
     def options(self, *, timeout: float | None = None) -> dict[str, Any]:
         """Return the JSON Schema of the options: names, meanings, bounds, defaults."""
-        return operations.document(self._exchange(timeout), "/v1/options")
+        schema: dict[str, Any] = self._document("/v1/options", timeout)
+        return schema
 
     def limits(self, *, timeout: float | None = None) -> ServiceLimits:
         """Return the service's limits."""
-        return operations.limits(self._exchange(timeout))
+        return self._exchange(timeout).record(Call(method="GET", path="/v1/limits"), ServiceLimits)
 
     def ready(self, *, timeout: float | None = None) -> dict[str, Any]:
         """Return the state of each part of the service: queue, storage, workers."""
-        return operations.document(self._exchange(timeout), "/readyz")
+        parts: dict[str, Any] = self._document("/readyz", timeout)
+        return parts
+
+    def _document(self, path: str, timeout: float | None) -> Any:
+        _, body = self._exchange(timeout).answer(Call(method="GET", path=path, headers={"Accept": JSON}))
+        return json.loads(body)

@@ -68,11 +68,7 @@ class RemoteJob:
 
         try:
             result = self._client.wait(
-                self.id,
-                on_progress=None if on_progress is None else report,
-                folder=folder,
-                load=load,
-                timeout=timeout,
+                self.id, on_progress=None if on_progress is None else report, folder=folder, load=load, timeout=timeout
             )
         except JobEnded as ended:
             self.record = ended.job

@@ -34,15 +34,7 @@ class Rates:
         self._paid_off: dict[str, float] = {}
 
     def take(self, who: str, per_minute: int) -> float:
-        """Count a request; return 0 if it is allowed, else the seconds to wait (it is not counted then).
-
-        Parameters
-        ----------
-        who : str
-            The client.
-        per_minute : int
-            Requests allowed in a minute, at least 1.
-        """
+        """Count a client's request; return 0 if it is allowed, else the seconds to wait (it is not counted then)."""
         now, price = self._clock(), WINDOW / per_minute
         due = max(self._paid_off.get(who, now), now) + price
         if due - now > WINDOW * (1 + 1e-9):

@@ -23,8 +23,7 @@ router = APIRouter(prefix="/v1/jobs/{id}/artifacts", tags=["artifacts"])
 
 Name = Annotated[str, Path(description="A file of the job.", examples=["shapes.npz"])]
 Redirect = Annotated[
-    bool,
-    Query(description="The client follows a redirect to the object store, without its `Authorization` header."),
+    bool, Query(description="The client follows a redirect to the object store, without its `Authorization` header.")
 ]
 LINK_SECONDS = 300.0
 """Seconds within which a redirect to the object store has to be followed; the transfer itself may take longer."""

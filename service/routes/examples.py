@@ -52,9 +52,7 @@ def examples(request: Request) -> Examples:
                 title=one.title,
                 files=[
                     ExampleFile(
-                        part=part,
-                        file=file,
-                        url=str(request.app.url_path_for("example", name=one.name, file=file)),
+                        part=part, file=file, url=str(request.app.url_path_for("example", name=one.name, file=file))
                     )
                     for part, file in one.files
                 ],

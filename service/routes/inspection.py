@@ -59,15 +59,8 @@ def interpret(form: Form, folder: Path, uploads: Uploads, core: Service) -> Insp
 def sample_of(inputs: Inputs) -> list[list[int]]:
     """Return evenly spaced frames and points as integers in a square, small enough to be sent along for a picture.
 
-    Parameters
-    ----------
-    inputs : Inputs
-        Checked and interpreted.
-
-    Returns
-    -------
-    list of list of int
-        One list per frame: x and y of each point in turn, 0 … `BOX`, x right, y down, to one scale; `NOT_SEEN` twice for a hidden point.
+    One list per frame: x and y of each point in turn, 0 … `BOX`, x right, y down, to one scale; `NOT_SEEN` twice for a hidden
+    point.
     """
     points, visible = inputs.tracks.points, inputs.tracks.visible
     frames, chosen = evenly(len(points), SAMPLE_FRAMES), evenly(points.shape[1], SAMPLE_POINTS)

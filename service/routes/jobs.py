@@ -16,7 +16,8 @@ from pliant.service.problems import Refusal
 from pliant.service.submission import accept, form_rules
 from pliant.worker.errors import StoreUnavailable, UnknownJob
 from pliant.worker.jobs.retry import retry as run_again
-from pliant.worker.jobs.service import LARGEST_PAGE, Jobs
+from pliant.worker.jobs.service import Jobs
+from pliant.worker.jobs.validation import LARGEST_PAGE
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 
@@ -41,8 +42,7 @@ def idempotency_key(request: Request, key: _KeyHeader = None) -> str | None:
 
 Key = Annotated[str | None, Depends(idempotency_key)]
 Prefer = Annotated[
-    str | None,
-    Header(description="`wait=20` answers when the job has ended, or after 20 s, whichever comes first."),
+    str | None, Header(description="`wait=20` answers when the job has ended, or after 20 s, whichever comes first.")
 ]
 _WAIT = re.compile(r"\s*wait\s*=\s*(\d{1,6})\s*", re.IGNORECASE)
 _SUBMIT_ERRORS = problems(400, 401, 403, 408, 409, 413, 415, 422, 429, 503, 507)

@@ -13,7 +13,7 @@ from pliant.schemas.problems import ProblemCode
 from pliant.service.dependencies import Bound, Core
 from pliant.service.openapi import problems
 from pliant.service.problems import Refusal
-from pliant.worker.jobs.service import LARGEST_PAGE
+from pliant.worker.jobs.validation import LARGEST_PAGE
 
 router = APIRouter(tags=["about"])
 
@@ -51,8 +51,7 @@ async def healthz() -> dict[str, str]:
     "/readyz", operation_id="get_readiness", summary="Readiness: all parts answer", responses=problems(422, 503)
 )
 def readyz(
-    core: Core,
-    exclude: Annotated[list[Part] | None, Query(description="Parts to leave out; can be repeated.")] = None,
+    core: Core, exclude: Annotated[list[Part] | None, Query(description="Parts to leave out; can be repeated.")] = None
 ) -> dict[str, str]:
     """Return 200 if the job store, the blob store and at least one worker answer, else 503 with the missing parts.
 

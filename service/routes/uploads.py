@@ -27,7 +27,8 @@ from pliant.service.multipart import batches
 from pliant.service.openapi import problems
 from pliant.service.problems import refused, wrong_input
 from pliant.worker.errors import OffsetMismatch
-from pliant.worker.uploads.service import Capacity, Uploads, Writer
+from pliant.worker.uploads.service import Uploads
+from pliant.worker.uploads.writer import Capacity, Writer
 
 router = APIRouter(prefix="/v1/uploads", tags=["uploads"])
 
@@ -46,12 +47,10 @@ Offset = Annotated[
     ),
 ]
 Complete = Annotated[
-    str,
-    Header(alias="Upload-Complete", pattern=r"^\?[01]$", description="`?0` if more follows; `?1` is the default."),
+    str, Header(alias="Upload-Complete", pattern=r"^\?[01]$", description="`?0` if more follows; `?1` is the default.")
 ]
 Length = Annotated[
-    int | None,
-    Header(alias="Upload-Length", ge=0, le=ANY, description="Bytes of the whole upload, if known."),
+    int | None, Header(alias="Upload-Length", ge=0, le=ANY, description="Bytes of the whole upload, if known.")
 ]
 Digest = Annotated[
     str | None,

@@ -19,9 +19,6 @@ from pliant.worker.store.blobs import Blobs
 from pliant.worker.store.memory import MemoryHash, MemoryRecords
 from pliant.worker.tokens import Scope, Tokens
 
-FOLLOW_PAUSE = 0.02
-"""Seconds between two reads of a followed job's events."""
-
 
 class InMemoryService(httpx.BaseTransport, httpx.AsyncBaseTransport):
     """A Pliant service in this process; pass it as `transport` to any number of clients.
@@ -75,7 +72,6 @@ class InMemoryService(httpx.BaseTransport, httpx.AsyncBaseTransport):
         )
         self.worker = Worker(self.jobs, reconstruct, steps=steps, problem=problem)
         self._loop = Loop(create_app(self.jobs, settings, tokens=self.tokens))
-        self._loop.app.state.service.followers.pause = FOLLOW_PAUSE
         self._finalizer = weakref.finalize(self, _stop, self._loop, self.worker, self._scratch)
 
     def create_token(self, name: str = "test", *, scopes: tuple[Scope, ...] = (Scope.READ, Scope.SUBMIT)) -> str:

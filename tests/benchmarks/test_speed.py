@@ -88,13 +88,6 @@ def test_a_mesh_is_timed_against_a_grid():
     assert any("× the grid's time" in line for line in speed("mesh", "--frames", "6", "--points", "100"))
 
 
-@pytest.mark.long
-@pytest.mark.slow
-def test_bandwidth_and_profile_run():
-    assert any(line.startswith("ratio: ") for line in speed("bandwidth", "--frames", "6", "--points", "100"))
-    assert any("block_tridiagonal.py" in line for line in speed("profile", "--frames", "12", "--points", "1500"))
-
-
 def test_the_result_of_a_large_solve_lies_in_the_given_folder(bench, tmp_path, monkeypatch):
     monkeypatch.setattr("pliant.solver.reconstruction.blocks.BLOCK_OBSERVATIONS", 100)
     side_by_side = bench("speed.side_by_side")

@@ -74,7 +74,7 @@ def _check_mp4(stream: BinaryIO, name: str) -> None:
     end = os.fstat(stream.fileno()).st_size
     kinds: list[bytes] = []
     streams = 0
-    for count, (kind, body) in enumerate(_boxes(stream, 0, end)):
+    for count, (kind, body) in enumerate(_boxes(stream, end)):
         if count > MAX_BOXES:
             raise _refusal(
                 "unsupported_film", f"{name} with over {MAX_BOXES} boxes", "Convert it: ffmpeg -i FILM film.mp4"
@@ -107,9 +107,9 @@ def _check_mp4(stream: BinaryIO, name: str) -> None:
         raise _refusal("no_picture", f"{name}, which holds sound but no picture", "Pass a film with a picture track.")
 
 
-def _boxes(stream: BinaryIO, start: int, end: int) -> Iterator[tuple[bytes, bytes]]:
+def _boxes(stream: BinaryIO, end: int) -> Iterator[tuple[bytes, bytes]]:
     """Yield type and first bytes of all boxes, going into those of `NESTED`."""
-    pending = [(start, end)]
+    pending = [(0, end)]
     while pending:
         place, stop = pending.pop()
         while place + 8 <= stop:

@@ -47,16 +47,9 @@ class Truth:
 
     @classmethod
     def of(cls, film: RenderedFilm, tracks: ArrayLike, template: int, frames: ArrayLike | None = None) -> Truth:
-        """Follow the points of tracks `(F, N, 2)` from where they are in the template.
+        """Follow the points of tracks `(F, N, 2)`, in the film's pixels, from where they are in their row `template`.
 
-        Parameters
-        ----------
-        film
-            The film that was tracked.
-        tracks, template
-            Tracks in the film's pixels, and the row of the template frame among them.
-        frames
-            Number in the film of every row, shape `(F,)`; all frames by default.
+        `frames (F,)` are the numbers of the rows in the film; all frames by default.
         """
         found = np.asarray(tracks, dtype=np.float64)
         rows = np.arange(film.num_frames) if frames is None else np.asarray(frames, dtype=np.int64)
@@ -77,16 +70,9 @@ class Truth:
         )
 
     def shape_error(self, shapes: ArrayLike, points: ArrayLike | None = None) -> float:
-        """Return `e3d_frame` of reconstructed shapes after one scale for the film, which does not show how large things are.
+        """Return `e3d_frame_scaled`: a film does not show how large things are.
 
-        The scale is that of `e3d_frame_scaled`, whose value this is.
-
-        Parameters
-        ----------
-        shapes : array, shape (F, K, 3)
-            Reconstructed points.
-        points : array, shape (K,), optional
-            Which of the N tracked points they are; all by default.
+        `points (K,)` are which of the N tracked points the shapes `(F, K, 3)` are of; all by default.
         """
         found = np.asarray(shapes, dtype=np.float64)
         chosen = np.arange(len(self.on)) if points is None else np.asarray(points, dtype=np.int64)

@@ -36,18 +36,7 @@ MARGIN = 8
 
 
 def write_example_film(path: Path | str) -> Path:
-    """Render and encode the film; the suffix decides the container, see `RenderedFilm.write`.
-
-    Parameters
-    ----------
-    path
-        The file to write.
-
-    Raises
-    ------
-    FilmError
-        An unknown suffix, or a file that cannot be written.
-    """
+    """Render and encode the film; the suffix decides the container, see `RenderedFilm.write`."""
     film = _film()
     picture, low = _front(film)
     return film.write(path, fps=FPS, frame=lambda index: _frame(film, index, picture, low))

@@ -35,18 +35,10 @@ def triangulate(faces: NDArray[np.integer]) -> Ints:
 
 
 def rasterise(pixels: Floats, depth: Floats, triangles: Ints, *, size: tuple[int, int]) -> Surface:
-    """Find the nearest triangle at the centre of every pixel.
+    """Find the nearest triangle at the centre of every pixel; both sides of a triangle are visible.
 
-    Parameters
-    ----------
-    pixels : array, shape (P, 2)
-        Projected vertices; pixel (0, 0) has its centre at (0, 0).
-    depth : array, shape (P,)
-        Distance of the vertices along the optical axis, positive.
-    triangles : array, shape (T, 3)
-        Both sides of a triangle are visible.
-    size
-        Width and height in pixels.
+    `pixels (P, 2)` are the projected vertices, with the centre of pixel (0, 0) at (0, 0); `depth (P,)` is their positive distance
+    along the optical axis; triangles are `(T, 3)`; `size` is width and height.
     """
     width, height = size
     pixel, triangle, screen = _fragments(pixels[triangles], width, height)

@@ -55,16 +55,9 @@ class Animation:
 
 
 def animate(shapes: Floats, *, y_axis: str = "up", motion: str = "auto") -> Animation:
-    """Encode shapes `(F, P, 3)`, turned to y up.
+    """Encode shapes `(F, P, 3)` in world axes, turned to y up.
 
-    Parameters
-    ----------
-    shapes : array, shape (F, P, 3)
-        World axes.
-    y_axis : {'up', 'down'}
-        Where y of the shapes points.
-    motion : {'auto', 'frames'}
-        auto: as few modes as keep every point within `ERROR_BOUND`. frames: exact, up to 200 frames.
+    `motion="auto"` takes as few modes as keep every point within `ERROR_BOUND`; `frames` is exact, up to 200 frames.
     """
     if len(shapes) > MAX_FRAME_TARGETS:
         return _modes(shapes, y_axis, MAX_MODE_TARGETS)

@@ -39,12 +39,7 @@ class Painting:
 
     @classmethod
     def of(
-        cls,
-        quantity: str,
-        values: Floats,
-        known: NDArray[np.bool_] | None = None,
-        *,
-        unit: str = "the tracks' unit",
+        cls, quantity: str, values: Floats, known: NDArray[np.bool_] | None = None, *, unit: str = "the tracks' unit"
     ) -> Painting:
         """Choose the scale for values `(F, P)`."""
         counted = values.ravel() if known is None else values[known]

@@ -108,34 +108,13 @@ def write_glb(
     normals: str = "static", quantized: bool = False, colours: NDArray[np.uint16] | None = None, texture: Texture | None = None,
     view: View | None = None, on_progress: Callable[[float], None] | None = None,
 ) -> None:  # fmt: skip
-    """Write the animation.
+    """Write the animation, y up and right-handed, from the file's current position.
 
-    Parameters
-    ----------
-    file : binary file
-        Written from its current position, not closed.
-    animation : Animation
-        y up, right-handed.
-    triangles : array of int, shape (T, 3)
-        T = 0 writes a cloud of points.
-    fps : float
-        Frames per second; frame f is at f / fps seconds, with linear interpolation between.
-    node : dict
-        Properties of the node besides the mesh, e.g. `scale`.
-    name : str
-        Name of node and mesh.
-    normals : str
-        `static`: of the base shape; `animated`: displaced with the targets; `none`.
-    quantized : bool
-        16-bit positions and 8-bit normals by KHR_mesh_quantization.
-    colours : array of uint16, shape (P, 4), optional
-        RGBA of every point, linear light, 65535 for 1.
-    texture : Texture, optional
-        Base colour; embedded as JPEG.
-    view : View, optional
-        Camera, whose node follows that of the mesh and moves with it.
-    on_progress : callable, optional
-        Called with the share of bytes written.
+    Frame f is at f / fps seconds, with linear interpolation between; without triangles `(T, 3)` it is a cloud of points. `node`
+    has the properties of the node besides the mesh, e.g. `scale`. `normals` are `static` (those of the base shape), `animated`
+    (displaced with the targets) or `none`. `quantized` writes 16-bit positions and 8-bit normals by KHR_mesh_quantization.
+    `colours (P, 4)` are RGBA, linear light, 65535 for 1. The camera of `view` follows the mesh. `on_progress` gets the share of
+    bytes written.
     """
     buffer = Buffer()
     positions, target, placed = _rounded(animation, node, quantized=quantized)

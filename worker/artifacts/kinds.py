@@ -45,16 +45,7 @@ class Kind:
 
 
 def kinds_for(options: Options, *, size: tuple[int, int] = (0, 0), textured: bool = False) -> list[Kind]:
-    """Return the kinds that a job's options request, in the order of writing.
-
-    Parameters
-    ----------
-    options : Options
-        Of the job.
-    size : tuple of int
-        Frames and points, if known.
-    textured : bool
-        Whether there is a texture.
+    """Return the kinds that a job's options request, in the order of writing; `size` is frames and points, if known.
 
     Raises
     ------

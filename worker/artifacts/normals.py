@@ -40,15 +40,7 @@ class FittedNormals:
 
 
 def fit_normals(animation: Animation, triangles: Ints) -> FittedNormals:
-    """Fit the normals of an animation's frames, in one pass over the frames.
-
-    Parameters
-    ----------
-    animation : Animation
-        In modes.
-    triangles : array of int, shape (T, 3)
-        Not empty.
-    """
+    """Fit the normals of the frames of an animation in modes, which has triangles `(T, 3)`, in one pass over the frames."""
     import scipy.linalg  # not for the API process, which writes no file
 
     frames, modes = animation.weights.shape

@@ -138,26 +138,10 @@ def write_preview(
     point_names: Sequence[str] | None = None,
     texture: Texture | None = None,
 ) -> None:
-    """Write the file.
+    """Write the file: what was solved, its result, and where they are known the truth `(F, P, 3)`, in any axes, NaN where unknown.
 
-    Parameters
-    ----------
-    file : binary file
-        Open for writing, at its start.
-    tracks, mesh, solution
-        Input and result of the solve.
-    truth : array, shape (F, P, 3), optional
-        Ground truth in any axes, the tracks' unit; NaN where unknown.
-    y_axis : {'down', 'up'}
-        Direction of the image's y axis.
-    fps : float
-        Frames per second of the animation, before frames are skipped.
-    image_size : str, optional
-        Width and height of the picture that the tracks refer to, pixels, as the option `image_size` has it.
-    point_names : sequence of str, optional
-        Name of every point.
-    texture : Texture, optional
-        The film's picture and where the points are in it.
+    `y_axis` is the direction of the image's y axis; `fps` counts frames before some are skipped; `image_size` is as the option
+    has it.
     """
     stride = max(1, -(-solution.shapes[..., 0].size // MOST_OBSERVATIONS))
     facing, mirrored = (None, False) if truth is None else _onto(solution.shapes, truth)
@@ -196,12 +180,7 @@ def _input_sections(point_names: Sequence[str] | None, texture: Texture | None) 
 
 
 def _sections(
-    tracks: Tracks,
-    solution: Solution,
-    truth: Floats | None,
-    facing: Floats | None,
-    kept: range,
-    rounding: Rounding,
+    tracks: Tracks, solution: Solution, truth: Floats | None, facing: Floats | None, kept: range, rounding: Rounding
 ) -> list[Section]:
     """Return the sections from `cameras` to `rejected`, of the frames kept; `facing` is the truth aligned with the result."""
     shapes, std, camera = solution.shapes, solution.shapes_std, solution.camera

@@ -29,16 +29,7 @@ def build_report(
 ) -> dict[str, Any]:
     """Return the content of `report.json` as plain values for JSON.
 
-    Parameters
-    ----------
-    inputs, solution, options
-        Of the job.
-    metrics : mapping
-        By documented name; numbers that are not finite are written as null.
-    seconds : mapping, optional
-        Wall time of stages outside the solver, e.g. `loading`; those of the solver are part of the solution.
-    name : str
-        Name of the job.
+    Metrics that are not finite are written as null. `seconds` are of stages outside the solver, e.g. `loading`.
     """
     choices = asdict(solution.choices)
     reasons, warnings = choices.pop("reasons"), choices.pop("warnings")

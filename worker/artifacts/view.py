@@ -46,19 +46,9 @@ def view_of(
 ) -> View:
     """Return the glTF camera of shapes `(F, P, 3)` that the scene holds turned to y up and multiplied by `scale`.
 
-    Parameters
-    ----------
-    camera : Camera
-        Cameras of the result. A glTF camera cannot change its magnification: for orthographic cameras it is the geometric mean of the
-        scales, and the range of the scales is listed in `extras`.
-    shapes : array, shape (F, P, 3)
-        In the axes of the tracks.
-    y_axis : str
-        `down` or `up`, where y of the tracks points.
-    scale : float
-        Scene units per unit of the shapes.
-    image_size : tuple of float, optional
-        Width and height of the picture, pixels; without it the view holds all projected points.
+    A glTF camera cannot change its magnification: for orthographic cameras it is the geometric mean of the scales, and the range
+    of the scales is listed in `extras`. `y_axis` is where y of the tracks points. Without `image_size`, pixels, the view holds
+    all projected points.
     """
     axes = np.array([1.0, -1.0, -1.0]) if y_axis == "down" else np.ones(3)
     centre = _centre(camera, image_size)

@@ -25,25 +25,10 @@ def write_artifacts(
     inputs: Inputs, solution: Solution, options: Options, report: dict[str, Any], directory: Path, *, name: str = "",
     on_progress: OnProgress | None = None,
 ) -> list[Artifact]:  # fmt: skip
-    """Write the result files that a job's options ask for into a directory that exists.
+    """Write the result files that a job's options ask for into a directory that exists; return them in the order written.
 
-    Parameters
-    ----------
-    inputs, solution, options
-        Of the job.
-    report : dict
-        From `build_report`; `artifacts` and `seconds.exporting` are added to it. `artifacts` may list files that are there already.
-    directory : Path
-        Where the files go; files of the same names are replaced.
-    name : str
-        Name of the job, which the object in the files has.
-    on_progress : callable, optional
-        Called with the share that is done, in [0, 1].
-
-    Returns
-    -------
-    list of Artifact
-        In the order written; `report.json` is the last.
+    `artifacts` and `seconds.exporting` are added to `report`, whose `artifacts` may list files that are there already; it is
+    written last. `name` is that of the object in the files. `on_progress` gets the share that is done, in [0, 1].
 
     Raises
     ------
@@ -65,24 +50,7 @@ def write_artifacts(
 def write_kinds(
     result: Result, kinds: Sequence[Kind], directory: Path, *, on_progress: OnProgress
 ) -> tuple[list[Artifact], dict[str, Any]]:
-    """Write some result files into a directory that exists.
-
-    Parameters
-    ----------
-    result : Result
-        What is written.
-    kinds : sequence of Kind
-        Which files, in the order of writing.
-    directory, on_progress
-        As `write_artifacts`.
-
-    Returns
-    -------
-    written : list of Artifact
-        In the order of `kinds`.
-    entries : dict
-        What the report states of each, by file name.
-    """
+    """Write some result files, as `write_artifacts`; return them in the order of `kinds`, and what the report states of each."""
     written: list[Artifact] = []
     entries: dict[str, Any] = {}
     done, total = 0.0, sum(kind.share for kind in kinds)

@@ -15,13 +15,7 @@ _NO_ROOM_FOR_A_THREAD = ("can't start new thread", os.strerror(errno.EAGAIN))
 
 
 def problem_of(error: BaseException, *, memory_limit: int = 0) -> Problem:
-    """Return the problem for an exception in a job. Tracebacks go to the log, never into the record.
-
-    Parameters
-    ----------
-    memory_limit : int
-        Limit of the job's address space, bytes; 0: no limit.
-    """
+    """Return the problem for an exception in a job. Tracebacks go to the log, never into the record."""
     if isinstance(error, Invalid):
         return Problem.of(error.code, 422, detail=_sentence(str(error)), **members_of(error))
     if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):

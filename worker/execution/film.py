@@ -48,33 +48,9 @@ def reconstruct_film(
     on_progress: Callable[[Progress], None] | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> Finished:
-    """Track, solve, measure, write the files.
+    """Track, solve, measure and write the files, with the first stage `track`; raises as `reconstruct`.
 
-    Parameters
-    ----------
-    source : FilmSource
-        Film and region.
-    options : Options
-        How to track, solve and write; see `film_options`.
-    directory : Path
-        Where to write the files; created if missing.
-    scratch : Path
-        An empty folder for the film process.
-    name : str
-        As in `reconstruct`.
-    threads : int
-        Threads for optical flow.
-    bounds : FilmBounds
-        Limits of the film.
-    on_progress, should_stop : callable, optional
-        As in `reconstruct`; the first stage is `track`.
-
-    Raises
-    ------
-    Interrupted, TimedOut
-        As `reconstruct`.
-    InvalidInput
-        The film cannot be tracked or its tracks cannot be solved.
+    `scratch` is an empty folder for the film process; `threads` are for optical flow.
     """
     kinds_for(options)
     reporter = Reporter(on_progress if on_progress is not None else silent, shares=FILM_SHARES)

@@ -44,18 +44,8 @@ def write_further(
 ) -> Finished:
     """Write the files that a job's options name, from a stored result.
 
-    Parameters
-    ----------
-    inputs_file : Path
-        The inputs of the job that solved: canonical, or the `tracks.npz` of a film.
-    result_file : Path
-        Its `shapes.npz`.
-    job : Job
-        The job that writes; its metrics, verdict and warnings are those of the result.
-    directory : Path
-        Where the files go; made if need be.
-    on_progress, should_stop : callable, optional
-        As in `reconstruct`.
+    `inputs_file` has the inputs of the job that solved (canonical, or the `tracks.npz` of a film), `result_file` is its
+    `shapes.npz`. Metrics, verdict and warnings of `job`, which writes, are those of the result.
 
     Raises
     ------

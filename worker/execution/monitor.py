@@ -92,10 +92,7 @@ class Watch:
     def must_end(self, *, stop_by: float | None) -> Reason | None:
         """Write a heartbeat if one is due; return the reason to kill the job process now, or None.
 
-        Parameters
-        ----------
-        stop_by : float or None
-            Monotonic time until which the job may continue while the worker shuts down.
+        `stop_by` is the monotonic time until which the job may continue while the worker shuts down.
         """
         now = self.clock()
         self.stopping = stop_by is not None
@@ -136,17 +133,9 @@ class Watch:
 def finalize(watch: Watch, *, status: int, peak: int, patience: Patience) -> Stored | None:
     """Record the outcome of a job process that ended without recording one; otherwise change nothing.
 
-    Returns the record if it was written. The reason and the last output of the job process are logged before the record
-    becomes final, so the log of a finished job is complete.
-
-    Parameters
-    ----------
-    status : int
-        As `os.wait4` returns it.
-    peak : int
-        Peak resident size of the job process, bytes.
-    patience : Patience
-        Time limit for an unavailable store.
+    Returns the record if it was written. The reason and the last output of the job process are logged before the record becomes
+    final, so the log of a finished job is complete. `status` is as `os.wait4` returns it, `peak` the largest resident size in
+    bytes.
 
     Raises
     ------

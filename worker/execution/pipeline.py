@@ -33,29 +33,14 @@ def reconstruct(
     should_stop: Callable[[], bool] | None = None,
     solver: Callable[..., Solution] | None = None,
 ) -> Finished:
-    """Solve, measure, write the files.
+    """Solve, measure, and write the files into a directory, which is created if missing.
 
-    Parameters
-    ----------
-    inputs : Inputs
-        As returned by the readers.
-    options : Options
-        How to solve and which files to write.
-    directory : Path
-        Where to write the files; created if missing.
-    name : str
-        Name of the job, which the object in the files has.
-    on_progress : callable, optional
-        Called frequently; throttle if needed.
-    should_stop : callable, optional
-        Called frequently; once it returns True, the job ends with `Interrupted`, possibly before all files are written.
-    solver : callable, optional
-        Replaces `pliant.solver.solve`, in tests.
+    `on_progress` and `should_stop` are called frequently. `solver` replaces `pliant.solver.solve`, in tests.
 
     Raises
     ------
     Interrupted
-        `should_stop` returned True.
+        `should_stop` returned True; some files may be written.
     TimedOut
         The job took longer than `options.time_limit`.
     InvalidInput
@@ -84,24 +69,8 @@ def solve_and_write(
 ) -> Finished:
     """Run `reconstruct` as part of a longer job.
 
-    Parameters
-    ----------
-    inputs, options, directory
-        As in `reconstruct`.
-    reporter : Reporter
-        Receives the parts `loading`, `solving` and `exporting`.
-    halt : Halt
-        The stop condition.
-    name : str
-        As in `reconstruct`.
-    spent : mapping, optional
-        Seconds of earlier parts, for the report.
-    earlier : sequence of Artifact
-        Files of earlier parts, in the same directory, for the report.
-    warnings : sequence of str
-        Of earlier parts, for the report.
-    solver : callable, optional
-        As in `reconstruct`.
+    The reporter receives the parts `loading`, `solving` and `exporting`. `spent` (seconds), `earlier` (files in the same
+    directory) and `warnings` are of earlier parts, for the report.
     """
     directory.mkdir(parents=True, exist_ok=True)
     size = inputs.tracks.num_frames, inputs.tracks.num_points

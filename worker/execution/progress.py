@@ -71,18 +71,10 @@ class Reporter:
         seconds_left: float | None = None,
         followed: FollowedPoints | None = None,
     ) -> None:
-        """Report that the share `done` (0 to 1) of a part is done; omitted numbers keep their last value.
+        """Report that the share `done` (0 to 1) of a part, a key of `shares`, is done; omitted numbers keep their last value.
 
-        Parameters
-        ----------
-        part : str
-            A key of `shares`.
-        stage : str, optional
-            Stage to report; the name of the part by default.
-        seconds_left : float, optional
-            Until this part ends.
-        followed : FollowedPoints, optional
-            Points of the film that were just tracked; not repeated later.
+        The stage is the part by default. `seconds_left` is until this part ends. `followed`, the points just tracked, is not
+        repeated later.
         """
         with self._lock:
             now = self.clock()

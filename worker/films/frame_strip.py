@@ -37,21 +37,9 @@ QUALITY = 80
 
 
 def write_frames(film: Film, indices: NDArray[np.int64], path: Path) -> bool:
-    """Decode a film once more and write the pictures of some of its frames.
+    """Decode a film once more and write the pictures of some of its frames: `indices (F,)`, ascending, from 0 in the whole film.
 
-    Parameters
-    ----------
-    film : Film
-        The opened film.
-    indices : array of int, shape (F,)
-        Numbers of the frames, counted in the whole film from 0, ascending.
-    path : Path
-        The file to write.
-
-    Returns
-    -------
-    bool
-        False, and no file, where the pictures take more than `MOST_BYTES` or not all frames are found again.
+    Returns False, and writes no file, where the pictures take more than `MOST_BYTES` or not all frames are found again.
     """
     from pliant.tracking.contact_sheet import small_jpeg
 

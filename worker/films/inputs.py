@@ -23,19 +23,12 @@ TEXTURE_ARRAYS = frozenset(("template_image", "uv"))
 def read_tracked(file: Path, tracked: Tracked, options: Options) -> Inputs:
     """Read the `tracks.npz` of a film as the inputs of a solve: points in the film's pixels, y down, and their grid as mesh.
 
-    Parameters
-    ----------
-    file : Path
-        As written by the film process; validated like an uploaded file.
-    tracked : Tracked
-        The other results of tracking.
-    options : Options
-        `stride`, `max_points` and `min_seen`.
+    The file is validated like an uploaded one.
 
     Raises
     ------
     InvalidInput
-        The arrays do not fit together, or an option leaves too few points.
+        The arrays do not fit together, or `stride`, `max_points` or `min_seen` leave too few points.
     """
     arrays = read_file(file, field="film", limits=Limits(), wanted=REQUIRED | TEXTURE_ARRAYS)
     if not set(arrays) >= REQUIRED or arrays["tracks"].shape[:2] != arrays["confidence"].shape:

@@ -83,16 +83,8 @@ def check_film(
 ) -> FilmFacts:
     """Open a film and its region without tracking it; takes seconds, whatever the film's length.
 
-    Parameters
-    ----------
-    source, options, bounds
-        The film, how it would be tracked, and what it may cost.
-    estimate
-        Also estimate how many points would be tracked, and the time that it would take with so many threads.
-    picture
-        Also return the first frame.
-    threads
-        Threads that tracking would have.
+    With `estimate` it also estimates how many points would be tracked, and the time with so many threads; `picture` returns the
+    first frame.
 
     Raises
     ------
@@ -123,21 +115,10 @@ def track_film(
     on_progress: OnProgress | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> Tracked:
-    """Track a film; `tracks.npz` and `contact_sheet.jpg` are then in the scratch folder.
+    """Track a film; `tracks.npz` and `contact_sheet.jpg` are then in the scratch folder, which must be empty.
 
-    Parameters
-    ----------
-    source, options, bounds
-        The film, how to track it, and its limits.
-    scratch : Path
-        An empty folder.
-    threads : int
-        Threads for optical flow.
-    on_progress : callable, optional
-        Called with the completed share, in [0, 1], the numbers of frames and points where they are known, and the points that were just
-        tracked, if any.
-    should_stop : callable, optional
-        Called ten times a second; the film process is killed once it returns True.
+    `on_progress` gets the completed share in [0, 1], the numbers of frames and points where they are known, and the points that
+    were just tracked, if any. `should_stop` is called ten times a second; the film process is killed once it returns True.
 
     Raises
     ------

@@ -60,14 +60,7 @@ def store_inputs(
     limits: Limits = Limits(),  # noqa: B008 - frozen
     target: Path | None,
 ) -> Interpretation:
-    """Read, check and interpret the files of one job as `read_inputs` does, and store them in canonical form.
-
-    Parameters
-    ----------
-    tracks, mesh, ground_truth, rotations, options, limits
-        As in `read_inputs`.
-    target : Path, optional
-        Where to write the canonical inputs; None returns the interpretation only.
+    """Read, check and interpret the files of one job as `read_inputs` does; store them in canonical form if there is a target.
 
     Raises
     ------

@@ -37,21 +37,11 @@ def read_inputs(
     options: Options,
     limits: Limits = Limits(),  # noqa: B008 - frozen
 ) -> Inputs:
-    """Read, check and interpret the files of one job.
+    """Read, check and interpret the files of one job; files are recognised by content, not by name.
 
-    Parameters
-    ----------
-    tracks : Path
-        The tracks, in any of the documented formats; recognised by content, not by name.
-    mesh : Path or str, optional
-        A mesh file whose vertex i is point i, a grid size `"ROWSxCOLUMNS"`, or `"none"`; by default a mesh is generated.
-    ground_truth, rotations : Path, optional
-        True shapes, used for metrics only; known cameras, used instead of estimated ones. Both for all frames and points of the
-        tracks; the options `frames`, `stride` and `max_points` select from them as well.
-    options : Options
-        `layout`, `rows`, `coordinates` … take precedence over detection.
-    limits : Limits
-        Limits of the input.
+    `mesh` is a file whose vertex i is point i, a grid size `"ROWSxCOLUMNS"` or `"none"`; by default a mesh is generated. The
+    truth, used for metrics only, and the rotations, used instead of estimated cameras, are for all frames and points of the
+    tracks: `frames`, `stride` and `max_points` select from them as well. Options such as `layout` take precedence over detection.
 
     Raises
     ------
@@ -206,10 +196,7 @@ def _read_truth(
         ]
     if given is not None:
         return truth, raw.notes
-    return truth, [
-        "The tracks file also contains true shapes; they are used for metrics only.",
-        *raw.notes,
-    ]
+    return truth, ["The tracks file also contains true shapes; they are used for metrics only.", *raw.notes]
 
 
 def _hidden_notes(tracks: Tracks) -> list[str]:

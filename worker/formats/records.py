@@ -68,16 +68,7 @@ class GroundTruth:
 
     @classmethod
     def from_arrays(cls, shapes: ArrayLike, rotations: ArrayLike | None, *, like: tuple[int, int]) -> GroundTruth:
-        """Check truth against the tracks' frames and points.
-
-        Parameters
-        ----------
-        shapes : array_like, shape (F, P, 3)
-            True points.
-        rotations : array_like, shape (F, 2, 3) or (F, 3, 3), optional
-            True cameras.
-        like : tuple of int
-            `(F, P)` of the tracks.
+        """Check true shapes `(F, P, 3)` and cameras `(F, 2|3, 3)` against `like`, frames and points of the tracks.
 
         Raises
         ------

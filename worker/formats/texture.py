@@ -28,14 +28,7 @@ class Texture:
 
     @classmethod
     def from_tracked(cls, template_rgb: ArrayLike, uv: ArrayLike) -> Texture:
-        """Encode a template frame.
-
-        Parameters
-        ----------
-        template_rgb : array_like of uint8, shape (H, W, 3)
-            RGB.
-        uv : array_like, shape (P, 2)
-            In [0, 1], u right, v down.
+        """Encode a template frame, uint8 RGB `(H, W, 3)`, with coordinates `(P, 2)` in [0, 1], u right, v down.
 
         Raises
         ------

@@ -11,12 +11,9 @@ from pliant.worker.formats.cost import largest_that_fits
 
 
 def check_fits(interpretation: Interpretation, options: Options, memories: Iterable[int]) -> None:
-    """Check that one of the workers has the memory that a job is estimated to need.
+    """Check that a worker has the memory that a job is estimated to need.
 
-    Parameters
-    ----------
-    memories : iterable of int
-        Bytes that a job may take on each running worker; where none is known, every job passes.
+    `memories` are the bytes that a job may take on each running worker; where none is known, every job passes.
 
     Raises
     ------

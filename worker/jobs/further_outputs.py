@@ -9,11 +9,11 @@ from dataclasses import replace
 from pliant.schemas.job import Job, Status
 from pliant.schemas.outputs import OutputRequest
 from pliant.worker.artifacts import kinds_for
-from pliant.worker.errors import NotAllowedNow, UnknownJob
+from pliant.worker.errors import NotAllowedNow
 from pliant.worker.ids import new_job_id
 from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.service import Jobs
-from pliant.worker.jobs.submission import Submission, copy_beside
+from pliant.worker.jobs.submission import Submission
 from pliant.worker.records import Stored
 
 RESULT = "shapes.npz"
@@ -24,26 +24,11 @@ TRACKS = "tracks.npz"
 def make_outputs(
     jobs: Jobs, id: str, request: OutputRequest, *, idempotency_key: str | None = None
 ) -> tuple[Job, bool]:
-    """Queue a job that writes further files of a result.
+    """Queue a job that writes further files of a result; return it, and whether it is new.
 
-    The new job has copies of what it needs, so the first one may be deleted meanwhile; it counts against the same limits as
-    every other job. The same request again returns the same job; after one that failed or was cancelled it makes one more.
-
-    Parameters
-    ----------
-    id : str
-        A job that has succeeded.
-    request : OutputRequest
-        Which files, and how.
-    idempotency_key : str, optional
-        A repeated request with the same key returns the first new job, whatever its status.
-
-    Returns
-    -------
-    job : Job
-        The new job, or the one that the same request made before; its `outputs_of` is the id given.
-    new : bool
-        False if an earlier request made it.
+    The new job has copies of what it needs, so the first one may be deleted meanwhile; it counts against the same limits as every
+    other job. The same request again returns the same job; after one that failed or was cancelled it makes one more, unless it
+    has the same key.
 
     Raises
     ------
@@ -73,15 +58,7 @@ def make_outputs(
         submission = replace(submission, idempotency_key=f"outputs {wish} after {known.id}")
     _check(stored, submission)
     further = lifecycle.again(job, id=new_job_id(), now=jobs.clock(), outputs_of=id, options=submission.options)
-    copies = [(_inputs_of(stored), "inputs.npz"), (f"{stored.prefix}{RESULT}", "result.npz")]
-    try:
-        size = sum(jobs.blobs.get(key).size for key, _ in copies)
-        made = jobs.create(
-            further, submission, lambda key: copy_beside(jobs.blobs, copies, key), size=size, owner=stored.owner,
-            from_result=True,
-        )  # fmt: skip
-    except FileNotFoundError:  # deleted between our look and the copy
-        raise UnknownJob(id) from None
+    made = jobs.create_copy(further, submission, stored, inputs=_inputs_of(stored), result=f"{stored.prefix}{RESULT}")
     return made, made.id == further.id
 
 

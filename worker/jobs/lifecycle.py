@@ -24,15 +24,10 @@ FINAL = (Status.SUCCEEDED, Status.FAILED, Status.CANCELLED)
 
 
 def again(job: Job, *, id: str, now: datetime, **changes: object) -> Job:
-    """Return a new queued job like a finished one.
+    """Return a new queued job like a finished one, with other `changes`.
 
     Metrics, outcome, verdict and warnings stay. A failed or cancelled job has them only if it works from a stored result, and
     then they are those of that result.
-
-    Parameters
-    ----------
-    **changes
-        Further fields of the new job.
     """
     fresh: dict[str, object] = {
         "id": id, "status": Status.QUEUED, "created_at": now, "started_at": None, "finished_at": None, "expires_at": None,
@@ -163,12 +158,7 @@ def requeue(
     max_attempts: int | None,
     retention: float,
 ) -> Stored:
-    """Requeue a job that lost its worker; after `max_attempts` (None: no limit) it fails with `problem`.
-
-    Parameters
-    ----------
-    attempt_id, fresh : str
-        The lost attempt, and the id of the next one.
+    """Requeue a job that lost its worker, as attempt `fresh`; after `max_attempts` (None: no limit) it fails with `problem`.
 
     Raises
     ------

@@ -5,20 +5,17 @@ from __future__ import annotations
 import hashlib
 
 from pliant.schemas.job import Job, Status
-from pliant.worker.errors import NotAllowedNow, UnknownJob
+from pliant.worker.errors import NotAllowedNow
 from pliant.worker.ids import new_job_id
 from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.service import Jobs
-from pliant.worker.jobs.submission import Submission, copy_beside
+from pliant.worker.jobs.submission import Submission
 
 
 def retry(jobs: Jobs, id: str, *, idempotency_key: str | None = None) -> Job:
     """Run a failed or cancelled job again, as a new job with the same inputs, options, name and webhook.
 
-    Parameters
-    ----------
-    idempotency_key : str, optional
-        A repeated request with the same key returns the first new job.
+    A repeated request with the same key returns the first new job.
 
     Raises
     ------
@@ -44,12 +41,4 @@ def retry(jobs: Jobs, id: str, *, idempotency_key: str | None = None) -> Job:
         hint = "It has its result." if job.status is Status.SUCCEEDED else "Wait until it ends, or cancel it first."
         raise NotAllowedNow(id, job.status, wanted="run again", hint=hint)
     again = lifecycle.again(job, id=new_job_id(), now=jobs.clock(), retry_of=id)
-    try:
-        copies = [(stored.inputs, "inputs.npz"), *([(stored.result, "result.npz")] if stored.result else [])]
-        size = sum(jobs.blobs.get(key).size for key, _ in copies)
-        return jobs.create(
-            again, submission, lambda key: copy_beside(jobs.blobs, copies, key), size=size, owner=stored.owner,
-            from_result=stored.result is not None,
-        )  # fmt: skip
-    except FileNotFoundError:  # deleted between our look and the copy
-        raise UnknownJob(id) from None
+    return jobs.create_copy(again, submission, stored, inputs=stored.inputs, result=stored.result)

@@ -10,19 +10,11 @@ from pathlib import Path
 
 from pliant.schemas.job import Artifact, Interpretation, Job, JobPage, Status
 from pliant.worker import tracing
-from pliant.worker.errors import (
-    Conflict,
-    NotAllowedNow,
-    StoreUnavailable,
-    TooManyQueued,
-    UnknownArtifact,
-    UnknownJob,
-)
+from pliant.worker.errors import Conflict, NotAllowedNow, StoreUnavailable, TooManyQueued, UnknownArtifact, UnknownJob
 from pliant.worker.ids import check_id, is_id, new_attempt_id, new_job_id
 from pliant.worker.jobs import lifecycle
 from pliant.worker.jobs.admission import check_fits
-from pliant.worker.jobs.submission import Acceptance, Submission, key_digest, result_beside
-from pliant.worker.jobs.validation import LARGEST_PAGE as LARGEST_PAGE
+from pliant.worker.jobs.submission import Acceptance, Submission, folder_of, key_digest
 from pliant.worker.jobs.validation import check_event_id, check_key, check_page
 from pliant.worker.paths import make_data_directory
 from pliant.worker.records import Event, Records, Stored, utc_now
@@ -72,15 +64,8 @@ class Jobs:
     def submit(self, inputs_file: Path, submission: Submission, *, interpretation: Interpretation) -> Job:
         """Accept a job. After this returns the job ends with a result or an error, whichever process is killed.
 
-        Parameters
-        ----------
-        inputs_file : Path
-            Canonical inputs, as written by `worker.formats.save_inputs`. Linked or copied: the caller may unlink the
-            file, but must not write to it.
-        submission : Submission
-            The client's request.
-        interpretation : Interpretation
-            How the inputs were read.
+        The canonical inputs, as `worker.formats.save_inputs` writes them, are linked or copied: the caller may unlink the file,
+        but must not write to it.
 
         Raises
         ------
@@ -107,7 +92,7 @@ class Jobs:
         )
         check_fits(interpretation, submission.options, self.queue.memories().values())
         size = inputs_file.stat().st_size
-        return self.create(job, submission, lambda key: self.blobs.put(key, inputs_file), size=size)
+        return self._create(job, submission, lambda key: self.blobs.put(key, inputs_file), size=size)
 
     def known(self, submission: Submission) -> Job | None:
         """Return the job of an earlier identical request, None if the request is new. Raises as `submit`."""
@@ -147,21 +132,12 @@ class Jobs:
         return self._placed(self.stored(id))
 
     def page(self, *, cursor: str | None = None, limit: int = 50, statuses: Sequence[Status] | None = None) -> JobPage:
-        """Return jobs, newest first.
-
-        Parameters
-        ----------
-        cursor : str, optional
-            `JobPage.next` of the previous page.
-        limit : int
-            1–200.
-        statuses : sequence of Status, optional
-            Statuses to include; all by default.
+        """Return jobs, newest first, after the previous page's `JobPage.next`; of all statuses by default.
 
         Raises
         ------
         InvalidRequest
-            The cursor is malformed, or the limit is out of range.
+            The cursor is malformed, or the limit is not 1–200.
         """
         check_page(cursor, limit)
         wanted = tuple(Status) if statuses is None else tuple(statuses)
@@ -256,14 +232,9 @@ class Jobs:
         return "".join(f"{line}\n" for line in self.records.log(id))
 
     def events(self, id: str, *, after: str | None = None) -> list[Event]:
-        """Return the job's events after a given one; `records.changes` signals new ones.
+        """Return the job's events after a given one; None: the latest 256, or 16 of a finished job. `records.changes` signals new ones.
 
         The last event of a finished job is a `job` event with a final status; nothing follows it.
-
-        Parameters
-        ----------
-        after : str, optional
-            `Event.id`; None returns all that are kept: the latest 256, or the latest 16 of a finished job.
 
         Raises
         ------
@@ -306,27 +277,40 @@ class Jobs:
             raise UnknownJob(id)
         return stored
 
-    def create(
-        self, job: Job, submission: Submission, put: Callable[[str], object], *, size: int, owner: str | None = None,
-        from_result: bool = False,
-    ) -> Job:  # fmt: skip
-        """Store a new job and queue it.
-
-        Parameters
-        ----------
-        put : callable
-            Stores the inputs under a blob key, and the result to work from beside them, see `result_beside`.
-        size : int
-            Bytes that `put` stores.
-        owner : str, optional
-            Whose job it is; None: the owner of these jobs.
-        from_result : bool
-            The job works from a stored result instead of solving.
+    def create_copy(self, job: Job, submission: Submission, source: Stored, *, inputs: str, result: str | None) -> Job:
+        """Store and queue a new job of the source's owner, with copies of stored inputs and of a result to work from.
 
         Raises
         ------
         Conflict, QuotaExceeded, TooManyQueued
             As `submit`.
+        UnknownJob
+            The source was deleted meanwhile.
+        """
+        copies = {"inputs.npz": inputs} | ({} if result is None else {"result.npz": result})
+
+        def copy(to: str) -> None:
+            try:
+                for name, key in copies.items():
+                    self.blobs.copy(key, f"{folder_of(to)}{name}")
+            except FileNotFoundError:
+                self.blobs.delete(folder_of(to))
+                raise
+
+        try:
+            size = sum(self.blobs.get(key).size for key in copies.values())
+            return self._create(job, submission, copy, size=size, owner=source.owner, from_result=result is not None)
+        except FileNotFoundError:
+            raise UnknownJob(source.job.id) from None
+
+    def _create(
+        self, job: Job, submission: Submission, put: Callable[[str], object], *, size: int, owner: str | None = None,
+        from_result: bool = False,
+    ) -> Job:  # fmt: skip
+        """Store a new job and queue it.
+
+        `put` stores `size` bytes: the inputs under a blob key, and with `from_result` the result to work from beside them. The
+        job belongs to the owner of these jobs unless another is given.
         """
         acceptance = Acceptance(records=self.records, blobs=self.blobs, queue=self.queue, settings=self.settings)
         acceptance.check_quota(size)
@@ -336,7 +320,7 @@ class Jobs:
             owner=owner if owner is not None else self.owner or "",
             attempt_id=attempt_id,
             inputs=(inputs := f"jobs/{job.id}/{attempt_id}/inputs.npz"),
-            result=result_beside(inputs) if from_result else None,
+            result=f"{folder_of(inputs)}result.npz" if from_result else None,
             bytes=size,
             key=key_digest(submission.idempotency_key, self.owner),
             fingerprint=submission.fingerprint,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
 from pliant.schemas.job import Priority, Status
@@ -77,19 +77,7 @@ class Acceptance:
     def create(self, stored: Stored, put: Callable[[str], object], *, max_queued: int) -> Stored:
         """Store inputs, record and queue entry, in this order; a failure in between leaves no accepted job.
 
-        Parameters
-        ----------
-        stored : Stored
-            The new record.
-        put : callable
-            Stores the inputs under a blob key.
-        max_queued : int
-            Jobs of this owner that may be queued at once; 0: any number.
-
-        Returns
-        -------
-        Stored
-            The new record, or the one that already has its idempotency key or id.
+        `put` stores the inputs under a blob key. Returns the new record, or the one that already has its idempotency key or id.
 
         Raises
         ------
@@ -102,10 +90,10 @@ class Acceptance:
         try:
             kept = self.records.create(stored, max_queued=max_queued, max_bytes=most)
         except (TooManyQueued, QuotaExceeded):
-            self.blobs.delete(_folder_of(stored.inputs))
+            self.blobs.delete(folder_of(stored.inputs))
             raise
         if kept.inputs != stored.inputs:
-            self.blobs.delete(_folder_of(stored.inputs))
+            self.blobs.delete(folder_of(stored.inputs))
             return kept
         try:
             if self._over_running_limit(stored):
@@ -131,29 +119,8 @@ class Acceptance:
         return most > 0 and self.records.count(unfinished, owner=stored.owner) > most
 
 
-def result_beside(inputs: str) -> str:
-    """Return the blob key of the stored result that a job works from, beside its inputs."""
-    return f"{_folder_of(inputs)}result.npz"
-
-
-def copy_beside(blobs: Blobs, copies: Sequence[tuple[str, str]], inputs: str) -> None:
-    """Copy blobs, each to a name beside the inputs of a new job; all or none.
-
-    Raises
-    ------
-    FileNotFoundError
-        One of them is gone.
-    """
-    folder = _folder_of(inputs)
-    try:
-        for key, name in copies:
-            blobs.copy(key, f"{folder}{name}")
-    except FileNotFoundError:
-        blobs.delete(folder)
-        raise
-
-
-def _folder_of(inputs: str) -> str:
+def folder_of(inputs: str) -> str:
+    """Return the blob prefix of an attempt, from the key of its inputs."""
     return inputs.rpartition("/")[0] + "/"
 
 

@@ -68,26 +68,11 @@ def run_contained(
     on_line: Callable[[dict[str, Any]], None] | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> Ended:
-    """Start `python -I -m module`, wait for it, and return how it ended. It inherits only what is passed.
+    """Start `python -I -m module`, whose `main` calls `serve`, and return how it ended. It inherits only what is passed.
 
-    Parameters
-    ----------
-    module : str
-        A module whose `main` calls `serve`.
-    request : mapping
-        JSON for the process.
-    seconds : float
-        Wall time after which it is killed.
-    directory : str, optional
-        Its working directory.
-    descriptors : tuple of int
-        Open files that it inherits.
-    environment : mapping, optional
-        Environment variables, besides those that limit the numerical libraries to one thread.
-    on_line : callable, optional
-        Called with every JSON object that the process writes to the descriptor `progress` of its request.
-    should_stop : callable, optional
-        Called every `POLL` seconds; the process is killed once it returns True.
+    It is killed after `seconds` of wall time, or once `should_stop`, called every `POLL` seconds, returns True. Its environment
+    has `environment` and the variables that limit the numerical libraries to one thread. `on_line` is called with every JSON
+    object that it writes to the descriptor `progress` of its request.
     """
     with _Progress(on_line) as progress:
         stated = dict(request) if progress.target is None else {**request, "progress": progress.target}

@@ -16,12 +16,7 @@ _libc = ctypes.CDLL(None, use_errno=True) if sys.platform == "linux" else None
 def die_with_parent(parent: int, *, how: signal.Signals = signal.SIGKILL) -> None:
     """Make the kernel signal this process when its parent ends (Linux; elsewhere the parent's id is polled).
 
-    Parameters
-    ----------
-    parent : int
-        Process id of the parent, taken before the fork, since the parent may have ended.
-    how : signal
-        Signal to receive.
+    The id of the parent is taken before the fork, since it may have ended.
     """
     if _libc is not None:
         _libc.prctl(_PR_SET_PDEATHSIG, int(how), 0, 0, 0)

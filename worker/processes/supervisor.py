@@ -86,13 +86,7 @@ class Supervisor:
             raise
 
     def run(self, *, on_started: Callable[[], None] | None = None) -> None:
-        """Start the children and keep them running until SIGTERM or Ctrl-C; then stop them. A second signal stops waiting.
-
-        Parameters
-        ----------
-        on_started : callable, optional
-            Called once every child has started.
-        """
+        """Start the children and keep them running until SIGTERM or Ctrl-C; then stop them. A second signal stops waiting."""
         handlers = {number: signal.signal(number, self._on_signal) for number in (signal.SIGTERM, signal.SIGINT)}
         try:
             self._starting = True

@@ -134,8 +134,7 @@ class Blobs:
             named = f'attachment; filename="{key.rpartition("/")[2]}"'
             shown: Any = {"Content-Type": media_type, "Content-Disposition": named} if self._calls is not None else None
             self._call(
-                lambda: obstore.put(self._store, key, file, attributes=shown),
-                seconds=ANSWER_WITHIN + size / SLOWEST,
+                lambda: obstore.put(self._store, key, file, attributes=shown), seconds=ANSWER_WITHIN + size / SLOWEST
             )
         return size
 

@@ -34,10 +34,7 @@ class RemoteCalls:
     def run(self, call: Callable[[], Answer], *, seconds: float) -> Answer:
         """Return the result of the call; its exceptions pass through.
 
-        Parameters
-        ----------
-        seconds : float
-            Time limit, including the wait for a thread. The call itself may end later, by its own time limit.
+        The limit in seconds includes the wait for a thread. The call itself may end later, by its own time limit.
 
         Raises
         ------

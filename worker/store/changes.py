@@ -29,7 +29,6 @@ class RedisChanges(Changes):
             self._pubsub.subscribe(channel(prefix))
 
     def next(self, timeout: float) -> set[str]:
-        """See `Changes.next`."""
         found: set[str] = set()
         with reachable():
             until = time.monotonic() + timeout
@@ -41,7 +40,6 @@ class RedisChanges(Changes):
         return found
 
     def close(self) -> None:
-        """See `Changes.close`."""
         self._pubsub.close()
 
 
@@ -59,7 +57,6 @@ class MemoryChanges(Changes):
             self._arrived.notify_all()
 
     def next(self, timeout: float) -> set[str]:
-        """See `Changes.next`."""
         with self._arrived:
             self._arrived.wait_for(lambda: bool(self._ids), timeout)
             found, self._ids = self._ids, set()

@@ -51,19 +51,11 @@ class _Pipeline(Pipeline):
 
 
 def connect(url: str, *, decode: bool, retries: int = 3, answer_within: float | None = None) -> redis.Redis:
-    """Return a client that connects on first use.
+    """Return a client that connects on first use; `decode` gives text instead of bytes, which RQ needs.
 
-    Parameters
-    ----------
-    url : str
-        `redis://`, `rediss://` or `unix://`.
-    decode : bool
-        Text instead of bytes; RQ needs bytes.
-    retries : int
-        Retries after a broken connection, with growing pauses of up to 0.5 s. All writes are compare-and-set or
-        idempotent, so a retry after a lost reply is harmless. Timeouts are not retried: that would multiply the wait.
-    answer_within : float, optional
-        Seconds a command may take; `ANSWER_WITHIN` by default, and then few commands wait at once while the server is silent.
+    After a broken connection it retries with growing pauses of up to 0.5 s. All writes are compare-and-set or idempotent, so a
+    retry after a lost reply is harmless. Timeouts are not retried: that would multiply the wait. A command may take
+    `answer_within` seconds; by default `ANSWER_WITHIN`, and then few commands wait at once while the server is silent.
     """
     seconds = ANSWER_WITHIN if answer_within is None else answer_within
     client = (redis.Redis if answer_within is not None else _Client).from_url(

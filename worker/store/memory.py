@@ -31,7 +31,6 @@ class MemoryRecords(Records):
         self._clock = 0
 
     def create(self, stored: Stored, *, max_queued: int = 0, max_bytes: int = 0) -> Stored:
-        """See `Records.create`."""
         id = stored.job.id
         with self._lock:
             taken = self._keys.get(stored.key) if stored.key is not None else None
@@ -51,20 +50,17 @@ class MemoryRecords(Records):
             return stored
 
     def get(self, id: str) -> Stored:
-        """See `Records.get`."""
         with self._lock:
             if id not in self._records:
                 raise UnknownJob(id)
             return self._records[id]
 
     def find(self, key: str) -> Stored | None:
-        """See `Records.find`."""
         with self._lock:
             id = self._keys.get(key)
             return None if id is None else self._records[id]
 
     def replace(self, before: Stored, after: Stored) -> bool:
-        """See `Records.replace`."""
         id = before.job.id
         with self._lock:
             held = self._records.get(id)
@@ -76,7 +72,6 @@ class MemoryRecords(Records):
             return True
 
     def delete(self, id: str, *, at: datetime) -> None:
-        """See `Records.delete`."""
         with self._lock:
             gone = self._records.pop(id, None)
             if gone is not None:
@@ -88,19 +83,16 @@ class MemoryRecords(Records):
             self._publish(id)
 
     def deleted(self) -> dict[str, datetime]:
-        """See `Records.deleted`."""
         with self._lock:
             return dict(self._deleted)
 
     def forget_deleted(self, id: str) -> None:
-        """See `Records.forget_deleted`."""
         with self._lock:
             self._deleted.pop(id, None)
 
     def page(
         self, *, cursor: str | None, limit: int, statuses: Sequence[Status], owner: str | None
     ) -> tuple[list[Stored], str | None]:
-        """See `Records.page`."""
         with self._lock:
             fitting = [
                 each
@@ -114,13 +106,11 @@ class MemoryRecords(Records):
         return page, page[-1].sort_key if len(fitting) > limit else None
 
     def ids(self, status: Status) -> list[str]:
-        """See `Records.ids`."""
         with self._lock:
             fitting = sorted(each.sort_key for each in self._records.values() if each.job.status is status)
         return [key.split(":", 1)[1] for key in fitting]
 
     def count(self, statuses: Sequence[Status], *, owner: str | None = None) -> int:
-        """See `Records.count`."""
         with self._lock:
             return sum(
                 each.job.status in statuses and (owner is None or each.owner == owner)
@@ -128,24 +118,20 @@ class MemoryRecords(Records):
             )
 
     def oldest(self, status: Status) -> datetime | None:
-        """See `Records.oldest`."""
         with self._lock:
             return min(
                 (each.job.created_at for each in self._records.values() if each.job.status is status), default=None
             )
 
     def tallies(self) -> dict[str, float]:
-        """See `Records.tallies`."""
         with self._lock:
             return dict(self._tallies)
 
     def used(self) -> int:
-        """See `Records.used`."""
         with self._lock:
             return sum(each.bytes for each in self._records.values())
 
     def beat(self, id: str, attempt_id: str) -> Status | None:
-        """See `Records.beat`."""
         with self._lock:
             status = self.look(id, attempt_id)
             if status is not None:
@@ -153,13 +139,11 @@ class MemoryRecords(Records):
             return status
 
     def look(self, id: str, attempt_id: str) -> Status | None:
-        """See `Records.look`."""
         with self._lock:
             held = self._records.get(id)
             return held.job.status if held is not None and held.attempt_id == attempt_id else None
 
     def beats(self, ids: Iterable[str]) -> dict[str, Beat]:
-        """See `Records.beats`."""
         with self._lock:
             held = {id: self._records[id] for id in ids if id in self._records}
             return {
@@ -168,24 +152,20 @@ class MemoryRecords(Records):
             }
 
     def events(self, id: str, *, after: str | None) -> list[Event]:
-        """See `Records.events`."""
         with self._lock:
             return [each for each in self._events.get(id, []) if after is None or _later(each.id, after)]
 
     def changes(self) -> Changes:
-        """See `Records.changes`."""
         subscription = MemoryChanges()
         self._followers.add(subscription)
         return subscription
 
     def append_log(self, id: str, lines: Sequence[str]) -> None:
-        """See `Records.append_log`."""
         with self._lock:
             if id in self._records:
                 self._logs[id] = [*self._logs.get(id, []), *lines][-LOG_KEPT:]
 
     def log(self, id: str) -> list[str]:
-        """See `Records.log`."""
         with self._lock:
             return list(self._logs.get(id, []))
 
@@ -218,52 +198,42 @@ class MemoryQueue(Queue):
         self._held: set[str] = set()
 
     def push(self, id: str, attempt_id: str, *, front: bool = False) -> None:  # noqa: ARG002
-        """See `Queue.push`."""
         if attempt_id not in self._attempt_ids:
             self._attempt_ids.insert(0 if front else len(self._attempt_ids), attempt_id)
 
     def remove(self, attempt_id: str) -> None:
-        """See `Queue.remove`."""
         self.release(attempt_id)
         if attempt_id in self._attempt_ids:
             self._attempt_ids.remove(attempt_id)
 
     def hold(self, attempt_id: str) -> None:
-        """See `Queue.hold`."""
         self._held.add(attempt_id)
 
     def held(self) -> set[str]:
-        """See `Queue.held`."""
         return set(self._held)
 
     def release(self, attempt_id: str) -> None:
-        """See `Queue.release`."""
         self._held.discard(attempt_id)
 
     def waiting(self) -> list[str]:
-        """See `Queue.waiting`."""
         return list(self._attempt_ids)
 
     def place(self, attempt_id: str) -> int | None:
-        """See `Queue.place`."""
         return self._attempt_ids.index(attempt_id) if attempt_id in self._attempt_ids else None
 
     def tidy(self) -> None:
         """See `Queue.tidy`."""
 
     def workers(self) -> list[str]:
-        """See `Queue.workers`."""
         return ["memory"]
 
     def order(self, ranks: Mapping[str, int]) -> None:
-        """See `Queue.order`."""
         places = [place for place, each in enumerate(self._attempt_ids) if each in ranks]
         ordered = sorted((self._attempt_ids[place] for place in places), key=ranks.__getitem__)
         for place, each in zip(places, ordered, strict=True):
             self._attempt_ids[place] = each
 
     def memories(self) -> dict[str, int]:
-        """See `Queue.memories`."""
         return {}
 
 

@@ -100,7 +100,6 @@ class RedisQueue(Queue):
         self._queue = RqQueue(name, connection=client, serializer=JSONSerializer)
 
     def push(self, id: str, attempt_id: str, *, front: bool = False) -> None:
-        """See `Queue.push`."""
         with reachable():
             if self._redis.lpos(self._queue.key, attempt_id) is not None:
                 return
@@ -116,7 +115,6 @@ class RedisQueue(Queue):
             )
 
     def remove(self, attempt_id: str) -> None:
-        """See `Queue.remove`."""
         self.release(attempt_id)
         with reachable():
             for key in (self._queue.key, self._queue.intermediate_queue_key):
@@ -129,38 +127,31 @@ class RedisQueue(Queue):
                 self._redis.delete(RqJob.key_for(attempt_id))
 
     def hold(self, attempt_id: str) -> None:
-        """See `Queue.hold`."""
         with reachable():
             self._redis.sadd(self._held, attempt_id)
 
     def held(self) -> set[str]:
-        """See `Queue.held`."""
         with reachable():
             return {attempt_id.decode() for attempt_id in self._redis.smembers(self._held)}
 
     def release(self, attempt_id: str) -> None:
-        """See `Queue.release`."""
         with reachable():
             self._redis.srem(self._held, attempt_id)
 
     def waiting(self) -> list[str]:
-        """See `Queue.waiting`."""
         with reachable():
             return [attempt_id.decode() for attempt_id in self._redis.lrange(self._queue.key, 0, -1)]
 
     def place(self, attempt_id: str) -> int | None:
-        """See `Queue.place`."""
         with reachable():
             place: int | None = self._redis.lpos(self._queue.key, attempt_id)
         return place
 
     def order(self, ranks: Mapping[str, int]) -> None:
-        """See `Queue.order`."""
         with reachable():
             self._order(keys=[self._queue.key], args=[part for each in ranks.items() for part in each])
 
     def tidy(self) -> None:
-        """See `Queue.tidy`."""
         with reachable():
             if not self._queue.acquire_maintenance_lock():
                 return
@@ -171,7 +162,6 @@ class RedisQueue(Queue):
                 self._queue.release_maintenance_lock()  # type: ignore[no-untyped-call]
 
     def workers(self) -> list[str]:
-        """See `Queue.workers`."""
         with reachable():
             names = sorted(key.rsplit(":", 1)[1] for key in worker_registration.get_keys(queue=self._queue))
             pipe = self._redis.pipeline(transaction=False)
@@ -180,7 +170,6 @@ class RedisQueue(Queue):
             return [name for name, alive in zip(names, pipe.execute(), strict=True) if alive]
 
     def memories(self) -> dict[str, int]:
-        """See `Queue.memories`."""
         names = self.workers()
         with reachable():
             signs = self._redis.mget([alive_key(self._name, name) for name in names]) if names else []

@@ -140,7 +140,6 @@ class RedisRecords(Records):
         self._log = client.register_script(_LOG)
 
     def create(self, stored: Stored, *, max_queued: int = 0, max_bytes: int = 0) -> Stored:
-        """See `Records.create`."""
         name, data = event_of(None, stored)
         job = stored.job
         with reachable():
@@ -158,7 +157,6 @@ class RedisRecords(Records):
         return stored if taken is None else self.get(str(taken))
 
     def get(self, id: str) -> Stored:
-        """See `Records.get`."""
         with reachable():
             body = self._redis.hget(f"{self._at}job:{id}", "body")
         if body is None:
@@ -166,13 +164,11 @@ class RedisRecords(Records):
         return Stored.model_validate_json(body)
 
     def find(self, key: str) -> Stored | None:
-        """See `Records.find`."""
         with reachable():
             id = self._redis.get(f"{self._at}key:{key}")
         return None if id is None else self.get(id)
 
     def replace(self, before: Stored, after: Stored) -> bool:
-        """See `Records.replace`."""
         name, data = event_of(before, after)
         job, due = after.job, webhook_due(before, after)
         with reachable():
@@ -186,25 +182,21 @@ class RedisRecords(Records):
         return bool(written)
 
     def delete(self, id: str, *, at: datetime) -> None:
-        """See `Records.delete`."""
         with reachable():
             self._delete(args=[self._at, id, milliseconds(at)])
 
     def deleted(self) -> dict[str, datetime]:
-        """See `Records.deleted`."""
         with reachable():
             found = self._redis.zrange(f"{self._at}deleted", 0, -1, withscores=True)
         return {id: moment(int(at)) for id, at in found}
 
     def forget_deleted(self, id: str) -> None:
-        """See `Records.forget_deleted`."""
         with reachable():
             self._redis.zrem(f"{self._at}deleted", id)
 
     def page(
         self, *, cursor: str | None, limit: int, statuses: Sequence[Status], owner: str | None
     ) -> tuple[list[Stored], str | None]:
-        """See `Records.page`."""
         newest = "+" if cursor is None else f"({cursor}"
         with reachable():
             pipe = self._redis.pipeline(transaction=False)
@@ -219,46 +211,38 @@ class RedisRecords(Records):
         return page, keys[limit - 1] if len(keys) > limit else None
 
     def ids(self, status: Status) -> list[str]:
-        """See `Records.ids`."""
         with reachable():
             keys = self._redis.zrange(self._index(None, status), 0, -1)
         return [key.split(":", 1)[1] for key in keys]
 
     def count(self, statuses: Sequence[Status], *, owner: str | None = None) -> int:
-        """See `Records.count`."""
         with reachable():
             return sum(self._redis.zcard(self._index(owner, status)) for status in dict.fromkeys(statuses))
 
     def oldest(self, status: Status) -> datetime | None:
-        """See `Records.oldest`."""
         with reachable():
             first = self._redis.zrange(self._index(None, status), 0, 0)
         return moment(int(first[0].split(":", 1)[0])) if first else None
 
     def tallies(self) -> dict[str, float]:
-        """See `Records.tallies`."""
         with reachable():
             return {name: float(value) for name, value in self._redis.hgetall(f"{self._at}tally").items()}
 
     def used(self) -> int:
-        """See `Records.used`."""
         with reachable():
             return int(self._redis.get(f"{self._at}used") or 0)
 
     def beat(self, id: str, attempt_id: str) -> Status | None:
-        """See `Records.beat`."""
         with reachable():
             status = self._beat(args=[self._at, id, attempt_id])
         return None if status is None else Status(str(status))
 
     def look(self, id: str, attempt_id: str) -> Status | None:
-        """See `Records.look`."""
         with reachable():
             held, status = self._redis.hmget(f"{self._at}job:{id}", "token", "status")
         return Status(status) if held == attempt_id else None
 
     def beats(self, ids: Iterable[str]) -> dict[str, Beat]:
-        """See `Records.beats`."""
         wanted = list(ids)
         with reachable():
             pipe = self._redis.pipeline(transaction=False)
@@ -272,28 +256,23 @@ class RedisRecords(Records):
         }
 
     def events(self, id: str, *, after: str | None) -> list[Event]:
-        """See `Records.events`."""
         with reachable():
             entries = self._redis.xrange(f"{self._at}events:{id}", min="-" if after is None else f"({after}", max="+")
         return [Event(entry, fields["name"], fields["data"]) for entry, fields in entries]
 
     def changes(self) -> Changes:
-        """See `Records.changes`."""
         return RedisChanges(self._redis, prefix=self._at.removesuffix(":"))
 
     def append_log(self, id: str, lines: Sequence[str]) -> None:
-        """See `Records.append_log`."""
         if lines:
             with reachable():
                 self._log(args=[self._at, id, LOG_KEPT, *lines[-LOG_KEPT:]])
 
     def log(self, id: str) -> list[str]:
-        """See `Records.log`."""
         with reachable():
             return list(self._redis.lrange(f"{self._at}log:{id}", 0, -1))
 
     def ping(self) -> None:
-        """See `Records.ping`."""
         with reachable():
             self._redis.ping()
 

@@ -19,15 +19,13 @@ from pliant.worker.errors import Conflict, OffsetMismatch, TooManyUploads, Unkno
 from pliant.worker.ids import check_id, is_id
 from pliant.worker.settings import Settings
 from pliant.worker.uploads.folder import LENGTH, PART, RESERVED, WHOLE, content, declared_length, locked, taken
-from pliant.worker.uploads.writer import Capacity as Capacity
-from pliant.worker.uploads.writer import Writer as Writer
-from pliant.worker.uploads.writer import inconsistent
+from pliant.worker.uploads.writer import Capacity, Writer, inconsistent
 
 MAX_UPLOADS = 100
 """Maximum number of uploads per owner."""
 
 LATE = timedelta(minutes=10)
-"""Seconds after its expiry from which fsck reports an upload."""
+"""Time after its expiry from which fsck reports an upload."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,23 +78,11 @@ class Uploads:
             return self.get(id)
         return None
 
-    def size(self, id: str) -> int:
-        """Return the received bytes of an upload, 0 if there is no upload of that id."""
-        there = self.find(id)
-        return 0 if there is None else there.offset
-
     @contextmanager
     def write(self, id: str, *, offset: int, length: int | None, capacity: Capacity) -> Iterator[Writer]:
         """Resume an upload, or start it at offset 0, which discards an incomplete one of the same id.
 
-        Parameters
-        ----------
-        offset : int
-            Position of the next bytes; must equal the current size of the upload.
-        length : int, optional
-            Bytes of the complete upload, if known.
-        capacity : Capacity
-            Limits of its size.
+        `offset` must equal the current size of the upload; `length` is that of the complete one, if known.
 
         Raises
         ------

@@ -16,13 +16,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 from pliant.schemas.job import Upload
-from pliant.worker.errors import (
-    Conflict,
-    OffsetMismatch,
-    QuotaExceeded,
-    TooManyUploads,
-    UnknownUpload,
-)
+from pliant.worker.errors import Conflict, OffsetMismatch, QuotaExceeded, TooManyUploads, UnknownUpload
 from pliant.worker.ids import check_id, is_id
 from pliant.worker.settings import Settings
 from pliant.worker.store.blobs import Blobs
@@ -56,7 +50,6 @@ class SharedUploads(Uploads):
     states: UploadStates
 
     def get(self, id: str) -> Upload:
-        """See `Uploads.get`."""
         state = self._state(id)
         if state is None:
             raise UnknownUpload(id)
@@ -119,7 +112,6 @@ class SharedUploads(Uploads):
         raise UnknownUpload(id)
 
     def used(self) -> int:
-        """See `Uploads.used`."""
         now = time.time()
         return sum(state.taken(now) for state in self.states.all().values())
 
@@ -137,7 +129,6 @@ class SharedUploads(Uploads):
         return gone
 
     def findings(self, now: datetime) -> Iterator[str]:
-        """See `Uploads.findings`."""
         sizes, held = self.blobs.sizes(FOLDER), self.states.all()
         for name, state in held.items():
             lost = [key for key, size in state.pieces if sizes.get(f"{FOLDER}{name}/{state.generation}/{key}") != size]

@@ -104,12 +104,7 @@ class Writer:
             raise
 
     def finish(self, *, sha256: str | None) -> None:
-        """Complete the upload.
-
-        Parameters
-        ----------
-        sha256 : str, optional
-            Expected digest, from the sender.
+        """Complete the upload; `sha256` is the digest that the sender expects.
 
         Raises
         ------

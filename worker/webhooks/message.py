@@ -23,16 +23,10 @@ SECRET_BYTES = range(24, 65)
 
 
 def parse_webhook(url: str, secret: str, *, networks: str = "") -> Webhook | None:
-    """Return the webhook of a submission, None if it has none.
+    """Return the webhook of a submission, None for an empty URL.
 
-    Parameters
-    ----------
-    url : str
-        ``http`` or ``https``, a host, no user name; empty: no webhook.
-    secret : str
-        ``whsec_`` and 24 to 64 random bytes in base64.
-    networks : str
-        `Settings.webhook_networks`.
+    The URL has ``http`` or ``https``, a host and no user name; the secret is ``whsec_`` and 24 to 64 random bytes in base64;
+    `networks` is `Settings.webhook_networks`.
 
     Raises
     ------
@@ -79,12 +73,8 @@ def message(job: Job) -> bytes:
 def signed(secret: str, *, id: str, timestamp: int, body: bytes) -> dict[str, str]:
     """Return the headers by which the receiver verifies the sender and the age of a message.
 
-    Parameters
-    ----------
-    id : str
-        The same for all attempts at one message, so that the receiver recognises duplicates.
-    timestamp : int
-        Time of this attempt, seconds since 1970.
+    The id is the same for all attempts at one message, so that the receiver recognises duplicates; the timestamp is of this
+    attempt.
     """
     key = _key(secret)
     assert key is not None, "checked when the job was submitted"

@@ -131,14 +131,7 @@ class WebhookSender:
     def _take(self, busy: Counter[str]) -> tuple[str, int, list[str]] | None:
         """Lease a due message whose receiver and owner are below `PER_RECEIVER`; postpone the others.
 
-        Returns
-        -------
-        id : str
-            The job.
-        tries : int
-            Number of attempts, including this one.
-        limits : list of str
-            Keys of the receiver and the owner in `busy`.
+        Returns the job's id, the number of attempts including this one, and the keys of receiver and owner in `busy`.
         """
         while True:
             now = self.clock()

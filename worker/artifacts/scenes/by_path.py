@@ -13,12 +13,7 @@ from typing import IO
 def path_beside(file: IO[bytes], suffix: str) -> Iterator[Path]:
     """Yield the path of a temporary file beside `file`; its content is copied into `file` at the end, and it is removed.
 
-    Parameters
-    ----------
-    file : binary file
-        The target, which has a name.
-    suffix : str
-        Extension that the library requires, e.g. ``".abc"``.
+    The suffix is the extension that the library requires, e.g. ``".abc"``.
     """
     path = Path(f"{file.name}{suffix}")
     path.unlink(missing_ok=True)

@@ -36,18 +36,9 @@ class Surface:
 def read_surface(
     mesh: Path | str | None, *, num_points: int, picture: tuple[int, int] | None, limits: Limits
 ) -> Surface:
-    """Read the form part `mesh`.
+    """Read the form part `mesh`: a file, ROWSxCOLUMNS or `none`.
 
-    Parameters
-    ----------
-    mesh : Path, str or None
-        A file, ROWSxCOLUMNS or `none`. None: the picture's grid if the points are its pixels, else a generated mesh.
-    num_points : int
-        P.
-    picture : tuple of int, optional
-        Rows and columns of the picture whose pixels the points are.
-    limits : Limits
-        Largest number of faces.
+    None: the grid of the picture whose pixels the points are, else a generated mesh.
 
     Raises
     ------
@@ -67,7 +58,7 @@ def read_surface(
         if 0 < len(marked) < num_points:
             note = f"The mask selects {len(marked)} of the picture's {num_points} points."
             return Surface(Mesh.from_grid(number_cells(arrays["mask"])), "grid", [note], marked)
-    given_vertices(arrays, num_points=num_points, field="mesh")
+    given_vertices(arrays, num_points=num_points)
     surface = _mesh_of(arrays, num_points)
     _check_faces(len(surface.faces), limits)
     notes = [] if len(surface.faces) else ["The given mesh has no faces, so there is no smoothness in space."]
@@ -85,7 +76,7 @@ def _by_word(word: str, num_points: int, limits: Limits) -> Surface:
         )  # fmt: skip
     rows, columns = int(found[1]), int(found[2])
     if rows * columns != num_points:
-        raise mismatch("mesh", num_points, rows * columns)
+        raise mismatch(num_points, rows * columns)
     return Surface(_grid(rows, columns, limits), "grid", [])
 
 
@@ -104,11 +95,11 @@ def _mesh_of(arrays: Arrays, num_points: int) -> Mesh:
         return Mesh.from_faces(arrays.get("faces", arrays.get("array")), num_points)  # type: ignore[arg-type]
     if "mask" in arrays or "grid" in arrays:
         if "grid" not in arrays and np.count_nonzero(arrays["mask"]) != num_points:
-            raise mismatch("mesh", num_points, int(np.count_nonzero(arrays["mask"])))
+            raise mismatch(num_points, int(np.count_nonzero(arrays["mask"])))
         grid = arrays["grid"] if "grid" in arrays else number_cells(arrays["mask"])
         surface = Mesh.from_grid(grid)
         if surface.num_points != num_points:
-            raise mismatch("mesh", num_points, surface.num_points)
+            raise mismatch(num_points, surface.num_points)
         return surface
     raise InvalidInput(
         "missing_array", field="mesh", expected="faces, or grid", got=", ".join(sorted(arrays)) or "no array of a known name",

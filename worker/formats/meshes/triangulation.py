@@ -11,17 +11,11 @@ MAX_EDGE_RATIO = 5.0
 
 
 def triangulate(tracks: Tracks, *, y_axis: str) -> tuple[Mesh | None, list[str]]:
-    """Triangulate the points of the frame in which most are visible (the first such frame).
+    """Triangulate the points of the frame in which most are visible (the first such frame); return the mesh, and notes.
 
-    Triangles with an edge longer than 5 times the median edge length are removed. Faces are counter-clockwise as seen from the camera.
-    Points hidden in that frame have no face and so no spatial smoothness.
-
-    Returns
-    -------
-    mesh : Mesh or None
-        None when fewer than three points are visible at once or all lie on a line.
-    notes : list of str
-        Notes for the job's interpretation.
+    Triangles with an edge longer than 5 times the median edge length are removed. Faces are counter-clockwise as seen from the
+    camera. Points hidden in that frame have no face and so no spatial smoothness. There is no mesh when fewer than three points
+    are visible at once or all lie on a line.
     """
     from scipy.spatial import Delaunay, QhullError  # not for inputs that need no triangulation
 

@@ -105,12 +105,7 @@ def read_npz(
 ) -> tuple[Arrays, dict[str, str]]:
     """Read the wanted members of a zip of arrays: of numbers, but for those named in `texts`.
 
-    Returns
-    -------
-    arrays : dict
-        By name, without `.npy`.
-    passed_over : dict
-        Members that were not read, with the reason in words.
+    Returns the arrays by name, without `.npy`, and the members that were not read, with the reason in words.
 
     Raises
     ------

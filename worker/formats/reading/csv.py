@@ -43,14 +43,9 @@ def looks_like_csv(head: bytes) -> bool:
 def read_csv(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
     """Read one observation a line in any order, those that are missing hidden; or one row a frame, see `pose_tables`.
 
-    Frames and points are numbered as in the file, in rising order: the smallest number is the first frame, gaps in
-    frames are frames without observations, points are the numbers that occur.
-
-    Returns
-    -------
-    dict
-        `tracks (F, P, 2)` with NaN where there is no observation, and `visibility (F, P)` if the file has it; the tracks of other
-        writers under their own names.
+    Frames and points are numbered as in the file, in rising order: the smallest number is the first frame, gaps in frames are
+    frames without observations, points are the numbers that occur. Returns `tracks (F, P, 2)` with NaN where there is no
+    observation, and `visibility (F, P)` if the file has it; the tracks of other writers under their own names.
 
     Raises
     ------

@@ -101,12 +101,7 @@ def _check_within(item: h5py.Dataset, name: str, field: str) -> None:
 
 
 def check_before_reading(item: h5py.Dataset, name: str, so_far: int, field: str, limits: Limits) -> None:
-    """Refuse a data set that lies elsewhere, or that claims more than it can hold, before a value is read.
-
-    Parameters
-    ----------
-    so_far : int
-        Bytes of the data sets that were read already.
+    """Refuse a data set that lies elsewhere, or with the bytes read `so_far` claims more than it can hold, before a value is read.
 
     Raises
     ------

@@ -14,12 +14,7 @@ MAX_PIXELS_A_POINT = 64
 
 
 def read_png(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
-    """Read a PNG; pixels that are not black (and not wholly transparent) are points.
-
-    Returns
-    -------
-    dict
-        `mask (rows, columns)` of bool.
+    """Return `mask (rows, columns)` of bool: pixels of a PNG that are not black (and not wholly transparent) are points.
 
     Raises
     ------

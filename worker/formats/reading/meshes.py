@@ -23,12 +23,7 @@ NOT_A_MESH = "Give an OBJ, PLY, glTF or npz mesh, a grid size such as 48x64, or 
 
 
 def read_obj(stream: IO[bytes], *, field: str, limits: Limits) -> Arrays:
-    """Read `v` and `f` of a Wavefront OBJ; everything else is ignored.
-
-    Returns
-    -------
-    dict
-        `vertices (V, 3)` and `faces (T, 3)` or `(T, 4)`, indices from 0.
+    """Read `vertices (V, 3)` and `faces (T, 3)` or `(T, 4)`, from 0, of a Wavefront OBJ; all but `v` and `f` is ignored.
 
     Raises
     ------
@@ -109,7 +104,7 @@ def join_polygons(polygons: list[list[int]], *, field: str) -> NDArray[np.int64]
         raise damaged(f"{field}.faces", "an index beyond 64 bits") from error
 
 
-def given_vertices(arrays: Arrays, *, num_points: int, field: str) -> None:
+def given_vertices(arrays: Arrays, *, num_points: int) -> None:
     """Check that the mesh has a vertex for each point.
 
     Raises
@@ -120,13 +115,13 @@ def given_vertices(arrays: Arrays, *, num_points: int, field: str) -> None:
     if "vertices" in arrays:
         count = arrays["vertices"].shape[0] if arrays["vertices"].ndim else 0
         if count != num_points:
-            raise mismatch(field, num_points, count)
+            raise mismatch(num_points, count)
 
 
-def mismatch(field: str, num_points: int, num_vertices: int) -> InvalidInput:
+def mismatch(num_points: int, num_vertices: int) -> InvalidInput:
     """Return the error for a mesh that does not match the tracks."""
     return InvalidInput(
-        "vertex_count_mismatch", field=field, expected=f"{num_points} vertices, as the tracks have points", got=f"{num_vertices}",
+        "vertex_count_mismatch", field="mesh", expected=f"{num_points} vertices, as the tracks have points", got=f"{num_vertices}",
         hint="Vertex i of the mesh must be point i of the tracks, in the same order; omit the mesh to have one generated.",
     )  # fmt: skip
 

@@ -138,22 +138,10 @@ def deeplabcut_columns(rows: list[list[str]]) -> Columns | None:
 def read_rows(
     lines: Iterator[str], columns: Columns, separator: str, *, field: str, limits: Limits, before: int, width: int
 ) -> Arrays:
-    """Read the rows below the names.
+    """Read the rows below the names, of `width` cells; `before` lines were read already.
 
-    Parameters
-    ----------
-    lines : iterator of str
-        The lines that follow.
-    before : int
-        Lines that were read already.
-    width : int
-        Cells of a line.
-
-    Returns
-    -------
-    dict
-        The tracks `(F, P, 2)` under the writer's name, NaN where a cell is empty, `likelihood (F, P)` if there are confidences, and
-        `point_names` if the points have names.
+    Returns the tracks `(F, P, 2)` under the writer's name, NaN where a cell is empty, `likelihood (F, P)` if there are
+    confidences, and `point_names` if the points have names.
 
     Raises
     ------

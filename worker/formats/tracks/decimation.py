@@ -36,25 +36,8 @@ def thin(
 ) -> tuple[Indices, Mesh | None, list[str]]:
     """Choose points by the options `stride` and `max_points`.
 
-    Parameters
-    ----------
-    points : ndarray, shape (F, P, 2)
-        Points of the selected frames; NaN where hidden.
-    visible : ndarray, shape (F, P), optional
-        Confidence.
-    mesh : Mesh, optional
-        The mesh of all points; None if neighbours are not known yet.
-    options : Options
-        `stride` and `max_points`.
-
-    Returns
-    -------
-    kept : ndarray
-        Indices of the kept points, increasing.
-    mesh : Mesh or None
-        The mesh of the kept points; None without `mesh`.
-    notes : list of str
-        Notes for the interpretation.
+    Points are `(F, P, 2)`, NaN where hidden, of the selected frames. Returns the increasing indices of the kept points, their
+    mesh, None if neighbours are not known yet, and notes.
 
     Raises
     ------
@@ -138,16 +121,8 @@ def _thin_mesh(
 def spread(places: NDArray[np.float64], seen: NDArray[np.bool], limit: int, parts: Indices | None = None) -> Indices:
     """Choose at most `limit` points evenly over the picture: cells as small as the number allows, one point of each part a cell.
 
-    Parameters
-    ----------
-    places : ndarray, shape (m, P, 2)
-        Positions in some frames.
-    seen : ndarray of bool, shape (m, P)
-        Whether the positions are valid.
-    limit : int
-        Maximum number of points.
-    parts : ndarray, shape (P,), optional
-        Index of each point's connected component; components are sampled separately.
+    `places (m, P, 2)` are positions in some frames, `seen (m, P)` whether they are valid. `parts (P,)` numbers the connected
+    components, which are sampled separately.
     """
     with np.errstate(invalid="ignore"):
         weight = seen[..., None].astype(np.float64)

@@ -23,7 +23,7 @@ class Flat:
     """Rows and columns, if the points were the pixels of a picture; point index = row · columns + column."""
 
 
-def flatten(name: str, array: NDArray[np.generic], *, field: str) -> Flat:
+def flatten(name: str, array: NDArray[np.generic]) -> Flat:
     """Remove a batch axis of length 1, and flatten the pixels of pictures.
 
     Pictures are `(F, H, W, 2 or 3)` or `(F, 2, H, W)`, with or without a batch axis. Four axes with a first axis longer than 1 are
@@ -35,16 +35,16 @@ def flatten(name: str, array: NDArray[np.generic], *, field: str) -> Flat:
         Code wrong_shape: a batch of several videos, or more axes than are known.
     """
     if array.ndim == 5:
-        return _pictures(_single(array, field))
+        return _pictures(_single(array))
     if array.ndim == 4:
         if array.shape[0] == 1 and (array.shape[-1] in (2, 3) or array.shape[1] != 2):
             return Flat(array[0])
         if _is_picture(array):
             return _pictures(array)
-        return Flat(_single(array, field))
+        return Flat(_single(array))
     if array.ndim > 5:
         raise InvalidInput(
-            "wrong_shape", field=field, expected="(frames, points, 2)", got=f"{name} of shape {array.shape}",
+            "wrong_shape", field="tracks", expected="(frames, points, 2)", got=f"{name} of shape {array.shape}",
             hint="Reshape the array to three axes.",
         )  # fmt: skip
     return Flat(array)
@@ -62,10 +62,10 @@ def flatten_like(array: NDArray[np.generic], grid: tuple[int, int] | None) -> ND
     return array
 
 
-def _single(array: NDArray[np.generic], field: str) -> NDArray[np.generic]:
+def _single(array: NDArray[np.generic]) -> NDArray[np.generic]:
     if array.shape[0] != 1:
         raise InvalidInput(
-            "wrong_shape", field=field, expected="one video", got=f"a batch of {array.shape[0]}",
+            "wrong_shape", field="tracks", expected="one video", got=f"a batch of {array.shape[0]}",
             hint="Submit each element of the batch as its own job.",
         )  # fmt: skip
     return array.reshape(array.shape[1:])

@@ -41,16 +41,7 @@ class FilmTracks:
 
 
 def read_film_tracks(path: Path, *, shape: tuple[int, int], limits: Limits) -> FilmTracks:
-    """Read what belongs to the tracks of a film.
-
-    Parameters
-    ----------
-    path
-        A file of `pliant track`.
-    shape
-        Frames and points of its tracks.
-    limits
-        Largest arrays.
+    """Read what belongs to the tracks of a film from a file of `pliant track`; `shape` is frames and points.
 
     Raises
     ------

@@ -68,9 +68,9 @@ def understand(arrays: Arrays, options: Options) -> Understood:
     dialect, name = _recognised(named)
     if dialect.name == OWN:
         return _of_our_tracker(named, name, options)
-    flat = flatten(name, _numeric(named[name], name), field="tracks")
+    flat = flatten(name, _numeric(named[name], name))
     array, depths, named = _two_numbers(flat.array, name, dialect, named)
-    reading, notes = choose(name, array, dialect=dialect, options=options, field="tracks")
+    reading, notes = choose(name, array, dialect=dialect, options=options)
     found = find_visibility(named, reading, grid=flat.grid, kind=options.visibility)
     visible, how = (None, []) if found is None else found
     if depths is None:

@@ -110,25 +110,10 @@ def roughness(points: NDArray[np.generic]) -> float:
     return float(step / spread) if spread > 0 else float("inf")
 
 
-def choose(
-    name: str, array: NDArray[np.generic], *, dialect: Dialect, options: Options, field: str
-) -> tuple[Reading, list[str]]:
-    """Select the interpretation that the options request, that is documented, or that the data indicate.
+def choose(name: str, array: NDArray[np.generic], *, dialect: Dialect, options: Options) -> tuple[Reading, list[str]]:
+    """Select the interpretation that the options request, that is documented, or that the data indicate; return it and notes.
 
-    Parameters
-    ----------
-    name, array
-        As found in the file, batch axis removed.
-    dialect : Dialect
-        Its documented layout is used unless another is five times smoother in time.
-    options : Options
-        `layout` and `rows` take precedence over detection.
-
-    Returns
-    -------
-    reading : Reading
-    notes : list of str
-        The evidence.
+    The array has no batch axis. The documented layout of the dialect is used unless another is five times smoother in time.
 
     Raises
     ------
@@ -140,7 +125,7 @@ def choose(
     allowed = [one for one in readings(name, array) if _is_allowed(one, options)]
     if not allowed:
         raise InvalidInput(
-            "wrong_shape", field=field, expected="(frames, points, 2) or a matrix of 2·frames rows, with 3 frames and 4 points or more",
+            "wrong_shape", field="tracks", expected="(frames, points, 2) or a matrix of 2·frames rows, with 3 frames and 4 points or more",
             got=f"{name} of shape {array.shape}", hint="Transpose or reshape the array; check the options layout and rows.",
         )  # fmt: skip
     if len(allowed) == 1:
@@ -158,7 +143,7 @@ def choose(
         for one in ranked
     ]
     raise AmbiguousInput(
-        field=field, expected="tracks whose layout is certain", got=f"{name} of shape {array.shape}, which can be read as "
+        field="tracks", expected="tracks whose layout is certain", got=f"{name} of shape {array.shape}, which can be read as "
         + " or ".join(one.layout for one in ranked), hint="Set the options layout and rows to the correct one.", choices=choices,
     )  # fmt: skip
 

@@ -34,14 +34,7 @@ class Placed:
 def place(points: NDArray[np.generic], options: Options, *, picture: tuple[int, int] | None = None) -> Placed:
     """Convert fractions of the picture to pixels, and the coordinate order to x, y.
 
-    Parameters
-    ----------
-    points : ndarray, shape (F, P, 2)
-        As in the file.
-    options : Options
-        `coordinates`, `image_size` and `coordinate_order`.
-    picture : tuple of int, optional
-        Width and height, if the points are all pixels of a picture.
+    `picture` is its width and height, if the points are all its pixels.
 
     Raises
     ------
@@ -74,12 +67,7 @@ def project(
 ) -> tuple[NDArray[np.float64], str, list[str]]:
     """Project points in camera coordinates: x = fx X / Z + cx, y = fy Y / Z + cy; NaN for points behind the camera.
 
-    Parameters
-    ----------
-    points : ndarray, shape (..., 3)
-        X right, Y down, Z ahead of the camera.
-    intrinsics : ndarray, shape (4,) or (3, 3), optional
-        fx, fy, cx, cy in pixels.
+    X is right, Y down, Z ahead of the camera; `intrinsics` are fx, fy, cx, cy in pixels, or a matrix `(3, 3)`.
 
     Raises
     ------

@@ -39,27 +39,11 @@ def chosen_frames(text: str | None, num_frames: int) -> tuple[NDArray[np.intp], 
 def hide_sparsely_observed(
     points: NDArray[np.generic], visible: NDArray[np.float64] | None, mesh: Mesh | None, options: Options
 ) -> tuple[NDArray[np.float64], NDArray[np.intp], list[str]]:
-    """Set the weight of points that are visible in too few frames to 0.
+    """Set the weight of points that are visible in fewer frames than `min_seen` to 0.
 
-    Parameters
-    ----------
-    points : ndarray, shape (F, P, 2)
-        NaN where hidden.
-    visible : ndarray, shape (F, P), optional
-        Confidence.
-    mesh : Mesh, optional
-        Determines whether such points have neighbours to follow.
-    options : Options
-        `min_seen`.
-
-    Returns
-    -------
-    visible : ndarray, shape (F, P)
-        Confidence, 0 in every frame for these points.
-    dropped : ndarray
-        Their indices.
-    notes : list of str
-        Their number, indices, and position in the result.
+    Points are `(F, P, 2)`, NaN where hidden; the mesh determines whether such points have neighbours to follow. Returns
+    confidence `(F, P)`, 0 in every frame for these points; their indices; and notes with number, indices, and position in the
+    result.
 
     Raises
     ------

@@ -23,23 +23,10 @@ TWO_MAPS = ("visconfs_e", "visconf_maps_e")
 def find_visibility(
     named: Arrays, reading: Reading, *, grid: tuple[int, int] | None, kind: str
 ) -> tuple[NDArray[np.float64], list[str]] | None:
-    """Return the confidence that each point is visible, in the order of the tracks.
+    """Return the confidence `(F, P)` in [0, 1] that each point is visible, and notes; None if the file has no visibility.
 
-    Parameters
-    ----------
-    named : dict
-        The arrays of the tracks file.
-    reading : Reading
-        Interpretation of the tracks, applied to visibility as well.
-    grid : tuple of int, optional
-        Rows and columns of the picture, if the points are its pixels.
-    kind : str
-        The option `visibility`: auto, bool, probability or logits.
-
-    Returns
-    -------
-    tuple or None
-        Confidence in [0, 1], shape `(F, P)`, and notes; None if the file has no visibility.
+    `reading`, the interpretation of the tracks, is applied to visibility as well; `grid` is the size of the picture whose pixels
+    the points are; `kind` is the option `visibility`.
 
     Raises
     ------
