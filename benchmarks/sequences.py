@@ -71,7 +71,9 @@ def rolled_sheet(frames: int = 12) -> Case:
     """
     across, down = (each.ravel() for each in np.meshgrid(np.linspace(-1, 1, 7), np.linspace(-0.7, 0.7, 6)))
     bend, turn = np.linspace(0.3, 1.3, frames)[:, None], np.linspace(-0.6, 0.6, frames)[:, None]
-    sideways, down, forward = np.broadcast_arrays(np.sin(bend * across) / bend, down, (1 - np.cos(bend * across)) / bend)
+    sideways, down, forward = np.broadcast_arrays(
+        np.sin(bend * across) / bend, down, (1 - np.cos(bend * across)) / bend
+    )
     x, z = np.cos(turn) * sideways + np.sin(turn) * forward, np.cos(turn) * forward - np.sin(turn) * sideways
     shapes = np.stack([x, down, z + 4], axis=2)
     return Case(

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from pliant.solver.cameras.factorization import Upgrade, upgrades
 from pliant.solver.cameras.multistart import (
     CANDIDATES,
@@ -110,6 +111,9 @@ class CameraEstimate:
     candidates: tuple[OtherCameras, ...] = ()
     """All candidates of the multistart, which refinement with the shapes may rank otherwise."""
 
+    sampled: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
+    """Indices of the points of `sample`, shape `(S,)`."""
+
     depth_is_typical: bool = False
     """Whether the extent of depth rests on its prior and not on the tracks (`refinement.bas_relief`)."""
 
@@ -173,7 +177,7 @@ def estimate_cameras(
     return CameraEstimate(
         rotations, scales, completed.translations, best.basis_size, completed.gram, completed.sample,
         hypotheses, completed.outliers, completed.rank, completed.filling, None, ordered, reasons, _warnings(rotations),
-        candidates=candidates,
+        candidates=candidates, sampled=completed.sampled,
     )  # fmt: skip
 
 
@@ -289,6 +293,7 @@ def given_cameras(
         outliers=completed.outliers,
         rank=completed.rank,
         filling=completed.filling,
+        sampled=completed.sampled,
         ordered=settings.order != "any",
         reasons={"camera": reason},
     )

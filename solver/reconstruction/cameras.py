@@ -149,7 +149,7 @@ def _without_outliers(
     """
     seed = observations.settings.seed
     shown = np.flatnonzero(informative_frames(part.normalized.visible))
-    observed = Observed.of(part.normalized, estimate, shown, seed=seed)
+    observed = Observed.of(part.normalized, estimate, shown)
     probability, outliers = cross_fitted(observed, estimate, shown, seed=seed, should_stop=monitor)
     found = np.zeros(observations.tracks.visible.shape, dtype=bool)
     found[np.ix_(used[shown], observed.chosen)] = (observed.confidence > 0) & (probability < 0.5)

@@ -24,7 +24,7 @@ from pliant.solver.reconstruction.observations import Observations
 from pliant.solver.records import Floats, read_only
 from pliant.solver.refinement.covariance_learning import LearningData
 from pliant.solver.refinement.learned import Learned, turned_once
-from pliant.solver.tracks.completion import Filling, choose_points, gross
+from pliant.solver.tracks.completion import Filling, gross
 
 PREDICTED_TOGETHER = 256
 """Frames predicted at once; bounds the memory."""
@@ -52,12 +52,12 @@ def extended(
         Called between units of work; once it returns True, what is left is interpolated.
     """
     enter(should_stop, "extension")
-    normalized, frames = observations.normalized, len(observations.normalized.points)
+    frames = len(observations.normalized.points)
     turning = observations.turning
     scales, thin = np.asarray(estimate.scales), np.asarray(estimate.rotations)
     with_scales = bool((scales != 1).any()) and not _has_scales(observations)
     shapes = MeanShapes.of(covariance, thin, scales, np.asarray(estimate.sample))
-    chosen = choose_points(normalized.visible[used], np.random.default_rng(observations.settings.seed))
+    chosen = estimate.sampled
     views = _views(observations, estimate, chosen)
     poses = interpolated(used, thin, scales, covariance.modes, frames)
     if observations.known is not None:

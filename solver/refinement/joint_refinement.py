@@ -87,7 +87,7 @@ def refine_cameras(
         if normalized is not None and estimate.filling is not None:
             found = learned_at(start.gram, start.rotations, np.ones(len(start.used)), model_order, should_stop)
             start, found = _of_observations(
-                start, found, normalized, seed=seed, with_scales=False, turning=False, should_stop=should_stop
+                start, found, normalized, with_scales=False, turning=False, should_stop=should_stop
             )
             estimate = start.estimate
         return estimate, LearningData(
@@ -101,7 +101,7 @@ def refine_cameras(
     evidence, found = _refined(start, normalized, trial, model_order, should_stop)
     if normalized is not None and estimate.filling is not None and np.isfinite(found.energy):
         evidence, found = _of_observations(
-            evidence, found, normalized, seed=seed, with_scales=trial is not None and trial.start is not None,
+            evidence, found, normalized, with_scales=trial is not None and trial.start is not None,
             turning=True, should_stop=should_stop,
         )  # fmt: skip
         # The order suits completed tracks; moments state what hidden entries leave open. Errors without a limit and with the
@@ -265,7 +265,6 @@ def _of_observations(
     found: Learned,
     normalized: Normalized,
     *,
-    seed: int,
     with_scales: bool,
     turning: bool,
     should_stop: Callable[[], bool] | None,
@@ -276,7 +275,7 @@ def _of_observations(
     translations = np.array(estimate.translations)
     completed = Moments(evidence.gram, evidence.sample, translations[used], estimate.outliers)
     found, moments = on_observations(
-        Observed.of(normalized, estimate, used, seed=seed), found, completed, evidence.start_scales[used],
+        Observed.of(normalized, estimate, used), found, completed, evidence.start_scales[used],
         with_scales=with_scales, turning=turning, should_stop=should_stop,
     )  # fmt: skip
     translations[used] = moments.translations

@@ -19,7 +19,6 @@ from pliant.solver.model.expectation_maximisation import learned
 from pliant.solver.model.observation_model import ImageDensity, inlier_probabilities
 from pliant.solver.records import Floats
 from pliant.solver.refinement.learned import START_EM_ROUNDS, Learned, turned_once
-from pliant.solver.tracks.completion import choose_points
 from pliant.solver.tracks.normalization import Normalized
 
 ROUNDS = 3
@@ -49,10 +48,10 @@ class Observed:
     """Perspective at the frames used; None where tracks are not corrected."""
 
     @classmethod
-    def of(cls, normalized: Normalized, estimate: CameraEstimate, used: NDArray[np.intp], *, seed: int) -> Observed:
-        """Return the observations of the points that completion sampled with this seed."""
+    def of(cls, normalized: Normalized, estimate: CameraEstimate, used: NDArray[np.intp]) -> Observed:
+        """Return the observations of the points that completion sampled."""
         assert estimate.filling is not None
-        chosen = choose_points(normalized.visible, np.random.default_rng(seed))
+        chosen = estimate.sampled
         points, confidence = normalized.points[:, chosen], normalized.visible[:, chosen]
         weight = np.where(estimate.filling.outliers(points, confidence), 0.0, confidence)
         view = estimate.perspective

@@ -10,7 +10,7 @@ P; all points are then projected onto the basis in one pass.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -98,6 +98,9 @@ class Completed:
     filling: Filling | None = None
     """The factor that replaced hidden entries and outliers; None if none were replaced."""
 
+    sampled: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
+    """Indices of the sampled points, shape `(S,)`."""
+
 
 def complete(
     normalized: Normalized, *, seed: int = 0, rank: int = 0, should_stop: Callable[[], bool] | None = None
@@ -134,7 +137,7 @@ def complete(
     clean = outliers == 0.0 and bool((normalized.visible == 1).all())
     filling = None if clean else Filling(basis, spread, scale)
     gram, translations, sample = _carry(normalized, filling, chosen, should_stop)
-    return Completed(gram, sample, translations, 0 if clean else basis.shape[2], outliers, filling)
+    return Completed(gram, sample, translations, 0 if clean else basis.shape[2], outliers, filling, chosen)
 
 
 def seen_again(visible: Floats) -> int:

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
+from benchmarks.sequences import rolled_sheet
+
 ROOT = Path(__file__).parent.parent.parent
 
 

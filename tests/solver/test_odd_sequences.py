@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from pliant.solver import InvalidInput, KnownCamera, Mesh, Outcome, Settings, Solution, Tracks, solve
+from pliant.solver import InvalidInput, KnownCamera, Mesh, Outcome, Settings, Solution, Tracks, gallery, solve
 from pliant.solver.cameras.planar_ambiguity import poses
 from pliant.solver.cameras.scale import rigid_scales
 from pliant.solver.model.marginal_likelihood import LOWER, root_of
@@ -15,6 +15,11 @@ SEEDS = (2, 6, 12, 13, 17, 18, 19, 21, 23, 45, 71)
 
 MORE_SEEDS = (*sorted(set(range(24)) - set(SEEDS)), 91)
 """Sequences whose cameras are estimated."""
+
+
+def test_points_that_only_outliers_show_are_no_points_of_the_sample() -> None:
+    tracks = gallery.sphere(5, 20).tracks  # the sixteen points that completion keeps were compared with all twenty
+    assert np.isfinite(solve(tracks).shapes).all()
 
 
 @pytest.mark.parametrize("known", [True, False])

@@ -27,7 +27,7 @@ ONES = np.ones(20)
 def begun(tracks: Tracks) -> tuple[Observed, object, Moments]:
     normalized = normalize(tracks)
     estimate = given_cameras(normalized, KNOWN, Settings())
-    observed = Observed.of(normalized, estimate, USED, seed=0)
+    observed = Observed.of(normalized, estimate, USED)
     completed = Moments(estimate.gram, estimate.sample, np.asarray(estimate.translations), estimate.outliers)
     return observed, estimate, completed
 
