@@ -189,5 +189,15 @@ def covered(chosen: list[Row], held: list[Row]) -> str:
             f"| {name} | {len(values)} | {pooled(rows):.0%} | {right} | {int((values > AIM[1]).sum())} | "
             f"{int((values < AIM[0]).sum())} | {sum(inside)} of {len(inside)} |"
         )
-    lines += ["", f"The interval is ± {NINETY:g} standard deviations."]
+    lines += ["", f"The interval is ± {NINETY:g} standard deviations; {exceptions([*chosen, *held])}"]
     return "\n".join(lines)
+
+
+def exceptions(rows: list[Row]) -> str:
+    """Return a sentence that names the solves whose intervals hold less than `AIM` promises, the worst first."""
+    shares = [(share, row) for row in rows if (share := within(row)) is not None]
+    low = sorted(((share, row) for share, row in shares if share < AIM[0]), key=lambda each: each[0])
+    if not low:
+        return "no solve has fewer than 85 % of its positions within it."
+    names = ", ".join(f"{row['sequence']} {row['kind']} {share:.0%}" for share, row in low)
+    return f"solves with fewer than 85 % of their positions within it: {names}."

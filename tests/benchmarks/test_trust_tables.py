@@ -48,6 +48,8 @@ def test_sequences_count_equally_however_often_they_were_solved(bench) -> None:
     rows = [*often, solve_of("once", too_small=4.0)]
     expected = (tables.within(often[0], 1.645) + tables.within(rows[-1], 1.645)) / 2
     assert tables.pooled(rows, 1.645) == pytest.approx(expected)
+    assert "once clean" in tables.exceptions([*often, solve_of("once", too_small=20.0)])
+    assert "no solve" in tables.exceptions(often)
 
 
 def test_the_table_of_signs_counts_solves_by_their_true_error(bench) -> None:
