@@ -50,7 +50,13 @@ def in_model(points: np.ndarray) -> np.ndarray:
     return ((points + 0.5) * (256 / 640, 256 / 480)).astype(np.float32)
 
 
-@pytest.mark.parametrize("model", ["TAPNext", pytest.param("TAPIR", marks=[pytest.mark.slow, pytest.mark.long])])
+@pytest.mark.parametrize(
+    "model",
+    [
+        pytest.param("TAPNext", marks=pytest.mark.slow),
+        pytest.param("TAPIR", marks=[pytest.mark.slow, pytest.mark.long]),
+    ],
+)
 def test_from_tapnext(run, tmp_path: Path, model: str) -> None:
     points = in_model(SEQUENCE.tracks.points)[None]
     shape = points.shape[:3]
@@ -68,6 +74,7 @@ def test_from_tapnext(run, tmp_path: Path, model: str) -> None:
     assert (tmp_path / "face.glb").read_bytes()[:4] == b"glTF"
 
 
+@pytest.mark.slow
 def test_from_alltracker(run, tmp_path: Path) -> None:
     frames, height, width = 5, 24, 32
     row, column = np.mgrid[:height, :width].astype(np.float32)
@@ -110,6 +117,7 @@ def test_batch_resumes_where_it_stopped(run, tmp_path: Path) -> None:
     assert (tmp_path / "out" / "right" / "report.json").read_text()
 
 
+@pytest.mark.slow
 def test_many_at_once(run, tmp_path: Path) -> None:
     for name in ("a", "b"):
         np.savez(tmp_path / f"{name}.npz", tracks=SEQUENCE.tracks.points)
@@ -118,6 +126,7 @@ def test_many_at_once(run, tmp_path: Path) -> None:
     assert "a.npz: succeeded" in printed
 
 
+@pytest.mark.slow
 def test_evaluate(run, tmp_path: Path) -> None:
     np.savez(tmp_path / "tracks.npz", tracks=SEQUENCE.tracks.points)
     np.savez(tmp_path / "truth.npz", shapes=SEQUENCE.shapes)

@@ -99,6 +99,7 @@ def test_a_stop_between_blocks_leaves_a_result(film: gallery.Sequence) -> None:
 
 
 @pytest.mark.usefixtures("limited")
+@pytest.mark.slow
 def test_the_verdict_is_that_of_all_points_and_choices_those_of_all_blocks(film: gallery.Sequence) -> None:
     tracks, _ = gallery.corrupt_tracks(film.tracks, noise=0.003, outliers=0.08, hidden=0.3, seed=0)
     cameras, settings = given(film), Settings(max_reweightings=3)

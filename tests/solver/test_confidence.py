@@ -18,7 +18,7 @@ from pliant.solver.evaluation.trust import size_of
 from pliant.solver.tracks.normalization import normalize, relative
 from rolled_sheets import FOCAL, SIZE, rolled
 
-FACE = gallery.face(12, 80, degrees=60)
+FACE = gallery.face(6, 40, degrees=60)
 SPOILED, _ = gallery.corrupt_tracks(FACE.tracks, noise=0.005, outliers=0.08, hidden=0.1, seed=0)
 
 
@@ -45,12 +45,13 @@ def test_a_common_factor_of_all_confidences_changes_nothing(prior: str) -> None:
     assert part.trust == whole.trust
 
 
+@pytest.mark.slow
 def test_nor_does_it_between_the_stages() -> None:
     tracks = at(0.25)
     cameras = estimate_cameras(tracks, settings=Settings(max_reweightings=5))
     prior = learn_prior(tracks, cameras)
     found, whole = find_outliers(tracks, cameras, prior), solve_shapes(tracks, cameras, prior)
-    some = np.flatnonzero(np.arange(80) % 2)
+    some = np.flatnonzero(np.arange(40) % 2)
     half = Tracks.from_arrays(tracks.points[:, some], tracks.visible[:, some])
     assert (find_outliers(half, cameras, prior) == found[:, some]).all()
     assert solve_shapes(half, cameras, prior).choices.noise == pytest.approx(whole.choices.noise)

@@ -143,6 +143,7 @@ def test_the_cameras_project_to_the_pixels_given(close: Solution) -> None:
     assert close.camera.principal_point == pytest.approx(CENTRE)
 
 
+@pytest.mark.slow
 def test_mirrored_input_gives_mirrored_shapes(close: Solution) -> None:
     """The picture of the mirrored shape is not that of the shape: depth comes out with the other sign."""
     other = SEEN * [1, 1, -1]
@@ -178,6 +179,7 @@ def test_distances_of_a_rigid_thing_are_as_exact_as_its_shape() -> None:
     assert e3d_frame_scaled(found.shapes, seen) < 1e-3
 
 
+@pytest.mark.slow
 def test_a_principal_point_off_centre_is_used() -> None:
     corner = np.array([200.0, 650.0])
     views = pinhole(SEEN + np.array([150.0, -200.0, 0.0]), FOCAL, corner)

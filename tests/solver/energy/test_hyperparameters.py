@@ -79,6 +79,7 @@ def test_the_gaussian_prior_is_solved_in_double_precision_whatever_is_set(
     assert not any("needs float64" in warning for warning in default.choices.warnings)
 
 
+@pytest.mark.slow
 def test_the_default_is_robust_to_outliers_that_ruin_least_squares(face: gallery.Sequence, default: Solution) -> None:
     spoiled = gallery.corrupt(face, outliers=0.1, seed=3).tracks
     pseudo = error(face, spoiled, method="pseudo_inverse")

@@ -12,7 +12,15 @@ from rolled_sheets import FOCAL, SIZE, one_scale_error, rolled
 GIVEN = Settings(surface="isometric", focal=FOCAL, image_size=SIZE, order="film")
 
 
-@pytest.mark.parametrize("shown", [range(7), range(8), range(0, 49, 8)], ids=["row", "row and one", "diagonal"])
+@pytest.mark.parametrize(
+    "shown",
+    [
+        range(7),
+        pytest.param(range(8), marks=pytest.mark.slow),
+        pytest.param(range(0, 49, 8), marks=[pytest.mark.slow, pytest.mark.long]),
+    ],
+    ids=["row", "row and one", "diagonal"],
+)
 def test_a_frame_that_shows_a_line_of_a_sheet_leaves_the_others_as_they_are(shown: range) -> None:
     sheet = rolled(frames=6, side=7)
     visible = np.ones(sheet.tracks.visible.shape)
@@ -22,7 +30,7 @@ def test_a_frame_that_shows_a_line_of_a_sheet_leaves_the_others_as_they_are(show
     assert one_scale_error(found.shapes[others], sheet.points[others]) < 0.03
 
 
-@pytest.mark.parametrize("shown", [0, 5])
+@pytest.mark.parametrize("shown", [0, pytest.param(5, marks=pytest.mark.slow)])
 def test_a_frame_that_shows_too_little_is_like_its_neighbour_and_leaves_the_others_as_they_are(shown: int) -> None:
     sheet = rolled(frames=6, side=7)
     visible = np.ones(sheet.tracks.visible.shape)
@@ -52,6 +60,7 @@ def test_points_that_are_hardly_seen_together_are_no_sheet(required: bool) -> No
     assert surface.isometric_surface(sparse, image_size=SIZE, required=required).reason == surface.TOO_LITTLE
 
 
+@pytest.mark.slow
 def test_copies_of_points_give_finite_noise_and_probabilities() -> None:
     sheet = rolled(frames=6, side=5)
     found = solve(Tracks.from_arrays(np.repeat(sheet.tracks.points, 14, axis=1)), settings=GIVEN)

@@ -111,6 +111,7 @@ def test_hidden_points_and_outliers_leave_the_sheet_where_it_is() -> None:
     assert verdict.surface.outliers[~judged].mean() < 0.1
 
 
+@pytest.mark.slow
 def test_the_order_of_the_frames_has_no_effect() -> None:
     sheet = rolled(frames=5, side=5)
     order = np.array([3, 0, 1, 4, 2])
@@ -187,6 +188,7 @@ def test_the_solution_projects_back_onto_the_tracks_and_turns_a_camera_around_on
     assert trust.held_out_error is None
 
 
+@pytest.mark.slow
 def test_a_wrong_focal_length_is_reported_as_improbable() -> None:
     sheet = rolled(**SMALL)
     verdict = isometric_surface(sheet.tracks, focal=2 * FOCAL, image_size=SIZE, required=True)
@@ -223,6 +225,7 @@ def test_given_rotations_and_a_required_isometry_contradict() -> None:
         solve(sheet.tracks, cameras=known, settings=Settings(surface="isometric"))
 
 
+@pytest.mark.slow
 def test_a_free_surface_is_the_solve_without_isometry() -> None:
     tracks = gallery.sphere(5, 40).tracks
     free, auto = (

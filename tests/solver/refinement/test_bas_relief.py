@@ -138,7 +138,13 @@ def test_a_hill_bulges_and_a_bowl_does_not(y_up: bool) -> None:
     assert not bulges(given, (given.rotations[:, :2] @ MIRROR @ hill).transpose(0, 2, 1), y_up=y_up)
 
 
-@pytest.mark.parametrize(("y_up", "hidden"), [pytest.param(False, (), marks=pytest.mark.slow), (True, (3, 9))])
+@pytest.mark.parametrize(
+    ("y_up", "hidden"),
+    [
+        pytest.param(False, (), marks=[pytest.mark.slow, pytest.mark.long]),
+        pytest.param(True, (3, 9), marks=pytest.mark.slow),
+    ],
+)
 def test_a_face_has_its_nose_in_front(y_up: bool, hidden: tuple[int, ...]) -> None:
     """The first cameras of this one are inside out. Those of frames that show too little are between their neighbours'."""
     head = gallery.face(14, 60, degrees=30, seed=1)

@@ -87,7 +87,11 @@ def test_the_order_of_their_own_follows_from_the_content() -> None:
     assert sorted(content_order(hidden)) == list(range(10))
 
 
-@pytest.mark.parametrize("known", [pytest.param(False, marks=pytest.mark.slow), True], ids=["estimated", "given"])
+@pytest.mark.parametrize(
+    "known",
+    [pytest.param(False, marks=[pytest.mark.slow, pytest.mark.long]), pytest.param(True, marks=pytest.mark.slow)],
+    ids=["estimated", "given"],
+)
 def test_permuted_frames_give_permuted_shapes(known: bool) -> None:
     first = second = None
     if known:

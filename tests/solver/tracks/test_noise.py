@@ -93,6 +93,7 @@ def test_fine_deformation_is_not_learned_as_noise() -> None:
     assert learned(gram_of(tracks(500, modes=6, sigma=0.0)), PAIRS).noise_variance ** 0.5 < 1e-3
 
 
+@pytest.mark.slow
 def test_the_number_of_modes_is_cross_validated() -> None:
     few = [select_model_order(tracks(40, modes=modes, sigma=SIGMA), PAIRS) for modes in (0, 2)]
     assert [each.max_modes for each in few] == [0, 2]

@@ -13,6 +13,7 @@ from worker_house import House, settled
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="finds processes in /proc")
+@pytest.mark.slow
 def test_with_two_workers_the_running_limit_holds_and_all_jobs_finish(
     settings: Settings, inputs_files: tuple[Path, Path]
 ) -> None:

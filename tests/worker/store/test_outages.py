@@ -116,6 +116,7 @@ supervisor.run(on_started=lambda: print(*supervisor.pids().values(), flush=True)
 """
 
 
+@pytest.mark.slow
 def test_killing_the_supervisor_kills_all_and_loses_nothing(tmp_path: Path, inputs_files: tuple[Path, Path]) -> None:
     settings = Settings(data=tmp_path, workers=1, threads=1, lost_after=2.0, stop_grace=1.0)
     env = {**os.environ, **settings.to_environment()}
