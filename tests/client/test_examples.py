@@ -97,6 +97,7 @@ def test_from_alltracker(run, tmp_path: Path) -> None:
     assert (tmp_path / "face.glb").read_bytes()[:4] == b"glTF"
 
 
+@pytest.mark.slow
 def test_from_mat(run, tmp_path: Path) -> None:
     frames, points, _ = SEQUENCE.tracks.points.shape
     scipy.io.savemat(
@@ -106,6 +107,7 @@ def test_from_mat(run, tmp_path: Path) -> None:
     assert np.load(tmp_path / "out.npz")["shapes"].shape == (frames, points, 3)
 
 
+@pytest.mark.slow
 def test_batch_resumes_where_it_stopped(run, tmp_path: Path) -> None:
     (tmp_path / "clips").mkdir()
     np.savez(tmp_path / "clips" / "right.npz", tracks=SEQUENCE.tracks.points)

@@ -176,6 +176,7 @@ def test_a_result_in_a_file_is_that_in_memory(film: gallery.Sequence, tmp_path: 
 
 
 @pytest.mark.usefixtures("limited")
+@pytest.mark.slow
 def test_the_stages_are_the_whole_solve_in_blocks_too(film: gallery.Sequence, tmp_path: Path) -> None:
     settings = Settings(max_reweightings=4)
     whole = solve(film.tracks, film.mesh, cameras=given(film), settings=settings)

@@ -46,6 +46,7 @@ def given(sequence: gallery.Sequence) -> KnownCamera:
 
 
 @pytest.mark.usefixtures("limited")
+@pytest.mark.slow
 def test_deformation_between_the_frames_learned_from_is_found(film: gallery.Sequence) -> None:
     found = estimate_cameras(film.tracks, given(film))
     prior = learn_prior(film.tracks, found)

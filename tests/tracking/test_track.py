@@ -258,6 +258,7 @@ def test_a_region_lost_before_the_template_is_rejected(tmp_path: Path) -> None:
     assert caught.value.code == "region_lost"
 
 
+@pytest.mark.slow
 def test_uneven_times_and_a_broken_tail_get_warnings(tmp_path: Path) -> None:
     pictures = films.textured_pictures(24, (96, 72))
     path = films.with_uneven_times(films.write_film(tmp_path / "film.mp4", pictures), first=12)

@@ -91,6 +91,7 @@ def test_outliers_and_hidden_points_barely_change_the_cameras() -> None:
     assert degrees_apart(found.rotations, CAMERA) < 3
 
 
+@pytest.mark.slow
 def test_a_still_camera_is_reported() -> None:
     still = np.broadcast_to(np.eye(3), (8, 3, 3))
     found = estimate_cameras(normalize(Tracks.from_arrays(view(RIGID, still))), Settings())

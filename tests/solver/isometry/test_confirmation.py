@@ -28,6 +28,7 @@ def test_halves_of_a_rolled_sheet_agree() -> None:
     assert disagreement(search, chosen) < 0.1 * DISAGREEMENT
 
 
+@pytest.mark.slow
 def test_depths_along_the_rays_of_an_orthographic_flag_are_found_out_although_lengths_hardly_change() -> None:
     search = search_of(gallery.flag(6, 40).tracks)
     focal = 400.0
@@ -39,6 +40,7 @@ def test_depths_along_the_rays_of_an_orthographic_flag_are_found_out_although_le
     assert disagreement(search, chosen) > 10 * DISAGREEMENT
 
 
+@pytest.mark.slow
 def test_what_halves_do_not_confirm_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
     tracks = rolled(frames=6, side=7).tracks
     monkeypatch.setattr(surface, "disagreement", lambda search, chosen: 0.4)

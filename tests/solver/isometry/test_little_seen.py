@@ -30,7 +30,9 @@ def test_a_frame_that_shows_a_line_of_a_sheet_leaves_the_others_as_they_are(show
     assert one_scale_error(found.shapes[others], sheet.points[others]) < 0.03
 
 
-@pytest.mark.parametrize("shown", [0, pytest.param(5, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "shown", [pytest.param(0, marks=pytest.mark.slow), pytest.param(5, marks=[pytest.mark.slow, pytest.mark.long])]
+)
 def test_a_frame_that_shows_too_little_is_like_its_neighbour_and_leaves_the_others_as_they_are(shown: int) -> None:
     sheet = rolled(frames=6, side=7)
     visible = np.ones(sheet.tracks.visible.shape)

@@ -143,6 +143,7 @@ def test_a_shallow_face_without_perspective_is_not_taken_as_isometric() -> None:
     assert verdict.reason
 
 
+@pytest.mark.slow
 def test_outliers_only_end_with_a_warning_and_a_result() -> None:
     noise = Tracks.from_arrays(np.random.default_rng(0).uniform(0, 400, (4, 12, 2)))
     assert isometric_surface(noise).surface is None
@@ -165,6 +166,7 @@ def test_a_stopped_solve_does_not_assume_isometry() -> None:
     assert isometric_surface(sheet.tracks, focal=FOCAL, image_size=SIZE, should_stop=lambda: True).surface is None
 
 
+@pytest.mark.slow
 def test_the_solution_projects_back_onto_the_tracks_and_turns_a_camera_around_one_world() -> None:
     sheet = rolled(**SMALL)
     solution = solve(sheet.tracks, settings=Settings(focal=FOCAL, image_size=SIZE, order="film"))

@@ -64,7 +64,11 @@ def test_wrong_observations_of_little_confidence_are_as_good_as_hidden_in_the_co
     np.testing.assert_allclose(little.gram, hidden.gram, atol=3e-3 * np.abs(hidden.gram).max())
 
 
-@pytest.mark.parametrize("settings", [Settings(prior="smooth"), Settings(order="film")], ids=["smooth", "gaussian"])
+@pytest.mark.parametrize(
+    "settings",
+    [Settings(prior="smooth"), pytest.param(Settings(order="film"), marks=pytest.mark.slow)],
+    ids=["smooth", "gaussian"],
+)
 def test_wrong_observations_of_little_confidence_are_as_good_as_hidden_in_a_solve(settings: Settings) -> None:
     cameras = KnownCamera.from_arrays(MADE.rotations, MADE.scales)
     little, hidden = (

@@ -101,6 +101,7 @@ def test_the_number_of_modes_is_cross_validated() -> None:
     assert select_model_order(tracks(40, modes=8, sigma=0.02), PAIRS).max_modes == 8
 
 
+@pytest.mark.slow
 def test_many_points_support_at_least_the_true_modes() -> None:
     assert select_model_order(tracks(400, modes=2, sigma=SIGMA), PAIRS).max_modes >= 2
     assert select_model_order(tracks(400, modes=8, sigma=0.02), PAIRS).max_modes >= 8
