@@ -64,15 +64,15 @@ def from_gallery(sequence: Sequence, name: str) -> Case:
     return Case(name, sequence.tracks, sequence.mesh, sequence.shapes, cameras)
 
 
-def rolled_sheet(frames: int = 12) -> Case:
+def rolled_sheet(frames: int = 12, *, bend: tuple[float, float] = (0.3, 1.3)) -> Case:
     """Return a sheet of 7 × 6 points rolled onto cylinders before a turning pinhole camera with φ = 600 px and 640 × 480 px.
 
-    Shapes are in camera axes, half-widths of the sheet.
+    Shapes are in camera axes, half-widths of the sheet; `bend` is the curvature of the first and the last cylinder in this unit.
     """
     across, down = (each.ravel() for each in np.meshgrid(np.linspace(-1, 1, 7), np.linspace(-0.7, 0.7, 6)))
-    bend, turn = np.linspace(0.3, 1.3, frames)[:, None], np.linspace(-0.6, 0.6, frames)[:, None]
+    curved, turn = np.linspace(*bend, frames)[:, None], np.linspace(-0.6, 0.6, frames)[:, None]
     sideways, down, forward = np.broadcast_arrays(
-        np.sin(bend * across) / bend, down, (1 - np.cos(bend * across)) / bend
+        np.sin(curved * across) / curved, down, (1 - np.cos(curved * across)) / curved
     )
     x, z = np.cos(turn) * sideways + np.sin(turn) * forward, np.cos(turn) * forward - np.sin(turn) * sideways
     shapes = np.stack([x, down, z + 4], axis=2)

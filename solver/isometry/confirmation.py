@@ -8,6 +8,7 @@ of frames leads to other lengths. Lengths of a real sheet are those of one objec
 from __future__ import annotations
 
 import numpy as np
+from pliant.solver.evaluation.alignment import procrustes
 from pliant.solver.isometry.focal_sweep import FocalSearch, Tried
 from pliant.solver.isometry.inextensible import maximum_depth
 from pliant.solver.isometry.refinement import refine
@@ -16,6 +17,9 @@ from pliant.solver.records import Floats
 DISAGREEMENT = 0.05
 """Largest share of the edges' length by which a half may differ from the whole. Measured: paper .001, a comic page .002, paper with 1 px of
 noise, 10 % outliers and 30 % hidden .003, rolled cylinder .002; an orthographic flag 1.6 and 5.9, a face 8.2 and 8.9."""
+
+ALIGNMENTS = 10
+"""Alternations of the rigid shape and the rotations of the frames."""
 
 
 def disagreement(search: FocalSearch, chosen: Tried) -> float:
@@ -41,3 +45,14 @@ def unlike(lengths: Floats, others: Floats) -> float:
         return np.inf
     scaled = lengths[both] * float(np.median(others[both] / lengths[both]))
     return float(np.abs(scaled - others[both]).sum() / others[both].sum())
+
+
+def deformation(points: Floats) -> float:
+    """Return by how much shapes `(F, P, 3)` deform: their distance from one rigid shape, share of the size (root mean square)."""
+    centred = points - points.mean(axis=1, keepdims=True)
+    mean = centred[0]
+    aligned = centred
+    for _ in range(ALIGNMENTS):
+        aligned = centred @ procrustes(centred.transpose(0, 2, 1) @ mean, proper=True)
+        mean = aligned.mean(axis=0)
+    return float(np.sqrt(np.square(aligned - mean).sum() / np.square(centred).sum()))

@@ -15,10 +15,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from pliant.solver.isometry.anchors import Anchors, choose_anchors, connected, nearest_neighbours, unlike_frames
-from pliant.solver.isometry.confirmation import DISAGREEMENT, disagreement
+from pliant.solver.isometry.anchors import choose_anchors, connected, nearest_neighbours, unlike_frames
+from pliant.solver.isometry.confirmation import DISAGREEMENT, deformation, disagreement
 from pliant.solver.isometry.extension import Extended, complete_anchors, extend, flatten
 from pliant.solver.isometry.focal_sweep import CLEAR, FocalSearch, Tried, judged, sweep
+from pliant.solver.isometry.homographies import off_homography
 from pliant.solver.isometry.inextensible import SurfaceGraph, maximum_depth
 from pliant.solver.isometry.refinement import Isometry, edge_lengths, inconsistency, refine, typical
 from pliant.solver.records import Floats, Tracks
@@ -29,9 +30,10 @@ ANCHORS = 60
 SOLVED_FRAMES = 24
 """Frames of the conic program and of the focal lengths' comparison; the others start from the most similar one of these."""
 
-SHEETLIKE = 0.03
-"""Third over second singular value, squared, of the centred tracks below which `auto` tries isometry. Measured: paper .004, a comic page
-.019; bodies above .05, a nearly rigid head, for which I has false minima, .08."""
+SHEETLIKE = 0.06
+"""Distance of the pictures from homographies of each other, share of the size, below which `auto` tries isometry. Measured: sheets rolled
+up to half a cylinder .004 to .055, paper .028 and .040 with all errors, a comic page .042 and .052; a back .027, heads .02 to .06,
+other bodies from .065 on."""
 
 HOPELESS = 0.03
 """I of a small part at the first focal length above which `auto` tries no more. Measured: paper and page from half to four times the true
@@ -167,6 +169,8 @@ def isometric_surface(
     surface = _everywhere(search, tracks, seen, chosen)
     if surface is None:
         return IsometricVerdict("No isometric surface was found: its points do not hang together.", _trace(tried))
+    if not required and (rigid := _rigid(search, surface)) is not None:
+        return IsometricVerdict(rigid, _trace(tried))
     return IsometricVerdict(why, _trace(tried), surface, _warnings(clear, focal, least, chosen))
 
 
@@ -176,9 +180,9 @@ def _implausible(search: FocalSearch | None, focal: float, required: bool) -> st
         return TOO_LITTLE
     if required:
         return None
-    flatness = sheetlike(search.anchors)
-    if flatness > SHEETLIKE:
-        return f"Not tried as an isometric sheet: the third singular value of the tracks is {np.sqrt(flatness):.2f} of the second."
+    off = off_homography(search.anchors)
+    if off > SHEETLIKE:
+        return f"Not tried as an isometric sheet: the pictures differ from those of a plane by {off:.1%} of its size."
     changes = _glance(search, focal)
     return (
         f"Not an isometric sheet: edge lengths of a part of it change by {changes:.1%}." if changes > HOPELESS else None
@@ -194,23 +198,28 @@ def _confirmed(search: FocalSearch, chosen: Tried, why: str) -> tuple[bool, str]
     return True, f"{why} Halves of the frames agree about the lengths to {share:.1%}."
 
 
+def _rigid(search: FocalSearch, surface: IsometricSurface) -> str | None:
+    """Return why the surface is that of a rigid solid, None if it bends.
+
+    Pictures of a sheet differ from those of a plane because it bends, those of a solid because of its depth, which stays. A rigid solid
+    keeps all lengths as well, but a free surface determines it exactly: .0002 for a rigid face, .05 as a sheet.
+    """
+    bends, off = (
+        deformation(surface.points[:, :: max(1, surface.points.shape[1] // FIRST_LOOK)]),
+        off_homography(search.anchors),
+    )
+    if bends >= off:
+        return None
+    return (
+        f"Not taken as an isometric sheet: it deforms by {bends:.1%} of its size, while the pictures differ from those of a plane "
+        f"by {off:.1%}, as those of a rigid solid do."
+    )
+
+
 def _some_frames(points: Floats, seen: NDArray[np.bool_]) -> NDArray[np.intp]:
     """Return the frames of the first look, from some of the points."""
     often = np.argsort(-seen.sum(axis=0), kind="stable")[:: max(1, seen.shape[1] // FIRST_LOOK)]
     return unlike_frames(points[:, often], seen[:, often], SOLVED_FRAMES)
-
-
-def sheetlike(anchors: Anchors) -> float:
-    """Return the third eigenvalue over the second of the centred tracks' Gram matrix; hidden entries are filled with rank 3."""
-    known = np.repeat(anchors.seen, 2, axis=0)
-    matrix = anchors.points.transpose(0, 2, 1).reshape(len(known), -1)
-    rows = np.maximum(known.sum(axis=1, keepdims=True), 1)
-    matrix = np.where(known, matrix - (matrix * known).sum(axis=1, keepdims=True) / rows, 0.0)
-    for _ in range(1 if known.all() else 20):
-        left, values, right = np.linalg.svd(matrix - matrix.mean(axis=1, keepdims=True), full_matrices=False)
-        low = (left[:, :3] * values[:3]) @ right[:3] + matrix.mean(axis=1, keepdims=True)
-        matrix = np.where(known, matrix, low)
-    return float((values[2] / max(values[1], np.finfo(np.float64).tiny)) ** 2) if len(values) > 2 else 0.0
 
 
 def _prepared(

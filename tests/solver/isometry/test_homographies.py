@@ -1,0 +1,99 @@
+"""How nearly pictures are those of a plane."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pliant.solver import Settings, Tracks, solve
+from pliant.solver.isometry.anchors import Anchors
+from pliant.solver.isometry.confirmation import deformation
+from pliant.solver.isometry.homographies import FEWEST_COMMON, off_homography, unlike_homography
+from pliant.solver.isometry.surface import isometric_surface
+from pliant.solver.model.so3 import exponential
+from rolled_sheets import CENTRE, SIZE, one_scale_error
+
+from benchmarks.sequences import rolled_sheet
+
+
+def anchors_of(points: np.ndarray, seen: np.ndarray | None = None) -> Anchors:
+    return Anchors(points, np.ones(points.shape[:2], dtype=bool) if seen is None else seen, 0.0)
+
+
+def pictures(shape: np.ndarray, turns: np.ndarray, distance: float) -> np.ndarray:
+    """Pictures `(F, P, 2)` of a rigid shape `(P, 3)` that turns before a pinhole camera, its size 1."""
+    placed = shape @ exponential(turns).transpose(0, 2, 1) + [0, 0, distance]
+    return placed[..., :2] / placed[..., 2:]
+
+
+def turns(degrees: float) -> np.ndarray:
+    return np.radians(np.linspace(-degrees, degrees, 6))[:, None] * [0.3, 1.0, 0.1]
+
+
+@pytest.mark.parametrize("distance", [1.8, 50.0])
+def test_pictures_of_a_plane_are_homographies_however_near_it_is(distance: float) -> None:
+    plane = np.hstack([np.random.default_rng(0).uniform(-1, 1, (30, 2)), np.zeros((30, 1))])
+    assert off_homography(anchors_of(pictures(plane, turns(35), distance))) < 1e-9
+
+
+def test_a_solid_is_off_by_its_depth() -> None:
+    random = np.random.default_rng(0)
+    flat = random.uniform(-1, 1, (40, 2))
+    off = [
+        off_homography(anchors_of(pictures(np.hstack([flat, depth * random.normal(size=(40, 1))]), turns(20), 10.0)))
+        for depth in (0.01, 0.1, 0.5)
+    ]
+    assert 1e-4 < off[0] < 0.3 * off[1] < 0.3 * off[2]
+    assert off[2] > 0.06
+
+
+def test_frames_that_share_too_little_do_not_count() -> None:
+    plane = np.hstack([np.random.default_rng(0).uniform(-1, 1, (30, 2)), np.zeros((30, 1))])
+    points = pictures(plane, turns(20), 5.0)
+    points[5] = np.random.default_rng(1).normal(size=(30, 2))
+    seen = np.ones((6, 30), dtype=bool)
+    seen[5, FEWEST_COMMON - 1 :] = False
+    assert off_homography(anchors_of(points, seen)) < 1e-9
+    seen[:, FEWEST_COMMON - 1 :] = False
+    assert off_homography(anchors_of(points, seen)) == np.inf
+
+
+def test_points_at_one_place_are_no_plane_and_no_error() -> None:
+    assert unlike_homography(np.zeros((9, 2)), np.random.default_rng(0).normal(size=(9, 2))) > 0.1
+
+
+@pytest.mark.slow
+def test_a_sheet_that_turns_before_a_near_camera_is_taken_as_one() -> None:
+    sheet = rolled_sheet(bend=(0.2, 0.8))  # its third singular value is .22 of the second
+    found = solve(sheet.tracks, settings=Settings(image_size=SIZE))
+    assert found.choices.reasons["surface"].startswith("Taken as an isometric sheet")
+    assert found.camera.focal == pytest.approx(600, rel=0.03)
+    assert one_scale_error(found.shapes @ found.camera.rotations.transpose(0, 2, 1), sheet.shapes) < 0.01
+
+
+def test_a_body_is_not_tried() -> None:
+    body = np.random.default_rng(0).normal(size=(60, 3)) * 0.4
+    verdict = isometric_surface(Tracks.from_arrays(500 * pictures(body, turns(30), 4.0)), image_size=SIZE)
+    assert verdict.surface is None
+    assert verdict.reason.startswith("Not tried as an isometric sheet: the pictures differ from those of a plane by")
+
+
+@pytest.mark.slow
+def test_a_rigid_solid_is_no_sheet_although_it_keeps_all_lengths() -> None:
+    across = np.stack(np.meshgrid(np.linspace(-1, 1, 8), np.linspace(-1, 1, 8)), axis=2).reshape(-1, 2)
+    dome = np.column_stack([across, 0.25 * np.exp(-2 * np.square(across).sum(axis=1))])
+    tracks = Tracks.from_arrays(500 * pictures(dome, turns(25), 4.0) + CENTRE)
+    verdict = isometric_surface(tracks, image_size=SIZE)
+    assert verdict.surface is None
+    assert "as those of a rigid solid do" in verdict.reason
+    assert isometric_surface(tracks, image_size=SIZE, required=True).surface is not None
+
+
+def test_deformation_is_the_distance_from_one_rigid_shape() -> None:
+    random = np.random.default_rng(0)
+    shape = random.normal(size=(50, 3))
+    shape -= shape.mean(axis=0)
+    moved = shape @ exponential(random.normal(size=(7, 3))).transpose(0, 2, 1) + random.normal(size=(7, 1, 3))
+    assert deformation(moved) < 1e-9
+    size = np.sqrt(np.square(shape).sum() / 50)
+    noisy = moved + 0.01 * size / np.sqrt(3) * random.normal(size=moved.shape)
+    assert deformation(noisy) == pytest.approx(0.01 * np.sqrt(6 / 7), rel=0.1)
