@@ -7,8 +7,8 @@ Sequences of DIR whose truth is in camera axes and whose focal length is known. 
 
 - `auto`, `given`: default settings with `image_size`, without and with the focal length
 - `free`: the same as `auto` with `surface=free`
-- `mdh`: the conic program of Chhatkuli and others (TPAMI 2018) alone, with the focal length, on `ANCHORS` points spread over the sheet;
-  not on spoiled tracks, which it does not resist
+- `mdh`: the conic program of Chhatkuli and others (TPAMI 2018) alone, its frames weighted as `isometry.inextensible` says, with the focal
+  length, on `ANCHORS` points spread over the sheet; not on spoiled tracks, which it does not resist
 - `plane`: in every frame the plane nearest to the true shape, so that no planar method can be better
 
 `all` adds 10 % outliers, 30 % hidden observations, noise of 1 px and drift (`benchmarks.accuracy.spoiling`); `shuffled` permutes the

@@ -204,10 +204,9 @@ def _rigid(search: FocalSearch, surface: IsometricSurface) -> str | None:
     Pictures of a sheet differ from those of a plane because it bends, those of a solid because of its depth, which stays. A rigid solid
     keeps all lengths as well, but a free surface determines it exactly: .0002 for a rigid face, .05 as a sheet.
     """
-    bends, off = (
-        deformation(surface.points[:, :: max(1, surface.points.shape[1] // FIRST_LOOK)]),
-        off_homography(search.anchors),
-    )
+    some = replace(search.anchors, points=search.anchors.points[search.frames], seen=search.seen[search.frames])
+    off = off_homography(some)
+    bends = deformation(surface.points[:, :: max(1, surface.points.shape[1] // FIRST_LOOK)])
     if bends >= off:
         return None
     return (

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from pliant.solver import Settings, Tracks, solve
+from pliant.solver.isometry import surface
 from pliant.solver.isometry.anchors import Anchors
 from pliant.solver.isometry.confirmation import deformation
 from pliant.solver.isometry.homographies import FEWEST_COMMON, off_homography, unlike_homography
@@ -86,6 +87,20 @@ def test_a_rigid_solid_is_no_sheet_although_it_keeps_all_lengths() -> None:
     assert verdict.surface is None
     assert "as those of a rigid solid do" in verdict.reason
     assert isometric_surface(tracks, image_size=SIZE, required=True).surface is not None
+
+
+@pytest.mark.slow
+def test_pairs_of_pictures_are_those_of_few_frames_however_long_the_film_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    compared: list[int] = []
+
+    def off(anchors: Anchors) -> float:
+        compared.append(len(anchors.seen))
+        return off_homography(anchors)
+
+    monkeypatch.setattr(surface, "off_homography", off)
+    verdict = isometric_surface(rolled_sheet(40, bend=(0.2, 0.8)).tracks, image_size=SIZE)
+    assert verdict.surface is not None
+    assert compared == [surface.SOLVED_FRAMES, surface.SOLVED_FRAMES]
 
 
 def test_deformation_is_the_distance_from_one_rigid_shape() -> None:
