@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 
 import films
 import numpy as np
 import pytest
+from pliant.tracking import estimate as tracking_estimate
 from pliant.tracking import open_film, track_film
-from pliant.tracking.estimate import Estimate, estimate
+from pliant.tracking.estimate import FLOWS, Estimate, estimate
 
 SIZE = (96, 72)
 
@@ -35,11 +37,16 @@ def test_points_are_those_that_tracking_begins_with(film: Path) -> None:
     assert taken(film).points > 1.2 * taken(film, region).points
 
 
-def test_time_grows_with_the_frames_and_falls_with_the_threads(film: Path) -> None:
-    whole = min(taken(film).seconds for _ in range(3))
-    assert whole > 0
-    assert min(taken(film, frames=":4").seconds for _ in range(3)) < whole / 3
-    assert min(taken(film, threads=8).seconds for _ in range(3)) < whole / 3
+def test_time_is_that_of_one_frame_for_every_frame_shared_by_the_threads(
+    film: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert taken(film).seconds > 0
+    clock = itertools.count()
+    monkeypatch.setattr(tracking_estimate.time, "perf_counter", lambda: float(next(clock)))
+    frame = FLOWS + 1.0  # a clock that ticks once between two readings: flows, and the rest of a frame
+    assert taken(film).seconds == 40 * frame
+    assert taken(film, frames=":4").seconds == 4 * frame
+    assert taken(film, threads=8).seconds == 40 * frame / 8
 
 
 def test_without_texture_there_is_nothing_to_track(film: Path) -> None:
